@@ -9,7 +9,7 @@ BENCH := .venv/.bench
 # pytest rewrites Hypothesis and all tests in each process, unless it may keep their bytecode.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-core test-numpy test-e2e check build bench bench-trade fuzz mutants clean
+.PHONY: demo test test-core test-numpy test-e2e check build bench bench-trade fuzz clean
 
 demo: $(DEMO)         ## the main job: the committed room, its cameras, half of it pruned, into out/
 	$(PY) docs/demo.py
@@ -29,9 +29,8 @@ test-e2e: $(BENCH) build ## the installed zip in real Blenders; skips, with the 
 	# fails gets one more try, and failing twice fails the build.
 	$(PY) -m pytest tests/e2e/test_w*.py || $(PY) -m pytest tests/e2e/test_w*.py --last-failed
 
-check: $(DEV)         ## lint, format, types, and whether each mutant's line is still there
+check: $(DEV)         ## lint, format, types
 	.venv/bin/ruff check && .venv/bin/ruff format --check && .venv/bin/mypy
-	$(PY) tests/mutants.py --stale
 
 build: $(DEV)         ## the extension's zip, validated, into build/
 	$(PY) .ci/build_extension.py
@@ -45,9 +44,6 @@ bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." m
 
 fuzz: $(DEV)          ## hostile files, for SECONDS
 	$(PY) -m tests.fuzz --seconds $(or $(SECONDS),300)
-
-mutants: $(DEV)       ## deliberate faults in core, each to be caught by the tests
-	$(PY) tests/mutants.py
 
 clean:                ## all that was made
 	rm -rf .venv .venv-* build out .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

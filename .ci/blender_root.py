@@ -17,13 +17,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 from made_once import UnavailableError, cache_folder, made_once, print_path
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-    from pathlib import Path
 
 PACKAGES = (
     "blender",
@@ -61,8 +58,9 @@ def install_commands() -> None:
     for command in (["apt-get", "update"], install):
         done = subprocess.run(command, stdout=sys.stderr, check=False)
     if done.returncode != 0:
-        message = f"{hint}\nThat was tried and failed with exit code {done.returncode}."
-        raise UnavailableError(message)
+        raise UnavailableError(
+            f"{hint}\nThat was tried and failed with exit code {done.returncode}."
+        )
 
 
 def make_root(release: str, root: Path, lock: int) -> None:
@@ -101,8 +99,9 @@ def make_root(release: str, root: Path, lock: int) -> None:
     if done.returncode != 0:
         # Of a chain of errors the first ones name the cause.
         reason = "".join(errors[:3]).strip()
-        message = f"mmdebstrap {release} failed with exit code {done.returncode}:\n{reason}"
-        raise UnavailableError(message)
+        raise UnavailableError(
+            f"mmdebstrap {release} failed with exit code {done.returncode}:\n{reason}"
+        )
     check_blender(root)
 
 
@@ -137,11 +136,11 @@ def enter(
         words += ["--ro-bind", os.fspath(root / name), f"/{name}"]
     for link in ("bin", "lib", "lib64", "sbin"):
         words += ["--symlink", f"usr/{link}", f"/{link}"]
-    words += ["--dev", "/dev", "--proc", "/proc", "--tmpfs", "/run", "--tmpfs", "/tmp"]  # noqa: S108
+    words += ["--dev", "/dev", "--proc", "/proc", "--tmpfs", "/run", "--tmpfs", "/tmp"]
     for option, folders in (("--ro-bind", read_only), ("--bind", writable)):
         for folder in folders:
             words += [option, os.fspath(folder), os.fspath(folder)]
-    variables = {"PATH": "/usr/bin:/bin", "HOME": "/tmp", **(environment or {})}  # noqa: S108
+    variables = {"PATH": "/usr/bin:/bin", "HOME": "/tmp", **(environment or {})}
     for name, value in variables.items():
         words += ["--setenv", name, value]
     return words
@@ -158,8 +157,7 @@ def check_blender(root: Path) -> None:
     command = [*enter(root), "blender", "--background", "--version"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0 or not done.stdout.startswith("Blender "):
-        message = f"Blender in {root} does not start:\n{done.stdout}{done.stderr}"
-        raise UnavailableError(message)
+        raise UnavailableError(f"Blender in {root} does not start:\n{done.stdout}{done.stderr}")
 
 
 def provide(release: str) -> Path:
@@ -181,11 +179,11 @@ def provide(release: str) -> Path:
         If it cannot be had here.
     """
     if sys.platform != "linux":
-        message = f"a Debian root needs Linux, this is {sys.platform}"
-        raise UnavailableError(message)
+        raise UnavailableError(f"a Debian root needs Linux, this is {sys.platform}")
     if not (cache_folder() / release).is_dir() and os.geteuid() != 0:
-        message = f"making the root {release!r} needs to be run as root (mmdebstrap --mode=root)"
-        raise UnavailableError(message)
+        raise UnavailableError(
+            f"making the root {release!r} needs to be run as root (mmdebstrap --mode=root)"
+        )
     install_commands()
     return made_once(release, lambda root, lock: make_root(release, root, lock))
 

@@ -15,12 +15,9 @@ import re
 import shutil
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from made_once import UnavailableError, made_once, print_path
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 # Every `bpy` from Blender 4.2 to 5.0 is built for this Python and no other.
 PYTHON = (3, 11)
@@ -47,8 +44,9 @@ def find_python() -> str:
     name = "python{}.{}".format(*PYTHON)
     if found := shutil.which(name):
         return found
-    message = f"bpy needs {name}: not on PATH (Debian 12: apt-get install {name} {name}-venv)"
-    raise UnavailableError(message)
+    raise UnavailableError(
+        f"bpy needs {name}: not on PATH (Debian 12: apt-get install {name} {name}-venv)"
+    )
 
 
 def make_environment(version: str, folder: Path, lock: int) -> None:
@@ -77,8 +75,7 @@ def make_environment(version: str, folder: Path, lock: int) -> None:
         if done.returncode != 0:
             # pip says last what could not be had, after all its attempts.
             reason = "\n".join(done.stdout.strip().splitlines()[-2:])
-            message = f"{' '.join(command)} failed:\n{reason}"
-            raise UnavailableError(message)
+            raise UnavailableError(f"{' '.join(command)} failed:\n{reason}")
 
 
 def provide(version: str) -> Path:
@@ -100,8 +97,7 @@ def provide(version: str) -> Path:
         If it cannot be had here.
     """
     if not re.fullmatch(r"\d+\.\d+\.\d+", version):
-        message = f"a version like 4.5.15 was expected, not {version!r}"
-        raise UnavailableError(message)
+        raise UnavailableError(f"a version like 4.5.15 was expected, not {version!r}")
     folder = made_once(
         f"bpy-{version}", lambda partial, lock: make_environment(version, partial, lock)
     )

@@ -60,8 +60,9 @@ def fetch_wheel(name: str) -> Path:
         If it is unknown, cannot be downloaded or is not the file that was pinned.
     """
     if name not in WHEEL_SHA256:
-        message = f"{MANIFEST.name} names {name}, and {Path(__file__).name} has no SHA-256 for it"
-        raise BuildError(message)
+        raise BuildError(
+            f"{MANIFEST.name} names {name}, and {Path(__file__).name} has no SHA-256 for it"
+        )
     wheel = BUILD / "wheels" / name
     if not wheel.exists():
         project, version = name.split("-")[:2]
@@ -70,8 +71,7 @@ def fetch_wheel(name: str) -> Path:
         run(command)
     found = hashlib.sha256(wheel.read_bytes()).hexdigest()
     if found != WHEEL_SHA256[name]:
-        message = f"{wheel} has SHA-256 {found}, expected {WHEEL_SHA256[name]}"
-        raise BuildError(message)
+        raise BuildError(f"{wheel} has SHA-256 {found}, expected {WHEEL_SHA256[name]}")
     return wheel
 
 
@@ -82,8 +82,7 @@ def run(command: list[str]) -> None:
     )
     print(done.stdout, end="", file=sys.stderr)
     if done.returncode != 0:
-        message = f"exit code {done.returncode}: {' '.join(command)}"
-        raise BuildError(message)
+        raise BuildError(f"exit code {done.returncode}: {' '.join(command)}")
 
 
 def stage(manifest: dict[str, Any]) -> Path:
@@ -141,8 +140,7 @@ def extension_tool(blender: str | None) -> tuple[list[str], list[str]]:
             # Only Blender itself fills in the list of tags that extensions.blender.org allows.
             tags = script.parents[4] / TAGS
             return [sys.executable, str(script)], [f"--valid-tags={tags}"]
-    message = "no Blender: pip install bpy==4.5.15 (Python 3.11), or give --blender PATH"
-    raise BuildError(message)
+    raise BuildError("no Blender: pip install bpy==4.5.15 (Python 3.11), or give --blender PATH")
 
 
 def build(blender: str | None = None) -> Path:

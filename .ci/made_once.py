@@ -6,11 +6,8 @@ import fcntl
 import os
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 UNAVAILABLE = 69  # EX_UNAVAILABLE of sysexits.h
 
@@ -99,7 +96,8 @@ def _remove(folder: Path) -> None:
     if mounts.exists():
         points = [line.split()[4] for line in mounts.read_text().splitlines()]
         if inside := [point for point in points if Path(point).is_relative_to(folder)]:
-            message = f"{folder} is left of a killed run and has mounts: unmount {inside} first"
-            raise RuntimeError(message)
+            raise RuntimeError(
+                f"{folder} is left of a killed run and has mounts: unmount {inside} first"
+            )
     if folder.exists():
         shutil.rmtree(folder)

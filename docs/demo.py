@@ -16,13 +16,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 PROJECT = Path(__file__).resolve().parent.parent
 ROOM = PROJECT / "tests/data/room_small"
 OUT = PROJECT / "out"
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from collections.abc import Iterator
 
 CAMERA = "018"
 PERCENTAGE = int(sys.argv[1]) if len(sys.argv) > 1 else 75
@@ -33,14 +31,14 @@ RESOURCES = tempfile.mkdtemp(prefix="refine-demo-")
 os.environ["BLENDER_USER_RESOURCES"] = RESOURCES
 sys.path.insert(0, str(PROJECT))
 
-import bpy  # noqa: E402
-import numpy as np  # noqa: E402
+import bpy
+import numpy as np
 
-import refine_addon  # noqa: E402
-from refine_addon.core.splats import SH_C0  # noqa: E402
-from refine_addon.mesh import scores as mesh_scores  # noqa: E402
-from refine_addon.mesh.attributes import read_attribute, write_attribute  # noqa: E402
-from refine_addon.ui.render_operators import IMAGE  # noqa: E402
+import refine_addon
+from refine_addon.core.splats import SH_C0
+from refine_addon.mesh import scores as mesh_scores
+from refine_addon.mesh.attributes import read_attribute, write_attribute
+from refine_addon.ui.render_operators import IMAGE
 
 
 def training_cameras(path: Path) -> int:

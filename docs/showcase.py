@@ -8,14 +8,11 @@ decide what goes; the pictures are those of one between them, before and after. 
 README says of them. The scene is in the public domain (CC0).
 """
 
-# ruff: noqa: PLR2004 - the numbers are what the things look like
-
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFilter, ImageFont
@@ -23,18 +20,17 @@ from PIL import Image, ImageColor, ImageDraw, ImageFilter, ImageFont
 PROJECT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(PROJECT))
 
-from benchmarks.tables.million import write_cameras, write_ply  # noqa: E402
-from refine_addon.core import Budget, Settings, Splats, View, ViewSet, prune  # noqa: E402
-from refine_addon.core.pictures import compare  # noqa: E402
-from refine_addon.core.splats import SH_C0, joined, opacity_logits  # noqa: E402
+from collections.abc import Callable
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from numpy.typing import NDArray
 
-    from numpy.typing import NDArray
+from benchmarks.tables.million import write_cameras, write_ply
+from refine_addon.core import Budget, Settings, Splats, View, ViewSet, prune
+from refine_addon.core.pictures import compare
+from refine_addon.core.splats import SH_C0, joined, opacity_logits
 
-    Array = NDArray[np.float64]
-    Texture = Callable[[Array, Array], Array]  # of u and v in 0..1, (n,) each: colours, (n, 3)
+Array = NDArray[np.float64]
+Texture = Callable[[Array, Array], Array]  # of u and v in 0..1, (n,) each: colours, (n, 3)
 
 SHARE = 0.7
 """Of the splats, what goes."""

@@ -5,13 +5,13 @@
 
 def register() -> None:
     """Register everything with Blender."""
-    from . import registration  # noqa: PLC0415 - core must import where there is no bpy
+    from . import registration
 
     registration.register()
 
 
 def unregister() -> None:
     """Undo `register`, in reverse."""
-    from . import registration  # noqa: PLC0415
+    from . import registration
 
     registration.unregister()

@@ -13,7 +13,7 @@ def main() -> int:
     """
     try:
         # Only here: Ctrl-C may come while these load.
-        from . import command  # noqa: PLC0415
+        from . import command
 
         # Afterwards a signal would only break into Python's own tidying up.
         code = command.main(sys.argv[1:], last=True)

@@ -5,13 +5,11 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future, wait
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from .core.work import Cancelled, checkpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 Answer = TypeVar("Answer")
 
@@ -55,5 +53,5 @@ def serve() -> None:
                 continue
             try:
                 answer.set_result(function())
-            except BaseException as error:  # noqa: BLE001 - raised where it was asked for
+            except BaseException as error:
                 answer.set_exception(error)

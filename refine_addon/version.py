@@ -13,7 +13,7 @@ def _version() -> str:
         manifest = folder / "blender_manifest.toml"
         if manifest.is_file():
             return str(tomllib.loads(manifest.read_text("utf-8"))["version"])
-    from importlib import metadata  # noqa: PLC0415 - slow to import, and seldom needed
+    from importlib import metadata
 
     return metadata.version("refine-addon")  # installed by pip
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from . import main_thread
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
 
 _LOSSLESS = 100
 """Quality at which Blender compresses WebP without loss."""
@@ -32,13 +28,11 @@ class BlenderImages:
         ``VP8L`` (14 bits each, less 1, behind a byte), or ``VP8 `` (14 bits each, behind 6 bytes).
         """
         kind, start = data[12:16], data[20:30]
-        if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(start) < 10:  # noqa: PLR2004
-            msg = "no WebP image"
-            raise ValueError(msg)
+        if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(start) < 10:
+            raise ValueError("no WebP image")
         # Blender shows a black image where the data of one cannot be unpacked.
         if int.from_bytes(data[4:8], "little") + 8 > len(data):
-            msg = "truncated"
-            raise ValueError(msg)
+            raise ValueError("truncated")
         if kind == b"VP8X":
             sides = [int.from_bytes(start[at : at + 3], "little") + 1 for at in (4, 7)]
         elif kind == b"VP8L":
@@ -68,8 +62,7 @@ class BlenderImages:
                 image.alpha_mode = "CHANNEL_PACKED"
                 width, height = image.size
                 if (width, height) != self.size(data):
-                    msg = "damaged"
-                    raise ValueError(msg)
+                    raise ValueError("damaged")
                 values = np.empty(width * height * 4, np.float32)
                 image.pixels.foreach_get(values)
             finally:

@@ -37,8 +37,8 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from refine_addon.command.info import describe  # noqa: E402 - from this checkout, installed or not
-from refine_addon.core import (  # noqa: E402
+from refine_addon.command.info import describe
+from refine_addon.core import (
     Occlusion,
     RefineError,
     Settings,
@@ -48,8 +48,8 @@ from refine_addon.core import (  # noqa: E402
     read_splats,
     score,
 )
-from refine_addon.core.formats.ply_columns import empty_rows, splats_from_columns  # noqa: E402
-from refine_addon.core.formats.registry import FORMATS, SUFFIXES  # noqa: E402
+from refine_addon.core.formats.ply_columns import empty_rows, splats_from_columns
+from refine_addon.core.formats.registry import FORMATS, SUFFIXES
 
 MEMORY = 40_000_000
 """Bytes that any of these small inputs may cost; NumPy and JSON need some of their own."""
@@ -356,13 +356,11 @@ def use_ply(folder: Path) -> None:
     describe(file)
     file.write(again, overwrite=True)
     if path.read_bytes() != again.read_bytes():
-        msg = "rewritten with nothing pruned it is another file"
-        raise AssertionError(msg)
+        raise AssertionError("rewritten with nothing pruned it is another file")
     keep = np.arange(len(file)) % 2 == 0
     file.write(again, keep, columns={"mine": np.ones(len(file), np.float32)}, overwrite=True)
     if len(read_ply(again)) != int(keep.sum()):
-        msg = "pruned it holds another number of splats"
-        raise AssertionError(msg)
+        raise AssertionError("pruned it holds another number of splats")
 
 
 def use_splats(folder: Path) -> None:
@@ -489,8 +487,7 @@ def use_cameras(folder: Path) -> None:
                 continue
             raise
         if not np.isfinite(scores.values).all():
-            msg = "scores are not finite"
-            raise AssertionError(msg)
+            raise AssertionError("scores are not finite")
 
 
 Target = tuple[Callable[[], list[Files]], Callable[[Path], None]]
@@ -518,7 +515,7 @@ TARGETS: dict[str, Target] = {
 }
 
 
-class Crash(Exception):  # noqa: N818 - what fuzzers call it
+class Crash(Exception):
     """Something other than a result or an error for the user, and the files that led to it."""
 
     def __init__(self, files: Files, why: str) -> None:
@@ -600,7 +597,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in names:
         end = time.monotonic() + options.seconds / len(names)
         try:
-            chance = random.Random(f"{seed} {name}")  # noqa: S311 - no secret
+            chance = random.Random(f"{seed} {name}")
             tried, taken = fuzz(name, chance, lambda _, end=end: time.monotonic() < end)
         except Crash as crash:
             crashes += 1

@@ -5,14 +5,11 @@ Nothing here uses the code under test; a file is a concatenation of bytes whose 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from hypothesis import strategies as st
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 TYPES = {
     "char": "i1",

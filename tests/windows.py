@@ -84,8 +84,7 @@ def until(operator, context, is_so=lambda: False):
         if answer != {"PASS_THROUGH"} or is_so():
             return answer
         time.sleep(0.01)
-    msg = "it never ended"
-    raise AssertionError(msg)
+    raise AssertionError("it never ended")
 
 
 def until_over(operator, context):

@@ -8,14 +8,16 @@ resolution. A splat whose F is singular (seen too little) has the lowest score t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from refine_addon.core.splats import rotation_matrices
+from refine_addon.core.splats import Splats, rotation_matrices
+from refine_addon.core.views import View
 
-from ..renderer.compositing import add_up, bins_of
+from ..renderer.compositing import Bins, add_up, bins_of
 from ..renderer.footprints import (
     Camera,
     Footprints,
@@ -36,16 +38,6 @@ from ..renderer.jacobians import (
     shape_gradient,
 )
 from ..renderer.rasterizer import dealt
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.views import View
-
-    from ..renderer.compositing import Bins
 
 # Columns of a splat's moments: of contrast^2 w w' (upper triangle), of weight contrast w for each
 # channel, and of weight^2.

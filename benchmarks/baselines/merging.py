@@ -24,15 +24,13 @@ exactly as many remain as the budget asks for.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refine_addon.core.affine import quaternion
 from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 BLOCK = 3000
 """Largest number of splats of a block."""

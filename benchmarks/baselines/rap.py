@@ -11,22 +11,17 @@ import io
 import math
 import pickle
 import zipfile
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from refine_addon.core import spherical_harmonics
 from refine_addon.core.errors import RefineError
-from refine_addon.core.splats import SH_C0, base_color, opacity
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.splats import Splats
+from refine_addon.core.splats import SH_C0, Splats, base_color, opacity
 
 FEATURES = 15
 NEIGHBOURS = 128
@@ -155,15 +150,14 @@ def read_weights(path: Path) -> Layers:
             reader = _Tensors(archive, pickled.removesuffix("data.pkl"))
             tensors = list(reader.load().values())
     except (OSError, zipfile.BadZipFile, pickle.UnpicklingError, StopIteration) as error:
-        msg = f"{path}: expected weights that PyTorch saved ({error!r})"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: expected weights that PyTorch saved ({error!r})") from error
     layers = list(zip(tensors[::2], tensors[1::2], strict=False))
     widths = [FEATURES, *(len(bias) for _, bias in layers)]
     fitting = [
         matrix.shape == (out, width)
         for (matrix, _), width, out in zip(layers, widths, widths[1:], strict=False)
     ]
-    if not layers or not all(fitting) or widths[-1] != 2 or len(tensors) % 2:  # noqa: PLR2004
+    if not layers or not all(fitting) or widths[-1] != 2 or len(tensors) % 2:
         msg = f"{path}: expected layers from {FEATURES} features to 2 outputs, got tensors of "
         msg += f"shapes {[tensor.shape for tensor in tensors]}"
         raise RefineError(msg)
@@ -177,7 +171,7 @@ class _Tensors(pickle.Unpickler):
         super().__init__(io.BytesIO(archive.read(f"{folder}data.pkl")))
         self._archive, self._folder = archive, folder
 
-    def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401
+    def find_class(self, module: str, name: str) -> Any:
         """Return what stands for a name in the pickle."""
         known: dict[tuple[str, str], Any] = {
             ("collections", "OrderedDict"): _Dictionary,
@@ -185,11 +179,10 @@ class _Tensors(pickle.Unpickler):
             ("torch", "FloatStorage"): np.dtype("<f4"),
         }
         if (module, name) not in known:
-            msg = f"{module}.{name} is not allowed"
-            raise pickle.UnpicklingError(msg)
+            raise pickle.UnpicklingError(f"{module}.{name} is not allowed")
         return known[module, name]
 
-    def persistent_load(self, pid: Any) -> NDArray[np.float32]:  # noqa: ANN401
+    def persistent_load(self, pid: Any) -> NDArray[np.float32]:
         """Return the numbers of one tensor."""
         _, dtype, member, *_ = pid
         return np.frombuffer(self._archive.read(f"{self._folder}data/{member}"), dtype)

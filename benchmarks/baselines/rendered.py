@@ -8,22 +8,16 @@ not render ignore them (`RENDERED` names those that do).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from refine_addon.core.splats import Splats
 from refine_addon.core.splats import opacity as activated_opacity
+from refine_addon.core.views import ViewSet
 
-from ..renderer.rasterizer import accumulate_statistics
+from ..renderer.rasterizer import Statistics, accumulate_statistics
 from . import fisher
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.views import ViewSet
-
-    from ..renderer.rasterizer import Statistics
 
 Baseline = Callable[["Splats", "ViewSet", "Statistics | None"], "NDArray[np.float64]"]
 
@@ -143,6 +137,5 @@ def _relative_volume(splats: Splats, quantile: float) -> NDArray[np.float64]:
 
 def _required(statistics: Statistics | None) -> Statistics:
     if statistics is None:
-        msg = "this baseline needs the statistics of rendered views, got None"
-        raise ValueError(msg)
+        raise ValueError("this baseline needs the statistics of rendered views, got None")
     return statistics

@@ -109,8 +109,7 @@ def decimate(source: Path, target: Path, flag: str, keep_count: int) -> Run:
         said.seek(0)
         text = said.read().decode(errors="replace").strip()
     if code != 0 or not target.is_file():
-        msg = f"splat-transform ended with {code}: {text}"
-        raise RefineError(msg)
+        raise RefineError(f"splat-transform ended with {code}: {text}")
     return Run(seconds, busy, peak)
 
 

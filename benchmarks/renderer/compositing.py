@@ -6,10 +6,11 @@ The rules are those of `rasterizer`.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from .footprints import (
     ALPHA_CUT,
@@ -26,9 +27,6 @@ from .footprints import (
     V,
     disc_distance,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 TILE = 16
 """Side of a tile, pixels."""

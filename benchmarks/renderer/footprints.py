@@ -6,18 +6,14 @@ The rules are those of `rasterizer`; the frame is OpenCV's.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from refine_addon.core.splats import drawable, opacity, rotation_matrices
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.views import View
+from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
+from refine_addon.core.views import View
 
 LOW_PASS = 0.3
 """Variance added to every footprint so that it is not thinner than a pixel, pixels squared."""
@@ -130,11 +126,11 @@ def gaussians(
     count = len(means)
     shapes = means.shape, scales.shape, np.shape(quaternions), opacities.shape
     if shapes != ((count, 3), (count, 3), (count, 4), (count,)):
-        msg = f"expected shapes (N, 3), (N, 3), (N, 4), (N,), got {shapes}"
-        raise ValueError(msg)
+        raise ValueError(f"expected shapes (N, 3), (N, 3), (N, 4), (N,), got {shapes}")
     if harmonics.shape not in [(count, k * k, 3) for k in range(1, 6)]:
-        msg = f"expected harmonics ({count}, 1, 4, 9, 16 or 25, 3), got {harmonics.shape}"
-        raise ValueError(msg)
+        raise ValueError(
+            f"expected harmonics ({count}, 1, 4, 9, 16 or 25, 3), got {harmonics.shape}"
+        )
     axes = rotation_matrices(np.asarray(quaternions)) * scales[:, None, :]
     matrices = axes @ np.swapaxes(axes, 1, 2)
     rows, columns = np.triu_indices(3)
@@ -269,7 +265,7 @@ def _project_disc(
     row, box = out
     matrix = np.empty((3, 3))
     for column in range(3):
-        mean = column == 2  # noqa: PLR2004 - the third column
+        mean = column == 2
         point = scene.means[i] if mean else scene.tangents[i, :, column] + camera.center
         x, y, z = to_camera(camera, point)
         matrix[0, column] = camera.fx * x + camera.cx * z

@@ -6,12 +6,13 @@ The loss is any function of one rendered picture, given by its gradient by the p
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from .compositing import add_up, bins_of
+from .compositing import Bins, add_up, bins_of
 from .footprints import RED, Camera, Footprints, Gaussians, footprints_of, sh_basis
 from .jacobians import (
     CONTRAST,
@@ -26,13 +27,6 @@ from .jacobians import (
     turn_gradient,
 )
 from .rasterizer import dealt
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from .compositing import Bins
 
 # Columns of what is summed for every splat: by its shape, by log opacity, by its colour.
 _LOG_OPACITY, _COLOR, _SUMS = SHAPE, SHAPE + 1, SHAPE + 4

@@ -16,12 +16,13 @@ they do in the reference implementation's own gradients.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from .compositing import ALPHA_MAX, TILE, TRANSMITTANCE_STOP, compose, tile_hits
+from .compositing import ALPHA_MAX, TILE, TRANSMITTANCE_STOP, Bins, compose, tile_hits
 from .footprints import (
     FIELD_OF_VIEW_CLAMP,
     RED,
@@ -35,11 +36,6 @@ from .footprints import (
     sh_basis,
     to_camera,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from .compositing import Bins
 
 SHAPE = 5
 """Numbers of a footprint without its opacity: u, v, xx, xy, yy."""

@@ -30,11 +30,15 @@ Frame: OpenCV. Camera x right, y down, z forward; `rotation` is world to camera.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
+
+from refine_addon.core.splats import Splats
+from refine_addon.core.views import View
 
 from .compositing import (
     HITS,
@@ -43,6 +47,7 @@ from .compositing import (
     SUMS,
     WEIGHT,
     WEIGHT_MAX,
+    Bins,
     Target,
     bins_of,
     draw_tiles,
@@ -57,16 +62,6 @@ from .footprints import (
     gaussians_of,
     sh_basis,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.views import View
-
-    from .compositing import Bins
 
 __all__ = [
     "Camera",

@@ -12,22 +12,18 @@ away. Cameras walk round the objects at two heights, and look at them.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refine_addon.core.splats import SH_C0, Splats
 from refine_addon.core.views import View, ViewSet
 
 from ..tables.million import write_cameras, write_ply
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 OBJECTS = 40
 SIZE = 10.0

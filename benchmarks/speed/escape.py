@@ -14,13 +14,10 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from .main_thread import BINARIES, PROJECT, installed
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 KINDS = ("plain", "cycles", "splats")
 

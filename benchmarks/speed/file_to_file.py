@@ -29,8 +29,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -38,9 +38,6 @@ from refine_addon.core import SURVIVORS, Budget, read_ply
 from refine_addon.core.formats.ply_header import with_count
 
 from ..baselines import splat_transform
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 ROOT = Path(__file__).parents[2]
 ROOM = ROOT / "tests/data/room_small"

@@ -74,7 +74,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         plain, back = Path(folder) / "in.ply", Path(folder) / "back.ply"
         make_input(plain, options.splats)
-        if options.degree < 3:  # noqa: PLR2004 - the room's
+        if options.degree < 3:
             whole, plain = plain, Path(folder) / "short.ply"
             if theirs is None:
                 parser.error(f"--degree needs splat-transform: {splat_transform.MISSING}")

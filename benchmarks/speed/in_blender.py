@@ -15,12 +15,13 @@ import statistics
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 # Before bpy is imported, so that nobody's own Blender settings are read or written.
 os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="refine-bench-")
+
+from collections.abc import Callable, Sequence
 
 import bpy
 
@@ -30,9 +31,6 @@ from refine_addon.mesh import attributes as mesh_attributes
 from refine_addon.mesh import edit as mesh_edit
 
 from .file_to_file import make_input
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 IMPORTED = 1_000_000
 DELETED = 3_000_000

@@ -16,19 +16,16 @@ import argparse
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..tables.million import write_cameras, write_ply
 from . import capture
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 PROJECT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(PROJECT / "tests" / "e2e"), str(PROJECT / ".ci")]
 
-from blenders import BINARIES, Binary, provide  # noqa: E402 - a module of the tests
+from blenders import BINARIES, Binary, provide
 
 SPLATS = 160_000
 GOALS = {160_000: 0.3, 1_000_000: 1.0}

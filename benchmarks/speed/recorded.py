@@ -15,24 +15,20 @@ import json
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from refine_addon.core import Budget, pace, prune_file, prune_tiles, read_cameras, read_ply
-from refine_addon.core.costs import Cost
+from refine_addon.core.costs import Cost, Plan
 from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.levels.files import LevelsRequest, lod_file
 from refine_addon.core.levels.lod import Levels
 from refine_addon.core.operation.requests import PruneRequest
 from refine_addon.core.survivor_choice import SURVIVORS
 from refine_addon.core.task import METHODS, Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from refine_addon.core.costs import Plan
 
 EVENTS = 150
 """So many reports of a run are kept, evenly spread; all are told to the run."""

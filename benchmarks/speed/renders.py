@@ -15,26 +15,23 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 # Before bpy is imported, so that nobody's own Blender settings are read or written.
 os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="refine-bench-")
 
+from collections.abc import Sequence
+
 import bpy
 from mathutils import Matrix
+from numpy.typing import NDArray
 
 import refine_addon
 from refine_addon.cameras.objects import SOURCE, view_from_camera
 from refine_addon.core import read_ply
 
 from ..renderer.rasterizer import render
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 IMAGE = "Render with Splats"
 SAMPLES = 16

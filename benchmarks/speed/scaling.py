@@ -20,18 +20,15 @@ import pstats
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from refine_addon.core import Budget, prune_file, read_cameras, work
 from refine_addon.core.operation.requests import PruneRequest
+from refine_addon.core.survivor_choice import SurvivorChoice
 from refine_addon.core.task import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from refine_addon.core.survivor_choice import SurvivorChoice
-    from refine_addon.core.work import Progress
+from refine_addon.core.work import Progress
 
 CORES = (2, 4, 8, 16)
 WAYS: dict[str, tuple[str, SurvivorChoice]] = {
@@ -64,7 +61,7 @@ class Division:
 
     def watch(self) -> None:
         """Time the pieces of all calls from now on; of pieces within pieces the outer ones."""
-        in_turn = work._in_turn  # noqa: SLF001 - what one thread does
+        in_turn = work._in_turn
 
         def timed(
             whole: Callable[[slice], Result],
@@ -91,7 +88,7 @@ class Division:
 
             return in_turn(of_piece, pieces, step, progress, what)
 
-        work._in_turn = timed  # noqa: SLF001
+        work._in_turn = timed
 
 
 def spread(seconds: Sequence[float], cores: int) -> float:
@@ -111,7 +108,7 @@ def spread(seconds: Sequence[float], cores: int) -> float:
 def modelled(scene: Path, request: PruneRequest) -> tuple[Division, float]:
     """Return how a prune is divided, done by one thread, and seconds of the processor."""
     division = Division()
-    in_turn = work._in_turn  # noqa: SLF001 - put back below
+    in_turn = work._in_turn
     division.watch()
     try:
         with tempfile.TemporaryDirectory() as made:
@@ -121,7 +118,7 @@ def modelled(scene: Path, request: PruneRequest) -> tuple[Division, float]:
             division.serial.disable()
             return division, time.process_time() - start
     finally:
-        work._in_turn = in_turn  # noqa: SLF001
+        work._in_turn = in_turn
 
 
 def clocked(scene: Path, request: PruneRequest, threads: int) -> float:

@@ -14,21 +14,25 @@ import json
 import math
 import statistics
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from refine_addon.core import ClosedForm, Occlusion, Settings, Splats, read_cameras, read_ply, score
+from refine_addon.core import (
+    ClosedForm,
+    Occlusion,
+    Settings,
+    Splats,
+    ViewSet,
+    read_cameras,
+    read_ply,
+    score,
+)
 from refine_addon.core.work import default_threads
 
 from ..baselines import splat_transform
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from refine_addon.core import ViewSet
 
 ROOM = Path(__file__).parents[2] / "tests/data/room_small"
 

@@ -26,8 +26,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,9 +38,6 @@ from refine_addon.core.formats.ply_columns import REQUIRED
 from refine_addon.core.task import METHODS
 
 from ..baselines import splat_transform
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 ROOT = Path(__file__).parents[2]
 ROOM = ROOT / "tests/data/room_small"

@@ -17,16 +17,14 @@ import argparse
 import json
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from ..baselines import splat_transform
 from ..tables.million import write_cameras, write_ply
 from . import capture
 from .file_to_file import run
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 SIZES = (160_000, 1_000_000, 2_200_000)
 FIGURES = Path(__file__).parent / "figures.json"

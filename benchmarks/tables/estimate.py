@@ -19,28 +19,23 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refine_addon.core import Settings, prune
 from refine_addon.core.errors import RefineError
 from refine_addon.core.pipeline.score_splats import with_quality
 from refine_addon.core.report import little_seen
 from refine_addon.core.selection import Budget
+from refine_addon.core.splats import Splats
+from refine_addon.core.survivor_choice import Became
+from refine_addon.core.views import ViewSet
 
 from .evaluate import Evaluator, read_scene
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.survivor_choice import Became
-    from refine_addon.core.views import ViewSet
 
 DELETE, ABSORB, REFIT = "delete", "absorb", "refit"
 BECOMING: dict[str, Became] = {DELETE: "unchanged", ABSORB: "absorb", REFIT: "refit"}
@@ -120,7 +115,7 @@ def measure(
                 raise RefineError(result.report["estimated_psnr_note"])
             renders, gone = evaluator.evaluate(left).renders, 1.0 - float(result.keep.mean())
             truth, curve = renders.values["psnr"], with_quality(result.scores).quality
-            assert curve is not None  # noqa: S101 - there is an estimate
+            assert curve is not None
             of_views = curve.of_views(gone, BECOMING[way])
             # Absorbed results are compared in validation views only.
             told = [place for place, name in enumerate(renders.names) if name in of_views]
@@ -193,8 +188,9 @@ def measure_between(
             )
             estimate = result.report["estimated_psnr_between"]
             if estimate is None:
-                msg = f"of {len(views)} views nothing is told of what lies between them"
-                raise RefineError(msg)
+                raise RefineError(
+                    f"of {len(views)} views nothing is told of what lies between them"
+                )
             renders = evaluator.evaluate(result.survivors(splats)).renders
             warned = bool(little_seen(result.scores.seen))
             yield Between(way, ratio, estimate, np.asarray(renders.values["psnr"]), warned)

@@ -24,12 +24,13 @@ import importlib.util
 import json
 import sys
 import time
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from skimage.metrics import structural_similarity
 
@@ -39,20 +40,13 @@ from refine_addon.core.errors import RefineError
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.scores import Scores
 from refine_addon.core.selection import Budget, select
+from refine_addon.core.splats import Splats
+from refine_addon.core.views import ViewSet
 
 from ..baselines import rap
 from ..baselines.rendered import BASELINES, RENDERED
 from ..renderer import rasterizer
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.views import ViewSet
-
-    from ..renderer.rasterizer import Statistics
+from ..renderer.rasterizer import Statistics
 
 PSNR_CAP = 100.0
 """What identical images count as, dB; for comparison, rounding to 8 bits alone makes 59 dB."""
@@ -125,15 +119,7 @@ class Evaluator:
         metrics: Sequence[str] = METRICS[:2],
         near: float = 0.2,
     ) -> None:
-        """Render the original from every view.
-
-        Raises
-        ------
-        ModuleNotFoundError
-            If FLIP is asked for and not installed.
-        ValueError
-            If a picture is not of its view's size.
-        """
+        """Render the original from every view."""
         if "flip" in metrics and not flip_installed():
             raise ModuleNotFoundError(FLIP_MISSING)
         self.views = views
@@ -227,7 +213,7 @@ def _ssim(image: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
 
 
 def _flip(image: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
-    import flip_evaluator  # noqa: PLC0415 - optional
+    import flip_evaluator
 
     arrays = (np.ascontiguousarray(a, np.float32) for a in (reference, image))
     return float(flip_evaluator.evaluate(*arrays, "LDR", applyMagma=False)[1])
@@ -283,8 +269,9 @@ def _split(file: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
         split = json.loads(file.read_text(encoding="utf-8"))
         return split["train"], split["test"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        msg = f"{file}: expected lists of names 'train' and 'test' ({error!r})"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"{file}: expected lists of names 'train' and 'test' ({error!r})"
+        ) from error
 
 
 def scores_of(

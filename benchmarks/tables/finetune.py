@@ -11,26 +11,20 @@ splat is added, split or removed meanwhile.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
+from refine_addon.core.views import View, ViewSet
 
 from ..renderer import rasterizer
 from ..renderer.footprints import camera_of, gaussians
 from ..renderer.gradients import HARMONICS, LOGIT, MEAN, SCALE, TURN, gradient
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.views import View, ViewSet
-
-    from .evaluate import Evaluator
+from .evaluate import Evaluator
 
 ITERATIONS = 500
 RATIOS = (0.7, 0.9)
@@ -272,6 +266,5 @@ def measure(
 def _photo_psnr(evaluator: Evaluator, splats: Splats) -> float:
     found = evaluator.evaluate(splats).pictures
     if found is None:
-        msg = "fine-tuning needs photos of held-out views, got none"
-        raise ValueError(msg)
+        raise ValueError("fine-tuning needs photos of held-out views, got none")
     return found.mean["psnr"]

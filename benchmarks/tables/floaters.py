@@ -23,9 +23,9 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refine_addon.core.cleaning.clean import Cleaning, clean
 from refine_addon.core.cleaning.clusters import touching
@@ -37,20 +37,16 @@ from refine_addon.core.cleaning.search import (
     ISOLATED_SUPPORT,
     SUPPORT,
     Search,
+    _Suspects,
 )
 from refine_addon.core.formats.ply import read_ply
-from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import SH_C0, Splats, joined, opacity
+from refine_addon.core.views import View, ViewSet
+from refine_addon.core.visibility import projection
+from refine_addon.core.visibility.ray_sample import validation_rays
 from refine_addon.core.work import silent
 
 from .evaluate import Evaluator, read_scene
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refine_addon.core.cleaning.search import _Suspects
-    from refine_addon.core.views import View, ViewSet
 
 COUNTS = {"front": 1100, "blob": 800, "veil": 100}
 KINDS = ("single", "cluster", "needle", "veil")
@@ -333,13 +329,7 @@ def _sure(folder: Path, recipe: str, seed: int) -> str:
 
 
 class _Asked(Search):
-    """A search that keeps why splats stay.
-
-    Attributes
-    ----------
-    why : dict of str to (M,) bool
-        Of the Gaussians that stay, the first of these that is true of each.
-    """
+    """A search that keeps why splats stay."""
 
     def _floats(self, suspects: _Suspects) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         shows, faint = super()._floats(suspects)

@@ -11,9 +11,10 @@ view are told apart by counting with 16 views and with 32.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, get_args, get_type_hints
+from typing import Any, ClassVar, get_args, get_type_hints
 
 import numpy as np
 
@@ -21,13 +22,9 @@ from refine_addon.core.scoring import closed_form, occlusion
 from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.splats import ARRAYS, Splats
 from refine_addon.core.task import Settings
+from refine_addon.core.views import ViewSet
 
 from ..renderer import rasterizer
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from refine_addon.core.views import ViewSet
 
 READINGS = ("z", "distance", "default")
 ANALYTIC = {
@@ -58,14 +55,14 @@ class Counting(np.ndarray):
 
     total: ClassVar[int] = 0
 
-    def __array_ufunc__(  # noqa: D105
+    def __array_ufunc__(
         self,
         ufunc: np.ufunc,
         method: str,
-        *inputs: Any,  # noqa: ANN401
-        out: Any = None,  # noqa: ANN401
-        **options: Any,  # noqa: ANN401
-    ) -> Any:  # noqa: ANN401
+        *inputs: Any,
+        out: Any = None,
+        **options: Any,
+    ) -> Any:
         plain = [_plain(value) for value in inputs]
         if out is not None:
             options["out"] = tuple(_plain(value) for value in out)
@@ -76,7 +73,7 @@ class Counting(np.ndarray):
             Counting.total += _operations(ufunc, method, plain, result)
         return _counting(result) if out is None else out[0] if len(out) == 1 else out
 
-    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:  # noqa: ANN401, D105
+    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
         del types
         if function is np.einsum:
             operands = [_plain(value) for value in args[1:]]
@@ -93,7 +90,7 @@ class Counting(np.ndarray):
             return _counting(function(*plain, **{k: _plain(v) for k, v in kwargs.items()}))
         return super().__array_function__(function, (Counting,), args, kwargs)
 
-    def cumsum(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+    def cumsum(self, *args: Any, **kwargs: Any) -> Any:
         """Count what the C code of `ndarray` would do unseen."""
         return np.cumsum(self, *args, **kwargs)
 
@@ -199,28 +196,28 @@ class _CountingNumPy:
          "linspace", "stack", "concatenate", "hstack", "column_stack"}
     )  # fmt: skip
 
-    def __getattr__(self, name: str) -> Any:  # noqa: ANN401
+    def __getattr__(self, name: str) -> Any:
         value = getattr(np, name)
         if name not in self.MAKERS:
             return value
         return lambda *args, **kwargs: _counting(value(*args, **kwargs))
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401
+def _plain(value: Any) -> Any:
     return value.view(np.ndarray) if isinstance(value, Counting) else value
 
 
-def _counting(value: Any) -> Any:  # noqa: ANN401
+def _counting(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(map(_counting, value))
     return value.view(Counting) if isinstance(value, np.ndarray) else value
 
 
-def _floating(value: Any) -> bool:  # noqa: ANN401
+def _floating(value: Any) -> bool:
     return np.issubdtype(getattr(value, "dtype", type(value)), np.inexact)
 
 
-def _operations(ufunc: np.ufunc, method: str, inputs: list[Any], result: Any) -> int:  # noqa: ANN401
+def _operations(ufunc: np.ufunc, method: str, inputs: list[Any], result: Any) -> int:
     """Return how many operations one call is."""
     if isinstance(result, tuple):
         result = result[0]

@@ -18,13 +18,16 @@ are, and with every parameter in the unit that makes its own diagonal entry 1.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from refine_addon.core.splats import SH_C0, opacity, rotation_matrices
+from refine_addon.core.splats import SH_C0, Splats, opacity, rotation_matrices
+from refine_addon.core.views import ViewSet
 
 from ..renderer.compositing import bins_of
 from ..renderer.footprints import RED, Camera, Gaussians, camera_of, footprints_of, gaussians_of
@@ -41,14 +44,6 @@ from ..renderer.jacobians import (
     shape_gradient,
 )
 from ..renderer.rasterizer import accumulate_statistics
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.views import ViewSet
 
 PARAMETERS = 14
 MEAN, SCALE, ROTATION, LOGIT, COLOR = 0, 3, 6, 10, 11

@@ -16,20 +16,14 @@ import argparse
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from refine_addon.core import Levels, lod, prune, read_ply
+from refine_addon.core.splats import Splats
 
 from ..baselines import splat_transform
-from .evaluate import Evaluator, read_scene
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from refine_addon.core.splats import Splats
-
-    from .evaluate import Scene
+from .evaluate import Evaluator, Scene, read_scene
 
 SHARES = (0.5, 0.25, 0.12, 0.06)
 
@@ -51,7 +45,7 @@ def in_one_go(scene: Scene) -> Iterator[tuple[Splats, str]]:
     for budget in Levels(SHARES).budgets(len(scene.splats)):
         start = time.process_time()
         made = prune(scene.splats, scene.train, budget, survivors="absorb").absorbed
-        assert made is not None  # noqa: S101 - it was asked for
+        assert made is not None
         yield made.splats, f" ({time.process_time() - start:.0f} s)"
 
 

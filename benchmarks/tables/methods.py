@@ -7,10 +7,11 @@ offers is asked of its `Settings`, so that a method that is added there is measu
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
@@ -21,16 +22,11 @@ from refine_addon.core.scores import Scores
 from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import ARRAYS, Splats
+from refine_addon.core.views import ViewSet
 
 from ..baselines import merging, rap, splat_transform
 from ..baselines.rendered import BASELINES, RENDERED, ROUNDS, removed_in_rounds
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from refine_addon.core.views import ViewSet
-
-    from ..renderer.rasterizer import Statistics
+from ..renderer.rasterizer import Statistics
 
 OURS, LITERATURE, EXTERNAL = "ours", "literature", "external"
 
@@ -104,7 +100,7 @@ def _baselines() -> list[Method]:
     methods = []
     for name, function in BASELINES.items():
 
-        def score(task: Task, statistics: Statistics | None, function: Any = function) -> Scores:  # noqa: ANN401
+        def score(task: Task, statistics: Statistics | None, function: Any = function) -> Scores:
             return as_scores(function(task.splats, task.views, statistics), len(task.views))
 
         about = ABOUT.get(name, name)
@@ -141,7 +137,7 @@ def _merging() -> list[Method]:
     methods = []
     for dress, text in about.items():
 
-        def reduce(task: Task, keep_count: int, ratio: float, dress: Any = dress) -> Splats:  # noqa: ANN401
+        def reduce(task: Task, keep_count: int, ratio: float, dress: Any = dress) -> Splats:
             del ratio
             return merging.reduce(task.splats, keep_count, dress)
 

@@ -11,29 +11,25 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.formats.ply_columns import columns_from_splats
 from refine_addon.core.splats import SH_C0, Splats, drawable, joined, opacity, rotation_matrices
 from refine_addon.core.task import METHODS
+from refine_addon.core.views import ViewSet
 
 from ..baselines import splat_transform
 from ..speed.file_to_file import run
 from .evaluate import Evaluator
 from .sizes import scaled
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.views import ViewSet
 
 COUNT = 1_000_000
 RATIO = 0.5
@@ -106,8 +102,7 @@ def split(splats: Splats, count: int) -> Splats:
     """
     now = splats.take(drawable(splats))
     if not 0 < len(now) <= count:
-        msg = f"cannot make {count} splats of {len(now)} that can be drawn"
-        raise ValueError(msg)
+        raise ValueError(f"cannot make {count} splats of {len(now)} that can be drawn")
     random = np.random.default_rng(0)
     while len(now) < count:
         areas = np.sum(np.sort(now.log_scales, axis=1)[:, 1:], axis=1)

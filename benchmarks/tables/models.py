@@ -14,26 +14,20 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from refine_addon.core import prune
 from refine_addon.core.affine import quaternion
-from refine_addon.core.rendering import MODELS
+from refine_addon.core.rendering import MODELS, Model
 from refine_addon.core.selection import Budget
-from refine_addon.core.splats import rotation_matrices, with_model
+from refine_addon.core.splats import Splats, rotation_matrices, with_model
+from refine_addon.core.survivor_choice import SurvivorChoice
+from refine_addon.core.views import ViewSet
 
 from .evaluate import Evaluator, read_scene
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from refine_addon.core.rendering import Model
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.survivor_choice import SurvivorChoice
-    from refine_addon.core.views import ViewSet
 
 WAYS: tuple[SurvivorChoice, ...] = ("unchanged", "absorb", "refit")
 

@@ -14,31 +14,26 @@ first turn.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 from unittest import mock
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refine_addon.core import Settings
-from refine_addon.core.estimate.psnr import psnr_against
 from refine_addon.core.pipeline.absorb_splats import absorb_removed
 from refine_addon.core.pipeline.score_splats import score_once
-from refine_addon.core.seeing import cast, points, projection, ray_sample
-from refine_addon.core.seeing.ray_sample import RaySample
+from refine_addon.core.quality.psnr import psnr_against
+from refine_addon.core.splats import Splats
+from refine_addon.core.views import View, ViewSet
+from refine_addon.core.visibility import cast, points, projection, ray_sample
+from refine_addon.core.visibility.ray_sample import RaySample
 from refine_addon.core.work import silent
 
 from .evaluate import read_scene
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from contextlib import AbstractContextManager
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.views import View, ViewSet
 
 RAYS = 1 << 16
 """Rays of the held-out views."""
@@ -63,7 +58,7 @@ def other_cells(turn: int) -> AbstractContextManager[Any]:
     sides = points.cell_size
     factor = 1.0 + WIDER * turn
     return mock.patch(
-        "refine_addon.core.seeing.measuring.cell_size",
+        "refine_addon.core.visibility.measuring.cell_size",
         lambda *arguments: factor * sides(*arguments),
     )
 

@@ -19,30 +19,25 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from refine_addon import core
 from refine_addon.core import Settings
-from refine_addon.core.refitting.refit import SIMPLER, Refit, refit_on
-from refine_addon.core.refitting.round_rays import RoundRays
+from refine_addon.core.refit.refit import SIMPLER, Refit, Refitted, refit_on
+from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.selection import Budget
+from refine_addon.core.splats import Splats
+from refine_addon.core.survivor_choice import Became
 from refine_addon.core.views import ViewSet
 from refine_addon.core.work import silent
 
 from ..speed import capture
 from .evaluate import Evaluator, read_scene
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from refine_addon.core.refitting.refit import Refitted
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.survivor_choice import Became
-
-    from .methods import Task
+from .methods import Task
 
 STARTS: dict[str, tuple[str, Became]] = {
     "absorbed": ("occlusion", "absorb"),
@@ -111,7 +106,7 @@ def measure(task: Task, evaluator: Evaluator, ratios: Sequence[float]) -> list[C
             left, start = _left(task.splats, task.views, ratio, method, survivors)
             ways = CHEAPER if survivors == "absorb" else {name: Cheaper()}
             for label, way in ways.items():
-                label = name if way == Cheaper() else label  # noqa: PLW2901
+                label = name if way == Cheaper() else label
                 rounds = [
                     (seconds, evaluator.evaluate(refitted.splats).renders.mean["psnr"])
                     for seconds, refitted in _timed(left, task.splats, task.views, way)

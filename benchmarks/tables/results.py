@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from .cost import Cost
-    from .estimate import Estimated
-    from .finetune import Tuned
-    from .flops import Counts
-    from .hessian import Energies
-    from .methods import Method
-    from .million import Million
-    from .refits import Curve
-    from .sizes import Timed
-    from .variants import Line
+from .cost import Cost
+from .estimate import Estimated
+from .finetune import Tuned
+from .flops import Counts
+from .hessian import Energies
+from .methods import Method
+from .million import Million
+from .refits import Curve
+from .sizes import Timed
+from .variants import Line
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,16 +6,13 @@ if the photos had been taken, or reduced, to another size.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+from refine_addon.core.views import ViewSet
 
-    from refine_addon.core.views import ViewSet
-
-    from .cost import Cost
-    from .methods import Method, Task
+from .cost import Cost
+from .methods import Method, Task
 
 WIDTHS = (480, 1920)
 """Widths measured beside that of the files, pixels."""

@@ -23,16 +23,21 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from refine_addon.core import processes
 from refine_addon.core.errors import RefineError
+from refine_addon.core.scores import Scores
 from refine_addon.core.selection import Budget, select
+from refine_addon.core.splats import Splats
+from refine_addon.core.views import ViewSet
 
 from ..baselines import splat_transform
 from ..renderer import rasterizer
+from ..renderer.rasterizer import Statistics
 from . import (
     estimate,
     evaluate,
@@ -49,15 +54,6 @@ from . import (
 from .cost import Cost
 from .methods import Method, Task
 from .results import Measured, Row
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
-
-    from refine_addon.core.scores import Scores
-    from refine_addon.core.splats import Splats
-    from refine_addon.core.views import ViewSet
-
-    from ..renderer.rasterizer import Statistics
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOM = ROOT / "tests/data/room_small"

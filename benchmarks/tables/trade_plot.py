@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from .methods import EXTERNAL, LITERATURE, OURS
 from .refits import STARTS
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from .results import Measured, Row
+from .results import Measured, Row
 
 COLORS = {OURS: "#d1495b", LITERATURE: "#30638e", EXTERNAL: "#6a994e"}
 MARKERS = {OURS: "o", LITERATURE: "s", EXTERNAL: "^"}
@@ -21,10 +17,10 @@ MARKERS = {OURS: "o", LITERATURE: "s", EXTERNAL: "^"}
 
 def draw(file: Path, scene: Measured) -> None:
     """Draw quality over time, one frame for each ratio."""
-    import matplotlib as mpl  # noqa: PLC0415 - slow, and only needed here
+    import matplotlib as mpl
 
     mpl.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415
+    from matplotlib import pyplot as plt
 
     ratios = sorted({row.ratio for row in scene.rows})
     figure, frames = plt.subplots(

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime as dt
 import os
 import platform
 from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numba
 
+from refine_addon.core.views import ViewSet
+
 from ..baselines import splat_transform
-from .evaluate import HELD_OUT
+from .evaluate import HELD_OUT, Scene
 from .methods import OURS
+from .results import Measured, Row
 from .trade_plot import draw
 from .trade_sections import sections, table
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Iterable, Sequence
-
-    from refine_addon.core.views import ViewSet
-
-    from .evaluate import Scene
-    from .results import Measured, Row
 
 DIGITS = {"psnr": 1, "ssim": 3, "flip": 3}
 MEGABYTE = 1e6

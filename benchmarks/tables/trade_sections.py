@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from . import finetune, flops, million, refits
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from .cost import Cost
-    from .results import Measured
+from .cost import Cost
+from .results import Measured
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

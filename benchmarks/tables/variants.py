@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from refine_addon.core import Settings, score
 from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.scoring.occlusion import Occlusion
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from .evaluate import Evaluator
-    from .methods import Task
+from .evaluate import Evaluator
+from .methods import Task
 
 
 def _occlusion(views: int = 0, **changes: float) -> Settings:

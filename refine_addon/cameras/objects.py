@@ -9,17 +9,15 @@ import json
 import math
 from dataclasses import replace
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.affine import QUARTER, QUARTERS, quaternion
 from ..core.errors import RefineError
 from ..core.views import View
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 WEIGHT = "refine_weight"
 """Custom property of a camera object: how much its view counts, 1 without it."""
@@ -74,17 +72,15 @@ def view_from_camera(
         ``refine_weight`` is no number >= 0.
     """
     if obj.type != "CAMERA":
-        msg = f"object '{obj.name}': is of type {obj.type}, expected a camera"
-        raise RefineError(msg)
+        raise RefineError(f"object '{obj.name}': is of type {obj.type}, expected a camera")
     evaluated = obj.evaluated_get(depsgraph)
     data = evaluated.data if evaluated.is_evaluated else obj.data
     if data.type != "PERSP":
         kind = {"ORTHO": "orthographic", "PANO": "panoramic"}.get(data.type, data.type.lower())
-        msg = (
+        raise RefineError(
             f"camera '{obj.name}' is {kind}, expected a perspective one; change its lens type, or "
             "choose cameras without it"
         )
-        raise RefineError(msg)
     matrix = world_matrix(obj, depsgraph)
     source = _source(obj)
     size, aspect = render_size(scene)
@@ -127,11 +123,10 @@ def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArr
         return snapped(np.array(evaluated.matrix_world, np.float64))
     moving = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
     if moving or obj.constraints or (obj.parent and obj.parent_type != "OBJECT"):
-        msg = (
+        raise RefineError(
             f"object '{obj.name}': is disabled in viewports or excluded from the view layer, where "
             "Blender evaluates no animation or constraint; enable it first"
         )
-        raise RefineError(msg)
     matrix = np.array(obj.matrix_basis, np.float64)
     if obj.parent:
         inverse = np.array(obj.matrix_parent_inverse, np.float64)
@@ -240,11 +235,10 @@ def pose(name: str, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     axes = matrix[:3, :3] / np.where(lengths > 0.0, lengths, 1.0)
     if lengths.min() <= 0.0 or np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:
-        msg = (
+        raise RefineError(
             f"camera '{name}' is sheared or flat, as under a parent that is scaled unevenly; apply "
             "the parent's scale first"
         )
-        raise RefineError(msg)
     return FLIP[:, None] * axes.T, matrix[:3, 3]
 
 
@@ -252,11 +246,10 @@ def _weight(obj: bpy.types.Object) -> float:
     weight = obj.get(WEIGHT, 1.0)
     number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
     if not number or not 0.0 <= weight < math.inf:
-        msg = (
+        raise RefineError(
             f"camera '{obj.name}': custom property {WEIGHT} is {weight!r}, expected a number "
             "of at least 0"
         )
-        raise RefineError(msg)
     return float(weight)
 
 
@@ -310,11 +303,10 @@ def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
     except (TypeError, ValueError, AttributeError):
         complete = False
     if not complete:
-        msg = (
+        raise RefineError(
             f"camera '{obj.name}': custom property {SOURCE} is damaged; delete it, and the camera "
             "is used as Blender shows it"
         )
-        raise RefineError(msg)
     return source
 
 

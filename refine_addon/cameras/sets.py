@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..core.views import View, ViewSet
 from ..mesh.layout import LAYOUT
 from ..mesh.native import is_native
 from .objects import SHEAR, camera_from_view, quarter_turn, view_from_camera, world_matrix
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import bpy
-    from numpy.typing import NDArray
 
 _FEW = 16
 """So many cameras at most are looked at to tell whether all are to be turned."""
@@ -80,8 +76,7 @@ class CameraChoice:
         if self.source == "FRAMES":
             return views_from_frames(context, self.frames, splats)
         if self.source == "COLLECTION" and self.collection is None:
-            msg = "no cameras: choose the collection that holds them"
-            raise RefineError(msg)
+            raise RefineError("no cameras: choose the collection that holds them")
         context.view_layer.update()  # or the list of objects holds gaps where some were removed
         cameras = [_active_camera(scene)] if self.source == "ACTIVE" else self.cameras(context)
         if not cameras:
@@ -90,8 +85,7 @@ class CameraChoice:
                 where = "none is selected"
             elif self.source == "COLLECTION":
                 where = f"none is in collection '{self.collection.name}'"
-            msg = f"no cameras: {where}; scoring needs at least one"
-            raise RefineError(msg)
+            raise RefineError(f"no cameras: {where}; scoring needs at least one")
         depsgraph = context.evaluated_depsgraph_get()
         views = tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras)
         return ViewSet(views, turn=_turn(cameras, views, splats, depsgraph))
@@ -179,8 +173,9 @@ def views_from_frames(
     """
     scene = context.scene
     if not len(frames):
-        msg = f"no frames: the range starts at {frames.start} and ends at {frames.stop - 1}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"no frames: the range starts at {frames.start} and ends at {frames.stop - 1}"
+        )
     now = world_matrix(splats, context.evaluated_depsgraph_get()) if splats else None
     before = (scene.frame_current, scene.frame_subframe, scene.camera)
     views = []
@@ -225,11 +220,10 @@ def _turn(
 
 def _active_camera(scene: bpy.types.Scene) -> bpy.types.Object:
     if scene.camera is None:
-        msg = (
+        raise RefineError(
             f"no cameras: scene '{scene.name}' has no active camera at frame "
             f"{scene.frame_current}; set one, or choose other cameras"
         )
-        raise RefineError(msg)
     return scene.camera
 
 
@@ -241,9 +235,8 @@ def _against(
         return view
     motion = now @ np.linalg.inv(then)
     if np.abs(motion[:3, :3].T @ motion[:3, :3] - np.eye(3)).max() > SHEAR:
-        msg = (
+        raise RefineError(
             f"object '{obj.name}': its scale is animated; the views of different frames then "
             "see different splats: choose one frame"
         )
-        raise RefineError(msg)
     return view.turned(motion[:3, :3], motion[:3, 3])

@@ -11,12 +11,9 @@ done. `terminal` is all that prints, in `words` where several subcommands say th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from .signals import Listener, exit_code, reason  # and nothing that loads NumPy, see `Listener`
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -> int:
@@ -40,8 +37,8 @@ def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -
     with Listener(last=last) as listener:
         try:
             # Loads all of core, and with it NumPy: a signal waits until that is there.
-            from ..core.work import share_heap  # noqa: PLC0415
-            from . import flow  # noqa: PLC0415
+            from ..core.work import share_heap
+            from . import flow
 
             if last:
                 share_heap()
@@ -50,7 +47,7 @@ def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -
             listener.wait()
         except KeyboardInterrupt as stop:
             listener.wait()
-            from .terminal import complain  # noqa: PLC0415 - by now it is there
+            from .terminal import complain
 
             told = "".join(f" {note};" for note in getattr(stop, "__notes__", ()))
             complain(f"{reason(stop)};{told} nothing was left half-written")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import stat
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from ..core import RefineError
 from ..core.formats.registry import SUFFIXES, format_named, without_suffix
@@ -14,11 +16,6 @@ from . import zones
 from .options import DEFAULT_LEVELS, arrangement, budget, cleaning, levels, settings, survivors
 from .report import is_report
 from .zones import ROLES
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
 
 
 def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
@@ -88,13 +85,7 @@ def _refuse_urls(parser: argparse.ArgumentParser, options: argparse.Namespace) -
 
 
 def _check_settings(options: argparse.Namespace) -> None:
-    """Refuse values that cannot be, and a budget that means nothing to the method.
-
-    Raises
-    ------
-    RefineError
-        For a value.
-    """
+    """Refuse values that cannot be, and a budget that means nothing to the method."""
     if options.command == "clean":
         cleaning(options)
         return
@@ -103,15 +94,14 @@ def _check_settings(options: argparse.Namespace) -> None:
         check_goal(options.distance_psnr)
     scoring = settings(options)
     if scoring.refit.rounds is not None and options.survivors != "refit":
-        msg = f"rounds is {scoring.refit.rounds}, expected only with --survivors refit"
-        raise RefineError(msg)
+        raise RefineError(f"rounds is {scoring.refit.rounds}, expected only with --survivors refit")
     if options.command == "prune":
         budget(options).refuse_meaningless(scoring.method, frustum=scoring.frustum)
 
 
 def open_blend() -> str:
     """Return the path of the open .blend, "" if it was never saved."""
-    import bpy  # noqa: PLC0415 - only there inside Blender
+    import bpy
 
     return str(bpy.data.filepath)
 
@@ -142,10 +132,10 @@ def _check_report(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     path = os.path.realpath(options.report)
     for other in filter(None, others):
         # Unlike pathlib's, these two never fail, whatever the name.
-        if os.path.realpath(os.path.expanduser(other)) == path:  # noqa: PTH111
+        if os.path.realpath(os.path.expanduser(other)) == path:
             parser.error(f"--report {options.report} is {other}, expected a file of its own")
     pictures = getattr(options, "pictures", None)
-    if pictures and path.endswith(".png") and os.path.dirname(path) == os.path.realpath(pictures):  # noqa: PTH120
+    if pictures and path.endswith(".png") and os.path.dirname(path) == os.path.realpath(pictures):
         parser.error(f"--report {options.report} may be one of the pictures; choose another name")
     beginning = _beginning(options.report) if options.overwrite else None
     if beginning is not None and not is_report(beginning):
@@ -176,8 +166,9 @@ def _beginning(path: Path) -> bytes | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        msg = f"{path}: cannot be looked into ({error.strerror or error}); nothing was changed"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"{path}: cannot be looked into ({error.strerror or error}); nothing was changed"
+        ) from error
 
 
 def _check_source(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from ..core import CleanRequest, file_to_file
+from ..core import CleanRequest, ViewSet, file_to_file
 from . import zones
 from .options import cleaning
+from .run import Run
 from .words import by, written
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ..core import ViewSet
-    from .run import Run
 
 
 def clean(run: Run) -> None:

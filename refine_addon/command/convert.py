@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from ..core import ConvertRequest, convert_files
 from .options import arrangement
+from .run import Run
 from .words import sizes, written
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from .run import Run
 
 
 def convert(run: Run) -> None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from ..core import RefineError
 from . import checks, runs
 from .options import make_parser
 from .terminal import complain, described, flush
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 DONE, FAILED, USAGE = 0, 1, 2
 """Exit codes: done, failed on an input, wrong usage."""
@@ -34,7 +31,7 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
     try:
         options = parser.parse_args(list(arguments), argparse.Namespace(scene=scene))
         if scene:
-            from . import open_blend  # noqa: PLC0415 - needs Blender
+            from . import open_blend
 
             open_blend.check()
         checks.check(parser, options)

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..core import read_splats
+from ..core import SplatFile, read_splats
 from ..core.splats import drawable
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ..core import SplatFile
-    from .run import Run
+from .run import Run
 
 
 def info(run: Run) -> None:

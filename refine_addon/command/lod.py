@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from ..core.estimate.quality import in_words
+from ..core import ViewSet
 from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import LevelsRequest, lod_file
+from ..core.quality.curve import in_words
 from ..core.report import size_in_words
 from .options import levels, settings
+from .run import Run
 from .words import by
 from .zones import of_files
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ..core import ViewSet
-    from .run import Run
 
 
 def lod(run: Run) -> None:

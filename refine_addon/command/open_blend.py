@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import bpy
 
 from ..core import RefineError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 _COMMAND = ("-c", "--command")
 
@@ -32,5 +29,4 @@ def check(words: Sequence[str] | None = None) -> None:
     starts = (place for place, word in enumerate(words) if word in _COMMAND)
     named = [word for word in words[1 : next(starts, 0)] if word.lower().endswith(".blend")]
     if named and not bpy.data.filepath:
-        msg = f"{named[-1]}: Blender could not open it, and says why above"
-        raise RefineError(msg)
+        raise RefineError(f"{named[-1]}: Blender could not open it, and says why above")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from ..core import (
     CHOICES,
@@ -23,17 +24,13 @@ from ..core import (
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.levels.files import GOAL
-from ..core.refitting.refit import Refit
+from ..core.refit.refit import Refit
 from ..core.rendering import MODELS
+from ..core.survivor_choice import SurvivorChoice
 from ..core.urls import Url, is_url, refuse_url
 from ..core.whole_file import expanded
 from ..version import VERSION
 from . import zones
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ..core.survivor_choice import SurvivorChoice
 
 DEFAULT_RATIO = 0.5
 
@@ -125,7 +122,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:  # noqa: ANN401 - as below
+def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:
     """Return the parser of a new subcommand, with examples under its help."""
     examples = "\n".join(f"  {example}" for example in EXAMPLES[name])
     return commands.add_parser(
@@ -137,7 +134,7 @@ def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:  # 
     )
 
 
-def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+def _add_prune(commands: Any) -> None:
     prune = _add(commands, "prune", "remove the splats the cameras would miss least")
     prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=_FILES)
     _add_object(prune)
@@ -225,7 +222,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     _add_common(prune)
 
 
-def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+def _add_clean(commands: Any) -> None:
     cleaning = _add(commands, "clean", "remove what the cameras see to float in the air")
     cleaning.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help=_FILES)
     _add_outputs(cleaning, "; without it, only say what would go")
@@ -243,7 +240,7 @@ def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     _add_common(cleaning)
 
 
-def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+def _add_score(commands: Any) -> None:
     scoring = _add(commands, "score", "write the file with a float property refine_score")
     scoring.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help="a file of splats")
     _add_object(scoring)
@@ -256,7 +253,7 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     _add_common(scoring)
 
 
-def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+def _add_lod(commands: Any) -> None:
     making = _add(commands, "lod", "write levels of detail, each with what it costs")
     making.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
     making.add_argument(
@@ -322,7 +319,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
     _add_common(making)
 
 
-def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+def _add_convert(commands: Any) -> None:
     convert = _add(commands, "convert", "write files of splats as one, in another format")
     convert.add_argument(
         "inputs", nargs="+", type=_given, metavar="IN", help="known by its content; several merge"
@@ -364,7 +361,7 @@ def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not nam
     _add_common(convert)
 
 
-def _add_render(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+def _add_render(commands: Any) -> None:
     render = _add(commands, "render", "render the open scene with splats, by its output settings")
     chosen = render.add_mutually_exclusive_group()
     chosen.add_argument(
@@ -500,8 +497,9 @@ def _numbers(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(word) for word in text.split(","))
     except ValueError as error:
-        msg = f"expected numbers with commas between them, got {text!r}"
-        raise argparse.ArgumentTypeError(msg) from error
+        raise argparse.ArgumentTypeError(
+            f"expected numbers with commas between them, got {text!r}"
+        ) from error
 
 
 def _numbered(text: str, count: int) -> tuple[int | None, tuple[float, ...]]:
@@ -509,8 +507,9 @@ def _numbered(text: str, count: int) -> tuple[int | None, tuple[float, ...]]:
     first, colon, rest = text.rpartition(":")
     numbers = _numbers(rest)
     if len(numbers) != count or (colon and not (first.isdecimal() and int(first))):
-        msg = f"expected {count} numbers with commas between them, or N: and these, got {text!r}"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError(
+            f"expected {count} numbers with commas between them, or N: and these, got {text!r}"
+        )
     return int(first) if colon else None, numbers
 
 
@@ -522,8 +521,7 @@ def _words(text: str) -> tuple[str, ...]:
 def _name(text: str) -> str:
     """Return what is there; a variable that a script did not set is a mistake, not a default."""
     if not text:
-        msg = "expected a name, got none"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError("expected a name, got none")
     return text
 
 
@@ -531,8 +529,7 @@ def _source(text: str) -> tuple[str, str]:
     """Return the kind of source as the panel names it, and the name of a collection or ""."""
     kind, colon, name = text.partition(":")
     if (f"{kind}:NAME" if colon else kind) not in SOURCES or (colon and not name):
-        msg = f"expected one of {', '.join(SOURCES)}, got {text!r}"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError(f"expected one of {', '.join(SOURCES)}, got {text!r}")
     return kind.upper(), name
 
 
@@ -542,25 +539,25 @@ def _frames(text: str) -> range:
     try:
         first, last, step = map(int, numbers if numbers[2:] else [*numbers, "1"])
     except ValueError as error:
-        msg = f"expected A:B:STEP or A:B in whole numbers, got {text!r}"
-        raise argparse.ArgumentTypeError(msg) from error
+        raise argparse.ArgumentTypeError(
+            f"expected A:B:STEP or A:B in whole numbers, got {text!r}"
+        ) from error
     if step < 1 or max(abs(first), abs(last)) > LAST_FRAME:
-        msg = (
+        raise argparse.ArgumentTypeError(
             f"expected A:B:STEP with frames from {-LAST_FRAME} to {LAST_FRAME} and a step of at "
             f"least 1, got {text!r}"
         )
-        raise argparse.ArgumentTypeError(msg)
     if last < first:
-        msg = f"expected at least one frame, got {text!r}, which starts after it ends"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError(
+            f"expected at least one frame, got {text!r}, which starts after it ends"
+        )
     return range(first, last + 1, step)
 
 
 def _given(text: str) -> Path:
     """Return the path of what is read, as it was given."""
     if "\0" in text:
-        msg = "a path holds no zero byte"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError("a path holds no zero byte")
     try:
         refuse_url(text)
     except RefineError as error:
@@ -581,8 +578,9 @@ def _folder(text: str) -> Path | Url:
 def _path(text: str) -> Path:
     """Return the path of what is written, the home folder spelt out."""
     if text == "-":
-        msg = "nothing is written to standard output: give the name of a file (./- is one, too)"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError(
+            "nothing is written to standard output: give the name of a file (./- is one, too)"
+        )
     try:
         return expanded(_given(text))
     except RefineError as error:
@@ -601,8 +599,7 @@ def most_views(options: argparse.Namespace) -> int:
     Raise `RefineError` where their number cannot be.
     """
     if options.views_between < 0:
-        msg = f"--views-between is {options.views_between}, expected 0 or more"
-        raise RefineError(msg)
+        raise RefineError(f"--views-between is {options.views_between}, expected 0 or more")
     return options.views + options.views_between if options.views > 0 else options.views
 
 
@@ -630,8 +627,7 @@ def arrangement(options: argparse.Namespace) -> Arrangement:
         # Those of all inputs first, so that an input's own takes their place.
         for number, values in sorted(getattr(options, name), key=lambda item: item[0] or 0):
             if number is not None and number > len(asked):
-                msg = f"--{name} {number}: there are {len(asked)} inputs"
-                raise RefineError(msg)
+                raise RefineError(f"--{name} {number}: there are {len(asked)} inputs")
             for move in asked if number is None else [asked[number - 1]]:
                 move[name] = values if len(values) > 1 else values[0]
     moves = tuple(Move(**move) for move in asked)

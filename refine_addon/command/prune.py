@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from ..core import PruneRequest, picture_files, prune_file, prune_tiles
-from ..core.estimate.quality import UNSEEN, in_views, in_words
+from ..core import PruneRequest, ViewSet, picture_files, prune_file, prune_tiles
 from ..core.formats.registry import without_suffix
 from ..core.picture_files import PictureFiles
+from ..core.quality.curve import UNSEEN, in_views, in_words
 from ..core.tiles.storage import located
+from ..core.tiles.workers import Workers
 from . import zones
 from .options import budget, cleaning, settings, survivors
+from .run import Run
 from .words import by, by_survivors, sizes, written
-
-if TYPE_CHECKING:
-    import argparse
-    from pathlib import Path
-
-    from ..core import ViewSet
-    from ..core.tiles.workers import Workers
-    from .run import Run
 
 
 def prune(run: Run) -> None:
@@ -90,13 +86,13 @@ def _workers(options: argparse.Namespace) -> contextlib.AbstractContextManager[W
     """Return who works on tiles; None for this process alone."""
     if options.workers is None and not options.scheduler:
         return contextlib.nullcontext()
-    from ..core.tiles.cluster import cluster  # noqa: PLC0415 - needs Dask
+    from ..core.tiles.cluster import cluster
 
     return cluster(options.workers, options.scheduler)
 
 
 def _prune_object(run: Run) -> dict[str, Any]:
-    from ..objects.operation import prune_object  # noqa: PLC0415 - needs Blender
+    from ..objects.operation import prune_object
 
     options, name = run.options, run.options.object
     request, demanded = _request(options, run.views(), name), zones.of_object(options)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import bpy
 
 from ..core import RefineError
 from ..core.work import Cancelled
 from ..render import frames
 from ..render.engine import Shared
-
-if TYPE_CHECKING:
-    from .run import Run
+from .run import Run
 
 
 def render(run: Run) -> None:
@@ -25,8 +21,7 @@ def render(run: Run) -> None:
         for step in filter(None, frames.steps(scene, chosen, shared, write=True)):
             bpy.ops.render.render(scene=step.scene, animation=step.animation)
     except Cancelled:
-        msg = "a render was stopped"
-        raise RefineError(msg) from None
+        raise RefineError("a render was stopped") from None
     except RuntimeError as error:  # what Blender reports
         raise RefineError(str(error).strip()) from error
     drawn = set(shared.frames)

@@ -34,8 +34,9 @@ def check(path: Path, *, overwrite: bool) -> None:
         with tempfile.TemporaryFile(dir=target.parent):
             pass
     except OSError as error:
-        msg = f"{path}: cannot be written ({error.strerror or error}); nothing was changed"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"{path}: cannot be written ({error.strerror or error}); nothing was changed"
+        ) from error
 
 
 def write(
@@ -77,8 +78,7 @@ def write(
         if isinstance(error.__cause__, OSError):
             why = error.__cause__.strerror or why
         done = "; the splats were" if splats else ""
-        msg = f"{path}: the report was not written ({why}){done}"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: the report was not written ({why}){done}") from error
 
 
 def is_report(beginning: bytes) -> bool:

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..core import RefineError, read_cameras, with_views_between
+from ..core import RefineError, ViewSet, read_cameras, with_views_between
 from ..core.errors import printable
 from ..core.pace import Pace
 from ..core.report import MANY_UNSEEN
 from ..core.urls import Url
 from ..core.whole_file import new_folder
+from ..core.work import Progress
 from . import report
 from .terminal import Terminal, complain, described
 from .words import saved
 from .zones import words
-
-if TYPE_CHECKING:
-    import argparse
-    from collections.abc import Callable
-
-    from ..core import ViewSet
-    from ..core.work import Progress
 
 
 class Run:
@@ -60,7 +56,7 @@ class Run:
         if path is not None:
             views, facts = read_cameras(path), {"source": "file", "file": str(path)}
         else:
-            from . import scene_cameras  # noqa: PLC0415 - needs Blender
+            from . import scene_cameras
 
             views, facts = scene_cameras.chosen(self.options)
         self._cameras = {"cameras": facts}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import argparse
 
 from . import report
 from .clean import clean
@@ -13,12 +13,9 @@ from .prune import prune
 from .run import Run
 from .score import score
 
-if TYPE_CHECKING:
-    import argparse
-
 
 def _render(run: Run) -> None:
-    from .render import render  # noqa: PLC0415 - needs Blender
+    from .render import render
 
     render(run)
 

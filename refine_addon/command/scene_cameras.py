@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
 import bpy
 
 from ..cameras.sets import CameraChoice
-from ..core import RefineError
+from ..core import RefineError, ViewSet
 from ..objects import splat_object
-
-if TYPE_CHECKING:
-    import argparse
-
-    from ..core import ViewSet
 
 
 def chosen(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
@@ -46,8 +42,7 @@ def _given(options: argparse.Namespace) -> CameraChoice:
     collection = bpy.data.collections.get(name)
     if kind == "COLLECTION" and collection is None:
         names = ", ".join(sorted(each.name for each in bpy.data.collections)) or "none"
-        msg = f"no collection '{name}' in the open .blend (collections: {names})"
-        raise RefineError(msg)
+        raise RefineError(f"no collection '{name}' in the open .blend (collections: {names})")
     return CameraChoice(kind, collection, frames)
 
 

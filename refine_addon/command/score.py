@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from ..core import ScoreRequest, file_to_file
+from ..core import ScoreRequest, ViewSet, file_to_file
 from . import zones
 from .options import settings
+from .run import Run
 from .words import by_survivors
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ..core import ViewSet
-    from .run import Run
 
 
 def score(run: Run) -> None:
@@ -37,7 +33,7 @@ def _score_file(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
 
 
 def _score_object(run: Run) -> dict[str, Any]:
-    from ..objects.operation import score_object  # noqa: PLC0415 - needs Blender
+    from ..objects.operation import score_object
 
     options, name = run.options, run.options.object
     request = ScoreRequest(run.views(), settings(options), overwrite=options.overwrite)

@@ -7,11 +7,8 @@ import os
 import signal
 import sys
 import threading
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from types import FrameType
-    from typing import Self
+from types import FrameType
+from typing import Any, Self
 
 REASONS = {"SIGINT": "cancelled", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 """What each signal is called in a message; Windows lacks the last."""

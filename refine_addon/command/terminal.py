@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import TYPE_CHECKING, Literal, TextIO
+from collections.abc import Callable, Iterable
+from typing import Literal, TextIO
 
 from ..core.errors import printable
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
 
 _CLEAR = "\r\x1b[K"
 
@@ -101,4 +99,4 @@ def _write(name: Literal["stdout", "stderr"], text: str) -> None:
     except OSError:
         # Whoever read this has gone, or its disk is full: the work goes on. Python would try once
         # more as it exits, and make that the exit code.
-        setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115 - closed with the process
+        setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
-from ..core.estimate.quality import in_words
 from ..core.pace import in_time
+from ..core.quality.curve import in_words
 from ..core.report import size_in_words, sizes_in_words
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 def by(views: Mapping[str, int]) -> str:

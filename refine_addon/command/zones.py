@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..core import RefineError, Zone
-from ..core.volumes import parse
-
-if TYPE_CHECKING:
-    from ..core.volumes import Role, Volume
-    from ..objects.demands import Demands
+from ..core.volumes import Role, Volume, parse
+from ..objects.demands import Demands
 
 ROLES: dict[str, Role] = {"protect": "protect", "remove_inside": "remove", "keep_inside": "keep"}
 """Options -> what becomes of the splats in a volume."""
@@ -42,8 +39,7 @@ def zone_argument(text: str) -> ZoneArgument:
         If it is nothing, or numbers that are no volume.
     """
     if not text:
-        msg = "expected a name or a volume, got none"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError("expected a name or a volume, got none")
     try:
         return ZoneArgument(text, parse(text))
     except RefineError as error:
@@ -114,9 +110,9 @@ def of_object(options: argparse.Namespace) -> Demands:
     RefineError
         See `of_files` and `Demands.of_scene`.
     """
-    import bpy  # noqa: PLC0415 - only there inside Blender
+    import bpy
 
-    from ..objects import demands, splat_object  # noqa: PLC0415 - need Blender
+    from ..objects import demands, splat_object
 
     obj = splat_object.find(options.object)
     names, zones = [], []
@@ -150,23 +146,22 @@ def _items(options: argparse.Namespace) -> list[tuple[Role, ZoneArgument]]:
     ]
 
 
-def _marks(obj: Any, name: str) -> bool:  # noqa: ANN401 - an object of Blender
+def _marks(obj: Any, name: str) -> bool:
     return name in obj.vertex_groups or name in getattr(obj.data, "attributes", ())
 
 
 def _zone(role: Role, item: ZoneArgument, also: str) -> Zone:
     if item.volume is not None:
         return Zone(role, f"'{item.text}'", item.volume)
-    import bpy  # noqa: PLC0415 - only there inside Blender
+    import bpy
 
-    from ..objects import demands  # noqa: PLC0415 - needs Blender
+    from ..objects import demands
 
     obj = bpy.context.scene.objects.get(item.text)
     if obj is None:
         fit = [o.name for o in bpy.context.scene.objects if demands.can_be_volume(o)]
         there = ", ".join(fit[:8]) or "none"
-        msg = (
+        raise RefineError(
             f"no object '{item.text}' in the open .blend{also} (objects that are volumes: {there})"
         )
-        raise RefineError(msg)
     return demands.zone(role, obj)

@@ -19,7 +19,7 @@ from .operation.arranged import Arrangement, Move, convert_files
 from .operation.files import file_to_file, prune_file
 from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, ScoreRequest
 from .pipeline import prune, score
-from .refitting.refit import Refit, Refitted, refit, refit_rounds
+from .refit.refit import Refit, Refitted, refit, refit_rounds
 from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion

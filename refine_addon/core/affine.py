@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import spherical_harmonics
 from .errors import RefineError
 from .splats import Splats, rotation_matrices
 from .work import chunks
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
@@ -138,24 +136,22 @@ def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
         `with_sh` also if it scales directions differently.
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        msg = f"expected a finite (4, 4) matrix, got {matrix.tolist()}"
-        raise RefineError(msg)
+        raise RefineError(f"expected a finite (4, 4) matrix, got {matrix.tolist()}")
     scales = scales_of(matrix)
     if is_flat(matrix) or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        msg = (
+        raise RefineError(
             f"the transform is flat or not affine (scales {scales.tolist()}): it cannot be applied"
         )
-        raise RefineError(msg)
     if not _SMALLEST <= scales[2] <= scales[0] <= _LARGEST:
-        msg = f"the transform scales by {scales[0]:g}, expected {_SMALLEST:g} to {_LARGEST:g}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"the transform scales by {scales[0]:g}, expected {_SMALLEST:g} to {_LARGEST:g}"
+        )
     if with_sh and not is_uniform(matrix):
-        msg = (
+        raise RefineError(
             f"the transform scales directions differently ({scales.round(6).tolist()}); splat "
             "colours cannot follow that exactly: bake the object's transform (Bake Transform), or "
             "make its scale uniform first"
         )
-        raise RefineError(msg)
 
 
 def _rotated(quaternions: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:

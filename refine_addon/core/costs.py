@@ -5,12 +5,10 @@ A run puts these right as it goes by; see `pace`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from .views import View
+from .views import View
 
 SECONDS = {
     "activating": (0.0, 1.4e-6, 0.0, 1.0),

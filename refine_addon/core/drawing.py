@@ -7,31 +7,24 @@ benchmarks to 75 dB and more.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import spherical_harmonics
-from .seeing import projection
-from .seeing.cast import hits
-from .seeing.ray_sample import colors_from
-from .seeing.ray_sums import in_front
-from .seeing.rays import LOG_OPAQUE
-from .splats import SH_C0
-from .views import ViewSet
+from .splats import SH_C0, Splats
+from .views import View, ViewSet
+from .visibility import projection
+from .visibility.cast import hits
+from .visibility.projection import Footprints
+from .visibility.ray_sample import colors_from
+from .visibility.ray_sums import in_front
+from .visibility.rays import LOG_OPAQUE
+from .visibility.scene import Scene
 from .work import Progress, for_chunks, part, silent
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from .seeing.projection import Footprints
-    from .seeing.scene import Scene
-    from .splats import Splats
-    from .views import View
 
 _PIXELS = 1 << 15  # drawn at a time, about, which limits temporary memory
 _PAIRS = 1 << 18  # pairs of footprint and pixel at a time

@@ -8,16 +8,12 @@ after another, in the order of their names.
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import RefineError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 _MAGIC = 20000630
 _MULTI_PART = 0x1000  # flag of the version
@@ -46,22 +42,20 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
         data = path.read_bytes()
         return _channels(data)
     except OSError as error:
-        msg = f"{path}: cannot be read ({error.strerror or error})"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, KeyError, IndexError, struct.error) as error:
-        msg = f"{path}: expected an OpenEXR image in one part, without compression; {error}"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"{path}: expected an OpenEXR image in one part, without compression; {error}"
+        ) from error
 
 
 def _channels(data: bytes) -> dict[str, NDArray[np.float32]]:
     magic, version = struct.unpack_from("<II", data)
     if magic != _MAGIC or version & _MULTI_PART:
-        msg = f"it begins with {magic}, version {version:#x}"
-        raise ValueError(msg)
+        raise ValueError(f"it begins with {magic}, version {version:#x}")
     header, start = _header(data)
     if header["compression"] != b"\0":
-        msg = f"its compression is number {header['compression'][0]}"
-        raise ValueError(msg)
+        raise ValueError(f"its compression is number {header['compression'][0]}")
     left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
     width, height = right - left + 1, bottom - top + 1
     line = np.dtype(

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
+from pathlib import Path, PurePosixPath
 
 from .errors import RefineError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from .urls import Url
+from .urls import Url
 
 _POINTER = b"version https://git-lfs.github.com/spec/"
 GZIP = b"\x1f\x8b"
@@ -44,8 +39,9 @@ def refuse_pointer(path: Path | Url, head: bytes) -> None:
         If it is one; with advice.
     """
     if head.startswith(_POINTER):
-        msg = f"{path}: a Git LFS pointer, not the file itself: 'git lfs pull' fetches that"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: a Git LFS pointer, not the file itself: 'git lfs pull' fetches that"
+        )
 
 
 def refuse_foreign_splats(path: Path | Url, head: bytes) -> None:
@@ -64,8 +60,7 @@ def refuse_foreign_splats(path: Path | Url, head: bytes) -> None:
     refuse_pointer(path, head)
     problem = foreign_kind(path, head)
     if problem:
-        msg = f"{path}: {problem}"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: {problem}")
 
 
 def foreign_kind(path: Path | Url, head: bytes) -> str:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .affine import moved
 from .work import chunks
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
 
 LEAST = 6
 """Points that a map is found of at least: any four have one in common."""
@@ -188,7 +185,7 @@ def _fitted(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[
     middle, target = (np.average(points, axis=0, weights=weights) for points in (before, after))
     source = (before - middle) * weights[:, None]
     left, spread, axes = np.linalg.svd(source, full_matrices=False)
-    if len(spread) < 3 or not spread[1] > _FLAT * spread[0]:  # noqa: PLR2004 - of space
+    if len(spread) < 3 or not spread[1] > _FLAT * spread[0]:
         return None
     flat = not spread[2] > _FLAT * spread[0]
     inverse = np.array([1.0 / spread[0], 1.0 / spread[1], 0.0 if flat else 1.0 / spread[2]])

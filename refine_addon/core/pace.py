@@ -13,17 +13,11 @@ from __future__ import annotations
 import math
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
-from typing import TYPE_CHECKING
 
-from .costs import by_views
-from .work import default_threads, silent
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from .costs import Plan
-    from .work import Progress
+from .costs import Plan, by_views
+from .work import Progress, default_threads, silent
 
 _MINUTE, _TENS_TO = 60, 300  # seconds; up to the latter, times are told in tens of seconds
 

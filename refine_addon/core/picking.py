@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .absorbing.neighbours import nearest
+from .merging.neighbours import nearest
 from .work import Progress, silent
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 Mode = Literal["SET", "ADD", "SUBTRACT", "INTERSECT"]
 """What becomes of a selection when some splats are taken."""

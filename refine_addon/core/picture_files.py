@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from .errors import RefineError
-from .pictures import AMPLIFIED, CAMERAS, compare
+from .pictures import AMPLIFIED, CAMERAS, Comparison, compare
 from .png import png
+from .splats import Splats
+from .views import ViewSet
 from .whole_file import new_folder, refuse_existing, whole_file
 from .work import Progress, silent
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from .pictures import Comparison
-    from .splats import Splats
-    from .views import ViewSet
 
 KINDS = ("before", "after", "difference")
 """The three pictures of a view; each is the end of a file name."""
@@ -110,8 +106,7 @@ class PictureFiles:
             with whole_file(path, overwrite=self.overwrite) as stream:
                 stream.write(data)
         except RefineError as error:
-            msg = f"{error}; the pruning itself is done"
-            raise RefineError(msg) from error
+            raise RefineError(f"{error}; the pruning itself is done") from error
 
     def _paths(self, views: ViewSet) -> list[dict[str, Path]]:
         """Return the files of each view, by `KINDS`."""

@@ -6,25 +6,20 @@ How they are drawn is said in `drawing`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .drawing import picture
-from .estimate.psnr import psnr_of
+from .quality.psnr import psnr_of
 from .rendering import NEAR_RELATIVE
-from .seeing import frustum, projection
-from .seeing.ray_sample import colors_from
-from .views import ViewSet
+from .splats import Splats
+from .views import View, ViewSet
+from .visibility import frustum, projection
+from .visibility.projection import Gaussians
+from .visibility.ray_sample import colors_from
+from .visibility.scene import Scene
 from .work import Progress, part, silent
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from .seeing.projection import Gaussians
-    from .seeing.scene import Scene
-    from .splats import Splats
-    from .views import View
 
 LONGEST = 960
 """Pixels along the longer side of a picture, at most: views of more are drawn smaller."""

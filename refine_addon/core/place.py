@@ -7,14 +7,12 @@ and each error names the file, the place, what was got and what was expected.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeGuard
+from pathlib import Path
+from typing import Any, NoReturn, Self, TypeGuard
 
 from .errors import RefineError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 LARGEST_NUMBER = 1e18
 """Largest number that is taken, such as a coordinate: its square still fits float32."""
@@ -58,8 +56,7 @@ class Place:
             Always.
         """
         where = f"{self.where}: " if self.where else ""
-        msg = f"{self.path}: {where}{problem}"
-        raise RefineError(msg)
+        raise RefineError(f"{self.path}: {where}{problem}")
 
     def number(self, value: object) -> float:
         """Return `value` if it is a number of at most `LARGEST_NUMBER`."""
@@ -106,7 +103,7 @@ class Place:
             self.fail(f"missing {missing[0]!r}, expected the keys {', '.join(required)}")
         return value
 
-    def parsed(self, text: bytes | str) -> Any:  # noqa: ANN401 - whatever stands there
+    def parsed(self, text: bytes | str) -> Any:
         """Return what a text in JSON says; errors name line and column."""
         try:
             return json.loads(text)

@@ -20,9 +20,10 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from .work import (
     REPLACES_MAPPED,
@@ -34,9 +35,6 @@ from .work import (
     return_freed,
     silent,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 Result = TypeVar("Result")
 
@@ -181,7 +179,7 @@ def _apart(
             process = free.get()
             try:
                 process.tell(piece.start)
-                return process.answer()  # type: ignore[no-any-return]
+                return process.answer()
             finally:
                 free.put(process)
 
@@ -255,18 +253,18 @@ class _Process:
             flags = subprocess.CREATE_NO_WINDOW | subprocess.CREATE_NEW_PROCESS_GROUP
             away = {"creationflags": flags}
         # Imports ignore what is no string. `Path.resolve` raises on loops of links, this does not.
-        path = [os.path.abspath(each) for each in sys.path if isinstance(each, str)]  # noqa: PTH100
+        path = [os.path.abspath(each) for each in sys.path if isinstance(each, str)]
         told = json.dumps([_PACKAGE, str(_FOLDER), path])
         unwritten = ["-B"] * sys.dont_write_bytecode
         # Each uses one core.
         single = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
-        self._popen = subprocess.Popen(  # noqa: S603 - this same Python
+        self._popen = subprocess.Popen(
             [sys.executable, "-I", "-S", *unwritten, "-c", _BEGIN, told],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             env={**os.environ, **single}, **away,
         )  # fmt: skip
-        assert self._popen.stdin  # noqa: S101 - as asked for
-        assert self._popen.stdout  # noqa: S101
+        assert self._popen.stdin
+        assert self._popen.stdout
         self._to, self._from = self._popen.stdin, self._popen.stdout
         self._used = time.monotonic()
 
@@ -287,13 +285,13 @@ class _Process:
         except (OSError, ValueError) as error:  # ended, or killed here
             raise _LostError from error
 
-    def answer(self) -> Any:  # noqa: ANN401 - whatever the work returns
+    def answer(self) -> Any:
         """Wait for the answer to what was told; return what the work returns, or raise its error.
 
         Raise `_LostError` if the process has ended, or its answer means nothing here.
         """
         try:
-            done, result = pickle.load(self._from)  # noqa: S301 - our own process
+            done, result = pickle.load(self._from)
         except Exception as error:
             raise _LostError from error
         self._used = time.monotonic()
@@ -343,7 +341,7 @@ def _unpacked(task: _Task) -> Callable[[int], Any]:
     with Path(task.path).open("rb") as stream:
         mapped = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY))
     arrays = [mapped[start:end] for start, end in task.places]
-    work: Callable[[int], Any] = pickle.loads(task.pickled, buffers=arrays)  # noqa: S301 - our own
+    work: Callable[[int], Any] = pickle.loads(task.pickled, buffers=arrays)
     return work
 
 
@@ -356,7 +354,7 @@ def serve() -> None:
         message = _next(told)
         try:
             if isinstance(message, int):
-                assert work  # noqa: S101 - it is told first
+                assert work
                 result = True, _called(work, message)
             else:
                 work = None  # first, so that the arrays of both never are there at once
@@ -364,7 +362,7 @@ def serve() -> None:
                 if work is None:
                     return_freed()
                 result = True, None
-        except BaseException as error:  # noqa: BLE001 - raised again where it was asked for
+        except BaseException as error:
             result = False, error
         pickle.dump(result, answers, protocol=5)
         answers.flush()
@@ -375,13 +373,13 @@ def _called(work: Callable[[int], Result], number: int) -> Result:
     return for_chunks(lambda _: work(number), 1, 1, threads=1)[0]
 
 
-def _next(told: BinaryIO) -> Any:  # noqa: ANN401 - a task, a number or None
+def _next(told: BinaryIO) -> Any:
     """Return the next message; end this process if none comes for long."""
     watch = threading.Timer(IDLE, os._exit, (0,))
     watch.daemon = True
     watch.start()
     try:
-        return pickle.load(told)  # noqa: S301 - of the process that started this one
+        return pickle.load(told)
     except EOFError:
         sys.exit()
     finally:

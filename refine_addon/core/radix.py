@@ -7,16 +7,13 @@ so the numbers can be read a part at a time, on several machines, in any order.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    Count = Callable[[list[int], int], NDArray[np.int64]]
+Count = Callable[[list[int], int], NDArray[np.int64]]
 
 DIGIT = 16
 """Bits that are counted at a time."""

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import platform
 import time
+from collections.abc import Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .estimate.cost import expected_seconds
-from .estimate.quality import FEWEST, expected, in_words, out_of_reach, parted
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from _typeshed import DataclassInstance
-    from numpy.typing import NDArray
-
-    from .absorbing.absorb import Counts
-    from .formats.ply import SplatFile
-    from .formats.registry import Packed
-    from .scores import Scores
-    from .selection import Budget
-    from .survivor_choice import Became
-
+from .formats.ply import SplatFile
+from .formats.registry import Packed
+from .merging.absorb import Counts
+from .quality.cost import expected_seconds
+from .quality.curve import FEWEST, expected, in_words, out_of_reach, parted
+from .scores import Scores
+from .selection import Budget
+from .survivor_choice import Became
 
 SEES_TOO_LITTLE = "the views see too little for an estimate of the pictures' quality"
 NOT_ESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is the budget"
@@ -81,7 +75,7 @@ def size_in_words(count: int) -> str:
     >>> size_in_words(4_940_000), size_in_words(32_000)
     ('4.9 MB', '32.0 kB')
     """
-    return f"{count / 1e3:,.1f} kB" if count < 1e5 else f"{count / 1e6:,.1f} MB"  # noqa: PLR2004
+    return f"{count / 1e3:,.1f} kB" if count < 1e5 else f"{count / 1e6:,.1f} MB"
 
 
 def sizes_in_words(first: int, between: str, second: int) -> str:
@@ -156,7 +150,7 @@ def make_report(
     scores: Scores,
     keep: NDArray[np.bool_],
     budget: Budget,
-    settings: DataclassInstance,
+    settings: Any,
     clock: Clock,
 ) -> dict[str, Any]:
     """Return the report of a prune, as plain JSON values.
@@ -268,7 +262,7 @@ def little_seen(seen: NDArray[np.int32]) -> str:
     >>> little_seen(np.array([2, 2, 2, 3]))
     ''
     """
-    share = np.count_nonzero(seen < 2) / max(len(seen), 1)  # noqa: PLR2004 - one view or none
+    share = np.count_nonzero(seen < 2) / max(len(seen), 1)
     if share < LITTLE_SEEN:
         return ""
     return (

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import RefineError
+from .quality.alignment import Alignment
+from .quality.curve import Quality
 from .splats import among_all
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from .estimate.alignment import Alignment
-    from .estimate.quality import Quality
-    from .seeing.ray_sample import RaySample
+from .visibility.ray_sample import RaySample
 
 _DISTINCT = 1 << 24  # largest number of equal steps from 0 to 1 that are distinct in float32
 
@@ -131,11 +128,10 @@ class Scores:
             return
         unscored = ~self.scored if rest is None else rest & ~self.scored
         if unscored.any():
-            msg = (
+            raise RefineError(
                 f"{np.count_nonzero(unscored)} splats had to go when the others were scored, and "
                 "need not go now; score again"
             )
-            raise RefineError(msg)
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:

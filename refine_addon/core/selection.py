@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import radix
 from .errors import RefineError
-from .estimate.quality import PSNR_CAP
+from .quality.curve import PSNR_CAP, Quality
+from .scores import Scores
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from .estimate.quality import Quality
-    from .scores import Scores
-
-    RowBytes = float | NDArray[np.int64]
+RowBytes = float | NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -58,18 +53,11 @@ class Budget:
     psnr: float | None = None
 
     def __post_init__(self) -> None:
-        """Check that exactly one value is given, and that it is in range.
-
-        Raises
-        ------
-        RefineError
-            With the name of the value, its value and what was expected.
-        """
+        """Check that exactly one value is given, and that it is in range."""
         names = [item.name for item in fields(self) if getattr(self, item.name) is not None]
         if len(names) != 1:
             known = ", ".join(item.name for item in fields(self))
-            msg = f"expected one of {known}, got {names or 'none'}"
-            raise RefineError(msg)
+            raise RefineError(f"expected one of {known}, got {names or 'none'}")
         value = getattr(self, names[0])
         # Functions, so that only the check of the given value runs.
         checks: dict[str, tuple[str, Callable[[], bool]]] = {
@@ -77,13 +65,12 @@ class Budget:
             "keep": ("a whole number of at least 1", lambda: value >= 1 and value % 1 == 0),
             "max_mb": ("a positive number", lambda: 0 < value < math.inf),
             "threshold": ("a number", lambda: -math.inf < value < math.inf),
-            "min_seen": ("a percentage, 0 to 100", lambda: 0 <= value <= 100),  # noqa: PLR2004
+            "min_seen": ("a percentage, 0 to 100", lambda: 0 <= value <= 100),
             "psnr": (f"more than 0 and less than {PSNR_CAP:g} dB", lambda: 0 < value < PSNR_CAP),
         }
         expected, holds = checks[names[0]]
         if not holds():
-            msg = f"{names[0]} is {value}, expected {expected}"
-            raise RefineError(msg)
+            raise RefineError(f"{names[0]} is {value}, expected {expected}")
 
     @property
     def kind(self) -> str:
@@ -104,14 +91,14 @@ class Budget:
             See `Scores`.
         """
         if method == "auto" and self.threshold is not None:
-            msg = (
+            raise RefineError(
                 "a threshold means something else to each method: choose closed-form or occlusion "
                 "instead of auto, or another budget"
             )
-            raise RefineError(msg)
         if self.min_seen is not None and not frustum:
-            msg = "without the frustum test every view sees every splat: min_seen would remove none"
-            raise RefineError(msg)
+            raise RefineError(
+                "without the frustum test every view sees every splat: min_seen would remove none"
+            )
 
     def after(self, gone: int, count: int) -> Budget:
         """Return the budget for what is left of `count` splats when `gone` went before.
@@ -158,11 +145,11 @@ class Budget:
             else:
                 shortest = row_bytes
             if not shortest:
-                msg = "max_mb needs to know how many bytes a splat takes in the file"
-                raise RefineError(msg)
+                raise RefineError("max_mb needs to know how many bytes a splat takes in the file")
             if room < shortest:
-                msg = f"max_mb is {self.max_mb}, too small for one splat of {shortest:.0f} bytes"
-                raise RefineError(msg)
+                raise RefineError(
+                    f"max_mb is {self.max_mb}, too small for one splat of {shortest:.0f} bytes"
+                )
             if isinstance(row_bytes, np.ndarray):
                 return None
             return max(count - math.floor(room / Fraction(row_bytes)), 0)
@@ -329,8 +316,7 @@ def least_seen(percentage: float, views: int) -> int:
 def refuse_none_left(budget: Budget, before: int, after: int) -> None:
     """Raise `RefineError` if none of the splats would stay."""
     if not after:
-        msg = f"{budget.kind} would remove all {before} splats; nothing was removed"
-        raise RefineError(msg)
+        raise RefineError(f"{budget.kind} would remove all {before} splats; nothing was removed")
 
 
 def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -> None:
@@ -342,11 +328,10 @@ def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -
     # A PSNR that all of the curve reaches may be reached beyond its end, too.
     beyond = budget.psnr is not None and budget.psnr <= quality_of(scores).psnr[-1]
     if beyond or gone[np.argsort(scores.values, kind="stable")[settled:]].any():
-        msg = (
+        raise RefineError(
             f"these scores were computed for a budget that removes up to {settled} of "
             f"{len(gone)} splats, and this one removes more: score again, for all budgets"
         )
-        raise RefineError(msg)
 
 
 def quality_of(scores: Scores) -> Quality:
@@ -358,11 +343,10 @@ def quality_of(scores: Scores) -> Quality:
         If the scores have none.
     """
     if scores.quality is None:
-        msg = (
+        raise RefineError(
             "these scores have no estimate of the pictures' quality: score again with a PSNR as "
             "budget, or choose another budget where the views see too little"
         )
-        raise RefineError(msg)
     return scores.quality
 
 

@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .seeing import projection
-from .seeing.cast import hits
-from .seeing.ray_sums import in_front
+from .splats import Splats
 from .views import View, ViewSet
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from .seeing.projection import Footprints, Gaussians
-    from .seeing.scene import Scene
-    from .splats import Splats
+from .visibility import projection
+from .visibility.cast import hits
+from .visibility.projection import Footprints, Gaussians
+from .visibility.ray_sums import in_front
+from .visibility.scene import Scene
 
 LIGHT_LEFT = 0.1
 """Transmittance at whose depth a surface ends. Surfaces are made of several layers of splats: those

@@ -10,19 +10,16 @@ that rays are cast only from the points of the others.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import RefineError
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    Index = NDArray[np.int64]
+Index = NDArray[np.int64]
 
 _GRID = 128  # cells along each axis at most; four points a cell hold more than the grid costs
 _FEW = 512  # points below which a grid does not pay
@@ -61,21 +58,13 @@ class Solid:
     turned: bool = field(init=False)
 
     def __post_init__(self) -> None:
-        """Join equal vertices, and check the mesh.
-
-        Raises
-        ------
-        RefineError
-            If it has no faces, a vertex is not finite, or the mesh is not closed.
-        """
+        """Join equal vertices, and check the mesh."""
         vertices = np.asarray(self.vertices, np.float64).reshape(-1, 3) + 0.0  # -0 equals 0
         triangles = np.asarray(self.triangles, np.int64).reshape(-1, 3)
         if not len(triangles):
-            msg = "has no faces, expected a closed mesh"
-            raise RefineError(msg)
+            raise RefineError("has no faces, expected a closed mesh")
         if not np.isfinite(vertices).all():
-            msg = "has a vertex that is not finite, expected a closed mesh"
-            raise RefineError(msg)
+            raise RefineError("has a vertex that is not finite, expected a closed mesh")
         order = np.lexsort(vertices.T)
         new = np.ones(len(order), np.bool_)
         new[1:] = (vertices[order[1:]] != vertices[order[:-1]]).any(axis=1)
@@ -86,11 +75,10 @@ class Solid:
         triangles = triangles[(a != b) & (b != c) & (c != a)]
         open_edges, turned = _edges(triangles, len(order))
         if open_edges or not len(triangles):
-            msg = (
+            raise RefineError(
                 f"is not closed: {open_edges} of its edges belong to an odd number of faces; fill "
                 "the holes, or add a Remesh modifier"
             )
-            raise RefineError(msg)
         for name, value in (
             ("vertices", vertices[order[new]]),
             ("triangles", triangles),

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .work import chunks
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 
@@ -55,7 +53,7 @@ def _values(directions: NDArray[Any], degree: int) -> list[NDArray[Any]]:
     if degree >= 1:
         c = math.sqrt(3.0) / 2 * root
         bands.append([-c * y, c * z, -c * x])
-    if degree >= 2:  # noqa: PLR2004
+    if degree >= 2:
         c = math.sqrt(15.0) / 2 * root
         bands.append(
             [
@@ -66,7 +64,7 @@ def _values(directions: NDArray[Any], degree: int) -> list[NDArray[Any]]:
                 c / 2 * (xx - yy),
             ]
         )
-    if degree >= 3:  # noqa: PLR2004
+    if degree >= 3:
         a, b = math.sqrt(35.0 / 2) / 4 * root, math.sqrt(21.0 / 2) / 4 * root
         c = math.sqrt(105.0) / 2 * root
         bands.append(
@@ -80,7 +78,7 @@ def _values(directions: NDArray[Any], degree: int) -> list[NDArray[Any]]:
                 -a * x * (xx - 3 * yy),
             ]
         )
-    if degree >= 4:  # noqa: PLR2004
+    if degree >= 4:
         a, b = math.sqrt(35.0) * 3 / 4 * root, math.sqrt(35.0 / 2) * 3 / 4 * root
         c, d = math.sqrt(5.0) * 3 / 4 * root, math.sqrt(5.0 / 2) * 3 / 4 * root
         bands.append(

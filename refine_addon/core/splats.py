@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import RefineError
+from .rendering import Model
 from .work import chunks, for_chunks
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from .rendering import Model
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -138,8 +134,9 @@ def refuse_mixed(models: Sequence[Model]) -> None:
     """Raise `RefineError` if splats that are to become one scene are drawn in different ways."""
     if len(set(models)) > 1:
         listed = ", ".join(dict.fromkeys(models))
-        msg = f"splats of different models ({listed}), expected one: say how all are drawn"
-        raise RefineError(msg)
+        raise RefineError(
+            f"splats of different models ({listed}), expected one: say how all are drawn"
+        )
 
 
 def above_constant(degree: int) -> int:
@@ -383,8 +380,9 @@ def refuse_undrawable(good: int, total: int) -> None:
         How many splats can be drawn, and how many there are.
     """
     if not good:
-        msg = f"none of the {total} splats can be drawn: each is transparent or not finite"
-        raise RefineError(msg)
+        raise RefineError(
+            f"none of the {total} splats can be drawn: each is transparent or not finite"
+        )
 
 
 _UNIT_TOLERANCE = 5e-7  # of the squared length: four squares, each rounded to float32

@@ -23,5 +23,4 @@ that is as good, and where the method or the budget says how to delete; see `Tas
 def refuse_unknown(survivors: str, choices: tuple[str, ...] = CHOICES) -> None:
     """Raise `RefineError` if `survivors` is none of the choices."""
     if survivors not in choices:
-        msg = f"survivors is {survivors!r}, expected one of {', '.join(choices)}"
-        raise RefineError(msg)
+        raise RefineError(f"survivors is {survivors!r}, expected one of {', '.join(choices)}")

@@ -5,20 +5,15 @@ This module stands above formats and absorbing, so that neither has to know the 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .affine import transformed
-from .formats.ply_columns import ChangedColumns
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from .absorbing.absorb import Absorbed
-    from .formats.ply_columns import Columns
+from .formats.ply_columns import ChangedColumns, Columns
+from .merging.absorb import Absorbed
 
 
 def survivor_columns(

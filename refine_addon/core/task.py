@@ -4,30 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import RefineError
-from .refitting.refit import Refit
+from .merging.absorb import Absorbed
+from .refit.refit import Refit
+from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
-from .splats import among_all
-from .survivor_choice import refuse_unknown
-from .views import refuse_other
+from .selection import Budget, RowBytes
+from .splats import Splats, among_all
+from .survivor_choice import SurvivorChoice, refuse_unknown
+from .views import ViewSet, refuse_other
+from .visibility.ray_sample import RaySample
 from .volumes import refuse_all
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from .absorbing.absorb import Absorbed
-    from .scores import Scores
-    from .seeing.ray_sample import RaySample
-    from .selection import Budget, RowBytes
-    from .splats import Splats
-    from .survivor_choice import SurvivorChoice
-    from .views import ViewSet
-    from .work import Cancelled
+from .work import Cancelled
 
 METHODS = ("auto", "occlusion", "closed-form")
 """The first is the default."""
@@ -61,22 +55,13 @@ class Settings:
     refit: Refit = field(default_factory=Refit)
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            If a value is out of range.
-        """
+        """Check the values."""
         if self.method not in METHODS:
-            msg = f"method is {self.method!r}, expected one of {', '.join(METHODS)}"
-            raise RefineError(msg)
+            raise RefineError(f"method is {self.method!r}, expected one of {', '.join(METHODS)}")
         if not 0.0 <= self.tolerance < math.inf:
-            msg = f"tolerance is {self.tolerance}, expected a number of dB, 0 or more"
-            raise RefineError(msg)
+            raise RefineError(f"tolerance is {self.tolerance}, expected a number of dB, 0 or more")
         if self.views < 0:
-            msg = f"views is {self.views}, expected 0 (all) or more"
-            raise RefineError(msg)
+            raise RefineError(f"views is {self.views}, expected 0 (all) or more")
 
     @property
     def frustum(self) -> bool:
@@ -182,13 +167,7 @@ class Task:
     reusable: bool = False
 
     def __post_init__(self) -> None:
-        """Check what survivors may become, and that the views are such.
-
-        Raises
-        ------
-        RefineError
-            If there is no such choice, or the views are none.
-        """
+        """Check what survivors may become, and that the views are such."""
         refuse_unknown(self.survivors)
         if self.views is not None:
             refuse_other(self.views)
@@ -209,8 +188,9 @@ class Task:
             If they were not given.
         """
         if self.splats is None or self.views is None:
-            msg = "splats without scores need views to be scored, and absorbing needs both"
-            raise RefineError(msg)
+            raise RefineError(
+                "splats without scores need views to be scored, and absorbing needs both"
+            )
         return self.splats, self.views
 
     def forced(self) -> NDArray[np.bool_] | None:

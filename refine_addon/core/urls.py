@@ -43,8 +43,7 @@ def is_url(text: Path | str) -> bool:
 def refuse_url(text: Path | str) -> None:
     """Raise `RefineError` if a URL stands where only a path can."""
     if is_url(text):
-        msg = (
+        raise RefineError(
             f"{text}: is a URL, expected a local path; only the tiles and the folder of "
             "'prune --together' can be URLs"
         )
-        raise RefineError(msg)

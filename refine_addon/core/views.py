@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import RefineError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
 
 ORTHONORMAL = 1e-3
 """How far from orthonormal a rotation may be: four decimals in a text file are enough."""
@@ -58,21 +55,14 @@ class View:
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Check all values.
-
-        Raises
-        ------
-        RefineError
-            If a value is wrong; with the view's name and the value.
-        """
+        """Check all values."""
         try:
             rotation = np.array(self.rotation, np.float64)
             center = np.array(self.center, np.float64)
             _check_pose(rotation, center)
             self._check_image()
         except (TypeError, ValueError) as error:
-            msg = f"view {self.name!r}: {error}"
-            raise RefineError(msg) from error
+            raise RefineError(f"view {self.name!r}: {error}") from error
         left, _, right = np.linalg.svd(rotation)
         object.__setattr__(self, "rotation", left @ right)  # exactly orthonormal again
         object.__setattr__(self, "center", center)
@@ -94,43 +84,38 @@ class View:
     def _check_image(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, self.near, self.weight)
         if not all(math.isfinite(number) for number in numbers) or math.isnan(self.far):
-            msg = f"fx, fy, cx, cy, near and weight must be finite, got {numbers}"
-            raise ValueError(msg)
+            raise ValueError(f"fx, fy, cx, cy, near and weight must be finite, got {numbers}")
         size = (self.width, self.height)
         if self.fx <= 0 or self.fy <= 0 or min(size) < 1 or size != tuple(map(int, size)):
-            msg = (
+            raise ValueError(
                 "expected positive focal lengths and whole numbers of pixels, got "
                 f"fx {self.fx}, fy {self.fy}, {self.width} x {self.height}"
             )
-            raise ValueError(msg)
         if self.weight < 0 or self.near < 0 or self.far <= self.near:
-            msg = (
+            raise ValueError(
                 f"expected weight >= 0 and 0 <= near < far, got weight {self.weight}, "
                 f"near {self.near}, far {self.far}"
             )
-            raise ValueError(msg)
 
 
 def is_orthonormal(matrix: NDArray[np.float64]) -> bool:
     """Return whether a matrix (3, 3) is a rotation or a reflection, up to `ORTHONORMAL`."""
     # Entries first: those of a rotation are at most 1, and squares of large ones could overflow.
-    small = np.abs(matrix).max() <= 2.0  # noqa: PLR2004
+    small = np.abs(matrix).max() <= 2.0
     return bool(small and np.abs(matrix @ matrix.T - np.eye(3)).max() <= ORTHONORMAL)
 
 
 def _check_pose(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> None:
     if rotation.shape != (3, 3) or center.shape != (3,):
-        msg = f"expected rotation (3, 3) and center (3,), got {rotation.shape} and {center.shape}"
-        raise ValueError(msg)
+        raise ValueError(
+            f"expected rotation (3, 3) and center (3,), got {rotation.shape} and {center.shape}"
+        )
     if not (np.isfinite(rotation).all() and np.isfinite(center).all()):
-        msg = "rotation and center must be finite numbers"
-        raise ValueError(msg)
+        raise ValueError("rotation and center must be finite numbers")
     if np.abs(center).max() > np.finfo(np.float32).max:
-        msg = f"center {center.tolist()} is beyond the range of float32"
-        raise ValueError(msg)
+        raise ValueError(f"center {center.tolist()} is beyond the range of float32")
     if not is_orthonormal(rotation):
-        msg = f"rotation is not orthonormal: {rotation.tolist()}"
-        raise ValueError(msg)
+        raise ValueError(f"rotation is not orthonormal: {rotation.tolist()}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,20 +138,12 @@ class ViewSet:
     turn: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a set without any view that counts.
-
-        Raises
-        ------
-        RefineError
-            If there is no view, or none with a positive weight.
-        """
+        """Refuse a set without any view that counts."""
         object.__setattr__(self, "views", tuple(self.views))
         if not self.views:
-            msg = "no cameras: scoring needs at least one view"
-            raise RefineError(msg)
+            raise RefineError("no cameras: scoring needs at least one view")
         if not any(view.weight > 0 for view in self.views):
-            msg = f"all {len(self.views)} views have weight 0: at least one must count"
-            raise RefineError(msg)
+            raise RefineError(f"all {len(self.views)} views have weight 0: at least one must count")
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -197,8 +174,7 @@ class ViewSet:
         by_name = {view.name: view for view in self.views}
         missing = [name for name in names if name not in by_name]
         if missing:
-            msg = f"no view named {missing[0]!r} among {len(self)} views"
-            raise RefineError(msg)
+            raise RefineError(f"no view named {missing[0]!r} among {len(self)} views")
         return replace(self, views=tuple(by_name[name] for name in names))
 
     @property
@@ -316,5 +292,6 @@ def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
 def refuse_other(views: object) -> None:
     """Raise `RefineError` if what is given as views is no `ViewSet`."""
     if not isinstance(views, ViewSet):
-        msg = f"views is a {type(views).__name__}, expected a ViewSet: ViewSet((view, ...))"
-        raise RefineError(msg)
+        raise RefineError(
+            f"views is a {type(views).__name__}, expected a ViewSet: ViewSet((view, ...))"
+        )

@@ -8,16 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .views import ViewSet
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from .views import View
+from .views import View, ViewSet
 
 WIDEST = math.radians(90.0)
 """Views that are turned farther than that from each other have nothing between them."""
@@ -45,7 +40,7 @@ def views_between(views: ViewSet, most: int) -> list[View]:
         nor, as far as names differ, their order changes it.
     """
     ordered = [view for view, _ in views.by_distance()]
-    if most < 1 or len(ordered) < 2:  # noqa: PLR2004 - between two
+    if most < 1 or len(ordered) < 2:
         return []
     centers = np.array([view.center for view in ordered])
     place = ViewSet(tuple(ordered)).places()

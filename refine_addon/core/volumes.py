@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .affine import is_flat, moved, scales_of
 from .errors import RefineError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 Role = Literal["protect", "remove", "keep"]
 
@@ -40,23 +37,18 @@ class Box:
     --------
     >>> Box((0, 0, 0), (1, 1, np.inf)).inside(np.array([[0.5, 0, 9], [0.5, 1, 9]])).tolist()
     [True, False]
-    """  # noqa: D205 - the first two lines are one paragraph
+    """
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        """Check the corners.
-
-        Raises
-        ------
-        RefineError
-            If one of them is NaN, or the second is not above the first along every axis.
-        """
+        """Check the corners."""
         for axis, low, high in zip("xyz", self.low, self.high, strict=True):
             if not low < high:
-                msg = f"box goes from {low:g} to {high:g} in {axis}, expected a larger number last"
-                raise RefineError(msg)
+                raise RefineError(
+                    f"box goes from {low:g} to {high:g} in {axis}, expected a larger number last"
+                )
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which points, (N, 3), lie inside, (N,)."""
@@ -78,19 +70,13 @@ class Sphere:
     radius: float
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises
-        ------
-        RefineError
-            If one is not finite, or the radius is not above 0.
-        """
+        """Check the numbers."""
         if not np.isfinite([*self.center, self.radius]).all():
-            msg = f"sphere at {self.center} has radius {self.radius}, expected finite numbers"
-            raise RefineError(msg)
+            raise RefineError(
+                f"sphere at {self.center} has radius {self.radius}, expected finite numbers"
+            )
         if self.radius <= 0.0:
-            msg = f"sphere has radius {self.radius:g}, expected more than 0"
-            raise RefineError(msg)
+            raise RefineError(f"sphere has radius {self.radius:g}, expected more than 0")
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which points, (N, 3), lie inside, (N,)."""
@@ -116,17 +102,10 @@ class MovedVolume:
     matrix: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        """Check the matrix.
-
-        Raises
-        ------
-        RefineError
-            If it is flat.
-        """
+        """Check the matrix."""
         if is_flat(self.matrix):
             scales = scales_of(self.matrix).round(9).tolist()
-            msg = f"is flat (scales {scales}), expected a volume"
-            raise RefineError(msg)
+            raise RefineError(f"is flat (scales {scales}), expected a volume")
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which points, (N, 3), lie inside, (N,)."""
@@ -156,16 +135,14 @@ def parse(text: str) -> Volume | None:
     except ValueError:
         numbers = []
     if len(numbers) != len(_FORMS[kind].split(",")):
-        msg = f"expected {kind}:{_FORMS[kind]} in numbers, got '{text}'"
-        raise RefineError(msg)
+        raise RefineError(f"expected {kind}:{_FORMS[kind]} in numbers, got '{text}'")
     a, b, c, *others = numbers
     try:
         if kind == "sphere":
             return Sphere((a, b, c), others[0])
         return Box((a, b, c), (others[0], others[1], others[2]))
     except RefineError as error:
-        msg = f"'{text}': {error}"
-        raise RefineError(msg) from error
+        raise RefineError(f"'{text}': {error}") from error
 
 
 _FORMS = {"box": "x0,y0,z0,x1,y1,z1", "sphere": "x,y,z,radius"}
@@ -259,8 +236,7 @@ def forced(
         inside = zone.volume.inside(means)
         count = int(np.count_nonzero(inside))
         if not count and not zone.idle:
-            msg = f"{zone.name} holds the centre of no splat ({_extent(means)})"
-            raise RefineError(msg)
+            raise RefineError(f"{zone.name} holds the centre of no splat ({_extent(means)})")
         facts.append({"role": zone.role, "name": zone.name, "splats": count})
         masks[zone.role] = masks[zone.role] | inside if zone.role in masks else inside
     if "keep" in masks:
@@ -280,8 +256,7 @@ def forced(
 def refuse_all(removed: NDArray[np.bool_]) -> None:
     """Raise `RefineError` if all splats must go."""
     if len(removed) and removed.all():
-        msg = f"all {len(removed)} splats lie where they must go; nothing was removed"
-        raise RefineError(msg)
+        raise RefineError(f"all {len(removed)} splats lie where they must go; nothing was removed")
 
 
 def _extent(means: NDArray[Any]) -> str:

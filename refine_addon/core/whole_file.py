@@ -12,7 +12,7 @@ import re
 import secrets
 import stat
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 from .errors import RefineError, reason_of
 from .urls import refuse_url
@@ -23,8 +23,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 
 def expanded(path: Path | str) -> Path:
@@ -39,8 +38,7 @@ def expanded(path: Path | str) -> Path:
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
-        msg = f"{path}: cannot be found ({error})"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: cannot be found ({error})") from error
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
@@ -54,18 +52,16 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
     except (OSError, ValueError) as error:  # a name too long, a folder that may not be entered
         raise RefineError(_explain(path, error)) from error
     if stat.S_ISDIR(mode):
-        msg = f"{path}: is a folder, expected a file name to write to"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: is a folder, expected a file name to write to")
     if mode and not stat.S_ISREG(mode):
-        msg = f"{path}: is a device, expected the name of a file"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: is a device, expected the name of a file")
     if mode and not overwrite:
-        msg = f"{path}: exists already; choose another name or overwrite it (--overwrite)"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: exists already; choose another name or overwrite it (--overwrite)"
+        )
     if not stat.S_ISDIR(folder):
         missing = path.parent if mode_of(path.parent) == 0 else behind
-        msg = f"{path}: cannot be written, there is no folder {missing}"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: cannot be written, there is no folder {missing}")
 
 
 def refuse_one_file(paths: Iterable[Path]) -> None:
@@ -74,8 +70,7 @@ def refuse_one_file(paths: Iterable[Path]) -> None:
     for path in paths:
         other = first.setdefault(os.path.realpath(path), path)
         if other is not path:
-            msg = f"{path}: is the same file as {other}, by a link; remove the link"
-            raise RefineError(msg)
+            raise RefineError(f"{path}: is the same file as {other}, by a link; remove the link")
 
 
 def mode_of(path: Path) -> int:
@@ -108,8 +103,9 @@ def new_folder(path: Path) -> Iterator[None]:
             made += itertools.takewhile(lambda folder: not mode_of(folder), (path, *path.parents))
             path.mkdir(parents=True, exist_ok=True)
         except (OSError, ValueError) as error:
-            msg = f"{path}: cannot be made ({getattr(error, 'strerror', None) or error})"
-            raise RefineError(msg) from error
+            raise RefineError(
+                f"{path}: cannot be made ({getattr(error, 'strerror', None) or error})"
+            ) from error
         yield
     finally:
         for folder in made:
@@ -123,11 +119,10 @@ def refuse_mapped(path: Path, source: Path) -> None:
         return
     with contextlib.suppress(OSError, ValueError):
         if path.samefile(source):
-            msg = (
+            raise RefineError(
                 f"{path}: is the file being read, which this system cannot replace; "
                 "write to another name"
             )
-            raise RefineError(msg)
 
 
 @contextlib.contextmanager
@@ -171,7 +166,7 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
                 if stat.S_IMODE(os.fstat(stream.fileno()).st_mode) != mode:
                     # By descriptor: the owner of the folder may have put a link of that name there.
                     named = stream.fileno() if os.chmod in os.supports_fd else temporary
-                    os.chmod(named, mode)  # noqa: PTH101 - pathlib takes no descriptor
+                    os.chmod(named, mode)
             checkpoint()  # cancelled while the file was written: leave none
             if overwrite:
                 temporary.replace(target)

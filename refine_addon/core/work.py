@@ -11,12 +11,10 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 Progress = Callable[[float, str], "bool | None"]
 """Called as ``progress(fraction, what)``; returning ``False`` cancels."""
@@ -32,7 +30,7 @@ _REPORT_INTERVAL = 0.1  # seconds between two reports while chunks take long
 _own = threading.local()  # `checkpoint` calls the `check` of its own thread
 
 
-class Cancelled(Exception):  # noqa: N818 - not an error: the user asked to stop
+class Cancelled(Exception):
     """Raised between two pieces of work when the progress callback returns ``False``."""
 
 
@@ -173,7 +171,7 @@ def for_chunks(
     return list(each_chunk(work, total, chunk, progress=progress, what=what, threads=threads))
 
 
-def each_chunk(  # noqa: PLR0913 - all but three are optional
+def each_chunk(
     work: Callable[[slice], Result],
     total: int,
     chunk: int,
@@ -240,7 +238,7 @@ def _in_turn(
         yield result
 
 
-def _side_by_side(  # noqa: PLR0913, PLR0917 - those of `for_chunks`
+def _side_by_side(
     work: Callable[[slice], Result],
     pieces: list[slice],
     step: int,

@@ -10,28 +10,23 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.formats.ply import REQUIRED, SplatFile
-from ..core.formats.ply_columns import THIRD_SCALE
+from ..core.formats.ply_columns import THIRD_SCALE, Columns
 from ..core.formats.registry import scene_name
 from ..core.rendering import MODELS
 from ..core.splats import Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-    from collections.abc import Set as AbstractSet
-
-    from numpy.typing import NDArray
-
-    from ..core.formats.ply_columns import Columns
-    from .native import Place
+from .native import Place
 
 _GROUP = 16
 """Columns that are transposed together: float32 numbers in a cache line of 64 bytes."""

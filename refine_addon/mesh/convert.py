@@ -6,27 +6,22 @@ with its name, transform, parent, collections and custom properties, and for all
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
+from ..core.formats.ply_columns import Columns
 from . import attributes as mesh_attributes
 from . import drift, native
 from .edit import check_changeable, group_weights
-from .layout import KINDS, PLACES, STORAGE, SplatObject, check, rest_count
+from .layout import KINDS, PLACES, STORAGE, Column, SplatObject, check, rest_count
 from .native import Place
 from .node_trees import add, chain, new_tree
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from ..core.formats.ply_columns import Columns
-    from .layout import Column
 
 _TRANSFORM = (
     *("rotation_mode", "location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle"),
@@ -54,8 +49,9 @@ def read(checked: SplatObject) -> Callable[[], Attributes]:
     obj = checked.obj
     check_changeable(obj)
     if obj.type == "POINTCLOUD" and not checked.layout.native:
-        msg = f"object '{obj.name}': is a point cloud without {native.NAMES}: nothing to convert"
-        raise RefineError(msg)
+        raise RefineError(
+            f"object '{obj.name}': is a point cloud without {native.NAMES}: nothing to convert"
+        )
     columns = _moved(checked)
     names = [column.name for column in columns]
     if checked.layout.native:
@@ -235,11 +231,10 @@ def _copy_attributes(checked: SplatObject, data: bpy.types.ID) -> None:
         if not _copied(attribute) or name in moved or name[0] == ".":
             continue
         if name in needed:
-            msg = (
+            raise RefineError(
                 f"object '{checked.obj.name}': has an attribute '{name}', a name that the splats "
                 f"of a {other_form(checked.mesh).lower()} need; rename it first"
             )
-            raise RefineError(msg)
         values = mesh_attributes.read_attribute(checked.mesh, name)
         mesh_attributes.write_attribute(data, name, attribute.data_type, values)
 
@@ -281,6 +276,6 @@ def _animate(old: bpy.types.AnimData, new: bpy.types.AnimData) -> None:
         new.drivers.from_existing(src_driver=driver)
 
 
-def other_form(data: Any) -> str:  # noqa: ANN401 - an object's data
+def other_form(data: Any) -> str:
     """Return what `converted` makes of an object's data, in words."""
     return "Mesh" if native.is_native(data) else "Point Cloud"

@@ -8,22 +8,19 @@ note goes with its vertex wherever Blender takes it, and into the file.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.moves import Move, affine_moves
 from . import attributes as mesh_attributes
 from . import native
 from .layout import sh_degree, unlisted
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    import bpy
-    from numpy.typing import NDArray
 
 HOME = "refine_home"
 """Vector on points: where the splat was when its scales, rotation and harmonics were written."""

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from . import attributes as mesh_attributes
 from .layout import splat_count
 from .node_trees import chain, named_attribute, new_tree
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
 
 REMOVE = "refine_remove"
 """Boolean point attribute: the splats that the budget removes."""
@@ -41,11 +37,10 @@ def check_writable(obj: bpy.types.Object) -> None:
     """Raise `RefineError` if the object or its data belongs to a library."""
     if obj.data.library or obj.library:
         source = (obj.data.library or obj.library).filepath
-        msg = (
+        raise RefineError(
             f"object '{obj.name}': is linked from {source}, which cannot be changed here; open "
             "that file, or make the object and its data local"
         )
-        raise RefineError(msg)
 
 
 def check_changeable(obj: bpy.types.Object) -> None:
@@ -53,11 +48,13 @@ def check_changeable(obj: bpy.types.Object) -> None:
     check_writable(obj)
     label = f"object '{obj.name}'"
     if obj.mode != "OBJECT":
-        msg = f"{label}: is in {obj.mode.replace('_', ' ').lower()} mode; go to object mode first"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{label}: is in {obj.mode.replace('_', ' ').lower()} mode; go to object mode first"
+        )
     if getattr(obj.data, "shape_keys", None):  # point clouds have none
-        msg = f"{label}: has shape keys, which hold every vertex again; apply or delete them first"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{label}: has shape keys, which hold every vertex again; apply or delete them first"
+        )
 
 
 def check_deletable(obj: bpy.types.Object) -> None:
@@ -65,12 +62,11 @@ def check_deletable(obj: bpy.types.Object) -> None:
     check_changeable(obj)
     users = obj.data.users - obj.data.use_fake_user
     if users > 1:
-        msg = (
+        raise RefineError(
             f"object '{obj.name}': shares its data '{obj.data.name}' with {users - 1} other "
             "user(s), which would lose the splats too; make it single-user first (Object > "
             "Relations)"
         )
-        raise RefineError(msg)
 
 
 @contextmanager
@@ -127,8 +123,9 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         with bpy.context.temp_override(object=obj, active_object=obj, selected_objects=[obj]):
             bpy.ops.object.modifier_apply(modifier=name)
     except RuntimeError as error:
-        msg = f"object '{obj.name}': Blender could not delete the splats ({str(error).strip()})"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"object '{obj.name}': Blender could not delete the splats ({str(error).strip()})"
+        ) from error
     finally:
         if name in obj.modifiers:
             obj.modifiers.remove(obj.modifiers[name])
@@ -136,8 +133,9 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         mesh_attributes.remove_attribute(obj.data, REMOVE)
     left = splat_count(obj.data)
     if left != expected:
-        msg = f"object '{obj.name}': {left} splats were left, expected {expected}; report this"
-        raise RefineError(msg)
+        raise RefineError(
+            f"object '{obj.name}': {left} splats were left, expected {expected}; report this"
+        )
 
 
 def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
@@ -223,8 +221,9 @@ def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
         expected += " (a point cloud has no vertex groups)"
     else:
         expected = f"a vertex group, or {expected}"
-    msg = f"object '{obj.name}': nothing to protect is named '{name}'{what}; expected {expected}"
-    raise RefineError(msg)
+    raise RefineError(
+        f"object '{obj.name}': nothing to protect is named '{name}'{what}; expected {expected}"
+    )
 
 
 def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:

@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Collection
 
+import bpy
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.cleaning.clean import REASONS
+from ..core.cleaning.clean import REASONS, Cleaned
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
-from .layout import splat_count
+from .layout import SplatObject, splat_count
 from .records import parsed
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    import bpy
-    from numpy.typing import NDArray
-
-    from ..core.cleaning.clean import Cleaned
-    from .layout import SplatObject
 
 REASON = "refine_floats"
 """Integer point attribute: 0, or the place of the splat's reason in `REASONS`, from 1."""
@@ -40,11 +33,10 @@ def store(checked: SplatObject, cleaned: Cleaned) -> None:
     """
     mesh_edit.check_writable(checked.obj)
     if len(checked) != len(cleaned.keep):
-        msg = (
+        raise RefineError(
             f"object '{checked.obj.name}': has {len(checked)} splats, floaters were looked for "
             f"among {len(cleaned.keep)}; look again"
         )
-        raise RefineError(msg)
     reasons = np.zeros(len(cleaned.keep), np.int32)
     for number, name in enumerate(REASONS, start=1):
         reasons[cleaned.by_reason[name]] = number
@@ -87,8 +79,7 @@ def mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
         If nobody looked for floaters since the splats changed.
     """
     if counts(checked.mesh) is None:
-        msg = f"object '{checked.obj.name}': look for floaters first"
-        raise RefineError(msg)
+        raise RefineError(f"object '{checked.obj.name}': look for floaters first")
     numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
     return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from . import attributes as mesh_attributes
-
-if TYPE_CHECKING:
-    import bpy
-    from numpy.typing import NDArray
 
 HEAT = "refine_heat"
 """Colour attribute on points."""

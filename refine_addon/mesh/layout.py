@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import bpy
 import numpy as np
 
 from ..core.errors import RefineError
@@ -18,16 +20,9 @@ from ..core.formats.ply import REQUIRED, REST_COUNTS, stated_model
 from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.formats.ply_header import new_header, with_model
 from ..core.formats.ply_write import PLY_TYPES
-from ..core.rendering import MODELS
+from ..core.rendering import MODELS, Model
 from . import native
 from .native import Place
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import bpy
-
-    from ..core.rendering import Model
 
 LAYOUT = "refine_layout"
 """Custom property of the mesh: how the file it came from was laid out, as JSON."""
@@ -215,21 +210,19 @@ def check(obj: bpy.types.Object) -> SplatObject:
     """
     label = f"object '{obj.name}'"
     if obj.type not in _TYPES:
-        msg = f"{label}: is of type {obj.type}, expected a mesh or a point cloud that holds splats"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{label}: is of type {obj.type}, expected a mesh or a point cloud that holds splats"
+        )
     if obj.mode == "EDIT":
-        msg = f"{label}: is in edit mode; leave edit mode first"
-        raise RefineError(msg)
+        raise RefineError(f"{label}: is in edit mode; leave edit mode first")
     if obj.get("3DGS_Mesh_Type") == "face":
-        msg = (
+        raise RefineError(
             f"{label}: KIRI's 'face' form has four vertices a splat, expected one; "
             "use its 'vert' form, or import the PLY file here"
         )
-        raise RefineError(msg)
     if not splat_count(obj.data):
         points = "points" if obj.type == "POINTCLOUD" else "vertices"
-        msg = f"{label}: has no {points}, expected one a splat"
-        raise RefineError(msg)
+        raise RefineError(f"{label}: has no {points}, expected one a splat")
     native.refuse_lost_base(obj)
     layout = layout_of(obj)
     _check_attributes(obj, layout)
@@ -462,20 +455,18 @@ def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
         present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
         more = ", ..." if len(present) > _MOST_NAMES else ""
         or_native = f" or Blender's own {native.NAMES}" if obj.type == "POINTCLOUD" else ""
-        msg = (
+        raise RefineError(
             f"object '{obj.name}': has no attribute {', '.join(dict.fromkeys(absent))}; expected "
             f"the properties of a 3DGS file{or_native} on its points "
             f"(it has {', '.join(present[:_MOST_NAMES])}{more})"
         )
-        raise RefineError(msg)
     for column in layout.columns:
         attribute = attributes[column.attribute]
         if not _is(attribute, column.place.kinds):
-            msg = (
+            raise RefineError(
                 f"object '{obj.name}': attribute '{attribute.name}' is {attribute.data_type} on "
                 f"{attribute.domain}, expected {' or '.join(column.place.kinds)} on POINT"
             )
-            raise RefineError(msg)
 
 
 def _is(attribute: bpy.types.Attribute | None, kinds: tuple[str, ...]) -> bool:

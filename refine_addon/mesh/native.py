@@ -7,17 +7,14 @@ older versions too, and one that geometry nodes made.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import bpy
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..core.splats import opacity, scales, single_log_scales, single_logits
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Any
-
-    import bpy
-    from numpy.typing import NDArray
 
 BASE, SCALE, ROTATION, HARMONIC = "radiance:base", "scale", "rotation", "radiance:sh_"
 
@@ -109,8 +106,7 @@ def lost_base(obj: bpy.types.Object) -> bool:
 def refuse_lost_base(obj: bpy.types.Object) -> None:
     """Raise `RefineError` for what is left of Blender's splats where their colours were lost."""
     if lost_base(obj):
-        msg = (
+        raise RefineError(
             f"object '{obj.name}': has no attribute {BASE}, which holds colour and opacity: "
             "Blender 5.0 and older drop it where they open a file of 5.3; use 5.2 or later"
         )
-        raise RefineError(msg)

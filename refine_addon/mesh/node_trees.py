@@ -45,7 +45,7 @@ def chain(tree: bpy.types.NodeTree, nodes: list[bpy.types.Node]) -> None:
     tree.links.new(socket, end.inputs[0])
 
 
-def add(tree: bpy.types.NodeTree, kind: str, **settings: Any) -> bpy.types.Node:  # noqa: ANN401
+def add(tree: bpy.types.NodeTree, kind: str, **settings: Any) -> bpy.types.Node:
     """Add a node of a type and set its properties."""
     node = tree.nodes.new(kind)
     for name, value in settings.items():

@@ -8,7 +8,7 @@ from typing import Any
 
 
 @lru_cache(maxsize=16)
-def parsed(text: str) -> Any:  # noqa: ANN401 - whatever was recorded
+def parsed(text: str) -> Any:
     """Return a record as values, which nobody may change: panels ask whenever they are drawn.
 
     Raises

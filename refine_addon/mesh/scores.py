@@ -5,25 +5,22 @@ from __future__ import annotations
 import json
 import zlib
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
-from ..core.estimate.quality import Quality
+from ..core.quality.curve import Quality
 from ..core.scores import Scores
 from ..core.selection import rank
+from ..core.task import Settings
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from . import heat_map
+from .layout import SplatObject
 from .records import parsed
-
-if TYPE_CHECKING:
-    import bpy
-    from numpy.typing import NDArray
-
-    from ..core.task import Settings
-    from .layout import SplatObject
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
@@ -96,11 +93,10 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
     if len(checked) != len(scores.values):
-        msg = (
+        raise RefineError(
             f"object '{checked.obj.name}': has {len(checked)} splats, was scored with "
             f"{len(scores.values)}; score it again"
         )
-        raise RefineError(msg)
     together, asked = provenance.together, provenance.asked
     ranks = together.ranks if together else rank(scores.values)
     new_record = json.dumps(
@@ -203,18 +199,16 @@ def stored_scores(checked: SplatObject, forced_out: NDArray[np.bool_] | None = N
     mesh, label = checked.mesh, f"object '{checked.obj.name}'"
     recorded = record(mesh)
     if recorded is None or not _has_scores(mesh):
-        msg = f"{label}: has no scores; score it first"
-        raise RefineError(msg)
+        raise RefineError(f"{label}: has no scores; score it first")
     values = mesh_attributes.read_attribute(mesh, SCORE)
     scored = mesh_attributes.read_attribute(mesh, SCORED)
     forced_out = np.zeros_like(scored) if forced_out is None else forced_out
     unscored = int(np.count_nonzero(~scored & ~forced_out))
     if len(values) > recorded["splats"] or unscored:
-        msg = (
+        raise RefineError(
             f"{label}: scored with {recorded['splats']} splats, has {len(values)} now, "
             f"{unscored} of them without a score; score it again"
         )
-        raise RefineError(msg)
     # The curve is that of all splats that were scored: of one object, with the same forced out.
     whole = len(values) == recorded["splats"] and not recorded.get("together")
     whole = whole and np.array_equal(forced_out, ~scored)

@@ -7,18 +7,14 @@ hidden, of which Blender itself knows nothing.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import bmesh
+import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from . import attributes as mesh_attributes
 from .edit import check_writable
 from .layout import splat_count
-
-if TYPE_CHECKING:
-    import bpy
-    from numpy.typing import NDArray
 
 HIDDEN = ".hide_vert"
 

@@ -4,33 +4,27 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.objects import world_matrix
 from ..core import volumes as core_volumes
 from ..core.affine import moved
 from ..core.errors import RefineError
 from ..core.solid import Solid
-from ..core.volumes import Box, Forced, MovedVolume, Sphere, Zone
+from ..core.volumes import Box, Forced, MovedVolume, Role, Sphere, Volume, Zone
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import splat_count
+from ..mesh.layout import SplatObject, splat_count
 from ..mesh.records import parsed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from ..core.volumes import Role, Volume
-    from ..mesh.layout import SplatObject
 
 FACTS = "refine_forced"
 """Custom property of the mesh: how many splats must stay and go, or why nobody knows, as JSON."""
@@ -96,8 +90,7 @@ class Demands:
         try:
             return core_volumes.forced(self.zones, means, protected, out)
         except RefineError as error:
-            msg = f"object '{checked.obj.name}': {error}"
-            raise RefineError(msg) from error
+            raise RefineError(f"object '{checked.obj.name}': {error}") from error
 
 
 NONE = Demands()
@@ -149,8 +142,7 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
         kind = f"of type {obj.type}"
         if obj.type == "EMPTY":
             kind = f"an empty shown as {obj.empty_display_type.replace('_', ' ').lower()}"
-        msg = f"{label}: is {kind}, {UNFIT}"
-        raise RefineError(msg)
+        raise RefineError(f"{label}: is {kind}, {UNFIT}")
     return Zone(role, label, volume, idle)
 
 
@@ -253,11 +245,10 @@ def _surface(
     evaluated = obj.evaluated_get(depsgraph)
     if not evaluated.is_evaluated:
         if obj.modifiers:
-            msg = (
+            raise RefineError(
                 f"object '{obj.name}': is disabled in viewports or excluded from the view layer, "
                 "where Blender applies no modifiers; enable it first"
             )
-            raise RefineError(msg)
         evaluated = obj
     mesh = evaluated.to_mesh()
     try:
@@ -273,17 +264,7 @@ def _surface(
 
 @dataclass(frozen=True, eq=False)
 class _CachedVolume:
-    """A volume whose last answers are kept: sliders ask for the same ones again and again.
-
-    Attributes
-    ----------
-    label : str
-        Names it in messages.
-    key : bytes
-        Tells it from other volumes.
-    make : callable
-        Returns the volume itself.
-    """
+    """A volume whose last answers are kept: sliders ask for the same ones again and again."""
 
     label: str
     key: bytes
@@ -296,15 +277,14 @@ class _CachedVolume:
             try:
                 mask = self.make().inside(points)
             except RefineError as error:
-                msg = f"{self.label}: {error}"
-                raise RefineError(msg) from error
+                raise RefineError(f"{self.label}: {error}") from error
             while len(_masks) >= _MOST_MASKS:
                 del _masks[next(iter(_masks))]  # the oldest
             _masks[key] = mask
         return _masks[key]
 
 
-def _digest(*parts: Any) -> bytes:  # noqa: ANN401 - buffers
+def _digest(*parts: Any) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
     for part in parts:
         digest.update(part)

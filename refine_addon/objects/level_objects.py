@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import RefineError
 from ..core.levels.files import GOAL
+from ..core.levels.lod import Level
 from ..mesh.layout import SplatObject, check
 from . import splat_object
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from ..core.levels.lod import Level
 
 FACTS = "refine_lod"
 """Custom property of the object of a level: what is known of it, as in the report of files."""
@@ -86,8 +82,7 @@ def levels_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
     original = obj.get(LEVEL_OF) or obj
     levels = [each for each in bpy.data.objects if each.get(LEVEL_OF) == original]
     if not levels:
-        msg = f"object '{obj.name}': has no levels; make them first"
-        raise RefineError(msg)
+        raise RefineError(f"object '{obj.name}': has no levels; make them first")
     return [original, *sorted(levels, key=lambda each: each[FACTS]["level"])]
 
 

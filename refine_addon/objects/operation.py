@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import bpy
 
 from ..cameras.objects import world_matrix
 from ..core.errors import RefineError
+from ..core.formats.format import Format
 from ..core.operation.files import FileSink
 from ..core.operation.loaded import Loaded, RowSizes
-from ..core.operation.run import run
+from ..core.operation.requests import PruneRequest, ScoreRequest
+from ..core.operation.run import Runtime, Written, run
+from ..core.task import Result
 from ..core.whole_file import expanded
 from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
@@ -31,15 +36,6 @@ from .splat_object import (
     modifier_notes,
     reduce_object,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from ..core.formats.format import Format
-    from ..core.operation.requests import PruneRequest, ScoreRequest
-    from ..core.operation.run import Runtime, Written
-    from ..core.task import Result
 
 
 def prune_object(
@@ -212,10 +208,9 @@ class ObjectSink:
             if self.save:
                 mesh_edit.check_deletable(self.checked.obj)
                 if not bpy.data.filepath:
-                    msg = (
+                    raise RefineError(
                         "the scene is not saved in a .blend file yet: --save has nowhere to save to"
                     )
-                    raise RefineError(msg)
             yield
 
     def write(self, loaded: Loaded, result: Result, runtime: Runtime) -> Written:

@@ -7,40 +7,32 @@ Operators of the panel work on the selection through here. A single object is ha
 from __future__ import annotations
 
 import uuid
+from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
-from ..core.estimate.quality import Quality
-from ..core.selection import rank
-from ..core.splats import joined
-from ..core.task import DEFAULTS, Task
+from ..core.merging.absorb import Absorbed
+from ..core.quality.curve import Quality
+from ..core.scores import Scores
+from ..core.selection import Budget, rank
+from ..core.splats import Splats, joined
+from ..core.survivor_choice import SurvivorChoice
+from ..core.task import DEFAULTS, Result, Settings, Task
+from ..core.views import ViewSet
 from ..core.volumes import Forced
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.layout import SplatObject
+from ..mesh.scores import Provenance
 from . import demands, splat_object
 from .demands import Demands
-from .splat_object import Outcome
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from ..core.absorbing.absorb import Absorbed
-    from ..core.scores import Scores
-    from ..core.selection import Budget
-    from ..core.splats import Splats
-    from ..core.survivor_choice import SurvivorChoice
-    from ..core.task import Result, Settings
-    from ..core.views import ViewSet
-    from ..mesh.layout import SplatObject
-    from ..mesh.scores import Provenance
-    from .splat_object import Change, Frame
+from .splat_object import Change, Frame, Outcome
 
 Members = list["SplatObject"]
 """The objects, by name; one at least."""
@@ -70,12 +62,11 @@ def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
     for member in group:
         other = owners.setdefault(member.mesh, member.obj.name)
         if other != member.obj.name:
-            msg = (
+            raise RefineError(
                 f"objects '{other}' and '{member.obj.name}' share their data '{member.mesh.name}', "
                 "which can hold the scores of one; make it single-user first (Object > Relations), "
                 "or select only one"
             )
-            raise RefineError(msg)
     return group
 
 
@@ -132,11 +123,10 @@ def check_forced(scene: bpy.types.Scene, group: Members, before: Sequence[Forced
     for member, was, now in zip(group, before, forced_of_each(scene, group), strict=True):
         pairs = ((was.protected, now.protected), (was.out, now.out))
         if any(not _same_mask(*pair) for pair in pairs):
-            msg = (
+            raise RefineError(
                 f"object '{member.obj.name}': what must stay or go has changed meanwhile; nothing "
                 "was removed: apply again"
             )
-            raise RefineError(msg)
 
 
 def _same_mask(one: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None) -> bool:
@@ -318,11 +308,10 @@ def apply(group: Members, parts: Sequence[Change]) -> Outcome:
         _check_counts(group, sum(len(part.keep) for part in parts))
     for member, part in zip(group, parts, strict=True):
         if len(group) > 1 and not part.keep.any():
-            msg = (
+            raise RefineError(
                 f"no splat of object '{member.obj.name}' would be left; nothing was removed: "
                 "delete the object, or let more stay"
             )
-            raise RefineError(msg)
     outcomes = splat_object.apply(list(zip(group, parts, strict=True)))
     totals = {
         field.name: sum(getattr(outcome, field.name) for outcome in outcomes)
@@ -346,11 +335,10 @@ def _check_counts(group: Members, count: int) -> None:
     total = sum(len(member) for member in group)
     if total != count:
         names = ", ".join(repr(member.obj.name) for member in group)
-        msg = (
+        raise RefineError(
             f"objects {names}: have {total} splats together and had {count} when the work began; "
             "do it again"
         )
-        raise RefineError(msg)
 
 
 def _check_scored_together(group: Members) -> None:
@@ -360,11 +348,10 @@ def _check_scored_together(group: Members) -> None:
         for member in group
     }
     if len(ids) > 1 or None in ids:
-        msg = (
+        raise RefineError(
             f"the {len(group)} selected objects were not scored together: score them as they are "
             "selected, or select only one"
         )
-        raise RefineError(msg)
 
 
 def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:

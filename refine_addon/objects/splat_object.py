@@ -7,20 +7,29 @@ and leaves the scene as it was.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.objects import world_matrix
 from ..core.affine import baked, check_affine, is_uniform, transformed
 from ..core.errors import RefineError
+from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
+from ..core.levels.lod import Level
+from ..core.merging.absorb import Absorbed
 from ..core.moves import Move
+from ..core.selection import Budget
+from ..core.splats import Splats
+from ..core.survivor_choice import SurvivorChoice
 from ..core.task import DEFAULTS, Result, Settings, Task
+from ..core.views import ViewSet
 from ..core.volumes import FREE, Forced
 from ..core.work import for_chunks
 from ..mesh import attributes as mesh_attributes
@@ -28,22 +37,8 @@ from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
+from ..mesh.layout import SplatObject
 from ..mesh.scores import RECORD, stored_scores
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..core.absorbing.absorb import Absorbed
-    from ..core.formats.ply import SplatFile
-    from ..core.levels.lod import Level
-    from ..core.selection import Budget
-    from ..core.splats import Splats
-    from ..core.survivor_choice import SurvivorChoice
-    from ..core.views import ViewSet
-    from ..mesh.layout import SplatObject
-
 
 _NORMALS = ("nx", "ny", "nz")
 
@@ -109,8 +104,7 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     try:
         return transformed(splats, matrix, rotate_sh=whole)
     except RefineError as error:
-        msg = f"object '{checked.obj.name}': {error}"
-        raise RefineError(msg) from None
+        raise RefineError(f"object '{checked.obj.name}': {error}") from None
 
 
 def can_become(group: Sequence[SplatObject], survivors: SurvivorChoice) -> SurvivorChoice:
@@ -285,11 +279,10 @@ def apply(parts: Sequence[tuple[SplatObject, Change]]) -> list[Outcome]:
     for checked, change in parts:
         mesh_edit.check_deletable(checked.obj)
         if len(change.keep) != len(checked):
-            msg = (
+            raise RefineError(
                 f"object '{checked.obj.name}': has {len(checked)} splats and had "
                 f"{len(change.keep)} when it was decided which stay; apply again"
             )
-            raise RefineError(msg)
         outcomes.append(_outcome(checked, change.keep))
     with ExitStack() as stack:
         for checked, _ in parts:
@@ -316,8 +309,9 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     """
     mesh_edit.check_deletable(checked.obj)
     if not keep.any():
-        msg = f"object '{checked.obj.name}': no splat would be left; nothing was deleted"
-        raise RefineError(msg)
+        raise RefineError(
+            f"object '{checked.obj.name}': no splat would be left; nothing was deleted"
+        )
     outcome = _outcome(checked, keep)
     with mesh_edit.all_or_nothing(checked.obj):
         reduce_object(checked, changed(frame_of(checked), keep, None))
@@ -469,6 +463,7 @@ def find(name: str) -> bpy.types.Object:
     if obj is None:
         names = [o.name for o in bpy.context.scene.objects if mesh_layout.looks_like_splats(o)]
         listed = ", ".join(names[:8]) or "none"
-        msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {listed})"
-        raise RefineError(msg)
+        raise RefineError(
+            f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {listed})"
+        )
     return obj

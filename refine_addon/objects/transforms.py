@@ -5,11 +5,13 @@ Each does all it says, or raises `RefineError` and leaves the scene as it was.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.objects import snapped, world_matrix
 from ..core.affine import is_flat
@@ -17,7 +19,7 @@ from ..core.errors import RefineError
 from ..core.formats.ply import REST_COUNTS
 from ..core.moves import Move
 from ..core.splats import above_constant, refuse_mixed
-from ..core.work import report
+from ..core.work import Progress, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -26,16 +28,9 @@ from ..mesh import heat_map
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
+from ..mesh.layout import SplatObject
 from . import demands
 from .splat_object import moved_columns, read_to_move, uneven_notes
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..core.work import Progress
-    from ..mesh.layout import SplatObject
 
 _UNMOVED = {
     "location": (0.0, 0.0, 0.0),
@@ -200,11 +195,10 @@ def _check_still(obj: bpy.types.Object) -> None:
     animated = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
     if animated or obj.constraints:
         what = "animated" if animated else "constrained"
-        msg = (
+        raise RefineError(
             f"object '{obj.name}': is {what}, which goes on to move it; remove that first, or "
             "export with Apply Transform"
         )
-        raise RefineError(msg)
 
 
 def _own_matrix(obj: bpy.types.Object, *, location: bool) -> NDArray[np.float64]:
@@ -213,8 +207,9 @@ def _own_matrix(obj: bpy.types.Object, *, location: bool) -> NDArray[np.float64]
     if not location:
         matrix[:3, 3] = 0.0
     if is_flat(matrix):
-        msg = f"object '{obj.name}': is scaled to nothing along an axis, which nothing undoes"
-        raise RefineError(msg)
+        raise RefineError(
+            f"object '{obj.name}': is scaled to nothing along an axis, which nothing undoes"
+        )
     return matrix
 
 
@@ -363,8 +358,7 @@ def _to_first(group: Sequence[SplatObject]) -> list[NDArray[np.float64]]:
     worlds = [world_matrix(member.obj, graph) for member in group]
     for member, world in zip(group, worlds, strict=True):
         if is_flat(world):
-            msg = f"object '{member.obj.name}': is scaled to nothing along an axis"
-            raise RefineError(msg)
+            raise RefineError(f"object '{member.obj.name}': is scaled to nothing along an axis")
     return [np.eye(4), *(np.linalg.inv(worlds[0]) @ world for world in worlds[1:])]
 
 
@@ -443,12 +437,12 @@ def _as_one(parts: Sequence[bpy.types.Object]) -> bpy.types.Object:
         with bpy.context.temp_override(**chosen):
             bpy.ops.object.join()
     except RuntimeError as error:
-        msg = f"Blender could not join the splats ({str(error).strip()})"
-        raise RefineError(msg) from error
+        raise RefineError(f"Blender could not join the splats ({str(error).strip()})") from error
     bpy.data.batch_remove(others)
     if len(first.data.vertices) != count:
-        msg = f"{len(first.data.vertices)} splats were joined, expected {count}; report this"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{len(first.data.vertices)} splats were joined, expected {count}; report this"
+        )
     return first
 
 

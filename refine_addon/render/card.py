@@ -7,24 +7,19 @@ same where there is no card.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import bpy
 import gpu
 import numpy as np
+from numpy.typing import NDArray
 
+from ..core.drawing import Layers
 from ..core.rendering import MODELS
+from ..core.splats import Splats
+from ..core.views import View
 from ..viewport import shader
 from ..viewport.arrays import Eye, as_texture, colors, farthest_first, in_front, pack
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..core.drawing import Layers
-    from ..core.splats import Splats
-    from ..core.views import View
 
 _FARTHEST = 1e6
 """Far plane over the near plane, where a view has none nearer."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import bpy
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 MARK = "refine_render"
 """Custom property of such a copy: the scene that it is of."""

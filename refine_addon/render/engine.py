@@ -5,36 +5,31 @@ Blender calls it in a thread of its own, on what it evaluated for this render.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import main_thread
 from ..cameras.objects import pose
 from ..core.affine import is_flat, transformed
-from ..core.drawing import draw, seen_from
+from ..core.drawing import Layers, draw, seen_from
 from ..core.errors import RefineError
-from ..core.seeing.scene import scene_of
 from ..core.sight import view_through
 from ..core.splats import Splats, drawable, joined
 from ..core.views import View, ViewSet
+from ..core.visibility.scene import scene_of
 from ..core.work import Cancelled, checked_by, checkpoint
 from ..mesh import attributes as mesh_attributes
 from ..mesh.layout import SplatObject, check, splat_count
 from . import card
 from .meshes import drawn_by_us
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ..core.drawing import Layers
 
 _FAR = 1e4
 """Scene sizes from which a camera without perspective is seen as one with it: less than .1 pixels
@@ -106,7 +101,7 @@ def load(folder: Path, frame: int) -> NDArray[np.float64]:
     return np.asarray(np.load(folder / f"{frame}.npy") / 65535.0)
 
 
-class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc] # noqa: N801 - of Blender
+class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
     """Draws splats."""
 
     bl_idname = "REFINE_SPLATS"
@@ -123,7 +118,7 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc] # noqa: N801 
             self._render(depsgraph, shared)
         except Cancelled:
             pass
-        except BaseException as error:  # noqa: BLE001 - raised again by `frames`
+        except BaseException as error:
             shared.error = error
             self.error_set(str(error))
 
@@ -176,17 +171,7 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc] # noqa: N801 
 
 
 class _Place(NamedTuple):
-    """How a camera sees.
-
-    Attributes
-    ----------
-    view : View
-        Of the whole image. Without perspective, from far away.
-    near : View
-        The same where the camera stands.
-    away : float
-        Distance of the two.
-    """
+    """How a camera sees."""
 
     view: View
     near: View
@@ -196,20 +181,13 @@ class _Place(NamedTuple):
 def _place(
     depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, size: tuple[int, int]
 ) -> _Place:
-    """Return how a camera sees; a view is a pinhole, so one without perspective stands far away.
-
-    Raises
-    ------
-    RefineError
-        If the camera is a panorama, sheared or flat.
-    """
+    """Return how a camera sees; a view is a pinhole, so one without perspective stands far away."""
     data, render = camera.data, depsgraph.scene.render
     if data.type not in {"PERSP", "ORTHO"}:
-        msg = (
+        raise RefineError(
             f"camera '{camera.name}' is a panorama (lens type {data.type}): splats can be drawn in "
             "perspective and orthographic cameras; change its lens type"
         )
-        raise RefineError(msg)
     width, height = size
     pixel = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
     projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, **pixel)
@@ -246,11 +224,6 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
     """Return all splats that a render shows, in the world, in the colours that they show to an eye.
 
     Instances are among them. Modifiers are not looked at, as in the 3D views.
-
-    Raises
-    ------
-    RefineError
-        If they are drawn in different ways: see `splats.refuse_mixed`.
     """
     parts = []
     for instance in depsgraph.object_instances:

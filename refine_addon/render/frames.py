@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import bpy
 
 from ..core.errors import RefineError
 from ..core.work import Cancelled
 from . import copies, engine
+from .engine import Shared
 from .meshes import Meshes, drawn_by_us
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Sequence
-
-    from .engine import Shared
-    from .passes import Rendered
+from .passes import Rendered
 
 Answer = TypeVar("Answer")
 
@@ -51,16 +48,13 @@ def refuse(scene: bpy.types.Scene) -> None:
     """Raise `RefineError` for what cannot be rendered."""
     label = f"scene '{scene.name}'"
     if scene.camera is None:
-        msg = f"{label}: has no camera; add one, or make one the active camera"
-        raise RefineError(msg)
+        raise RefineError(f"{label}: has no camera; add one, or make one the active camera")
     instanced = {obj.instance_collection for obj in bpy.data.objects} - {None}
     members = [member for collection in instanced for member in collection.all_objects]
     if not any(drawn_by_us(obj) for obj in (*scene.objects, *members)):
-        msg = f"{label}: has no splats to draw; import some, or use Render Image"
-        raise RefineError(msg)
+        raise RefineError(f"{label}: has no splats to draw; import some, or use Render Image")
     if scene.render.use_multiview:
-        msg = f"{label}: splats are not drawn in stereo; switch off Stereoscopy"
-        raise RefineError(msg)
+        raise RefineError(f"{label}: splats are not drawn in stereo; switch off Stereoscopy")
 
 
 def left_out(scene: bpy.types.Scene) -> list[str]:
@@ -183,7 +177,7 @@ def _check(shared: Shared, frame: int) -> None:
         raise Cancelled
 
 
-def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:  # noqa: FBT001
+def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
     """Tell whether the file of a frame is there and stays; else make one in its place if wanted."""
     path = Path(bpy.path.abspath(_scene(name).render.frame_path(frame=frame)))
     if stays and path.exists():

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.work import Cancelled
 from ..mesh import native
@@ -15,11 +17,6 @@ from ..mesh.layout import looks_like_splats
 from . import copies, see_through
 from .out_of_sight import out_of_sight
 from .passes import Rendered
-
-if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
-
-    from numpy.typing import NDArray
 
 _RENDERED = {
     *("MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES", "POINTCLOUD", "GREASEPENCIL"),
@@ -50,15 +47,7 @@ def drawn_by_us(obj: bpy.types.Object) -> bool:
 
 
 class _Apart(NamedTuple):
-    """Objects that are rendered together.
-
-    Attributes
-    ----------
-    others : list of bpy.types.Object
-        Those that are left out.
-    blended : bool
-        Whether the engine tells no depth of them, as EEVEE of what it blends; Cycles does.
-    """
+    """Objects that are rendered together."""
 
     others: list[bpy.types.Object]
     blended: bool = False

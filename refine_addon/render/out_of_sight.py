@@ -6,13 +6,10 @@ render that is over is found by the mark.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
 
 import bpy
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
 
 _MARK = "refine_out_of_sight"
 """Custom property of such an object: the property that was changed."""

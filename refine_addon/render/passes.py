@@ -7,19 +7,16 @@ So there are three steps: `Rendered.read`, Blender's view transform of `Light.pi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.drawing import Layers, in_order
 from ..core.exr import read_exr
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 _ROUNDS = 2
 """Pixels by which known depths are spread to pixels at edges without one."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    import bpy
+import bpy
 
 LAYERS = 4
 """Groups of objects that are rendered apart, at most: each costs a render."""

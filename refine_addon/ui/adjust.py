@@ -1,19 +1,14 @@
 """What of *Apply* can be adjusted afterwards, in the box *Adjust Last Operation* (F9)."""
 
-# ruff: noqa: TC002 - Blender runs the annotations
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty
 
-from .properties import AMOUNTS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .properties import RefineSettings
+from .properties import AMOUNTS, RefineSettings
 
 
 class Adjustable:

@@ -1,11 +1,10 @@
 """Cameras from files: as objects of the scene, by themselves or with the splats they lie beside."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
@@ -16,18 +15,16 @@ from ..cameras.objects import SHEAR, SOURCE, UPRIGHT
 from ..cameras.sets import create_cameras, known_turn
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError
-from ..core.estimate.alignment import Alignment
 from ..core.formats.registry import INDEX_NAMES
+from ..core.quality.alignment import Alignment
+from ..core.views import ViewSet
+from ..core.work import Progress
 from ..mesh import layout as mesh_layout
 from . import preferences
 from .on_thread import AskedFirst
 from .operator_bases import Answer, Needing, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
-
-if TYPE_CHECKING:
-    from ..core.views import ViewSet
-    from ..core.work import Progress
 
 FOLDER = "refine_folder"
 """Custom property of an imported object: the folder of its file."""
@@ -92,7 +89,7 @@ class REFINE_OT_import_cameras(AskedFirst, Needing, bpy.types.Operator, ImportHe
         folder = None if self.properties.is_property_set("filepath") else capture_folder(obj)
         if folder is None:
             return self.invoke_popup(context)
-        self.filepath = os.path.join(folder, "")  # noqa: PTH118 - ends in a separator
+        self.filepath = os.path.join(folder, "")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
@@ -100,8 +97,7 @@ class REFINE_OT_import_cameras(AskedFirst, Needing, bpy.types.Operator, ImportHe
         """Note which file to read."""
         path = Path(bpy.path.abspath(self.filepath))
         if len(self.files) > 1 and path.suffix not in _OF_MODELS:
-            msg = f"got {len(self.files)} files, expected one of cameras"
-            raise RefineError(msg)
+            raise RefineError(f"got {len(self.files)} files, expected one of cameras")
         return path
 
     @staticmethod
@@ -135,7 +131,7 @@ class REFINE_FH_cameras(bpy.types.FileHandler):
 
 
 def add_cameras(
-    operator: Any,  # noqa: ANN401 - either of the operators that import cameras
+    operator: Any,
     context: bpy.types.Context,
     views: ViewSet,
     path: Path,
@@ -169,7 +165,7 @@ def add_cameras(
     return collection
 
 
-def suggest_resolution(operator: Any, context: bpy.types.Context) -> None:  # noqa: ANN401
+def suggest_resolution(operator: Any, context: bpy.types.Context) -> None:
     """Have an operator that asks set the render size where nobody has chosen size or camera."""
     if not operator.properties.is_property_set("set_resolution"):
         operator.set_resolution = _is_untouched(context.scene)
@@ -203,7 +199,7 @@ def cameras_beside(folder: Path) -> Path | None:
 def capture_folder(obj: bpy.types.Object | None) -> Path | None:
     """Return where to look for the cameras of a splat object; None where nothing tells."""
     stored = obj.get(FOLDER) if obj is not None else None
-    if not isinstance(stored, str) or not stored or not os.path.isdir(stored):  # noqa: PTH112
+    if not isinstance(stored, str) or not stored or not os.path.isdir(stored):
         return None
     found = cameras_beside(Path(stored))
     return Path(stored) if found is None else found if found.is_dir() else found.parent

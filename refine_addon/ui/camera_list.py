@@ -1,18 +1,15 @@
 """The list of the cameras: what lies in the view of each, and how much of its picture changes."""
 
-# ruff: noqa: N801 - Blender's way to name classes and set options; runs annotations
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, FloatProperty, IntProperty, StringProperty
 
-from ..core.estimate.quality import in_words
+from ..core.quality.curve import in_words
 from .wrapped import counted, label
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _MOST = 6  # lines before the list scrolls
 
@@ -97,7 +94,7 @@ class REFINE_UL_cameras(bpy.types.UIList):
         manager: bpy.types.WindowManager,
         item: RefineCamera,
         _icon: int,
-        _active_data: Any,  # noqa: ANN401
+        _active_data: Any,
         _active_property: str,
     ) -> None:
         """Draw a camera; one that sees nothing is marked, and that whose picture changes most."""

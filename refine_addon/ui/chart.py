@@ -5,25 +5,18 @@ Arrays only: `price` shows them in the panel. Positions are pixels from the uppe
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.estimate.quality import UNSEEN
-from ..core.survivor_choice import SURVIVORS
+from ..core.quality.curve import UNSEEN, Quality
+from ..core.survivor_choice import SURVIVORS, Became
 from . import pixel_font
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
-    from ..core.estimate.quality import Quality
-    from ..core.survivor_choice import Became
-
-    Color = tuple[float, float, float]
-    Box = tuple[float, float, float, float]  # left, top, right, bottom
+Color = tuple[float, float, float]
+Box = tuple[float, float, float, float]  # left, top, right, bottom
 
 SIZE = 212
 """Pixels of an edge at scale 1, where a pixel of a letter is one of the screen."""
@@ -54,7 +47,7 @@ class Look:
     @property
     def dark(self) -> bool:
         """Whether it stands on a dark ground."""
-        return sum(self.ink) > 1.5  # noqa: PLR2004 - half of white
+        return sum(self.ink) > 1.5
 
     @property
     def colors(self) -> dict[str, Color]:

@@ -1,25 +1,27 @@
 """*Compare*: what the active camera sees now, what it would see after *Apply*, and what differs."""
 
-# ruff: noqa: D400, N801, RUF012 - Blender's names and tooltips
 from __future__ import annotations
 
 import json
 import zlib
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
 
 from ..cameras.sets import CameraChoice
 from ..core import pipeline
-from ..core.estimate.quality import in_words
 from ..core.picture_files import KINDS
 from ..core.pictures import AMPLIFIED, Comparison, compare
+from ..core.quality.curve import in_words
+from ..core.splats import Splats
+from ..core.task import Task
 from ..core.views import ViewSet
-from ..core.work import part
+from ..core.work import Progress, part
 from ..mesh import scores as mesh_scores
+from ..mesh.layout import SplatObject
 from ..mesh.records import parsed
 from ..objects import splat_group
 from . import plans
@@ -27,12 +29,6 @@ from .images import put
 from .on_thread import OnThread
 from .operator_bases import Answer, OnScored
 from .operators import apply_task
-
-if TYPE_CHECKING:
-    from ..core.splats import Splats
-    from ..core.task import Task
-    from ..core.work import Progress
-    from ..mesh.layout import SplatObject
 
 NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 """The pictures as images of the file, made anew by each comparison."""
@@ -105,7 +101,7 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def measured(obj: bpy.types.Object, settings: Any) -> str:  # noqa: ANN401 - RefineSettings
+def measured(obj: bpy.types.Object, settings: Any) -> str:
     """Return a sentence on what was measured of the plan of the moment, "" if nothing was."""
     try:
         noted = parsed(obj.data[MEASURED])

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import bpy
+import numpy as np
+from numpy.typing import NDArray
 
 from ..mesh import layout as mesh_layout
+from ..mesh.layout import SplatObject
 from ..objects import splat_object
 from . import plans
 from .operator_bases import Answer, AtOnce, OnSplats
-
-if TYPE_CHECKING:
-    import bpy
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from ..mesh.layout import SplatObject
 
 
 class Deleting(AtOnce, OnSplats):

@@ -1,12 +1,11 @@
 """The operators that write splats to a file, and levels to a folder."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
@@ -14,23 +13,18 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.formats import sog
+from ..core.formats.ply import SplatFile
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed, as_written, without_suffix
 from ..core.formats.streamed_sog import INDEX
 from ..core.formats.streamed_sog_write import StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
-from ..core.work import report
+from ..core.work import Progress, report
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.layout import SplatObject
 from ..objects import level_objects, splat_object
 from .on_thread import AskedFirst
 from .operator_bases import Answer, OnSplats
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ..core.formats.ply import SplatFile
-    from ..core.work import Progress
-    from ..mesh.layout import SplatObject
 
 _FORMATS = (
     (".ply", ".ply", "In the layout that was imported"),
@@ -211,7 +205,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
                 splats = Packed(file(), sog.FORMAT).chosen(job.target, None, {})
                 scene = scene or StreamedSog(splats.means, job.width, made)
                 scene.add(splats)
-            assert scene is not None  # noqa: S101 - there is an object at least
+            assert scene is not None
             scene.publish(job.target, overwrite=job.overwrite)
         return len(job.files)
 

@@ -1,31 +1,27 @@
 """Operators that find floaters, by what the cameras see, and delete them."""
 
-# ruff: noqa: D400, N801 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
 
 from ..core.cleaning.clean import Cleaned, Cleaning, clean
+from ..core.splats import Splats
+from ..core.views import ViewSet
+from ..core.volumes import Forced
+from ..core.work import Progress
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
+from ..mesh.layout import SplatObject
 from ..objects import splat_object
 from ..objects.demands import Demands
 from . import plans
 from .on_thread import OnThread
 from .operator_bases import Answer, AtOnce, OnSplats
 from .operators import chosen_views
-
-if TYPE_CHECKING:
-    from ..core.splats import Splats
-    from ..core.views import ViewSet
-    from ..core.volumes import Forced
-    from ..core.work import Progress
-    from ..mesh.layout import SplatObject
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +39,7 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.find_floaters"
     bl_label = "Find Floaters"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's way to set options
+    bl_options = {"REGISTER", "UNDO"}
     doing = "Looking for floaters"
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Searching:
@@ -85,7 +81,7 @@ class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.delete_floaters"
     bl_label = "Delete Floaters"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's way to set options
+    bl_options = {"REGISTER", "UNDO"}
 
     needs = (*OnSplats.needs, _searched)
 

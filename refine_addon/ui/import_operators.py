@@ -1,12 +1,10 @@
 """The operator that brings files of splats into the scene, and dropping them on the view."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 import mathutils
@@ -16,9 +14,11 @@ from bpy_extras.io_utils import ImportHelper
 from ..cameras.objects import SOURCE, UPRIGHT
 from ..core.cameras.read import read_cameras
 from ..core.errors import RefineError
+from ..core.formats.ply import SplatFile
 from ..core.formats.registry import INDEX_NAMES, READ_SUFFIXES, read_splats
 from ..core.formats.streamed_sog import INDEX
-from ..core.work import part, report
+from ..core.views import ViewSet
+from ..core.work import Progress, part, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..viewport import draw
@@ -36,11 +36,6 @@ from .on_thread import AskedFirst
 from .operator_bases import FAILURES, Answer, Needing, described, fail, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
-
-if TYPE_CHECKING:
-    from ..core.formats.ply import SplatFile
-    from ..core.views import ViewSet
-    from ..core.work import Progress
 
 _ROWS = 1 << 16
 """Rows that are read before the next look at whether the import was cancelled."""
@@ -222,8 +217,7 @@ def _read(path: Path, level: int, progress: Progress) -> SplatFile:
     report(progress, 0.0, "")
     file = read_splats(path, level=level)
     if not len(file):
-        msg = f"{path}: holds no splats"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: holds no splats")
     for start in range(0, len(file), _ROWS):
         report(progress, start / len(file), "")
         file.rows[start : start + _ROWS].tobytes()  # a mapped file is read when it is looked at

@@ -1,6 +1,5 @@
 """Splats that stand in the scene as instances of a collection, perhaps a linked one."""
 
-# ruff: noqa: D400, N801, RUF012 - Blender's names and tooltips
 from __future__ import annotations
 
 import bpy

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 
 from .. import main_thread
 from ..core.work import Cancelled, silent
 from ..mesh import layout as mesh_layout
+from ..mesh.layout import SplatObject
 from . import running as at_work
 from .operator_bases import FAILURES, Answer, fail
-from .running import Running
+from .running import Running, Sketch
 from .target import Target
 from .worker import Worker
-
-if TYPE_CHECKING:
-    from ..mesh.layout import SplatObject
-    from .running import Sketch
 
 _STEP = 0.05
 """Seconds between two events of the timer, at each of which the thread is looked at."""
@@ -46,7 +43,7 @@ class OnThread:
     """Whether it needs the active object."""
     _running: Running | None = None
 
-    def sketch(self, _job: Any) -> Sketch | None:  # noqa: ANN401 - its own kind
+    def sketch(self, _job: Any) -> Sketch | None:
         """Return what is to be done and shown ahead of the work."""
         return None
 

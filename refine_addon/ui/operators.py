@@ -3,32 +3,39 @@
 Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* is clicked.
 """
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.sets import CameraChoice
 from ..core import pipeline
-from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
 from ..core.pipeline.refit_splats import DOING
+from ..core.quality.curve import in_words
 from ..core.report import scoring_notes, sizes_in_words
-from ..core.seeing import frustum
-from ..core.task import may_absorb
-from ..core.work import part
+from ..core.scores import Scores
+from ..core.splats import Splats
+from ..core.task import Result, Settings, Task, may_absorb
+from ..core.views import ViewSet
+from ..core.visibility import frustum
+from ..core.volumes import Forced
+from ..core.work import Progress, part
 from ..mesh import convert
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
+from ..mesh.layout import SplatObject
 from ..mesh.scores import Provenance
 from ..objects import level_objects, splat_group, splat_object
 from ..objects.demands import Demands
+from ..objects.splat_object import Change, Frame
 from . import plans, staleness
 from .adjust import Adjustable
 from .on_thread import OnThread
@@ -40,21 +47,6 @@ from .operator_bases import (
 )
 from .running import Sketch
 from .wrapped import counted
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from ..core.scores import Scores
-    from ..core.splats import Splats
-    from ..core.task import Result, Settings, Task
-    from ..core.views import ViewSet
-    from ..core.volumes import Forced
-    from ..core.work import Progress
-    from ..mesh.layout import SplatObject
-    from ..objects.splat_object import Change, Frame
-
 
 _SCORED = 0.97
 """Share of the time of a scoring after which only the splats in each view are to be counted."""

@@ -1,14 +1,13 @@
 """The panel REFINE in the 3D view's sidebar: it draws settings and stored results."""
 
-# ruff: noqa: N801, RUF012 - Blender's way to name classes and set options
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 
 from ..cameras.sets import CameraChoice, known_turn
-from ..core.estimate.alignment import Alignment
+from ..core.quality.alignment import Alignment
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
@@ -29,15 +28,10 @@ from . import (
     wrapped,
 )
 from .panel_cache import cached
-from .properties import FLOATERS
+from .properties import FLOATERS, RefineSettings
 from .view_operators import MODES
-from .volumes import ROLES
+from .volumes import ROLES, RefineVolume
 from .wrapped import counted
-
-if TYPE_CHECKING:
-    from .properties import RefineSettings
-    from .volumes import RefineVolume
-
 
 _NONE = "Select an object that holds splats"
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
 
 import bpy
 from bpy.app.handlers import persistent
 
 from .running import redraw_panels
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable
 
 Answer = TypeVar("Answer")
 

@@ -6,12 +6,9 @@ A chart in a panel is an image, and Blender 4.2 to 4.5 hand out no pixels of tex
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 HEIGHT = 9
 """Rows of a line of text: 7 above the baseline and 2 below."""

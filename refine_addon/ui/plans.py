@@ -10,8 +10,9 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
@@ -19,30 +20,22 @@ from bpy.app.handlers import persistent
 
 from ..core import pipeline
 from ..core.errors import RefineError
-from ..core.estimate.alignment import Alignment
-from ..core.estimate.cost import expected_seconds
-from ..core.estimate.quality import in_views, in_words, out_of_reach, parted
 from ..core.pace import in_time
+from ..core.quality.alignment import Alignment
+from ..core.quality.cost import expected_seconds
+from ..core.quality.curve import in_views, in_words, out_of_reach, parted
 from ..core.report import MANY_UNSEEN, little_seen, sizes_in_words
-from ..core.selection import Tally, quality_of
-from ..core.survivor_choice import SURVIVORS
-from ..core.task import may_absorb
+from ..core.scores import Scores
+from ..core.selection import Budget, Tally, quality_of
+from ..core.survivor_choice import SURVIVORS, Became, SurvivorChoice
+from ..core.task import Task, may_absorb
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.records import parsed
 from ..objects import demands, splat_group
 from ..objects.splat_object import Outcome
 from . import camera_list, price
-from .chart import Place
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..core.scores import Scores
-    from ..core.selection import Budget
-    from ..core.survivor_choice import Became, SurvivorChoice
-    from ..core.task import Task
-    from .chart import Histogram
+from .chart import Histogram, Place
 
 PLAN = "refine_plan"
 """Custom property of the mesh: the last plan, or why there is none, as JSON."""
@@ -53,25 +46,7 @@ REST = 0.2
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What does not change while the budget does: of one object at one scoring.
-
-    Attributes
-    ----------
-    state : tuple
-        What it depends on; see `_state`.
-    tally : Tally
-    row_bytes, fixed_bytes : int
-        See `Budget.removals`.
-    kinds : Histogram
-    unseen : int
-        Splats whose centre lies in none of the views.
-    little_seen : str
-        See `report.little_seen`.
-    forced : int
-        Splats that go before all others, which all of the above leaves out.
-    scored_s : float or None
-        How long scoring them all took, seconds; None where that tells nothing of what else takes.
-    """
+    """What does not change while the budget does: of one object at one scoring."""
 
     state: tuple[Any, ...]
     tally: Tally
@@ -115,7 +90,7 @@ def unregister() -> None:
         kept.clear()
 
 
-def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports this module
+def key(settings: Any) -> str:
     """Return what a plan depends on; a stored plan of another key is out of date."""
     budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {_demanded(settings)!r}"
     return f"{budget} {settings.survivors} {settings.rounds} {settings.method}"
@@ -198,7 +173,7 @@ def wait(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: f
     bpy.app.timers.register(_rested, first_interval=seconds)
 
 
-def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:  # noqa: ANN401
+def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
     """Return the stored plan if it is that of the current budget and mesh, else None."""
     try:
         plan: dict[str, Any] = parsed(obj.data[PLAN])
@@ -392,7 +367,7 @@ def _objects(obj: bpy.types.Object) -> list[bpy.types.Object]:
     return splat_group.chosen(bpy.context.view_layer, obj)
 
 
-def _key(settings: Any, objects: list[bpy.types.Object]) -> str:  # noqa: ANN401
+def _key(settings: Any, objects: list[bpy.types.Object]) -> str:
     """Return what a plan for several objects depends on; see `key`."""
     others = [obj.name for obj in objects] if len(objects) > 1 else []
     return " ".join([key(settings), *map(repr, others)])
@@ -411,7 +386,7 @@ def _know(task: Task, state: tuple[Any, ...], scored_s: float | None) -> _Known:
     gone = 0 if forced is None else int(np.count_nonzero(forced))
     task = task if forced is None else task.without(forced)
     scores = task.scores
-    assert scores is not None  # noqa: S101 - a task of what is stored
+    assert scores is not None
     old = _known[0] if _known else None
     if old is not None and old.state == state and old.tally.is_of(scores, task.protected):
         return old
@@ -432,7 +407,7 @@ def _know(task: Task, state: tuple[Any, ...], scored_s: float | None) -> _Known:
     return known
 
 
-def _state(objects: list[bpy.types.Object], settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
+def _state(objects: list[bpy.types.Object], settings: Any) -> tuple[Any, ...]:
     """Return what tells a scoring of objects from another, and what is protected in them."""
     scorings = tuple(
         (
@@ -445,7 +420,7 @@ def _state(objects: list[bpy.types.Object], settings: Any) -> tuple[Any, ...]:  
     return scorings, _demanded(settings)
 
 
-def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
+def _demanded(settings: Any) -> tuple[Any, ...]:
     """Return the names and the volumes that say what must stay and go, and where these stand."""
     return (
         settings.protect,
@@ -456,7 +431,7 @@ def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
     )
 
 
-def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
+def _noted(known: _Known, settings: Any) -> dict[str, Any]:
     """Return the plan for a budget as plain values."""
     count, rest = known.count, known.count - known.forced
     plan: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
@@ -493,7 +468,7 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     return plan
 
 
-def _may_become(settings: Any, budget: Budget) -> Became:  # noqa: ANN401
+def _may_become(settings: Any, budget: Budget) -> Became:
     """Return what survivors may become, by the settings of the panel."""
     asked: SurvivorChoice = settings.survivors
     if asked != "auto":

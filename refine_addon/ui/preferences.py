@@ -1,19 +1,13 @@
 """What a user sets once: defaults of the panel in scenes into which splats are imported."""
 
-# ruff: noqa: TC002 - Blender runs the annotations
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from .properties import AMOUNTS, METHODS, OLDER, UPRIGHT_TEXT, VIEWS, take_over
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from .properties import RefineSettings
+from .properties import AMOUNTS, METHODS, OLDER, UPRIGHT_TEXT, VIEWS, RefineSettings, take_over
 
 PACKAGE = __package__.rpartition(".")[0]
 """The name under which the extension is enabled, such as ``bl_ext.user_default.refine_addon``."""
@@ -61,7 +55,7 @@ def fill(settings: RefineSettings, chosen: RefinePreferences) -> None:
             setattr(settings, name, getattr(chosen, name))
 
 
-def suggest(operator: Any, context: bpy.types.Context, name: str) -> None:  # noqa: ANN401
+def suggest(operator: Any, context: bpy.types.Context, name: str) -> None:
     """Give an operator that asks for its options the default of one that was not given."""
     chosen = _chosen(context)
     if chosen is not None and not operator.properties.is_property_set(name):

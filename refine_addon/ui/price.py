@@ -6,19 +6,14 @@ There is one, for the object that was looked at last.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import bpy
 import bpy.utils.previews
 import numpy as np
+from numpy.typing import NDArray
 
-from .chart import Chart, Look, by_score, by_views
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..core.scores import Scores
-    from .chart import Histogram, Place
+from ..core.scores import Scores
+from .chart import Chart, Histogram, Look, Place, by_score, by_views
 
 WIDTH = 11
 """Edge of the chart in units of the interface, about as wide as the sidebar is by default."""

@@ -1,10 +1,10 @@
 """What the user sets in the panel, and its conversion to the settings of core."""
 
-# ruff: noqa: TC002 - Blender runs the annotations
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import bpy
 import numpy as np
@@ -23,7 +23,7 @@ from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from ..core.levels.lod import Levels
-from ..core.refitting.refit import Refit
+from ..core.refit.refit import Refit
 from ..core.rendering import MODELS
 from ..core.selection import Budget
 from ..core.task import Settings
@@ -33,9 +33,6 @@ from ..mesh.edit import MARKING
 from . import plans
 from .select_panel import SelectSettings
 from .volumes import RefineVolume
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 METHODS = (
     ("auto", "Auto", "Occlusion with no more views than the pictures need"),
@@ -255,7 +252,7 @@ def decimal(value: float) -> float:
     return float(str(np.float32(value)))
 
 
-def take_over(settings: Any) -> None:  # noqa: ANN401 - RefineSettings, or the preferences
+def take_over(settings: Any) -> None:
     """Set what survivors may become by what was stored before there was that choice."""
     for older, name, chosen in (
         ("absorb", "survivors", ("unchanged", "absorb")),
@@ -399,8 +396,9 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         try:
             shares = tuple(float(word) for word in self.levels.split(","))
         except ValueError as error:
-            msg = f"Levels is {self.levels!r}, expected numbers with commas between them"
-            raise RefineError(msg) from error
+            raise RefineError(
+                f"Levels is {self.levels!r}, expected numbers with commas between them"
+            ) from error
         return Levels(shares, survivors=self.level_survivors)
 
     def to_frames(self, scene: bpy.types.Scene) -> range:

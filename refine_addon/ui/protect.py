@@ -1,6 +1,5 @@
 """The operator that marks splats by hand: to stay, or to go."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 import bpy
@@ -87,8 +86,7 @@ def _mark(obj: bpy.types.Object, mode: str, name: str) -> None:
     else:
         chosen = selection.selected(obj)
         if not chosen.any():
-            msg = f"object '{obj.name}': no splat is selected; select some first"
-            raise RefineError(msg)
+            raise RefineError(f"object '{obj.name}': no splat is selected; select some first")
         marked[chosen] = mode == "ADD"
     mesh_edit.mark_by_hand(obj, marked, name)
 
@@ -103,8 +101,7 @@ def _mark_in_edit_mode(obj: bpy.types.Object, mode: str, name: str) -> None:
         mesh_attributes.remove_attribute(mesh, name)
         return
     if not mesh.total_vert_sel:
-        msg = f"object '{obj.name}': no splat is selected"
-        raise RefineError(msg)
+        raise RefineError(f"object '{obj.name}': no splat is selected")
     marks = mesh.attributes.get(name)
     if marks and (marks.data_type, marks.domain) != ("BOOLEAN", "POINT"):
         mesh_attributes.remove_attribute(mesh, name)
@@ -114,8 +111,9 @@ def _mark_in_edit_mode(obj: bpy.types.Object, mode: str, name: str) -> None:
     try:
         bpy.ops.mesh.attribute_set(value_bool=mode == "ADD")
     except RuntimeError as error:
-        msg = f"object '{obj.name}': Blender could not mark the splats ({str(error).strip()})"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"object '{obj.name}': Blender could not mark the splats ({str(error).strip()})"
+        ) from error
     finally:
         if before in mesh.attributes:
             mesh.attributes.active = mesh.attributes[before]

@@ -1,37 +1,32 @@
 """Operators beside the warnings at Apply: each mends in one click what its warning tells."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import bpy
 import mathutils
 import numpy as np
 from bpy.props import EnumProperty, IntProperty
+from numpy.typing import NDArray
 
 from ..cameras.objects import UPRIGHT, WEIGHT, world_matrix
 from ..cameras.sets import CameraChoice, create_cameras
 from ..core.errors import RefineError
 from ..core.views import ViewSet
 from ..core.views_between import with_views_between
+from ..core.volumes import Forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from . import camera_list, plans
 from .operator_bases import Answer, AtOnce, OnSplats
 from .wrapped import counted
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..core.volumes import Forced
-    from ..mesh.layout import SplatObject
 
 _INNER = (5.0, 95.0)
 """Percentiles of the splats' positions that a ring frames: floaters far away do not count."""
@@ -121,13 +116,15 @@ class REFINE_OT_add_between(AtOnce, OnSplats, bpy.types.Operator):
         """Add them."""
         choice = CameraChoice.of_scene(context.scene)
         if choice.source == "FRAMES":
-            msg = "a shot decides: add cameras between its frames by more frames, not as objects"
-            raise RefineError(msg)
+            raise RefineError(
+                "a shot decides: add cameras between its frames by more frames, not as objects"
+            )
         views = choice.views(context)
         more = with_views_between(views, self.count).views[len(views) :]
         if not more:
-            msg = "no two cameras that decide stand apart and look alike: nothing is between them"
-            raise RefineError(msg)
+            raise RefineError(
+                "no two cameras that decide stand apart and look alike: nothing is between them"
+            )
         collection = bpy.data.collections.new("Views Between")
         create_cameras(ViewSet(more), collection)
         _join(context, collection)
@@ -153,11 +150,9 @@ class REFINE_OT_leave_out(AtOnce, OnSplats, bpy.types.Operator):
         leave = [camera for camera in cameras if camera.name in out]
         _refuse_libraries(leave)
         if not leave:
-            msg = "none of the cameras is known to see nothing; score first"
-            raise RefineError(msg)
+            raise RefineError("none of the cameras is known to see nothing; score first")
         if all(camera in leave or camera.get(WEIGHT, 1.0) == 0.0 for camera in cameras):
-            msg = "no camera would be left; add a ring of cameras"
-            raise RefineError(msg)
+            raise RefineError("no camera would be left; add a ring of cameras")
         for camera in leave:
             camera[WEIGHT] = 0.0
         self.report({"INFO"}, f"Left out {counted(len(leave), 'camera')}; score again")
@@ -201,16 +196,16 @@ def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
         cameras = [marker.camera for marker in scene.timeline_markers] + [scene.camera]
         cameras = list(dict.fromkeys(camera for camera in cameras if camera))
     if not cameras:
-        msg = "no cameras: choose those that decide, or add a ring of cameras"
-        raise RefineError(msg)
+        raise RefineError("no cameras: choose those that decide, or add a ring of cameras")
     return cameras
 
 
 def _refuse_libraries(objects: Iterable[bpy.types.Object]) -> None:
     for obj in objects:
         if obj.library:
-            msg = f"'{obj.name}': is linked from {obj.library.filepath}; make it local first"
-            raise RefineError(msg)
+            raise RefineError(
+                f"'{obj.name}': is linked from {obj.library.filepath}; make it local first"
+            )
 
 
 def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> list[bpy.types.Object]:
@@ -224,11 +219,13 @@ def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> lis
         while root.parent and root.parent not in ancestors:
             root = root.parent
         if root.parent:
-            msg = f"camera '{camera.name}' turns with the splats, being parented to them or theirs"
-            raise RefineError(msg)
+            raise RefineError(
+                f"camera '{camera.name}' turns with the splats, being parented to them or theirs"
+            )
         if root.constraints:
-            msg = f"'{root.name}': has constraints, which decide where it is; turn it by hand"
-            raise RefineError(msg)
+            raise RefineError(
+                f"'{root.name}': has constraints, which decide where it is; turn it by hand"
+            )
         roots.append(root)
     roots = list(dict.fromkeys(roots))
     _refuse_libraries(roots)
@@ -254,8 +251,7 @@ def _bounds(context: bpy.types.Context) -> _Bounds:
     means = mesh_attributes.read_attribute(checked.mesh, "position").astype(np.float64)
     means = means[np.isfinite(means).all(axis=1)]
     if not len(means):
-        msg = f"object '{checked.obj.name}': has no splat at a finite place"
-        raise RefineError(msg)
+        raise RefineError(f"object '{checked.obj.name}': has no splat at a finite place")
     means = means @ matrix[:3, :3].T + matrix[:3, 3]
     low, high = np.percentile(means, _INNER, axis=0)
     # Of one point, and of what is flat, a ball of some size.

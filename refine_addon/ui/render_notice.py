@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import bpy
 from bpy.app.handlers import persistent
 
 from ..render import copies, out_of_sight
 from ..render.meshes import drawn_by_us
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 NOTICE = "Splats are not in this render: use Render > Render Image with Splats"
 """What is said."""

@@ -1,11 +1,10 @@
 """*Render with Splats*: an operator that has Blender do one render after another, and waits."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
@@ -15,12 +14,10 @@ from .. import main_thread
 from ..core.work import Cancelled
 from ..render import card, frames
 from ..render.engine import Shared
+from ..render.frames import Step
 from .images import put
 from .operator_bases import FAILURES, Answer, Needing, fail, idle
 from .wrapped import counted
-
-if TYPE_CHECKING:
-    from ..render.frames import Step
 
 IMAGE = "Render with Splats"
 """Name of the image that shows the last frame."""
@@ -88,7 +85,7 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 
 
 class REFINE_OT_render(Needing, bpy.types.Operator):
-    """Render what the camera sees with the splats as the 3D view shows them, among meshes that the scene's engine renders; an animation is written where Output says"""  # noqa: E501 - a tooltip is one line
+    """Render what the camera sees with the splats as the 3D view shows them, among meshes that the scene's engine renders; an animation is written where Output says"""  # noqa: E501
 
     bl_idname = "refine.render"
     bl_label = "Render Image with Splats"

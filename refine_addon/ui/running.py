@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import bpy
 from bpy.app.handlers import persistent
 
 from ..core.pace import Pace
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ..core.work import Progress
-    from ..mesh.layout import SplatObject
-    from .target import Target
-    from .worker import Worker
+from ..core.work import Progress
+from ..mesh.layout import SplatObject
+from .target import Target
+from .worker import Worker
 
 _UNDO, _SAVE = "Undo", "Save"
 _WAIT = {

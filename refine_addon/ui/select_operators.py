@@ -1,23 +1,25 @@
 """Operators on the selection of splats: what changes it at once, and what is done with it."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from numpy.typing import NDArray
 
 from ..core import picking
 from ..core.errors import RefineError
 from ..core.picking import Axis
 from ..core.splats import opacity
+from ..core.work import Progress
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, selection
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.layout import SplatObject
 from ..objects import splat_object
 from ..objects.demands import Demands
 from . import plans
@@ -25,12 +27,6 @@ from .deleting import Deleting
 from .on_thread import OnThread
 from .operator_bases import Answer, AtOnce, OnSplats
 from .select_tools import MODES
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..core.work import Progress
-    from ..mesh.layout import SplatObject
 
 ACTIONS = (
     ("ALL", "All", "Select all splats that are not hidden"),
@@ -131,8 +127,9 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
             return floaters.mask(checked, context.scene.refine.reasons)
         if self.what == "GOING":
             if mesh_edit.REMOVE not in checked.mesh.attributes:
-                msg = f"object '{checked.obj.name}': nothing goes yet; score the splats first"
-                raise RefineError(msg)
+                raise RefineError(
+                    f"object '{checked.obj.name}': nothing goes yet; score the splats first"
+                )
             return mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
         forced = Demands.of_scene(context.scene).forced(checked)
         mask = forced.out if self.what == "OUTSIDE" else forced.protected
@@ -159,8 +156,7 @@ def quantity(checked: SplatObject, name: str) -> Quantity:
         return Quantity(sizes, Axis.of(sizes, logarithmic=True))
     record = mesh_scores.record(checked.mesh)
     if record is None:
-        msg = f"object '{checked.obj.name}': has no scores; score the splats first"
-        raise RefineError(msg)
+        raise RefineError(f"object '{checked.obj.name}': has no scores; score the splats first")
     values = mesh_attributes.read_attribute(checked.mesh, mesh_scores.SCORE)
     by_place = record["settings"]["method"] != "closed-form"  # scores are then places in an order
     return Quantity(values, Axis.of(values, logarithmic=not by_place))
@@ -174,7 +170,7 @@ def in_range(places: NDArray[np.float64], low: float, high: float) -> NDArray[np
 
 
 class REFINE_OT_grow_selection(OnThread, OnSplats, bpy.types.Operator):
-    """Select the neighbours of the selected splats too, or leave out those at the edge (Esc cancels)"""  # noqa: E501 - a tooltip is one line
+    """Select the neighbours of the selected splats too, or leave out those at the edge (Esc cancels)"""  # noqa: E501
 
     bl_idname = "refine.grow_selection"
     bl_label = "Grow Selection"
@@ -239,8 +235,9 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
         chosen = _some(checked.obj, selection.selected(checked.obj))
         mesh_edit.check_deletable(checked.obj)
         if chosen.all():
-            msg = f"object '{checked.obj.name}': all splats are selected; none would be left"
-            raise RefineError(msg)
+            raise RefineError(
+                f"object '{checked.obj.name}': all splats are selected; none would be left"
+            )
         apart = checked.obj.copy()
         apart.data = checked.mesh.copy()
         for collection in checked.obj.users_collection:
@@ -262,6 +259,5 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
 def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return a selection, (N,), or raise `RefineError` if it has no splat."""
     if not chosen.any():
-        msg = f"object '{obj.name}': no splat is selected"
-        raise RefineError(msg)
+        raise RefineError(f"object '{obj.name}': no splat is selected")
     return chosen

@@ -1,26 +1,19 @@
 """The box *Select* of the panel, its settings, and its histogram."""
 
-# ruff: noqa: N801, RUF012, TC002 - Blender's names; annotations are run
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..mesh import layout as mesh_layout
 from . import price, wrapped
 from .chart import BINS, Chart, Histogram
 from .panel_cache import cached_soon
-from .select_operators import ACTIONS, QUANTITIES, SETS, in_range, quantity
+from .select_operators import ACTIONS, QUANTITIES, SETS, Quantity, in_range, quantity
 from .select_tools import MODES, SHAPES, selected_count
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from .select_operators import Quantity
 
 _ICON = "selection"
 """Name of the histogram among the previews of `price`."""

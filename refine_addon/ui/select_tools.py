@@ -1,10 +1,9 @@
 """Tools of the toolbar that select the splats one sees: brush, lasso, box, sphere, colour."""
 
-# ruff: noqa: D400, N801, RUF012, TC002, TC003 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import gpu
@@ -12,14 +11,12 @@ import numpy as np
 from bpy.props import EnumProperty
 from gpu_extras.batch import batch_for_shader
 
+from ..core.picking import Mode
 from ..mesh import selection
 from . import selecting
 from .operator_bases import FAILURES, Answer, Needing, fail, idle, on_splats
 from .panel_cache import cached
 from .selecting import How, Stroke
-
-if TYPE_CHECKING:
-    from ..core.picking import Mode
 
 SHAPES = (
     ("BRUSH", "Brush", "Take the splats that a round brush covers"),

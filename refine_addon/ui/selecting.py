@@ -7,30 +7,26 @@ from the same place finds it there. Until it is known the way of the mouse is re
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.objects import world_matrix
 from ..core import picking, sight
 from ..core.affine import transformed
-from ..core.sight import Prepared
+from ..core.picking import Mode
+from ..core.sight import Prepared, Sight, Surface
 from ..core.splats import Splats
+from ..core.work import Progress
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import selection
 from ..mesh.edit_mode import readable
+from ..mesh.layout import SplatObject
 from ..viewport import draw as viewport_draw
 from .worker import Worker
-
-if TYPE_CHECKING:
-    import bpy
-    from numpy.typing import NDArray
-
-    from ..core.picking import Mode
-    from ..core.sight import Sight, Surface
-    from ..core.work import Progress
-    from ..mesh.layout import SplatObject
 
 LEAST_SIDE = 2
 """Pixels: a box or a lasso that is narrower was a click, which takes nothing."""
@@ -80,21 +76,7 @@ def forget() -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """What a thread needs to look.
-
-    Attributes
-    ----------
-    splats, view : object
-        What tells them from others.
-    selected : (N,) bool
-        What is selected by now.
-    source : Splats or Prepared or Sight
-        What is known already: splats in their own frame, at least.
-    matrix : (4, 4) float64
-        Of the object.
-    camera : (4, 4) float64, (4, 4) float64, (int, int)
-        See `sight.pinhole`.
-    """
+    """What a thread needs to look."""
 
     splats: object
     view: object
@@ -116,13 +98,7 @@ class _Job:
 
 
 def _job(context: bpy.types.Context) -> _Job:
-    """Read the active object and the view.
-
-    Raises
-    ------
-    RefineError
-        If the object holds no splats that can be read.
-    """
+    """Read the active object and the view."""
     obj, region, eye = context.object, context.region, context.region_data
     matrix = world_matrix(obj, context.evaluated_depsgraph_get())
     camera = (

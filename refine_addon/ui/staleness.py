@@ -6,11 +6,13 @@ the settings. What was done to the splats themselves is not looked for.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cameras.objects import SOURCE, WEIGHT, render_size
 from ..cameras.sets import CameraChoice
@@ -18,11 +20,6 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..objects import demands
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
 
 _NOISE = 1e-6
 """Relative: what another machine or version of Blender may make of the same matrices."""

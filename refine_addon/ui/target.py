@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
-
-if TYPE_CHECKING:
-    from ..mesh.layout import SplatObject
+from ..mesh.layout import SplatObject
 
 
 @dataclass(frozen=True)
@@ -62,18 +59,16 @@ class Target:
         """
         obj, label = self._object(), f"object '{self.name}'"
         if obj is None:
-            msg = f"{label}: was deleted meanwhile; there is nothing to write to"
-            raise RefineError(msg)
+            raise RefineError(f"{label}: was deleted meanwhile; there is nothing to write to")
         checked = mesh_layout.check(obj)
         if checked.mesh.session_uid != self.data:
-            msg = f"{label}: has other data, '{checked.mesh.name}', since; start again"
-            raise RefineError(msg)
+            raise RefineError(f"{label}: has other data, '{checked.mesh.name}', since; start again")
         if len(checked) != self.count:
-            msg = f"{label}: had {self.count} splats and has {len(checked)} since; start again"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{label}: had {self.count} splats and has {len(checked)} since; start again"
+            )
         if mesh_attributes.digest(checked) != self.digest:
-            msg = f"{label}: its splats were changed meanwhile; start again"
-            raise RefineError(msg)
+            raise RefineError(f"{label}: its splats were changed meanwhile; start again")
         return checked
 
     def _object(self) -> bpy.types.Object | None:

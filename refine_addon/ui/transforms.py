@@ -1,10 +1,9 @@
 """Operators that move splats as a whole, and what is noticed of what others did to them."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import bpy
 import mathutils
@@ -12,22 +11,17 @@ from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 
 from ..core.errors import RefineError
-from ..core.work import report
+from ..core.work import Progress, report
 from ..mesh import drift as mesh_drift
 from ..mesh import layout as mesh_layout
+from ..mesh.drift import Drift
+from ..mesh.layout import SplatObject
 from ..objects import splat_group, transforms
 from ..viewport import draw as viewport_draw
 from . import plans, wrapped
 from .on_thread import OnThread
 from .operator_bases import Answer, AtOnce, OnSplats, in_object_mode
 from .wrapped import counted
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from ..core.work import Progress
-    from ..mesh.drift import Drift
-    from ..mesh.layout import SplatObject
 
 _SOON = 0.1
 """Seconds until new splats are noted: Blender's operator that made them is over by then."""

@@ -1,6 +1,5 @@
 """The operator that draws splats in the 3D views."""
 
-# ruff: noqa: D400, N801, RUF012, TC001, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 from typing import Any
@@ -35,7 +34,7 @@ class REFINE_OT_view(bpy.types.Operator):
         return not bpy.app.background
 
     @classmethod
-    def description(cls, _context: bpy.types.Context, properties: Any) -> str:  # noqa: ANN401
+    def description(cls, _context: bpy.types.Context, properties: Any) -> str:
         """Return the tooltip of a button."""
         return next(text for mode, _, text in MODES if mode == properties.mode)
 

@@ -1,25 +1,19 @@
 """The list of volumes in the panel: objects that say what must stay and what must go."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
 from bpy.props import EnumProperty, IntProperty, PointerProperty
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..mesh import layout as mesh_layout
+from ..mesh.layout import SplatObject
 from ..objects import demands
 from . import demand_changes
 from .deleting import Deleting
 from .operator_bases import Answer, AtOnce, Needing, idle, on_splats
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..mesh.layout import SplatObject
 
 ROLES = (
     ("PROTECT", "Protect Inside", "Splats in it stay, whatever else is said", "LOCKED", 0),
@@ -111,8 +105,7 @@ def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
     objects = [o for o in context.selected_objects if not mesh_layout.looks_like_splats(o)]
     objects = [obj for obj in objects if obj not in listed]
     if not objects:
-        msg = "no volume: select closed meshes or empties, and the splats last"
-        raise RefineError(msg)
+        raise RefineError("no volume: select closed meshes or empties, and the splats last")
     for obj in objects:
         demands.zone("remove", obj)
     return objects
@@ -125,8 +118,7 @@ def _new_empty(
     means = demands.world_means(checked)
     means = means[np.isfinite(means).all(axis=1)]
     if not len(means):
-        msg = f"object '{checked.obj.name}': no splat has a finite centre"
-        raise RefineError(msg)
+        raise RefineError(f"object '{checked.obj.name}': no splat has a finite centre")
     share = _OUTSIDE_KEPT if role == "KEEP" else _OUTSIDE
     low, high = np.quantile(means, (share, 1.0 - share), axis=0)
     half = np.maximum((high - low) / 2.0, _LEAST_HALF)
@@ -173,6 +165,7 @@ class REFINE_OT_crop(Deleting, bpy.types.Operator):
         """Return the splats that must go."""
         forced_out = demands.Demands.of_scene(context.scene).forced(checked).out
         if forced_out is None or not forced_out.any():
-            msg = f"object '{checked.obj.name}': no volume says of any splat that it must go"
-            raise RefineError(msg)
+            raise RefineError(
+                f"object '{checked.obj.name}': no volume says of any splat that it must go"
+            )
         return forced_out

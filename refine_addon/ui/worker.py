@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Generic, TypeVar
+from collections.abc import Callable
+from typing import Generic, TypeVar
 
-from ..core.work import Cancelled, checked_by
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ..core.work import Progress
+from ..core.work import Cancelled, Progress, checked_by
 
 Result = TypeVar("Result")
 
@@ -95,7 +91,7 @@ class Worker(Generic[Result]):
             if getattr(result, "stopped", None) is None:  # see `Result.stopped`
                 self._check()  # nobody may be left to ask for the result
             self._outcome.append(result)
-        except BaseException as error:  # noqa: BLE001 - handed to the other thread by `result`
+        except BaseException as error:
             # Whoever cancels asks for no reason, and a traceback would keep what was worked on.
             self._error = Cancelled() if self.cancelled else error
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import blf
-
-if TYPE_CHECKING:
-    import bpy
+import bpy
 
 _TAKEN = 52
 """Pixels of a sidebar at scale 1 that are not text: margins, tabs, scroll bar."""

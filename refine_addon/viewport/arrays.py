@@ -7,20 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.formats.format import pieces
-from ..core.rendering import ALPHA_CUT
+from ..core.rendering import ALPHA_CUT, Model
 from ..core.spherical_harmonics import colors as colors_along
-from ..core.splats import SH_C0, drawable, opacity, rotation_matrices, scales
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..core.rendering import Model
-    from ..core.splats import Splats
+from ..core.splats import SH_C0, Splats, drawable, opacity, rotation_matrices, scales
 
 WIDTH = 4096
 """Columns of a texture that holds a value a splat, row by row."""

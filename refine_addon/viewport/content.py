@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import bpy
+import gpu
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..core.rendering import MODELS
@@ -14,20 +19,10 @@ from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh import selection as mesh_selection
 from ..mesh.edit_mode import readable
-from ..mesh.layout import check, sh_degree
+from ..mesh.layout import SplatObject, check, sh_degree
 from . import background, points, shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from concurrent.futures import Future
-
-    import bpy
-    import gpu
-    from numpy.typing import NDArray
-
-    from ..mesh.layout import SplatObject
-    from .placing import Placing
+from .placing import Placing
 
 
 @dataclass(eq=False)

@@ -5,23 +5,20 @@ from __future__ import annotations
 import contextlib
 import time
 import traceback
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
 from bpy.app.handlers import persistent
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
 from . import background, legend, outlines, placing, points, shader, veils
 from .content import Content
 from .view import Camera, View
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
 
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
 """What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
@@ -173,7 +170,7 @@ def _guarded(work: Callable[[], None]) -> None:
         return
     try:
         work()
-    except Exception as error:  # noqa: BLE001 - Blender would print it at every redraw
+    except Exception as error:
         traceback.print_exc()
         _state.failure = f"Splats cannot be drawn here: {error}"
         # Handlers must not be removed while they run.

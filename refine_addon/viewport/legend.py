@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import cache
-from typing import TYPE_CHECKING
 
 import blf
+import bpy
 import gpu
 from gpu_extras.batch import batch_for_shader
 
 from ..mesh.heat_map import ramp
 from .arrays import GOES, MARKS, STAYS
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    import bpy
 
 WORDS = {"HEAT": ("goes first", "goes last"), "STAYS": ("What stays",), "GOES": ("What goes",)}
 """What is written in a view, by mode; of the heat map at both ends of its bar."""

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING
 
+import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
+from numpy.typing import NDArray
 
 from .arrays import GOES, MARKS, STAYS
-
-if TYPE_CHECKING:
-    import bpy
-    from numpy.typing import NDArray
 
 _COLORS = {"PROTECT": MARKS[STAYS], "REMOVE": MARKS[GOES], "KEEP": MARKS[GOES]}
 """By the role of a volume."""

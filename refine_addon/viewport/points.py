@@ -7,15 +7,12 @@ object is shown as its bounding box. The object itself is not touched.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Container, Iterator
 
 import bpy
 
 from ..mesh.layout import looks_like_splats
 from . import placing
-
-if TYPE_CHECKING:
-    from collections.abc import Container, Iterator
 
 
 def hide(depsgraph: bpy.types.Depsgraph, refused: Container[int] = ()) -> None:

@@ -8,17 +8,14 @@ would decode them first. So splats are blended in a picture apart, and put into 
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
+from numpy.typing import NDArray
 
 from ..core.rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS, LOW_PASS
 from .arrays import SELECTED, SELECTED_SHARE, WIDTH
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _CONSTANTS = f"""
 #define WIDTH {WIDTH}
@@ -147,14 +144,14 @@ void main()
   vec2 beside = sqrt(shortest) * vec2(-direction.y, direction.x);
   vec2 offset;
   if (disc) {
-    /* The ray meets the plane of the disc: see core/seeing/projection.py, _discs. */
+    /* The ray meets the plane of the disc: see core/visibility/projection.py, _discs. */
     axes = vec4(along / longest, beside / shortest);
     plane = vec4(0.0, 0.0, 1e9, 1.0);
     if (perspective) {
       plane.xy = tilt_of(shape, seen, depth, focal * scale, row_x.xyz, row_y.xyz, row_z.xyz);
       plane.z = depth / view_data.size.z;
     }
-    /* The box of its edge: see core/seeing/cast.py, _disc_extent. */
+    /* The box of its edge: see core/visibility/cast.py, _disc_extent. */
     vec2 tilted = vec2(dot(along, plane.xy), dot(beside, plane.xy));
     float left = 1.0 - reach * dot(tilted, tilted);
     vec2 low = -view_data.size.xy;

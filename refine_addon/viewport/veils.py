@@ -8,23 +8,20 @@ Colours are those of the viewport, lit from the viewer; nodes are not run.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
+from numpy.typing import NDArray
 
 from ..mesh.layout import looks_like_splats
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    import bpy
-    from numpy.typing import NDArray
-
-    Color = tuple[float, float, float, float]
+Color = tuple[float, float, float, float]
 
 OPAQUE = 0.995
 """Opacity from which on Blender draws a mesh with its depth."""
@@ -185,7 +182,7 @@ def _triangles(
     colors = np.array(table, np.float32)
     linear = colors[:, :3].clip(0.0, 1.0)
     curved = 1.055 * np.maximum(linear, 1e-6) ** (1 / 2.4) - 0.055  # sRGB, IEC 61966-2-1
-    colors[:, :3] = np.where(linear > 0.0031308, curved, 12.92 * linear)  # noqa: PLR2004
+    colors[:, :3] = np.where(linear > 0.0031308, curved, 12.92 * linear)
     paint = colors[np.repeat(slots.clip(0, len(table) - 1), 3)]
     return places.reshape(-1, 3)[corners], paint
 

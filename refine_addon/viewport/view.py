@@ -7,11 +7,14 @@ them are sorted and coloured on the thread, and drawn when that is done.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gpu
 import numpy as np
+from numpy.typing import NDArray
 
 from ..mesh.heat_map import ramp
 from . import background, shader
@@ -28,15 +31,8 @@ from .arrays import (
     same,
     tinted,
 )
+from .content import Atlas, Content, Slot
 from .veils import Veils
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from concurrent.futures import Future
-
-    from numpy.typing import NDArray
-
-    from .content import Atlas, Content, Slot
 
 REST = 0.2
 """Seconds without a change after which a view rests."""
@@ -107,17 +103,7 @@ class _Part(NamedTuple):
 
 
 class _Sorted(NamedTuple):
-    """What the thread computed.
-
-    Attributes
-    ----------
-    order : (R, WIDTH) float32
-        Rows of the textures that are drawn, the farthest first, as a texture.
-    drawn : int
-        How many these are.
-    colors : (R, WIDTH * 4) float32 or None
-        Of all rows, as a texture; None where they are as before.
-    """
+    """What the thread computed."""
 
     order: NDArray[np.float32]
     drawn: int

@@ -14,7 +14,7 @@ from tests.windows import event, started_in_a_window, until, until_over
 
 
 @pytest.fixture
-def few(addon, room, room_cameras):  # noqa: ARG001
+def few(addon, room, room_cameras):
     """Every tenth splat of the room, scored, to be absorbed to two fifths."""
     core = addon.core
     remove = np.arange(len(room.data.vertices)) % 10 != 0
@@ -222,7 +222,7 @@ def test_esc_while_refitting_keeps_what_that_has_reached(addon, few, monkeypatch
     room, _ = few
     bpy.context.scene.refine.survivors = "refit"
     bpy.ops.refine.score()
-    done, measured = [], addon.core.refitting.round_rays.RoundRays.psnr
+    done, measured = [], addon.core.refit.round_rays.RoundRays.psnr
     count = len(room.data.vertices)
 
     def count_rounds(rays, *arguments):
@@ -232,7 +232,7 @@ def test_esc_while_refitting_keeps_what_that_has_reached(addon, few, monkeypatch
             time.sleep(0.01)
         return psnr
 
-    monkeypatch.setattr(addon.core.refitting.round_rays.RoundRays, "psnr", count_rounds)
+    monkeypatch.setattr(addon.core.refit.round_rays.RoundRays, "psnr", count_rounds)
     operator, context, said = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
     first = addon.ui.running.now().at_escape
     until(operator, context, lambda: len(done) > rounds)

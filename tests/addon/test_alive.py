@@ -15,7 +15,7 @@ from tests.windows import event, started_in_a_window, until, until_over
 
 
 @pytest.fixture
-def few(addon, room, room_cameras):  # noqa: ARG001
+def few(addon, room, room_cameras):
     """Every tenth splat of the room, to be scored by four views with what hides what."""
     addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 10 != 0)
     settings = bpy.context.scene.refine
@@ -24,7 +24,7 @@ def few(addon, room, room_cameras):  # noqa: ARG001
 
 
 @pytest.fixture
-def start(addon, few):  # noqa: ARG001
+def start(addon, few):
     """Return a function that clicks an operator's button; by default it is *Score*."""
 
     def start(cls=None, **properties):
@@ -73,7 +73,7 @@ def scored_by(obj, method):
 
 
 @pytest.mark.parametrize("kind", ["MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "TAB", "G", "SPACE"])
-def test_events_go_on_to_the_window(start, gate, kind):  # noqa: ARG001
+def test_events_go_on_to_the_window(start, gate, kind):
     """So views orbit, panels scroll and editors work."""
     operator, context, said = start()
 
@@ -101,7 +101,7 @@ def keys():
     ("held", "word"),
     [({"type": "Z"}, "Undo"), ({"type": "Z", "shift": True}, "Redo"), ({"type": "S"}, "Save")],
 )
-def test_undo_redo_and_save_are_refused_with_a_sentence(start, gate, held, word):  # noqa: ARG001
+def test_undo_redo_and_save_are_refused_with_a_sentence(start, gate, held, word):
     """By what the key map says; the same key alone, or let go of, is none of these."""
     operator, context, said = start()
     kind = held.pop("type")
@@ -115,7 +115,7 @@ def test_undo_redo_and_save_are_refused_with_a_sentence(start, gate, held, word)
         assert operator.modal(context, other) == {"PASS_THROUGH"}
 
 
-def test_only_one_operation_works_at_a_time(start, gate, addon):  # noqa: ARG001
+def test_only_one_operation_works_at_a_time(start, gate, addon):
     """They come back when it is over."""
     names = ["score", "apply", "levels", "find_floaters", "delete_floaters", "convert"]
     names += ["export_ply", "import_ply", "import_cameras", "crop"]
@@ -136,7 +136,7 @@ def test_only_one_operation_works_at_a_time(start, gate, addon):  # noqa: ARG001
     assert looks == [False]
 
 
-def test_what_stays_and_goes_is_not_changed_while_a_thread_works(start, gate):  # noqa: ARG001
+def test_what_stays_and_goes_is_not_changed_while_a_thread_works(start, gate):
     """Else marks would come too late for what was read already; they can be set again after it."""
     bpy.context.scene.refine.volumes.add()
     names = ("protect", "add_volume", "drop_volume")
@@ -200,7 +200,7 @@ def test_a_fault_on_the_thread_is_raised_and_locks_nothing(addon, start, gate, m
     assert operator.modal(context, event("TIMER")) == {"CANCELLED"}
 
 
-def test_only_sidebars_are_drawn_again(start, gate):  # noqa: ARG001
+def test_only_sidebars_are_drawn_again(start, gate):
     """A 3D view with a million splats is not; the status bar says phase and share, .4 of 97 %."""
     operator, context, _ = start()
     until(operator, context, lambda: any("39%" in str(text) for text in context.said))
@@ -399,7 +399,7 @@ def threads():
 
 
 @pytest.mark.parametrize("how", ["another file", "disabled"])
-def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):  # noqa: ARG001
+def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):
     """Another file is loaded, or the extension is switched off: nothing runs on or is left."""
     operator, context, _ = start()
     until(operator, context, lambda: addon.ui.running.now().stage == "shown")
@@ -453,7 +453,7 @@ def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, 
     assert (obj.name, len(obj.data.vertices)) == ("later", len(few.data.vertices))
 
 
-def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, monkeypatch):  # noqa: ARG001
+def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, monkeypatch):
     """Packing does not listen; what it wrote is not put in place afterwards, a second file is."""
     begun, free = threading.Event(), threading.Event()
     form = addon.core.formats.dot_splat.FORMAT

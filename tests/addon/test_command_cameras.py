@@ -138,7 +138,7 @@ def test_an_object_is_scored_by_the_cameras_that_are_named(addon, animated, tmp_
     assert outputs[0].read_bytes() != outputs[1].read_bytes()
 
 
-def test_frames_without_a_range_are_those_of_the_panel(addon, animated, tmp_path):  # noqa: ARG001
+def test_frames_without_a_range_are_those_of_the_panel(addon, animated, tmp_path):
     """`--source frames` is `--frames 1:21:5` there; `--frames 1:21` is another range."""
     short, facts = pruned(addon, tmp_path, "--source", "frames")
     same, _ = pruned(addon, tmp_path, "--source", "frames", "--frames", "1:21:5")
@@ -213,7 +213,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_a_choice_without_cameras_is_refused(addon, animated, tmp_path, capsys, unchanged, case):  # noqa: ARG001
+def test_a_choice_without_cameras_is_refused(addon, animated, tmp_path, capsys, unchanged, case):
     """Code 1, one sentence; it stands in the report too, and the scene is as it was."""
     change, options, expected = REFUSED[case]
     change()
@@ -239,7 +239,7 @@ def test_a_choice_without_cameras_is_refused(addon, animated, tmp_path, capsys, 
         (["--source", "active", "--frames", "1:2"], "--frames goes with --source frames alone"),
     ],
 )
-def test_two_choices_are_one_too_many(addon, animated, capsys, options, expected):  # noqa: ARG001
+def test_two_choices_are_one_too_many(addon, animated, capsys, options, expected):
     """Wrong usage, code 2."""
     words = ["prune", "--object", "room", "--dry-run", *options]
 

@@ -58,7 +58,7 @@ def test_a_second_comparison_replaces_the_first(room, room_cameras):
     assert len(room.data.vertices) == 39_755
 
 
-def test_images_of_the_user_stay_whatever_they_are_called(room, room_cameras):  # noqa: ARG001
+def test_images_of_the_user_stay_whatever_they_are_called(room, room_cameras):
     """One of such a name is not replaced, by a second comparison neither."""
     bpy.context.scene.camera = room_cameras.objects[0]
     mine = bpy.data.images.new(NAMES[0], 4, 4)

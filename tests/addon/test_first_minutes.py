@@ -238,7 +238,7 @@ def test_what_compare_measured_stays_in_the_panel_while_the_plan_is_the_same(
     assert before == moved == measured(quarter, scene.refine) == ""
 
 
-def test_levels_do_not_stand_on_top_of_each_other(quarter, room_cameras):  # noqa: ARG001
+def test_levels_do_not_stand_on_top_of_each_other(quarter, room_cameras):
     """They are hidden, in renders too; the original is shown, and stays active."""
     settings = bpy.context.scene.refine
     settings.levels, settings.survivors = "0.5, 0.25", "unchanged"
@@ -292,7 +292,7 @@ def _in_window(module):
     return SimpleNamespace(app=app, data=module.data, context=module.context, types=module.types)
 
 
-def test_the_chart_is_drawn_anew_after_undo(addon, quarter, room_cameras, monkeypatch):  # noqa: ARG001
+def test_the_chart_is_drawn_anew_after_undo(addon, quarter, room_cameras, monkeypatch):
     """Undo brings back the plan, but the chart is a picture of the session."""
     bpy.ops.refine.score()
     waited = []

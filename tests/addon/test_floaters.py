@@ -12,7 +12,7 @@ MOVED = 60
 
 
 @pytest.fixture
-def polluted(addon, quarter, room_cameras, room_views):  # noqa: ARG001
+def polluted(addon, quarter, room_cameras, room_views):
     """Move opaque splats before the cameras, alone, at an eighth of the way to the middle."""
     mesh, random = quarter.data, np.random.default_rng(5)
     count = len(mesh.vertices)

@@ -11,7 +11,7 @@ from .conftest import snapshot
 
 
 @pytest.fixture
-def few(addon, room, room_cameras):  # noqa: ARG001
+def few(addon, room, room_cameras):
     """Every tenth splat of the room, moved; two levels by deletion with the closed form."""
     remove = np.arange(len(room.data.vertices)) % 10 != 0
     addon.mesh.edit.delete_vertices(room, remove)
@@ -85,7 +85,7 @@ def test_protected_splats_are_in_every_level(addon, few):
 
 
 @pytest.mark.parametrize("levels", ["", "a, b", "0.5, 0.6", "1.5"])
-def test_levels_that_cannot_be_leave_the_scene_alone(few, levels):  # noqa: ARG001
+def test_levels_that_cannot_be_leave_the_scene_alone(few, levels):
     """The operator says what was expected."""
     bpy.context.scene.refine.levels = levels
     before = snapshot()
@@ -96,15 +96,14 @@ def test_levels_that_cannot_be_leave_the_scene_alone(few, levels):  # noqa: ARG0
     assert snapshot() == before
 
 
-def test_where_an_object_cannot_be_made_none_is(addon, few, monkeypatch):  # noqa: ARG001
+def test_where_an_object_cannot_be_made_none_is(addon, few, monkeypatch):
     """The second level fails: collection, objects and meshes are gone again."""
     whole, calls = addon.objects.splat_object.apply_object, []
 
     def failing(checked, result):
         calls.append(1)
         if len(calls) == 2:
-            msg = "no"
-            raise addon.core.RefineError(msg)
+            raise addon.core.RefineError("no")
         return whole(checked, result)
 
     monkeypatch.setattr(addon.objects.splat_object, "apply_object", failing)
@@ -116,7 +115,7 @@ def test_where_an_object_cannot_be_made_none_is(addon, few, monkeypatch):  # noq
     assert snapshot() == before
 
 
-def test_levels_go_with_one_undo(few):  # noqa: ARG001
+def test_levels_go_with_one_undo(few):
     """The module pushes no undo steps by itself; a window does, for an operator with UNDO."""
     bpy.ops.ed.undo_push(message="before")
     bpy.ops.refine.levels()

@@ -12,7 +12,7 @@ from .conftest import export
 
 
 @pytest.fixture
-def discs(addon, make_splats, tmp_path):  # noqa: ARG001 - the extension is on
+def discs(addon, make_splats, tmp_path):
     """Import splats without a third scale; return the object and its file."""
     columns = make_splats(40, degree=1)
     del columns["scale_2"]

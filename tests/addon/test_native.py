@@ -105,7 +105,7 @@ def file(addon):
 
 
 @pytest.fixture
-def cloud(file, empty_scene):  # noqa: ARG001
+def cloud(file, empty_scene):
     """Return the room as Blender 5.3 would have imported it."""
     return as_blender_imports(file.rows, "room")
 
@@ -180,7 +180,7 @@ def test_a_point_cloud_is_scored_like_the_file_it_exports(addon, core, cloud, ro
     assert room_cameras.objects
 
 
-def test_apply_deletes_points_and_leaves_all_else(addon, cloud, room_cameras):  # noqa: ARG001
+def test_apply_deletes_points_and_leaves_all_else(addon, cloud, room_cameras):
     """39755 - floor(.75 x 39755) = 9939 points, those of the highest rank, to the bit."""
     cloud.location = (1.0, 2.0, 3.0)
     cloud.data["note"] = "mine"
@@ -201,7 +201,7 @@ def test_apply_deletes_points_and_leaves_all_else(addon, cloud, room_cameras):  
     assert tuple(cloud.location) == (1.0, 2.0, 3.0)
 
 
-def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_cameras):  # noqa: ARG001
+def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_cameras):
     """By a boolean attribute, and by a float one where it is above 0; there are no groups."""
     bpy.ops.refine.score()
     ranks = addon.mesh.attributes.read_attribute(cloud.data, "refine_rank")
@@ -218,7 +218,7 @@ def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_camer
         keep_mask(addon, cloud, budget, "number")
 
 
-def test_absorbing_changes_survivors_alone(addon, cloud, room_cameras):  # noqa: ARG001
+def test_absorbing_changes_survivors_alone(addon, cloud, room_cameras):
     """What absorbed nothing is equal to the bit, though logarithms are taken and undone."""
     addon.mesh.edit.delete_vertices(cloud, np.arange(len(cloud.data.points)) % 10 != 0)
     settings = bpy.context.scene.refine
@@ -247,8 +247,7 @@ def test_an_apply_that_fails_leaves_the_point_cloud_as_it_was(addon, cloud, room
     before, name = contents(addon, cloud), cloud.data.name
 
     def refuse(*_arguments):
-        msg = "refused"
-        raise addon.core.RefineError(msg)
+        raise addon.core.RefineError("refused")
 
     monkeypatch.setattr(addon.mesh.attributes, "write_rows", refuse)
     with pytest.raises(RuntimeError, match="refused"):
@@ -322,7 +321,7 @@ def test_an_export_with_the_transform_turns_harmonics(addon, core, cloud, file, 
     assert np.abs(expected.sh_rest - file.splats().sh_rest).max() > 0.1
 
 
-def test_mesh_to_native_to_ply_keeps_activated_values(addon, core, room, file, tmp_path):  # noqa: ARG001
+def test_mesh_to_native_to_ply_keeps_activated_values(addon, core, room, file, tmp_path):
     """Less than 1e-6 of each; the header, normals and all that is not activated are equal."""
     bpy.ops.refine.convert()
     cloud = bpy.data.objects["room"]
@@ -439,7 +438,7 @@ def _keyed(room):
     room.shape_key_add(name="Basis")
 
 
-def _painting(room):  # noqa: ARG001
+def _painting(room):
     bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
 
 
@@ -478,8 +477,7 @@ def test_a_conversion_that_fails_changes_nothing(addon, room, unchanged, monkeyp
     """Not even a data-block is left over."""
 
     def refuse(*_arguments):
-        msg = "refused"
-        raise addon.core.RefineError(msg)
+        raise addon.core.RefineError("refused")
 
     monkeypatch.setattr(addon.mesh.drift, "carry", refuse)
     unchanged.start()
@@ -561,7 +559,7 @@ def test_blenders_own_import_is_what_these_tests_build(addon, core, file, tmp_pa
 
 
 @pytest.mark.parametrize("survivors", ["unchanged", "absorb", "refit"])
-def test_levels_of_detail_of_native_splats_are_native(addon, cloud, room_cameras, survivors):  # noqa: ARG001
+def test_levels_of_detail_of_native_splats_are_native(addon, cloud, room_cameras, survivors):
     """Copies reduced by the same apply: points of .1 and .05 of 9,939, rounded up."""
     addon.mesh.edit.delete_vertices(cloud, np.arange(39755) % 4 != 0)
     settings = bpy.context.scene.refine

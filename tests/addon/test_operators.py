@@ -75,7 +75,7 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
     [("ratio", 0.29), ("ratio", 0.7), ("keep", 1234), ("max_mb", 2.5), ("threshold", 0.1),
      ("min_seen", 20.0), ("ratio", 0.0), ("psnr", 38.5)],
 )  # fmt: skip
-def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, kind, value):  # noqa: ARG001
+def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, kind, value):
     """Blender stores 0.29 as 0.28999999165534973; floor(.29 * 39755) must still go."""
     settings = bpy.context.scene.refine
     settings.budget = kind
@@ -110,7 +110,7 @@ def test_settings_reach_core_as_they_were_typed(addon):
     )
 
 
-def test_scoring_writes_scores_ranks_views_and_colours(addon, room, room_cameras):  # noqa: ARG001
+def test_scoring_writes_scores_ranks_views_and_colours(addon, room, room_cameras):
     """Rank 0 belongs to the lowest score, 1 to the highest; the colour follows the rank."""
     bpy.ops.refine.score()
     read = addon.mesh.attributes.read_attribute
@@ -126,7 +126,7 @@ def test_scoring_writes_scores_ranks_views_and_colours(addon, room, room_cameras
     assert np.allclose(heat[np.argmax(rank), :3], ramp[-1], atol=1 / 255)
 
 
-def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):  # noqa: ARG001
+def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):
     """Attributes, groups, custom properties, materials and modifiers of the kept vertices."""
     mesh = room.data
     row = np.arange(len(mesh.vertices), dtype=np.int32)
@@ -152,7 +152,7 @@ def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):  
     assert not [t for t in bpy.data.node_groups if t.name.startswith("REFINE")]
 
 
-def test_apply_asks_for_new_scores_before_it_removes_more(room, room_cameras):  # noqa: ARG001
+def test_apply_asks_for_new_scores_before_it_removes_more(room, room_cameras):
     """Pressed twice, it must not halve twice; only adjusted, which Blender undoes first."""
     assert not bpy.ops.refine.apply.poll()
     bpy.ops.refine.score()
@@ -165,7 +165,7 @@ def test_apply_asks_for_new_scores_before_it_removes_more(room, room_cameras):  
     assert len(room.data.vertices) == count
 
 
-def test_apply_is_one_undo_step(room, room_cameras):  # noqa: ARG001
+def test_apply_is_one_undo_step(room, room_cameras):
     """One undo brings back the 39755 splats with their scores and plan."""
     bpy.ops.refine.score()
     bpy.ops.ed.undo_push(message="scored")
@@ -190,7 +190,7 @@ def test_operators_that_change_the_scene_can_be_undone(name):
     assert {"REGISTER", "UNDO"} <= cls.bl_options
 
 
-def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):  # noqa: ARG001
+def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):
     """Keeping 500 of 39755 with 100 protected that would all go: the 100 are among the 500."""
     bpy.ops.refine.score()
     score = addon.mesh.attributes.read_attribute(room.data, "refine_score")
@@ -212,7 +212,7 @@ def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):
         keep_mask(addon, room, budget, "opacity")
 
 
-def test_the_plan_says_before_apply_what_apply_does(addon, room, room_cameras):  # noqa: ARG001
+def test_the_plan_says_before_apply_what_apply_does(addon, room, room_cameras):
     """Made by scoring and by every change of the budget; never by drawing."""
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
@@ -231,7 +231,7 @@ def test_the_plan_says_before_apply_what_apply_does(addon, room, room_cameras): 
     )
 
 
-def test_a_plan_of_another_budget_is_not_shown(addon, room, room_cameras):  # noqa: ARG001
+def test_a_plan_of_another_budget_is_not_shown(addon, room, room_cameras):
     """While another object was active the budget changed: the stored plan no longer holds."""
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
@@ -248,7 +248,7 @@ def test_a_plan_of_another_budget_is_not_shown(addon, room, room_cameras):  # no
 def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
     addon,
     room,
-    room_cameras,  # noqa: ARG001
+    room_cameras,
     unchanged,
 ):
     """A threshold above every score would remove all."""
@@ -269,10 +269,10 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
      ("closed-form", "min_seen", "min_seen would remove none")],
 )  # fmt: skip
 @pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_a_budget_that_means_nothing_to_the_scores_is_refused(  # noqa: PLR0917
+def test_a_budget_that_means_nothing_to_the_scores_is_refused(
     addon,
     room,
-    room_cameras,  # noqa: ARG001
+    room_cameras,
     room_views,
     unchanged,
     case,
@@ -385,7 +385,7 @@ def test_cameras_that_cannot_be_read_are_explained(tmp_path, unchanged):
     unchanged()
 
 
-def test_an_existing_file_is_not_overwritten_unasked(room, tmp_path):  # noqa: ARG001
+def test_an_existing_file_is_not_overwritten_unasked(room, tmp_path):
     """From a script; the file browser asks by itself."""
     target = tmp_path / "out.ply"
     target.write_bytes(b"mine")
@@ -465,7 +465,7 @@ def _keyed(room):
     room.shape_key_add(name="Basis")
 
 
-def _painting(room):  # noqa: ARG001
+def _painting(room):
     bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
 
 
@@ -475,7 +475,7 @@ def _painting(room):  # noqa: ARG001
 )
 def test_an_object_that_cannot_lose_vertices_is_refused(
     room,
-    room_cameras,  # noqa: ARG001
+    room_cameras,
     unchanged,
     prepare,
     reason,
@@ -490,7 +490,7 @@ def test_an_object_that_cannot_lose_vertices_is_refused(
     unchanged()
 
 
-def test_edit_mode_greys_the_buttons(room, room_cameras):  # noqa: ARG001
+def test_edit_mode_greys_the_buttons(room, room_cameras):
     """In edit mode attributes are not to be had."""
     bpy.ops.refine.score()
     bpy.ops.object.mode_set(mode="EDIT")
@@ -535,7 +535,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
     assert len(room.data.vertices) == expected.sum()
 
 
-def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):  # noqa: ARG001
+def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):
     """What lies in a library cannot be changed from here; exporting it is no change."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
     bpy.ops.wm.read_homefile(use_empty=True)
@@ -578,7 +578,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
 )
 @pytest.mark.usefixtures("room_cameras")
 @pytest.mark.parametrize("said", ["", "Unable to allocate 9 GiB"])
-def test_too_little_memory_is_a_sentence(  # noqa: PLR0917
+def test_too_little_memory_is_a_sentence(
     addon, room, room_views, score, monkeypatch, module, function, operator,
     arguments, said
 ):  # fmt: skip
@@ -595,7 +595,7 @@ def test_too_little_memory_is_a_sentence(  # noqa: PLR0917
         getattr(bpy.ops.refine, operator)(**arguments)
 
 
-def test_apply_takes_another_budget_and_leaves_it_in_the_panel(room, room_cameras):  # noqa: ARG001
+def test_apply_takes_another_budget_and_leaves_it_in_the_panel(room, room_cameras):
     """As when it is adjusted: 30 % of 39,755 are 11,926. Without a value the panel's counts."""
     settings = bpy.context.scene.refine
     settings.ratio = 0.9
@@ -611,7 +611,7 @@ def test_apply_takes_another_budget_and_leaves_it_in_the_panel(room, room_camera
     assert settings.budget == "keep"
 
 
-def test_an_apply_that_fails_leaves_the_budget_of_the_panel(room, room_cameras):  # noqa: ARG001
+def test_an_apply_that_fails_leaves_the_budget_of_the_panel(room, room_cameras):
     """Nothing of the name is there to protect: no splat goes, and the next click is as before."""
     settings = bpy.context.scene.refine
     settings.ratio = 0.9

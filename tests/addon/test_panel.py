@@ -40,7 +40,7 @@ class Layout:
         self.drawn.append(name)
         return SimpleNamespace()
 
-    def operator_menu_enum(self, name, property, **_options):  # noqa: A002 - Blender's name
+    def operator_menu_enum(self, name, property, **_options):
         """Note a menu, and return something to set its properties on."""
         assert property in bpy.ops.refine.__getattr__(name.split(".")[1]).get_rna_type().properties
         self.drawn.append(name)
@@ -79,8 +79,7 @@ def draw(addon, monkeypatch):
     """Return a function that draws all panels and returns what they draw."""
 
     def never(*_arguments, **_options):
-        msg = "computed while drawing"
-        raise AssertionError(msg)
+        raise AssertionError("computed while drawing")
 
     def draw():
         drawn = []
@@ -109,7 +108,7 @@ def test_an_empty_scene_says_what_to_do_first(draw):
     assert "Select an object that holds splats" in drawn
 
 
-def test_each_step_shows_what_came_of_it(draw, room, room_cameras):  # noqa: ARG001
+def test_each_step_shows_what_came_of_it(draw, room, room_cameras):
     """Counts and sizes of the room: 39755 splats of 248 bytes, 9.9 MB; half go."""
     imported = draw()
     bpy.ops.refine.score()
@@ -126,7 +125,7 @@ def test_each_step_shows_what_came_of_it(draw, room, room_cameras):  # noqa: ARG
     assert not [text for text in applied if text.startswith(("Keeps", "chart", "Scored"))]
 
 
-def test_each_reason_of_floaters_is_told_with_how_sure_it_is(draw, addon, room, room_cameras):  # noqa: ARG001
+def test_each_reason_of_floaters_is_told_with_how_sure_it_is(draw, addon, room, room_cameras):
     """Per cent are the mean over what goes for the reason; where nothing goes there are none."""
     splats = addon.objects.splat_object.gather(addon.mesh.layout.check(room))
     views = addon.ui.operators.chosen_views(bpy.context)
@@ -147,7 +146,7 @@ def test_each_reason_of_floaters_is_told_with_how_sure_it_is(draw, addon, room, 
 def test_after_deletion_by_hand_the_panel_asks_for_scores_and_says_why(
     addon,
     room,
-    room_cameras,  # noqa: ARG001
+    room_cameras,
 ):
     """Nothing was applied, and the panel does not say so."""
     bpy.ops.refine.score()
@@ -177,7 +176,7 @@ def test_a_tool_says_in_the_header_how_many_splats_it_has_selected(addon, room):
     assert drawn == ["select_hidden", "1,234 selected", "select_hidden"]
 
 
-def test_a_point_cloud_is_drawn_as_a_mesh_is(draw, room, room_cameras):  # noqa: ARG001
+def test_a_point_cloud_is_drawn_as_a_mesh_is(draw, room, room_cameras):
     """Scored as a mesh and converted: the same lines, and the size of its file, 248 bytes a row."""
     bpy.ops.refine.score()
     mesh = draw()
@@ -200,7 +199,7 @@ def test_what_an_old_blender_left_of_splats_is_not_just_nothing(draw, empty_scen
     assert "Colours were lost: open it in Blender 5.2" in " ".join(draw())
 
 
-def test_a_plan_that_no_longer_holds_is_not_drawn(draw, room, room_cameras):  # noqa: ARG001
+def test_a_plan_that_no_longer_holds_is_not_drawn(draw, room, room_cameras):
     """The budget changed while another object was active; in a window a timer makes another."""
     bpy.ops.refine.score()
     bpy.context.view_layer.objects.active = None
@@ -210,7 +209,7 @@ def test_a_plan_that_no_longer_holds_is_not_drawn(draw, room, room_cameras):  # 
     assert "Keeps" not in " ".join(draw())
 
 
-def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_cameras):  # noqa: ARG001
+def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_cameras):
     """In one line, below what they were made by."""
     bpy.ops.refine.score()
     fresh = draw()
@@ -229,7 +228,7 @@ def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_camera
 def test_nothing_is_asked_of_the_scene_twice_until_it_changes(
     draw,
     addon,
-    room,  # noqa: ARG001
+    room,
     room_cameras,
     monkeypatch,
 ):
@@ -290,7 +289,7 @@ def test_each_camera_is_listed_with_what_it_sees(draw, addon, room, room_cameras
     assert " ".join(drawn).count("No splat lies in the view of 1 camera") == 2
 
 
-def test_one_is_not_counted_as_many(draw, room, room_cameras):  # noqa: ARG001
+def test_one_is_not_counted_as_many(draw, room, room_cameras):
     """A scene with one camera has "1 camera", not "1 cameras"."""
     for camera in list(room_cameras.objects)[1:]:
         room_cameras.objects.unlink(camera)
@@ -358,7 +357,7 @@ def test_every_source_of_cameras_is_drawn(draw, source):
     assert ("collection" in drawn) == (source == "COLLECTION")
 
 
-def test_the_quality_of_the_pictures_is_a_budget(draw, addon, room, room_cameras):  # noqa: ARG001
+def test_the_quality_of_the_pictures_is_a_budget(draw, addon, room, room_cameras):
     """Its own number is drawn; scores made without an estimate say what to do."""
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
@@ -373,7 +372,7 @@ def test_the_quality_of_the_pictures_is_a_budget(draw, addon, room, room_cameras
     assert any(text.startswith("Keeps ") for text in draw())
 
 
-def test_a_curve_of_more_splats_than_are_left_is_not_used(addon, room, room_cameras):  # noqa: ARG001
+def test_a_curve_of_more_splats_than_are_left_is_not_used(addon, room, room_cameras):
     """Where some were deleted by hand since, a share of the rest is another."""
     bpy.context.scene.refine.budget = "psnr"
     bpy.ops.refine.score()

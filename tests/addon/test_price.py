@@ -22,7 +22,7 @@ def chart(addon):
 def curve(addon):
     """Give a straight curve: 50 dB with 20 % removed, 30 with 80 %; absorbing gains 6 dB."""
     shares, psnr = np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0])
-    return addon.core.estimate.quality.Quality(shares, psnr, psnr + 6.0)
+    return addon.core.quality.curve.Quality(shares, psnr, psnr + 6.0)
 
 
 def pixel(picture, x, y):
@@ -146,7 +146,7 @@ BUDGETS = [
 def test_a_slider_says_at_once_what_the_plan_says_later(
     addon,
     room,
-    room_cameras,  # noqa: ARG001
+    room_cameras,
     monkeypatch,
     protect,
 ):
@@ -175,7 +175,7 @@ def test_a_slider_says_at_once_what_the_plan_says_later(
         assert marked.sum() == later["removed"] > 0
 
 
-def test_what_is_known_of_other_scores_is_not_used(addon, room, room_cameras, monkeypatch):  # noqa: ARG001
+def test_what_is_known_of_other_scores_is_not_used(addon, room, room_cameras, monkeypatch):
     """Scored again with fewer views by a script: nothing is said until the plan is made."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     bpy.ops.refine.score()
@@ -188,7 +188,7 @@ def test_what_is_known_of_other_scores_is_not_used(addon, room, room_cameras, mo
     assert plans.stored(room, settings) is None
 
 
-def test_what_is_protected_is_read_again(addon, room, room_cameras):  # noqa: ARG001
+def test_what_is_protected_is_read_again(addon, room, room_cameras):
     """All but 5000 splats are protected after the plan was made: only those can go."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     mask = room.data.attributes.new("mask", "BOOLEAN", "POINT")
@@ -202,7 +202,7 @@ def test_what_is_protected_is_read_again(addon, room, room_cameras):  # noqa: AR
     assert (before, plans.stored(room, settings)["removed"]) == (19877, 5000)
 
 
-def test_the_chart_is_made_with_the_plan_and_is_no_data_of_the_file(addon, room, room_cameras):  # noqa: ARG001
+def test_the_chart_is_made_with_the_plan_and_is_no_data_of_the_file(addon, room, room_cameras):
     """An icon with as many pixels as its edge squared; the file holds no image."""
     price = addon.ui.price
     before = price.shows(room.data)
@@ -242,7 +242,7 @@ def test_a_share_is_set_in_per_cent_and_kept_as_a_share(percent, ratio):
     assert settings.percent == np.float32(percent)
 
 
-def test_a_share_that_a_script_sets_is_shown_in_per_cent(room, addon, room_cameras):  # noqa: ARG001
+def test_a_share_that_a_script_sets_is_shown_in_per_cent(room, addon, room_cameras):
     """Half by default; setting per cent makes the plan anew."""
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
@@ -296,7 +296,7 @@ def test_what_absorbing_reaches_of_few_splats_is_neither_told_nor_drawn(addon, c
     assert sentence(plan | {"becomes": "absorb"}) == f"{start}, {unless}"
 
 
-def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):  # noqa: ARG001
+def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):
     """Beyond 95 % nothing is estimated; above what removing one splat leaves, none can go."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     settings.budget, settings.psnr = "psnr", 1.0
@@ -315,7 +315,7 @@ def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):  # noqa: ARG
     assert middle["psnr"] == pytest.approx(35.0, abs=0.01)
 
 
-def test_a_quality_with_absorb_counts_on_what_absorbing_reaches(addon, room, room_cameras):  # noqa: ARG001
+def test_a_quality_with_absorb_counts_on_what_absorbing_reaches(addon, room, room_cameras):
     """More goes than by deleting, and absorbing is expected to reach the quality asked for."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     settings.budget, settings.psnr, settings.views = "psnr", 35.0, 8
@@ -329,7 +329,7 @@ def test_a_quality_with_absorb_counts_on_what_absorbing_reaches(addon, room, roo
     assert plans.sentence(absorbed).startswith("Keeps about ")
 
 
-def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras):  # noqa: ARG001
+def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras):
     """The closed form makes none unless Quality was the budget."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     bpy.ops.refine.score()
@@ -360,7 +360,7 @@ def test_what_the_cameras_do_not_know_is_said_beside_apply(addon, room, room_cam
 
 
 @pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_success_is_no_warning(room, room_cameras, capfd, survivors):  # noqa: ARG001
+def test_success_is_no_warning(room, room_cameras, capfd, survivors):
     """Blender prints what operators report, each with its kind in front."""
     settings = bpy.context.scene.refine
     settings.views, settings.survivors = 4, survivors
@@ -373,7 +373,7 @@ def test_success_is_no_warning(room, room_cameras, capfd, survivors):  # noqa: A
     assert "Warning" not in said
 
 
-def test_an_export_suggests_a_name_that_no_file_has(addon, room, room_cameras, tmp_path):  # noqa: ARG001
+def test_an_export_suggests_a_name_that_no_file_has(addon, room, room_cameras, tmp_path):
     """Beside the .blend; "pruned" once splats were removed, else a copy."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     name = addon.ui.export_operators.REFINE_OT_export_ply.new_name
@@ -391,7 +391,7 @@ def test_an_export_suggests_a_name_that_no_file_has(addon, room, room_cameras, t
 
 def test_a_sentence_is_broken_where_the_panel_ends(addon):
     """No line is wider, none could take the next word too, and no word is lost."""
-    import blf  # noqa: PLC0415 - Blender's
+    import blf
 
     text = "Keeps 19,878 of 39,755, 4.9 of 9.9 MB, about 38 dB in these views (Absorb: about 46)"
     lines = addon.ui.wrapped.lines(text, 230, 11.0)

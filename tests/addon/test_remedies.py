@@ -70,7 +70,7 @@ def test_the_list_tells_how_close_each_picture_stays(addon, room, room_cameras):
     assert manager.refine_changes_most == min(told, key=many.__getitem__)
 
 
-def test_absorbing_changes_less(room, room_cameras):  # noqa: ARG001
+def test_absorbing_changes_less(room, room_cameras):
     """Each picture gains what all of them gain on average: 39,755 splats are enough to foretell."""
     settings, manager = bpy.context.scene.refine, bpy.context.window_manager
     settings.method, settings.views, settings.percent = "occlusion", 4, 50.0
@@ -84,7 +84,7 @@ def test_absorbing_changes_less(room, room_cameras):  # noqa: ARG001
     assert min(gains.values()) > 3.0
 
 
-def test_nothing_is_told_of_pictures_without_an_estimate(room, room_cameras):  # noqa: ARG001
+def test_nothing_is_told_of_pictures_without_an_estimate(room, room_cameras):
     """The closed form makes none."""
     bpy.ops.refine.score()
     manager = bpy.context.window_manager
@@ -331,7 +331,7 @@ def test_a_ring_needs_a_splat_somewhere(addon, room, unchanged):
     unchanged()
 
 
-def test_cameras_that_see_nothing_or_all_from_afar_are_left_out(room, room_cameras, warned):  # noqa: ARG001
+def test_cameras_that_see_nothing_or_all_from_afar_are_left_out(room, room_cameras, warned):
     """One looks from 860 m behind, one is beside all: both get weight 0 and are listed no more."""
     far, beside = list(room_cameras.objects)[:2]
     far.matrix_world = far.matrix_world @ mathutils.Matrix.Translation((0.0, 0.0, 860.0))
@@ -355,7 +355,7 @@ def test_cameras_that_see_nothing_or_all_from_afar_are_left_out(room, room_camer
     assert again == []
 
 
-def test_the_last_camera_is_not_left_out(room, room_cameras, warned):  # noqa: ARG001
+def test_the_last_camera_is_not_left_out(room, room_cameras, warned):
     """Where all are useless the remedy is a ring; nothing is left out of what was not scored."""
     with pytest.raises(RuntimeError, match="score first"):
         bpy.ops.refine.leave_out()
@@ -430,7 +430,7 @@ def test_what_must_go_is_not_kept_and_pictures_are_without_it(addon, room, room_
     assert not (kept & gone).any()
 
 
-def test_unseen_splats_are_known_of_scores_alone(room, unchanged):  # noqa: ARG001
+def test_unseen_splats_are_known_of_scores_alone(room, unchanged):
     """Without scores there is nothing to keep."""
     unchanged.start()
     with pytest.raises(RuntimeError, match="score it first"):

@@ -16,7 +16,7 @@ IMAGE = "Render with Splats"
 
 
 @pytest.fixture
-def shot(quarter, room_views):  # noqa: ARG001
+def shot(quarter, room_views):
     """Give a scene with splats and a camera, 60 x 40 px, on transparent film, by Cycles."""
     scene = bpy.context.scene
     view = room_views[20]

@@ -80,7 +80,7 @@ def test_what_is_hidden_is_not_selected(addon, chosen, either):
 @pytest.mark.parametrize(
     ("action", "words"), [("HIDE", "no splat is selected"), ("ISOLATE", "no splat is selected")]
 )
-def test_nothing_is_hidden_where_nothing_is_selected(room, unchanged, action, words):  # noqa: ARG001
+def test_nothing_is_hidden_where_nothing_is_selected(room, unchanged, action, words):
     """In one sentence."""
     unchanged.start()
     with pytest.raises(RuntimeError, match=words):
@@ -253,9 +253,9 @@ def test_the_selection_is_undone_and_in_the_file(chosen, room, tmp_path):
     assert chosen.read(bpy.data.objects["room"]) == [1, 2]
 
 
-def test_tools_are_in_the_toolbar_of_both_modes(addon):  # noqa: ARG001
+def test_tools_are_in_the_toolbar_of_both_modes(addon):
     """Five in object mode, five in edit mode of meshes."""
-    from bl_ui.space_toolsystem_toolbar import VIEW3D_PT_tools_active  # noqa: PLC0415
+    from bl_ui.space_toolsystem_toolbar import VIEW3D_PT_tools_active
 
     for mode in ("OBJECT", "EDIT_MESH"):
         tools = VIEW3D_PT_tools_active.tools_from_context(bpy.context, mode)

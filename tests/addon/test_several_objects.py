@@ -13,7 +13,7 @@ COUNT = 39_755
 
 
 @pytest.fixture
-def halves(addon, room_cameras):  # noqa: ARG001 - they decide
+def halves(addon, room_cameras):
     """Return the room as two selected objects: its first 20,000 splats, and the rest."""
     file = addon.core.read_ply(ROOM / "point_cloud.ply")
     made = []
@@ -181,8 +181,7 @@ def test_where_blender_fails_at_the_second_the_first_is_whole_again(addon, uncha
     def fails_once(obj, remove):
         calls.append(obj.name)
         if len(calls) == 2:
-            msg = "no second time"
-            raise addon.core.RefineError(msg)
+            raise addon.core.RefineError("no second time")
         delete(obj, remove)
 
     monkeypatch.setattr(addon.mesh.edit, "delete_vertices", fails_once)

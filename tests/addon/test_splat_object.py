@@ -19,14 +19,14 @@ PLY = ROOM / "point_cloud.ply"
 
 
 @pytest.fixture
-def scene_file(room, room_cameras, tmp_path):  # noqa: ARG001
+def scene_file(room, room_cameras, tmp_path):
     """Save the room and its cameras as a .blend."""
     path = tmp_path / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     return path
 
 
-def test_the_command_on_an_object_writes_what_it_writes_for_the_file(addon, scene_file, tmp_path):  # noqa: ARG001
+def test_the_command_on_an_object_writes_what_it_writes_for_the_file(addon, scene_file, tmp_path):
     """`prune --object` with the scene's cameras, against `prune FILE --cameras`: equal bytes."""
     by_object = ["prune", "--object", "room", "-o", str(tmp_path / "object.ply"), "--quiet"]
     by_file = [
@@ -50,7 +50,7 @@ def test_save_prunes_the_object_in_the_blend(addon, scene_file):
     assert "refine_score" in mesh.attributes
 
 
-def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # noqa: ARG001
+def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):
     """Nor does it write."""
     unchanged.start()
     report = addon.objects.operation.prune_object(
@@ -71,7 +71,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # n
 
 
 @pytest.mark.parametrize("options", [{}, {"save": True}])
-def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_file, options):  # noqa: ARG001
+def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_file, options):
     """The message lists the splat objects of the scene."""
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
@@ -82,7 +82,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
         )
 
 
-def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_cameras):  # noqa: ARG001
+def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_cameras):
     """There is no file to save to."""
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
@@ -182,7 +182,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
     assert [(row["nx"], row["ny"], row["nz"]) for row in rows] == [(0, 1, 0), (0, 0, 0)]
 
 
-def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # noqa: ARG001
+def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):
     """Someone deleted a vertex while the scoring ran."""
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     scores = addon.core.score(
@@ -219,7 +219,7 @@ def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, quart
     assert isinstance(cancelled._error, core.Cancelled)
 
 
-def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras, tmp_path):  # noqa: ARG001
+def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras, tmp_path):
     """The header's count follows the mesh: what is exported after two prunes is a whole file."""
     for _ in range(2):
         bpy.ops.refine.score()

@@ -144,7 +144,7 @@ def test_another_frame_of_a_scored_shot_is_no_change(addon, room):
     assert hints(addon, room) == ["cameras changed"]
 
 
-def test_the_note_survives_saving(addon, room, room_cameras, tmp_path):  # noqa: ARG001
+def test_the_note_survives_saving(addon, room, room_cameras, tmp_path):
     """Matrices are made anew from location, rotation and scale when a file is opened."""
     room.rotation_euler = (0.1, 0.2, 0.3)
     bpy.ops.refine.score()
@@ -175,7 +175,7 @@ def test_scores_without_a_note_or_with_a_damaged_one_have_nothing_to_say(
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_apply_goes_by_the_old_scores_and_says_so(addon, room, room_cameras, capfd, moved):  # noqa: ARG001
+def test_apply_goes_by_the_old_scores_and_says_so(addon, room, room_cameras, capfd, moved):
     """Blender prints what an operator reports when a script calls it."""
     bpy.ops.refine.score()
     keep = keep_mask(addon, room, addon.core.Budget(ratio=0.5))

@@ -34,7 +34,7 @@ def view(room_views):
 
 
 @pytest.fixture
-def imported(addon, quarter_file):  # noqa: ARG001
+def imported(addon, quarter_file):
     """Import every fourth splat of the room: 9,939."""
     bpy.ops.refine.import_ply(filepath=str(quarter_file))
     return bpy.context.object
@@ -161,7 +161,7 @@ def test_an_uneven_scale_is_baked_as_near_as_harmonics_come(addon, imported, see
     np.testing.assert_allclose(*covariances, rtol=1e-4, atol=2e-7)
 
 
-def test_scores_hold_when_a_transform_is_baked(addon, imported, room_cameras):  # noqa: ARG001
+def test_scores_hold_when_a_transform_is_baked(addon, imported, room_cameras):
     """The splats are where they were; the panel asks for no new scores."""
     imported.matrix_world = SOMEWHERE
     bpy.context.view_layer.update()
@@ -507,7 +507,7 @@ def test_who_turns_sizes_and_rotations_as_well_is_left_alone(addon, imported):
     assert told_of(addon, imported) == []
 
 
-def test_absorbing_and_conversion_are_no_drift(addon, imported, room_cameras):  # noqa: ARG001
+def test_absorbing_and_conversion_are_no_drift(addon, imported, room_cameras):
     """Survivors move and grow; a point cloud holds other numbers. A drift from before stays one."""
     select(imported)
     bpy.context.scene.refine.survivors = "absorb"
@@ -530,7 +530,7 @@ def test_absorbing_and_conversion_are_no_drift(addon, imported, room_cameras):  
 def test_score_apply_and_export_say_what_was_done(
     addon,
     imported,
-    room_cameras,  # noqa: ARG001
+    room_cameras,
     room_views,
     tmp_path,
     capfd,

@@ -16,7 +16,7 @@ def contents(addon, obj) -> dict[str, bytes]:
     }
 
 
-def test_apply_undo_redo_gives_bit_equal_attributes(addon, room, room_cameras):  # noqa: ARG001
+def test_apply_undo_redo_gives_bit_equal_attributes(addon, room, room_cameras):
     """The module pushes no undo steps by itself; the operators' own are pushed here."""
     name = room.name
     bpy.ops.ed.undo_push(message="start")
@@ -39,7 +39,7 @@ def test_apply_undo_redo_gives_bit_equal_attributes(addon, room, room_cameras): 
 def test_a_saved_scene_keeps_scores_and_settings_and_can_be_applied(
     addon,
     room,
-    room_cameras,  # noqa: ARG001
+    room_cameras,
     tmp_path,
 ):
     """The plan is the same after reopening, and apply deletes what it says."""
@@ -81,7 +81,7 @@ def test_a_shot_of_a_thousand_frames_is_a_view_set(addon, room):
     settings.source, settings.frame_step = "VISIBLE", 10
 
 
-def test_an_object_of_another_scene_is_left_alone(addon, room, room_cameras):  # noqa: ARG001
+def test_an_object_of_another_scene_is_left_alone(addon, room, room_cameras):
     """The command prunes objects of the open scene; another scene's has another name there."""
     other = bpy.data.scenes.new("other")
     mesh = room.data.copy()
@@ -100,7 +100,7 @@ def test_an_object_of_another_scene_is_left_alone(addon, room, room_cameras):  #
     assert contents(addon, elsewhere) == before
 
 
-def test_splats_joined_after_scoring_are_never_deleted_unscored(addon, room, room_cameras):  # noqa: ARG001
+def test_splats_joined_after_scoring_are_never_deleted_unscored(addon, room, room_cameras):
     """Joining gives them a score of 0, the lowest: apply refuses instead."""
     bpy.ops.refine.score()
     copy = bpy.data.objects.new("more", room.data.copy())

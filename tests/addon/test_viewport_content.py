@@ -36,7 +36,7 @@ def packing(addon, monkeypatch):
 
 
 @pytest.fixture
-def content(addon, packing, monkeypatch):  # noqa: ARG001
+def content(addon, packing, monkeypatch):
     """Give what views draw from, without textures: there is no graphics card in the background."""
     monkeypatch.setattr(addon.viewport.content.shader, "texture", lambda *_: None)
     return addon.viewport.content.Content()

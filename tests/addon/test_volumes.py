@@ -71,7 +71,7 @@ def facts(addon, obj):
 
 
 @pytest.fixture
-def crop(addon, room, room_cameras):  # noqa: ARG001
+def crop(addon, room, room_cameras):
     """Turn and move the room, and list volumes about its middle; return what they say of it.
 
     A turned cube with a Bevel modifier keeps; an ellipsoid in it removes; a box in that protects.
@@ -177,7 +177,7 @@ def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp
         assert np.array_equal(kept, mask(addon, room, "opacity")[by_api.keep])
 
 
-def test_boxes_in_numbers_lie_in_the_world(addon, room, room_cameras, tmp_path):  # noqa: ARG001
+def test_boxes_in_numbers_lie_in_the_world(addon, room, room_cameras, tmp_path):
     """The room is moved by 5 in x; those below its median there go, half of all."""
     room.location.x = 5.0
     bpy.context.view_layer.update()
@@ -192,7 +192,7 @@ def test_boxes_in_numbers_lie_in_the_world(addon, room, room_cameras, tmp_path):
     assert (left >= x - 5.0 - 1e-5).all()
 
 
-def test_input_files_go_by_objects_of_the_open_scene(addon, core, room, room_cameras, tmp_path):  # noqa: ARG001
+def test_input_files_go_by_objects_of_the_open_scene(addon, core, room, room_cameras, tmp_path):
     """In the cameras' world, where a file's coordinates are taken as they stand."""
     source = tmp_path / "in.ply"
     bpy.ops.refine.export_ply(filepath=str(source))
@@ -224,7 +224,7 @@ def test_score_of_an_object_leaves_out_what_must_go(addon, room, crop, tmp_path)
 def test_marks_by_hand_protect_without_being_named_and_stay_in_the_file(
     addon,
     room,
-    room_cameras,  # noqa: ARG001
+    room_cameras,
     tmp_path,
 ):
     """The 100 lowest are selected and marked; of 500 that stay they are 100, saved or not."""
@@ -291,7 +291,7 @@ def test_marks_are_set_in_edit_mode(addon, room):
     assert np.flatnonzero(mask(addon, room, "refine_protect")).tolist() == [7, 9]
 
 
-def test_without_a_selection_nothing_is_marked(addon, room, unchanged):  # noqa: ARG001
+def test_without_a_selection_nothing_is_marked(addon, room, unchanged):
     """In one sentence, in both modes."""
     select(room, [])
     unchanged.start()
@@ -331,7 +331,7 @@ def test_native_point_clouds_go_by_volumes_and_marks_as_meshes_do(addon, room, c
     assert mask(addon, cloud, "refine_protect").sum() == 5
 
 
-def test_a_volume_that_moved_asks_for_new_scores(addon, room, crop):  # noqa: ARG001
+def test_a_volume_that_moved_asks_for_new_scores(addon, room, crop):
     """The panel says so; what had to go then and need not now has no score, and is not guessed."""
     bpy.ops.refine.score()
     before = addon.ui.staleness.changes(bpy.context, room)
@@ -349,7 +349,7 @@ def test_a_volume_that_moved_asks_for_new_scores(addon, room, crop):  # noqa: AR
     assert bpy.ops.refine.apply() == {"FINISHED"}
 
 
-def test_the_best_splat_is_not_deleted_unscored_when_its_volume_moves(addon, room, room_cameras):  # noqa: ARG001
+def test_the_best_splat_is_not_deleted_unscored_when_its_volume_moves(addon, room, room_cameras):
     """Forced out at scoring it has no score; then the volume moves to one that cannot be drawn.
 
     Now as many scores are 0 as there are splats that cannot be drawn, but not those.
@@ -372,7 +372,7 @@ def test_the_best_splat_is_not_deleted_unscored_when_its_volume_moves(addon, roo
     assert len(room.data.vertices) == 39_755
 
 
-def test_a_volume_that_protects_alone_changes_no_score(addon, room, room_cameras):  # noqa: ARG001
+def test_a_volume_that_protects_alone_changes_no_score(addon, room, room_cameras):
     """What is protected is scored like the rest: nothing is out of date, and the plan follows."""
     bpy.ops.refine.score()
     center, upper = middle(addon, room)
@@ -389,7 +389,7 @@ def test_a_volume_that_protects_alone_changes_no_score(addon, room, room_cameras
 
 
 @pytest.fixture
-def guarded(addon, room, room_cameras):  # noqa: ARG001
+def guarded(addon, room, room_cameras):
     """Protect a box of the room by a volume, with a Quality of 35 dB as the budget."""
     settings = bpy.context.scene.refine
     settings.method, settings.views, settings.budget, settings.psnr = "occlusion", 4, "psnr", 35.0
@@ -399,7 +399,7 @@ def guarded(addon, room, room_cameras):  # noqa: ARG001
     return box
 
 
-def test_a_quality_keeps_in_the_panel_what_the_command_keeps(addon, core, room, guarded, tmp_path):  # noqa: ARG001
+def test_a_quality_keeps_in_the_panel_what_the_command_keeps(addon, core, room, guarded, tmp_path):
     """The curve of the panel is with the box protected; by that of free splats 81 fewer stay."""
     bpy.ops.refine.score()
     wanted = addon.mesh.scores.record(room.data)["protected"][0]
@@ -451,7 +451,7 @@ def test_a_plan_to_absorb_keeps_no_fewer_than_are_protected(addon, room, guarded
     assert plan["kept"] == protected
 
 
-def test_a_mesh_of_another_shape_is_another_volume(addon, room, room_cameras):  # noqa: ARG001
+def test_a_mesh_of_another_shape_is_another_volume(addon, room, room_cameras):
     """A corner of the cube pulled inwards: matrix and dimensions stay the same."""
     box = cube(middle(addon, room)[0], (0.5, 0.5, 0.5))
     volume(box, "REMOVE")
@@ -466,7 +466,7 @@ def test_a_mesh_of_another_shape_is_another_volume(addon, room, room_cameras):  
     assert addon.ui.staleness.changes(bpy.context, room) == ["volumes changed"]
 
 
-def test_a_volume_that_moves_marks_all_splats_anew(addon, room, room_cameras):  # noqa: ARG001
+def test_a_volume_that_moves_marks_all_splats_anew(addon, room, room_cameras):
     """Those of the active object, of one selected too, and of one that was marked before.
 
     The plan of another place of the volume no longer holds.
@@ -507,7 +507,7 @@ def test_what_must_go_is_deleted_at_once_without_scores(addon, room, crop):
     assert bpy.ops.refine.apply() == {"FINISHED"}
 
 
-def test_levels_and_floaters_leave_out_what_must_go(addon, core, room, quarter, crop):  # noqa: ARG001
+def test_levels_and_floaters_leave_out_what_must_go(addon, core, room, quarter, crop):
     """No level has any of it, and it is evidence of nothing."""
     protected, removed = crop
     settings = bpy.context.scene.refine
@@ -617,7 +617,7 @@ ODD = {
 
 
 @pytest.mark.parametrize("case", ODD)
-def test_what_is_no_volume_is_refused_by_name(addon, room, room_cameras, capsys, unchanged, case):  # noqa: ARG001
+def test_what_is_no_volume_is_refused_by_name(addon, room, room_cameras, capsys, unchanged, case):
     """By the command: code 1, one sentence, and nothing is changed."""
     make, expected = ODD[case]
     center, upper = middle(addon, room)
@@ -644,7 +644,7 @@ def test_the_panel_says_what_is_wrong_with_a_volume(addon, room, case):
         bpy.ops.refine.crop()
 
 
-def test_names_that_there_are_not_are_refused(addon, room, room_cameras, capsys):  # noqa: ARG001
+def test_names_that_there_are_not_are_refused(addon, room, room_cameras, capsys):
     """With the objects that would do; a group is looked for first where splats stay."""
     cube((0, 0, 0), (1, 1, 1), "Cube")
     words = ["prune", "--object", "room", "--dry-run", *CLOSED]
@@ -656,7 +656,7 @@ def test_names_that_there_are_not_are_refused(addon, room, room_cameras, capsys)
     assert second.endswith("in the open .blend (objects that are volumes: Cube)")
 
 
-def test_all_forced_out_is_refused(addon, room, room_cameras):  # noqa: ARG001
+def test_all_forced_out_is_refused(addon, room, room_cameras):
     """A volume far away keeps nothing."""
     volume(empty((1000, 0, 0), (1, 1, 1)), "KEEP")
 
@@ -665,7 +665,7 @@ def test_all_forced_out_is_refused(addon, room, room_cameras):  # noqa: ARG001
         bpy.ops.refine.score()
 
 
-def test_a_group_named_by_the_command_protects(addon, room, room_cameras, capsys):  # noqa: ARG001
+def test_a_group_named_by_the_command_protects(addon, room, room_cameras, capsys):
     """As the panel's; the terminal says how many."""
     group = room.vertex_groups.new(name="mine")
     group.add(list(range(100)), 1.0, "REPLACE")

@@ -16,7 +16,7 @@ from tests.windows import event, started_in_a_window, until_over
 
 
 @pytest.fixture
-def few(addon, room, room_cameras):  # noqa: ARG001
+def few(addon, room, room_cameras):
     """Every tenth splat of the room, to be absorbed to two fifths by four views."""
     addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 10 != 0)
     settings = bpy.context.scene.refine
@@ -48,8 +48,7 @@ def fail_at(addon, monkeypatch):
         delete = edit.delete_vertices
 
         def refuse(*_arguments):
-            msg = "refused"
-            raise addon.core.RefineError(msg)
+            raise addon.core.RefineError("refused")
 
         def delete_and_refuse(*arguments):
             delete(*arguments)
@@ -188,7 +187,7 @@ def left(references):
 
 
 @pytest.mark.parametrize("name", ["score", "apply"])
-def test_the_history_of_operators_holds_no_splats(few, noted, name):  # noqa: ARG001
+def test_the_history_of_operators_holds_no_splats(few, noted, name):
     """Blender keeps the operator that ran, to show it in *Adjust Last Operation*."""
     bpy.ops.refine.score()
     noted.clear()
@@ -201,7 +200,7 @@ def test_the_history_of_operators_holds_no_splats(few, noted, name):  # noqa: AR
 
 
 @pytest.fixture
-def started(addon, few):  # noqa: ARG001
+def started(addon, few):
     """Return a function that starts an operator as a click in a window does."""
     return lambda name: started_in_a_window(addon, getattr(addon.ui.operators, f"REFINE_OT_{name}"))
 
@@ -227,7 +226,7 @@ def work(addon, monkeypatch):
 
 @pytest.mark.parametrize("name", ["score", "apply"])
 @pytest.mark.parametrize("how", ["done", "escape", "work fails", "writing fails", "cancelled"])
-def test_an_operation_in_a_window_is_dropped_when_it_is_over(  # noqa: PLR0917
+def test_an_operation_in_a_window_is_dropped_when_it_is_over(
     addon, few, noted, started, work, monkeypatch, name, how
 ):
     """Done, cancelled by Esc or by Blender, failed on the thread or after: nothing lives on."""
@@ -239,8 +238,7 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(  # noqa: PLR0917
     if how == "writing fails":
 
         def refuse(*_arguments, **_options):
-            msg = "failed"
-            raise addon.core.RefineError(msg)
+            raise addon.core.RefineError("failed")
 
         monkeypatch.setattr(addon.mesh.scores, "store", refuse)
         monkeypatch.setattr(addon.objects.splat_object, "apply", refuse)

@@ -9,7 +9,7 @@ from mathutils import Euler, Matrix
 
 
 def test_the_file_of_a_moved_object_is_compared_where_the_object_stands(
-    addon, room, room_cameras, room_views, tmp_path  # noqa: ARG001
+    addon, room, room_cameras, room_views, tmp_path
 ):  # fmt: skip
     """Glb keeps single precision, so its file is as close as the splats kept; object moved."""
     core = addon.core

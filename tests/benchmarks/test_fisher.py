@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 pytest.importorskip("numba")
 
+from numpy.typing import NDArray
+
 from benchmarks.baselines import fisher
 from benchmarks.renderer import rasterizer
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 STEP = 1e-6
 BACKGROUND = (0.2, 0.5, 0.9)

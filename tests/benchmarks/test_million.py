@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 pytest.importorskip("numba")
 pytest.importorskip("skimage")
+
+from pathlib import Path
 
 from benchmarks.renderer import rasterizer
 from benchmarks.renderer.footprints import gaussians_of
@@ -19,9 +20,6 @@ from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.splats import Splats, opacity
 from refine_addon.core.views import View, ViewSet
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 VIEW = View(np.eye(3), np.zeros(3), 62.0, 62.0, 32.0, 24.0, 64, 48, name="front")
 

@@ -12,8 +12,8 @@ pytest.importorskip("numba")
 from benchmarks.renderer import rasterizer
 from refine_addon.core import Splats, View, ViewSet
 from refine_addon.core.scoring.occlusion import Occlusion
-from refine_addon.core.seeing import measuring, projection
-from refine_addon.core.seeing.measuring import Measured
+from refine_addon.core.visibility import measuring, projection
+from refine_addon.core.visibility.measuring import Measured
 
 SIDES = (12.0, 6.0, 3.0, 1.5)
 

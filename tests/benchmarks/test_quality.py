@@ -53,7 +53,7 @@ def test_the_closed_form_beats_the_published_readings(scene, evaluator):
 @pytest.mark.parametrize("method", ["occlusion", "auto"])
 def test_occlusion_beats_rendering_methods_at_every_ratio(scene, evaluator, method):
     """LightGaussian, rendered: 46.1 / 34.4 / 25.6 / 16.8 dB; required: 47.5 / 36.5 / 27.5 / 18."""
-    from refine_addon.core import score, select  # noqa: PLC0415
+    from refine_addon.core import score, select
 
     scores = score(scene.splats, scene.train, Settings(method))
     for ratio, least in ((0.3, 47.5), (0.5, 36.5), (0.7, 27.5), (0.9, 18.0)):

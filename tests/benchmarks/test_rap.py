@@ -36,7 +36,7 @@ class TorchPickler(pickle._Pickler):
         """Return what stands for the numbers of a tensor, which lie elsewhere."""
         return value.values if isinstance(value, Pickled) and not value.name else None
 
-    def save(self, value, save_persistent_id=True):  # noqa: FBT002
+    def save(self, value, save_persistent_id=True):
         """Write a value, or the call that `Pickled` stands for."""
         if isinstance(value, Pickled) and value.name:
             self.write(f"c{value.module}\n{value.name}\n".encode())
@@ -204,7 +204,7 @@ def test_rap_is_a_line_of_the_table_where_its_weights_are_given(
 def test_rap_is_part_of_the_trade_where_its_weights_are_given(tmp_path: Path) -> None:
     """A line of the tables, as any method of the literature."""
     pytest.importorskip("matplotlib")
-    from benchmarks.tables import trade  # noqa: PLC0415 - needs matplotlib
+    from benchmarks.tables import trade
 
     weights = write_weights(tmp_path / "net.pth", pointing(12))
     arguments = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,15 +11,13 @@ import pytest
 pytest.importorskip("numba")
 special = pytest.importorskip("scipy.special")
 
-import numba  # noqa: E402
+import numba
+from numpy.typing import NDArray
 
-from benchmarks.renderer import rasterizer  # noqa: E402
-from benchmarks.renderer.rasterizer import Camera, Gaussians  # noqa: E402
-from refine_addon.core.splats import Splats, rotation_matrices  # noqa: E402
-from refine_addon.core.views import View  # noqa: E402
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from benchmarks.renderer import rasterizer
+from benchmarks.renderer.rasterizer import Camera, Gaussians
+from refine_addon.core.splats import Splats, rotation_matrices
+from refine_addon.core.views import View
 
 BACKGROUND = (0.2, 0.5, 0.9)
 DC = math.sqrt(4.0 * math.pi)

@@ -151,8 +151,7 @@ def test_what_fails_is_said_and_the_rest_is_kept(
     """The report has the other method, names the one that failed, and the exit code is 1."""
 
     def broken(*_: object) -> None:
-        msg = "no such luck"
-        raise RefineError(msg)
+        raise RefineError("no such luck")
 
     made = [methods.Method("broken", methods.OURS, "", score=broken), *methods.everything()]
     monkeypatch.setattr(methods, "everything", lambda: made)

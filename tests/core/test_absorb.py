@@ -8,16 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from refine_addon.core.absorbing import merge_field, merge_graph, merging
-from refine_addon.core.absorbing.absorb import ALONE, STAGE, absorb, patience, stages
-from refine_addon.core.absorbing.merge_field import Field, ViewSums
-from refine_addon.core.absorbing.merge_graph import MergeGraph
-from refine_addon.core.absorbing.neighbours import nearest
 from refine_addon.core.affine import transformed
+from refine_addon.core.merging import field as merge_field
+from refine_addon.core.merging import graph as merge_graph
+from refine_addon.core.merging import pairs as merging
+from refine_addon.core.merging.absorb import ALONE, STAGE, absorb, patience, stages
+from refine_addon.core.merging.field import Field, ViewSums
+from refine_addon.core.merging.graph import MergeGraph
+from refine_addon.core.merging.neighbours import nearest
 from refine_addon.core.rendering import ALPHA_MAX
-from refine_addon.core.seeing.scene import Scene, scene_of
 from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
 from refine_addon.core.views import View, ViewSet
+from refine_addon.core.visibility.scene import Scene, scene_of
 from refine_addon.core.work import Cancelled
 
 SCENE = Scene(np.zeros(3), 1.0, np.eye(3))

@@ -20,7 +20,7 @@ from refine_addon.core import (
     score,
 )
 from refine_addon.core.affine import QUARTER
-from refine_addon.core.estimate.alignment import Alignment, alignment
+from refine_addon.core.quality.alignment import Alignment, alignment
 from tests.core.test_occlusion import cloud, look_along_z, ring, splats_of
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"

@@ -24,9 +24,9 @@ from refine_addon.core import (
     select,
 )
 from refine_addon.core.costs import Images
-from refine_addon.core.estimate.psnr import psnr_kept
+from refine_addon.core.quality.psnr import psnr_kept
 from refine_addon.core.scoring import auto, occlusion
-from refine_addon.core.seeing.ray_sample import validation_rays
+from refine_addon.core.visibility.ray_sample import validation_rays
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 COARSE = Occlusion(cell=16.0, density=1.0, rounds=2)

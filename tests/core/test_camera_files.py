@@ -762,7 +762,7 @@ def test_any_values_give_views_or_a_located_error(tmp_path, data):
         try:
             views = read(tmp_path, content)
         except RefineError as error:
-            assert str(error).startswith(str(tmp_path / "cameras.json"))  # noqa: PT017
+            assert str(error).startswith(str(tmp_path / "cameras.json"))
         else:
             assert isinstance(views, ViewSet)
             assert np.isfinite(views.rotations).all()

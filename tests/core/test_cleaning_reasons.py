@@ -10,7 +10,7 @@ import pytest
 from refine_addon.core import Cleaning, View, ViewSet, clean
 from refine_addon.core.cleaning import search, support
 from refine_addon.core.cleaning.clean import REASONS
-from refine_addon.core.seeing import cast, projection
+from refine_addon.core.visibility import cast, projection
 
 from .test_cleaning import FLOATER, SIDE, cameras, joined, made, wall
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet
 from refine_addon.core.scoring import closed_form, closed_form_block
-from refine_addon.core.seeing.frustum import Frustums
-from refine_addon.core.seeing.scene import principal_axes
+from refine_addon.core.visibility.frustum import Frustums
+from refine_addon.core.visibility.scene import principal_axes
 
 READINGS = [
     ClosedForm(),
@@ -464,7 +464,7 @@ def test_settings_that_cannot_be_are_refused(changes):
 
 def test_a_callback_that_answers_false_cancels():
     """At any of its calls."""
-    from refine_addon.core import Cancelled  # noqa: PLC0415
+    from refine_addon.core import Cancelled
 
     splats, views = random_scene(0)
     for last in range(2):

@@ -235,8 +235,7 @@ def test_a_worker_that_ends_while_it_starts_is_told_in_a_sentence(monkeypatch):
     distributed = pytest.importorskip("distributed")
 
     def failing(**_options):
-        msg = "Nanny failed to start."
-        raise RuntimeError(msg)
+        raise RuntimeError("Nanny failed to start.")
 
     monkeypatch.setattr(distributed, "LocalCluster", failing)
 

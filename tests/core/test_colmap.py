@@ -530,7 +530,7 @@ def test_any_damage_gives_views_or_a_located_error(tmp_path, data):
     try:
         views = read_cameras(tmp_path)
     except RefineError as error:
-        assert str(error).startswith(str(tmp_path))  # noqa: PT017
+        assert str(error).startswith(str(tmp_path))
     else:
         assert np.isfinite(views.rotations).all()
         assert np.isfinite(views.centers).all()

@@ -864,7 +864,7 @@ def test_an_output_that_is_named_as_compressed_is_refused(folder, capsys, name):
     assert not (folder / name).exists()
 
 
-def test_info_of_a_signalling_not_a_number_does_not_warn(folder, capsys):  # noqa: ARG001
+def test_info_of_a_signalling_not_a_number_does_not_warn(folder, capsys):
     """Only finite means are widened to float64."""
     file = read_ply("in.ply")
     rows = file.rows.copy()

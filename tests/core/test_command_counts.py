@@ -19,7 +19,7 @@ QUICK = ["--method", "closed-form", "--views", "2"]
 
 
 @pytest.fixture
-def broken(files):  # noqa: F811
+def broken(files):
     """Return the folder with a scene of 577 splats, the first three of which are NaN."""
     data = bytearray((files / "scene.ply").read_bytes())
     start = data.index(b"end_header\n") + len(b"end_header\n")
@@ -107,7 +107,7 @@ def test_every_report_says_what_was_seen_by_how_many_views(broken):
 
 
 @pytest.mark.slow
-def test_clean_and_lod_say_what_lies_in_no_view(files, capsys):  # noqa: F811
+def test_clean_and_lod_say_what_lies_in_no_view(files, capsys):
     """In the words of `prune`, and by how many views."""
     assert call(files, "clean", "--views", "2") == 0
     assert call(files, "lod", "--nested", "--views", "2", "-o", str(files / "out")) == 0
@@ -116,13 +116,13 @@ def test_clean_and_lod_say_what_lies_in_no_view(files, capsys):  # noqa: F811
     assert said.count("by 2 of 6 views") == 2
 
 
-def test_sizes_below_a_tenth_of_a_megabyte_are_in_kilobytes(files, capsys):  # noqa: F811
+def test_sizes_below_a_tenth_of_a_megabyte_are_in_kilobytes(files, capsys):
     """577 splats of 32 bytes are 18,464: that was said to be 0.0 MB."""
     assert main(["convert", str(files / "scene.ply"), str(files / "out.splat")]) == 0
     assert "-> 18.5 kB -> " in capsys.readouterr().out
 
 
-def test_a_limit_that_is_met_already_says_so(files, capsys):  # noqa: F811
+def test_a_limit_that_is_met_already_says_so(files, capsys):
     """The note has the size of the file, which becomes that of the output."""
     size = (files / "scene.ply").stat().st_size / 1e3
     out = ["-o", str(files / "out.ply"), *QUICK]
@@ -138,7 +138,7 @@ def test_a_limit_that_is_met_already_says_so(files, capsys):  # noqa: F811
     ("psnr", "words"),
     [("99", "by the estimate nothing can go at 99 dB"), ("1", "the estimate ends at 95% removed")],
 )
-def test_a_psnr_out_of_reach_is_said(files, capsys, psnr, words):  # noqa: F811
+def test_a_psnr_out_of_reach_is_said(files, capsys, psnr, words):
     """Nothing can go at 99 dB, and at 95 % removed these still have more than 1."""
     assert call(files, "prune", "--psnr", psnr, "--dry-run", "--views", "2") == 0
     assert f"note: {words}" in capsys.readouterr().out

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 QUICK = ["--nested", "--method", "closed-form", "--views", "2"]
 
 
-def test_lod_writes_levels_and_says_what_each_costs(files, capsys):  # noqa: F811
+def test_lod_writes_levels_and_says_what_each_costs(files, capsys):
     """577 splats: .5 are 289 (288.5), .1 are 58 (57.7); a line for each, and the report."""
     out, told = files / "out", files / "report.json"
 
@@ -38,7 +38,7 @@ def test_lod_writes_levels_and_says_what_each_costs(files, capsys):  # noqa: F81
 
 
 @pytest.mark.slow
-def test_by_default_survivors_absorb_and_four_levels_are_made(files):  # noqa: F811
+def test_by_default_survivors_absorb_and_four_levels_are_made(files):
     """Halves of halves, about: 289, 145, 70 and 35 of 577, rounded up."""
     assert call(files, "lod", "-o", str(files / "out"), "--views", "2", "--quiet") == 0
     made = [len(read_splats(files / f"out/scene.lod{number}.ply")) for number in range(1, 5)]
@@ -60,20 +60,20 @@ def test_by_default_survivors_absorb_and_four_levels_are_made(files):  # noqa: F
         (["--format", ".obj"], "invalid choice"),
     ],
 )
-def test_wrong_usage_ends_before_any_work(files, capsys, options, word):  # noqa: F811
+def test_wrong_usage_ends_before_any_work(files, capsys, options, word):
     """Code 2, and no folder."""
     assert call(files, "lod", "-o", str(files / "out"), *options) == 2
     assert word in capsys.readouterr().err
     assert not (files / "out").exists()
 
 
-def test_a_folder_for_the_files_is_required(files, capsys):  # noqa: F811
+def test_a_folder_for_the_files_is_required(files, capsys):
     """Argparse names the option."""
     assert call(files, "lod") == 2
     assert "--output-dir" in capsys.readouterr().err
 
 
-def test_files_that_exist_are_replaced_when_told_alone(files, capsys):  # noqa: F811
+def test_files_that_exist_are_replaced_when_told_alone(files, capsys):
     """The second run fails on the first level, the third replaces both."""
     run = ["lod", "--levels", ".5,.1", "-o", str(files / "out"), *QUICK]
     assert call(files, *run) == 0
@@ -83,7 +83,7 @@ def test_files_that_exist_are_replaced_when_told_alone(files, capsys):  # noqa: 
     assert call(files, *run, "--overwrite") == 0
 
 
-def test_ctrl_c_leaves_nothing(files, monkeypatch, capsys):  # noqa: F811
+def test_ctrl_c_leaves_nothing(files, monkeypatch, capsys):
     """Interrupted while the second level is made: 130, and the first level is gone again."""
     made = levels_files.each_level
 
@@ -100,19 +100,19 @@ def test_ctrl_c_leaves_nothing(files, monkeypatch, capsys):  # noqa: F811
     assert not (files / "out").exists()
 
 
-def test_without_cameras_there_are_no_levels(files, capsys):  # noqa: F811
+def test_without_cameras_there_are_no_levels(files, capsys):
     """They decide what goes."""
     assert main(["lod", str(files / "scene.ply"), "-o", str(files / "out")]) == 2
     assert "no cameras" in capsys.readouterr().err
 
 
-def test_one_level_is_one(files, capsys):  # noqa: F811
+def test_one_level_is_one(files, capsys):
     """It was "1 levels"."""
     assert call(files, "lod", "--levels", ".5", "-o", str(files / "out"), *QUICK) == 0
     assert ": 1 level of 577 splats, by 2 of 6 views, " in capsys.readouterr().out
 
 
-def test_levels_that_would_be_equal_are_made_once(files, capsys):  # noqa: F811
+def test_levels_that_would_be_equal_are_made_once(files, capsys):
     """Of 577, .999 are all (576.4); .002 and .0019 are both 2 (1.2 and 1.1)."""
     options = ["--levels", ".999,.5,.002,.0019", "-o", str(files / "out"), *QUICK]
 
@@ -128,7 +128,7 @@ def test_levels_that_would_be_equal_are_made_once(files, capsys):  # noqa: F811
     ]
 
 
-def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):  # noqa: F811
+def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):
     """Alone it is an error; beside another the note says so. 1 dB is out of reach."""
     run = ["lod", "-o", str(files / "out"), "--nested", "--views", "2"]
 
@@ -141,7 +141,7 @@ def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):  # noqa: F81
     assert "note: level 1: the estimate ends at 95% removed" in said
 
 
-def test_levels_with_names_that_are_too_long_leave_no_empty_folder(files, capsys):  # noqa: F811
+def test_levels_with_names_that_are_too_long_leave_no_empty_folder(files, capsys):
     """The source's 251 bytes and .lod1 are 256; neither the folder nor the one above it is left."""
     long = files / f"{'x' * 247}.ply"
     (files / "scene.ply").rename(long)
@@ -153,7 +153,7 @@ def test_levels_with_names_that_are_too_long_leave_no_empty_folder(files, capsys
     assert not (files / "a").exists()
 
 
-def test_a_level_can_be_the_source_of_a_new_run(files):  # noqa: F811
+def test_a_level_can_be_the_source_of_a_new_run(files):
     """It is in the folder: it stays."""
     out = files / "out"
     assert call(files, "lod", "-o", str(out), "--levels", ".5", *QUICK) == 0
@@ -165,7 +165,7 @@ def test_a_level_can_be_the_source_of_a_new_run(files):  # noqa: F811
     assert (out / "scene.lod1.lod1.ply").exists()
 
 
-def test_a_run_that_stops_before_its_first_level_leaves_the_run_before(files, monkeypatch):  # noqa: F811
+def test_a_run_that_stops_before_its_first_level_leaves_the_run_before(files, monkeypatch):
     """Nothing is taken away until there is something to replace it."""
     out = files / "out"
     assert call(files, "lod", "-o", str(out), *QUICK) == 0
@@ -180,7 +180,7 @@ def test_a_run_that_stops_before_its_first_level_leaves_the_run_before(files, mo
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_levels_that_are_one_file_by_a_link_are_refused(files, capsys):  # noqa: F811
+def test_levels_that_are_one_file_by_a_link_are_refused(files, capsys):
     out = files / "out"
     out.mkdir()
     (out / "scene.lod2.ply").symlink_to("scene.lod1.ply")
@@ -189,7 +189,7 @@ def test_levels_that_are_one_file_by_a_link_are_refused(files, capsys):  # noqa:
     assert "by a link" in capsys.readouterr().err
 
 
-def test_more_levels_of_a_run_before_are_named(files, capsys):  # noqa: F811
+def test_more_levels_of_a_run_before_are_named(files, capsys):
     """No list says whose they are, so they stay."""
     run = ["lod", "-o", str(files / "out"), "--overwrite", *QUICK]
     assert call(files, *run, "--levels", ".5,.3,.1") == 0
@@ -201,14 +201,14 @@ def test_more_levels_of_a_run_before_are_named(files, capsys):  # noqa: F811
 
 
 @pytest.fixture
-def streamed(files):  # noqa: F811
+def streamed(files):
     """Return the index of a streamed SOG to be made, and the command that makes it."""
     pytest.importorskip("PIL", reason="needs Pillow, which SOG does outside of Blender")
     path = files / "web/lod-meta.json"
     return path, ["lod", "--levels", ".5,.1", "-o", str(path), *QUICK]
 
 
-def test_a_streamed_sog_has_all_levels_and_the_source(files, streamed, capsys):  # noqa: F811
+def test_a_streamed_sog_has_all_levels_and_the_source(files, streamed, capsys):
     """577 splats as level 0, 289 and 58; positions to 16 bits, of the levels that files have."""
     path, run = streamed
     assert call(files, "lod", "--levels", ".5,.1", "-o", str(files / "out"), *QUICK) == 0
@@ -227,7 +227,7 @@ def test_a_streamed_sog_has_all_levels_and_the_source(files, streamed, capsys): 
     assert "note: .sog holds positions in 16 bits" in said
 
 
-def test_a_streamed_sog_is_replaced_when_told_alone(files, streamed, capsys):  # noqa: F811
+def test_a_streamed_sog_is_replaced_when_told_alone(files, streamed, capsys):
     """As a file is; nothing is left of what the run before had more."""
     path, run = streamed
     assert call(files, *run) == 0
@@ -241,7 +241,7 @@ def test_a_streamed_sog_is_replaced_when_told_alone(files, streamed, capsys):  #
     assert len(read_splats(path, level=1)) == 174
 
 
-def test_what_must_go_is_in_no_level_of_a_streamed_sog(files, streamed):  # noqa: F811
+def test_what_must_go_is_in_no_level_of_a_streamed_sog(files, streamed):
     """Nor in level 0: a viewer shows that, too."""
     path, run = streamed
     box = "box:-1,-1,0,1,1,99"
@@ -253,7 +253,7 @@ def test_what_must_go_is_in_no_level_of_a_streamed_sog(files, streamed):  # noqa
     assert len(read_splats(path)) == 577 - inside.sum() < 577
 
 
-def test_a_streamed_sog_that_is_stopped_leaves_nothing(files, streamed, monkeypatch):  # noqa: F811
+def test_a_streamed_sog_that_is_stopped_leaves_nothing(files, streamed, monkeypatch):
     """Neither of a new one, nor of one to be replaced, which stays as it was."""
     path, run = streamed
     made, stops = levels_files.each_level, [True]

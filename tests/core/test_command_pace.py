@@ -115,7 +115,7 @@ def test_progress_ends_with_the_time_left(monkeypatch):
 @pytest.mark.usefixtures("folder")
 def test_of_several_files_the_place_is_said(capsys):
     """The second of three is cut off: it is named as an error, and the third is still the third."""
-    with open("b.ply", "r+b") as stream:  # noqa: PTH123
+    with open("b.ply", "r+b") as stream:
         stream.truncate(1000)
 
     code = command.main(["prune", "a.ply", "b.ply", "c.ply", *PRUNE, "--output-dir", "out"])

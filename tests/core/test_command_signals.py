@@ -67,7 +67,7 @@ def start(
         stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=stderr,
-        preexec_fn=listen,  # noqa: PLW1509 - this process has no other thread
+        preexec_fn=listen,
     )
 
 
@@ -231,7 +231,7 @@ sys.exit(command.main(sys.argv[1:]))
 
 
 @pytest.fixture
-def halfway(folder):  # noqa: ARG001
+def halfway(folder):
     """Return a function that starts a run and waits until rows are in its temporary file."""
 
     def begin(*words, **options):

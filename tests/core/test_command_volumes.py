@@ -19,7 +19,7 @@ HALF = "box:-inf,-inf,-inf,0,inf,inf"
 
 
 @pytest.fixture
-def scene(files):  # noqa: F811 - the fixture
+def scene(files):
     """Return the folder, and where the splats lie along x and z."""
     means = read_ply(files / "scene.ply").splats().means
     return files, means[:, 0], means[:, 2]

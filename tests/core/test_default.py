@@ -21,10 +21,10 @@ from refine_addon.core import (
     read_ply,
     score,
 )
-from refine_addon.core.absorbing.absorb import Absorbed
-from refine_addon.core.estimate.quality import AS_GOOD, expected
+from refine_addon.core.merging.absorb import Absorbed
 from refine_addon.core.pipeline import absorb_splats, decide, decide_task
 from refine_addon.core.pipeline.refit_splats import Made, unchanged_note
+from refine_addon.core.quality.curve import AS_GOOD, expected
 from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
 from tests.strategies import ply_of

@@ -6,7 +6,7 @@ import os
 import re
 import struct
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,9 +29,6 @@ from refine_addon.core.picture_files import PictureFiles
 from refine_addon.core.splats import base_color, opacity, opacity_logits, rotation_matrices
 from tests.strategies import ply_of, splat_names
 from tests.users import own_folder
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FORMATS = [form for form in registry.FORMATS if form.suffix != ".sog" or find_spec("PIL")]
 """All but plain PLY; SOG where Pillow is installed."""

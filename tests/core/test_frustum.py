@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import View, ViewSet
-from refine_addon.core.seeing.frustum import Frustums
+from refine_addon.core.visibility.frustum import Frustums
 
 REACH = 0.05
 

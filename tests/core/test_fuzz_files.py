@@ -34,7 +34,7 @@ def test_files_broken_by_chance_end_in_an_error_or_a_result(name):
 
     `make fuzz` goes on from here.
     """
-    tried, taken = fuzz(name, random.Random(0), lambda count: count < 120)  # noqa: S311 - no secret
+    tried, taken = fuzz(name, random.Random(0), lambda count: count < 120)
 
     assert tried == 120
     assert 3 < taken < 90
@@ -44,8 +44,7 @@ def test_the_fuzzer_notices_what_is_wrong(tmp_path):
     """A traceback, an error without the file's name, a warning of NumPy's, hunger for memory."""
 
     def unnamed(_):
-        msg = "something is wrong"
-        raise RefineError(msg)
+        raise RefineError("something is wrong")
 
     for use in (lambda _: int("x"), unnamed, lambda _: np.float32(1e30) * np.float32(1e30)):
         with pytest.raises(Crash):
@@ -92,7 +91,7 @@ def test_splats_of_any_bits_are_pruned_without_a_warning(views, cells, wide):
         try:
             result = prune(splats_from_columns(rows), views, Budget(keep=10))
         except RefineError as error:
-            assert re.match(r"none of the 20 splats can be drawn|no camera sees", str(error))  # noqa: PT017
+            assert re.match(r"none of the 20 splats can be drawn|no camera sees", str(error))
         else:
             assert np.count_nonzero(result.keep) == 10
             assert np.isfinite(result.scores.values).all()

@@ -27,12 +27,12 @@ from refine_addon.core import (
     read_splats,
     score,
 )
-from refine_addon.core.absorbing import absorb as absorbing
-from refine_addon.core.estimate.psnr import psnr_against
 from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.levels import distance
 from refine_addon.core.levels.distance import OriginalPictures
+from refine_addon.core.merging import absorb as absorbing
 from refine_addon.core.pipeline import absorb_splats
+from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.splats import ARRAYS
 
 from .test_cleaning import cameras, wall

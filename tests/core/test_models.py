@@ -8,21 +8,22 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, Splats, View, ViewSet, read_splats
-from refine_addon.core.absorbing import merge_field, merging
-from refine_addon.core.absorbing.absorb import absorb
-from refine_addon.core.absorbing.merge_field import ViewSums
 from refine_addon.core.formats import ply_header
 from refine_addon.core.formats.ply_columns import columns_from_splats
 from refine_addon.core.formats.registry import FORMATS
 from refine_addon.core.levels.files import LevelsRequest, lod_file
 from refine_addon.core.levels.lod import Levels
+from refine_addon.core.merging import field as merge_field
+from refine_addon.core.merging import pairs as merging
+from refine_addon.core.merging.absorb import absorb
+from refine_addon.core.merging.field import ViewSums
 from refine_addon.core.operation.arranged import convert_files
 from refine_addon.core.operation.files import file_to_file
 from refine_addon.core.operation.requests import ConvertRequest, ScoreRequest
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS, MODELS
-from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.cast import hits
 from refine_addon.core.splats import LOG_ZERO, joined, opacity, rotation_matrices, with_model
+from refine_addon.core.visibility import projection
+from refine_addon.core.visibility.cast import hits
 
 
 def cloud(count, seed=0):

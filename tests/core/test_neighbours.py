@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from refine_addon.core.absorbing.neighbours import nearest
+from refine_addon.core.merging.neighbours import nearest
 from refine_addon.core.work import Cancelled
 
 

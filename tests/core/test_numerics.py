@@ -25,11 +25,12 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.absorbing import merge_field, merge_graph
+from refine_addon.core.merging import field as merge_field
+from refine_addon.core.merging import graph as merge_graph
 from refine_addon.core.pipeline import absorb_removed
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
-from refine_addon.core.seeing import points, projection
 from refine_addon.core.splats import ARRAYS, drawable, opacity
+from refine_addon.core.visibility import points, projection
 
 FINITE = [
     *(0.0, -0.0, 1.0, -1.0, 1e-45, 1e-38, -1e-30, 1e-3, 88.0, -88.0, 100.0, -100.0),
@@ -79,8 +80,9 @@ def view(center=(0.0, 0.0, 0.0), **changes) -> View:
     return View(np.eye(3), np.array(center, float), **values | changes)
 
 
-def scored(splats, views=None, settings=Settings("closed-form")):  # noqa: B008 - frozen
+def scored(splats, views=None, settings=None):
     """Score in this thread: NumPy's flags are raised in it alone."""
+    settings = settings or Settings("closed-form")
     views = views or ViewSet((view(), view([0.1, 0, 0])))
     return score(splats, views, settings, threads=1)
 

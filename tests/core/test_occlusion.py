@@ -12,10 +12,10 @@ from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, wor
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.scoring.occlusion import Occlusion
-from refine_addon.core.seeing import froxels, lattices, measuring, projection
-from refine_addon.core.seeing import points as points_module
-from refine_addon.core.seeing.measuring import Measured, Measuring
 from refine_addon.core.splats import ARRAYS, SH_C0, rotation_matrices
+from refine_addon.core.visibility import froxels, lattices, measuring, projection
+from refine_addon.core.visibility import points as points_module
+from refine_addon.core.visibility.measuring import Measured, Measuring
 
 ONCE = Occlusion(rounds=1)
 CUT = 1.0 / 255.0

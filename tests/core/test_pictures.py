@@ -15,10 +15,10 @@ from refine_addon.core import Budget, RefineError, Splats, prune
 from refine_addon.core.picture_files import KINDS, PictureFiles, chosen, in_words
 from refine_addon.core.pictures import AMPLIFIED, Comparison, compare, fitted
 from refine_addon.core.png import png
-from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.cast import cast
-from refine_addon.core.seeing.ray_sample import colors_from
 from refine_addon.core.views import View, ViewSet
+from refine_addon.core.visibility import projection
+from refine_addon.core.visibility.cast import cast
+from refine_addon.core.visibility.ray_sample import colors_from
 from refine_addon.core.work import Cancelled
 
 C0 = 0.28209479177387814

@@ -34,12 +34,12 @@ from refine_addon.core import (
 from refine_addon.core.pipeline import absorb_splats, decide
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.scoring.closed_form_block import LUMA
-from refine_addon.core.seeing import froxels, lattices, points, projection, ray_sums
-from refine_addon.core.seeing.measuring import Measured
-from refine_addon.core.seeing.scene import principal_axes
 from refine_addon.core.selection import rank
 from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
+from refine_addon.core.visibility import froxels, lattices, points, projection, ray_sums
+from refine_addon.core.visibility.measuring import Measured
+from refine_addon.core.visibility.scene import principal_axes
 from tests.strategies import plain_header, ply_of, splat_names
 
 ROOM = Path(__file__).parents[1] / "data/room_small"

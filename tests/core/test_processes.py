@@ -50,8 +50,7 @@ def slow(_number: int) -> None:
 
 def refuse(number: int) -> int:
     if number == 2:
-        message = "broken"
-        raise RefineError(message)
+        raise RefineError("broken")
     return number
 
 
@@ -252,7 +251,7 @@ def test_odd_entries_of_the_path_of_modules_do_not_matter(monkeypatch):
 def test_work_that_no_other_process_can_load_is_done_here(monkeypatch):
     """A module that only this process has, as one that is made while it runs."""
     module = types.ModuleType("made_here")
-    exec("def double(number): return 2 * number", vars(module))  # noqa: S102 - no file has it
+    exec("def double(number): return 2 * number", vars(module))
     module.double.__module__ = "made_here"
     monkeypatch.setitem(sys.modules, "made_here", module)
 

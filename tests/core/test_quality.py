@@ -22,15 +22,15 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.estimate.psnr import psnr_against, psnr_kept, psnr_of, quality_curve
-from refine_addon.core.estimate.quality import PSNR_CAP, SHARES, Quality, absorbed_from
 from refine_addon.core.pipeline import decide
+from refine_addon.core.quality.curve import PSNR_CAP, SHARES, Quality, absorbed_from
+from refine_addon.core.quality.psnr import psnr_against, psnr_kept, psnr_of, quality_curve
 from refine_addon.core.scoring import occlusion
-from refine_addon.core.seeing import cast, projection, ray_sample
-from refine_addon.core.seeing.ray_sample import validation_rays
-from refine_addon.core.seeing.rays import Rays
 from refine_addon.core.splats import opacity
 from refine_addon.core.task import Task
+from refine_addon.core.visibility import cast, projection, ray_sample
+from refine_addon.core.visibility.ray_sample import validation_rays
+from refine_addon.core.visibility.rays import Rays
 from tests.core.test_invariance import MOTIONS, moved
 from tests.core.test_occlusion import cloud, look_along_z, ring, splats_of
 

@@ -12,13 +12,13 @@ import pytest
 
 from refine_addon import core
 from refine_addon.core import ViewSet, processes, spherical_harmonics
-from refine_addon.core.refitting import linear, refit, round_rays, stored
+from refine_addon.core.refit import linear, refit, round_rays, stored
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS
-from refine_addon.core.seeing import cast as casting
-from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.cast import cast, cast_visible, pixels
-from refine_addon.core.seeing.ray_sample import colors_from
 from refine_addon.core.splats import rotation_matrices, with_model
+from refine_addon.core.visibility import cast as casting
+from refine_addon.core.visibility import projection
+from refine_addon.core.visibility.cast import cast, cast_visible, pixels
+from refine_addon.core.visibility.ray_sample import colors_from
 from refine_addon.core.work import Cancelled, silent
 from tests.core.test_invariance import moved, rotation
 from tests.core.test_occlusion import cloud, ring
@@ -292,8 +292,9 @@ def test_a_ray_counts_as_much_with_its_error_as_with_its_derivatives(monkeypatch
     """Half as much with both: half of the errors, a quarter of J'r and of the diagonal."""
     found = {}
     for trust in (1.0, 0.5):
-        every = lambda errors, trust=trust: np.full(errors.shape[1], trust, np.float32)  # noqa: E731
-        monkeypatch.setattr(linear, "_trust", every)
+        monkeypatch.setattr(
+            linear, "_trust", lambda errors, t=trust: np.full(errors.shape[1], t, np.float32)
+        )
         found[trust] = linear_of(few(), ring()[0])
 
     whole, half = found[1.0], found[0.5]
@@ -567,7 +568,7 @@ def test_a_process_maps_the_harmonics_of_splats_that_lie_channel_by_channel():
     told = pickle.dumps(target, protocol=5, buffer_callback=arrays.append)
 
     assert len(told) < 10_000
-    again = pickle.loads(told, buffers=arrays)  # noqa: S301 - our own
+    again = pickle.loads(told, buffers=arrays)
     hit, view = np.arange(0, len(gaussians), 3), ring(2)[0]
     np.testing.assert_array_equal(again.colors(hit, view), target.colors(hit, view))
 

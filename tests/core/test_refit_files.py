@@ -25,13 +25,13 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
 )
-from refine_addon.core.estimate.psnr import psnr_against
 from refine_addon.core.pipeline import decide
-from refine_addon.core.refitting.refit import Refit
-from refine_addon.core.refitting.round_rays import RoundRays
-from refine_addon.core.seeing.ray_sample import validation_rays
+from refine_addon.core.quality.psnr import psnr_against
+from refine_addon.core.refit.refit import Refit
+from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
+from refine_addon.core.visibility.ray_sample import validation_rays
 from refine_addon.core.work import Cancelled
 from tests.strategies import ply_of
 

@@ -69,7 +69,7 @@ def reports(command):
 
 
 @pytest.mark.parametrize("command", RUNS)
-def test_every_key_of_a_report_is_in_the_reference(files, monkeypatch, command):  # noqa: F811
+def test_every_key_of_a_report_is_in_the_reference(files, monkeypatch, command):
     """And every key that the reference has for the command is written by one of its runs.
 
     Without a curve `quality` itself is null.
@@ -90,7 +90,7 @@ def test_every_key_of_a_report_is_in_the_reference(files, monkeypatch, command):
     assert [key for key in keys if len(missing(found, [key])) == len(found)] == []
 
 
-def test_an_input_that_fails_has_three_keys(files, monkeypatch):  # noqa: F811
+def test_an_input_that_fails_has_three_keys(files, monkeypatch):
     """As the reference says."""
     monkeypatch.chdir(files)
     assert main(["info", "nothing.ply", "--report", "report.json", "--quiet"]) == 1

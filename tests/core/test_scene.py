@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from refine_addon.core import View, ViewSet
-from refine_addon.core.seeing import scene
-from refine_addon.core.seeing.scene import scene_of
+from refine_addon.core.visibility import scene
+from refine_addon.core.visibility.scene import scene_of
 
 LENS = {"fx": 50.0, "fy": 50.0, "cx": 50.0, "cy": 50.0, "width": 100, "height": 100}
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import Budget, RefineError, Scores, rank, select
-from refine_addon.core.estimate.quality import Quality
+from refine_addon.core.quality.curve import Quality
 from refine_addon.core.scores import shares_gone
 from refine_addon.core.selection import Tally
 from tests.strategies import masks, scores

@@ -186,8 +186,7 @@ def test_a_storage_that_fails_leaves_what_is_done(folder, memory, views, monkeyp
     def failing(self, source, target, **options):
         sent.append(target)
         if len(sent) == 2:
-            msg = "the line is dead"
-            raise ConnectionError(msg)
+            raise ConnectionError("the line is dead")
         return put(self, source, target, **options)
 
     monkeypatch.setattr(type(memory), "put_file", failing)
@@ -209,8 +208,7 @@ def test_a_storage_that_cannot_be_written_to_is_known_at_once(memory, views, mon
     """Before anything is scored."""
 
     def refused(_self, _path, _value, **_options):
-        msg = "read-only"
-        raise PermissionError(msg)
+        raise PermissionError("read-only")
 
     monkeypatch.setattr(type(memory), "pipe_file", refused)
     monkeypatch.setattr(units.Unit, "take", None)
@@ -255,8 +253,7 @@ def test_a_storage_that_only_sends_whole_files_is_refused(memory, monkeypatch):
     class Stream(io.BytesIO):
         def seek(self, place, _whence=0):
             if place:
-                msg = "no ranges"
-                raise ValueError(msg)
+                raise ValueError("no ranges")
 
     opened = Stream(memory.cat_file("/in/a.ply"))
     monkeypatch.setattr(type(memory), "open", lambda *_given, **_options: opened)

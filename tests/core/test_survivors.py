@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Splats, read_ply, survivor_columns
-from refine_addon.core.absorbing.absorb import Absorbed
 from refine_addon.core.affine import transformed
 from refine_addon.core.formats import ply_write
 from refine_addon.core.formats.ply_columns import values_by_name
+from refine_addon.core.merging.absorb import Absorbed
 from refine_addon.core.splats import ARRAYS
 from tests.strategies import plain_ply
 

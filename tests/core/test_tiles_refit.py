@@ -19,17 +19,17 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
 )
-from refine_addon.core.estimate.psnr import psnr_against
-from refine_addon.core.refitting import round_rays
-from refine_addon.core.refitting.refit import Refit
-from refine_addon.core.refitting.round_rays import Window
+from refine_addon.core.quality.psnr import psnr_against
+from refine_addon.core.refit import round_rays
+from refine_addon.core.refit.refit import Refit
+from refine_addon.core.refit.round_rays import Window
 from refine_addon.core.scoring import closed_form
-from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.cast import cast
-from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import joined
 from refine_addon.core.tiles import absorbing, gaussians, refitting, units
 from refine_addon.core.views import ViewSet
+from refine_addon.core.visibility import projection
+from refine_addon.core.visibility.cast import cast
+from refine_addon.core.visibility.ray_sample import validation_rays
 from tests.strategies import plain_header, splat_names
 from tests.tiles import COUNT, ROOM, cut, room_rows, told_by_plan, write
 

@@ -21,10 +21,8 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
 )
-from refine_addon.core.estimate.psnr import psnr_against
+from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.scoring import closed_form
-from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import joined
 from refine_addon.core.tiles import absorbing, gaussians, seeing, units
 from refine_addon.core.tiles.folder import Folder
@@ -32,6 +30,8 @@ from refine_addon.core.tiles.gaussians import SceneContext
 from refine_addon.core.tiles.seeing import StoredRays
 from refine_addon.core.tiles.workers import InProcess, Runner
 from refine_addon.core.views import ViewSet
+from refine_addon.core.visibility import projection
+from refine_addon.core.visibility.ray_sample import validation_rays
 from tests.strategies import plain_header, splat_names
 from tests.tiles import COUNT, ROOM, cut, room_rows, told_by_plan, write
 
@@ -64,7 +64,7 @@ def views():
 
 
 @pytest.fixture
-def tiles(tmp_path, rows, small):  # noqa: ARG001 - set before
+def tiles(tmp_path, rows, small):
     """Write the rows as four files, and as one."""
     write(tmp_path / "whole.ply", rows)
     return cut(tmp_path, rows)

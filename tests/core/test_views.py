@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, View, ViewSet
-from refine_addon.core.seeing.frustum import census
+from refine_addon.core.visibility.frustum import census
 
 
 def view(center=(0.0, 0.0, 0.0), **changes) -> View:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Budget, Settings, ViewSet, prune, with_views_between
-from refine_addon.core.estimate.psnr import psnr_kept
-from refine_addon.core.estimate.quality import Quality
+from refine_addon.core.quality.curve import Quality
+from refine_addon.core.quality.psnr import psnr_kept
 from refine_addon.core.views_between import views_between
 from tests.core.test_invariance import MOTIONS, moved
 from tests.core.test_occlusion import splats_of

@@ -64,8 +64,7 @@ def test_an_error_stops_the_chunks_that_run(threads):
             endless(piece)
         elif threads > 1:
             running.wait()
-        message = "broken"
-        raise ValueError(message)
+        raise ValueError("broken")
 
     start = time.monotonic()
 

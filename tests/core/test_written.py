@@ -11,8 +11,8 @@ import pytest
 from refine_addon.command import main
 from refine_addon.core import Budget, PruneRequest, Settings, prune_file, read_splats
 from refine_addon.core.affine import transformed
-from refine_addon.core.estimate.psnr import psnr_against
 from refine_addon.core.operation.written import written_facts
+from refine_addon.core.quality.psnr import psnr_against
 
 from .test_cleaning import cameras, wall
 from .test_command_clean import files  # noqa: F401 - a fixture
@@ -112,7 +112,7 @@ def test_a_file_in_another_frame_is_moved_to_that_of_the_views(source, tmp_path)
 
 
 @pytest.mark.slow
-def test_the_command_says_it(files, capsys):  # noqa: F811
+def test_the_command_says_it(files, capsys):
     """On the line of the quality, and in the report."""
     told = files / "report.json"
     code = main([

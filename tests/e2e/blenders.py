@@ -221,6 +221,7 @@ def _run(
                 raise
             printed = process.communicate()
             last = "\n".join("".join(printed).splitlines()[-80:])
-            message = f"{Path(words[0]).name} was ended after {patience:.0f} s:\n{last}"
-            raise StepError(message) from None
+            raise StepError(
+                f"{Path(words[0]).name} was ended after {patience:.0f} s:\n{last}"
+            ) from None
     return subprocess.CompletedProcess(words, process.returncode, *printed)

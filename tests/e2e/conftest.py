@@ -11,18 +11,15 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 # The harness and the tools it stands on are modules of the tests, not of the package.
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2] / ".ci")]
 
-from blenders import (  # noqa: E402
+from blenders import (
     BINARIES,
     MODULES,
     PROJECT,

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import plyfile
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def rows(path: Path) -> np.ndarray:

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import re
 import signal
-from typing import TYPE_CHECKING
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
-from blenders import without_blender
+from blenders import Binary, Blender, without_blender
 from PIL import Image
 from splat_rows import rows, rows_in
-
-if TYPE_CHECKING:
-    import subprocess
-    from pathlib import Path
-
-    from blenders import Binary, Blender
 
 
 def refine(binary: Binary, *words: str | Path) -> subprocess.CompletedProcess[str]:

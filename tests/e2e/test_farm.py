@@ -6,15 +6,11 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-from blenders import PROJECT
+from blenders import PROJECT, Binary
 
 from refine_addon.core import read_ply
-
-if TYPE_CHECKING:
-    from blenders import Binary
 
 OPENJD = Path(sys.executable).with_name("openjd")
 

@@ -5,13 +5,9 @@ from __future__ import annotations
 import tomllib
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-from blenders import PROJECT
-
-if TYPE_CHECKING:
-    from blenders import Binary, Blender
+from blenders import PROJECT, Binary, Blender
 
 MANIFEST = tomllib.loads((PROJECT / "blender_manifest.toml").read_text(encoding="utf-8"))
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
+from blenders import Blender
 from splat_rows import rows, rows_in
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from blenders import Blender
 
 
 def test_import_score_apply_export(blender: Blender, cloud: Path, cameras: Path, pruned: Path):

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
-from blenders import PROJECT
+from blenders import PROJECT, Binary
 from PIL import Image
 
 from benchmarks.renderer.rasterizer import render
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.formats.ply import read_ply
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from blenders import Binary
 
 PICTURES = PROJECT / "build" / "e2e"
 

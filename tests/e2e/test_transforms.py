@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+from blenders import Binary, Blender
 from view_pictures import fewer, psnr, view_in
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from blenders import Binary, Blender
 
 KEPT = {
     *("apply mended", "undo", "redo", "baked", "duplicate", "linked duplicate", "single user"),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
-from blenders import PROJECT
+from blenders import PROJECT, Binary
 from PIL import Image
 from view_pictures import fewer, psnr, reference, view_in
 
@@ -17,11 +17,6 @@ from benchmarks.tables.million import write_ply
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.splats import joined
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from blenders import Binary
 
 PICTURES = PROJECT / "docs" / "walk"
 TAKEN = PROJECT / "build" / "e2e"

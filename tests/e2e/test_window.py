@@ -5,23 +5,18 @@ from __future__ import annotations
 import math
 import shutil
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
+from blenders import Binary
 from view_pictures import psnr, reference, view_in
 
 from benchmarks.tables.models import version
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.formats.ply_columns import columns_from_splats
 from refine_addon.core.formats.ply_header import new_header, with_model
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from blenders import Binary
-
-    from refine_addon.core.rendering import Model
+from refine_addon.core.rendering import Model
 
 
 def test_score_apply_and_undo_by_hand(binary: Binary, blend: Path):

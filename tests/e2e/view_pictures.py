@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -10,9 +11,6 @@ from PIL import Image
 from benchmarks.renderer.rasterizer import render
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.views import View
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def fewer(cloud: Path, folder: Path) -> Path:

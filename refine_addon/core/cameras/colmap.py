@@ -13,8 +13,10 @@ import codecs
 import mmap
 import struct
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -24,11 +26,6 @@ from ..splats import rotation_matrices
 from ..views import View, ViewSet
 from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
 from .place import CameraPlace, is_file
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
 
 SUFFIXES = (".bin", ".txt")
 """Binary files are preferred, as in COLMAP itself."""
@@ -308,7 +305,7 @@ def _text_images(path: Path) -> list[Image]:
         image_id = _whole(where, "IMAGE_ID", fields[0])
         camera_id = _whole(where, "CAMERA_ID", fields[8])
         images.append(_image(where, image_id, pose, camera_id, fields[9]))
-        place, points = next(lines, (place, b""))  # noqa: PLW2901 - an image takes two lines
+        place, points = next(lines, (place, b""))
         if len(points) < SHORT_LINE and len(points.split()) % 3:
             place.fail(
                 f"expected the points of image row {len(images) - 1} as X, Y, POINT3D_ID each "

@@ -16,21 +16,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..views import ORTHONORMAL, View, ViewSet
 from .image_size import image_size
 from .lenses import FISHEYE624, MODELS_BY_NAME, PANORAMAS, Model, counted, lens_note
 from .place import CameraPlace, is_file, is_folder, read_json
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
 
 DATAPARSER_FILE = "dataparser_transforms.json"
 
@@ -135,7 +132,7 @@ class _Entry:
         """
         place = self.at("transform_matrix")
         matrix = place.matrix(self.frame["transform_matrix"], (3, 4), 4)
-        if len(matrix) > 3 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:  # noqa: PLR2004
+        if len(matrix) > 3 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
             place.at("row 3").fail(f"expected [0, 0, 0, 1], got {matrix[3].tolist()}")
         axes, scale = _without_scale(place, matrix[:3, :3])
         if abs(scale - 1) > ORTHONORMAL:

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import stat
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..foreign_files import foreign_kind, refuse_pointer
 from ..place import LARGEST_NUMBER, Place, described
 from ..views import View, is_orthonormal
 from ..whole_file import mode_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 SMALLEST_LENGTH = 1e-6
 """Smallest focal length (pixels) or scale."""

@@ -7,7 +7,7 @@ place in the file. Nothing that would move a camera is guessed.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -17,9 +17,6 @@ from ..whole_file import expanded
 from .colmap import MODEL_FILES, SUFFIXES, find_colmap, read_colmap
 from .nerfstudio import read_transforms
 from .place import CameraPlace, exists, is_file, is_folder, read_json
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 """Keys that every camera of a ``cameras.json`` must have."""

@@ -13,22 +13,18 @@ Only the second step decides. A splat with nothing behind it, such as one of a s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..seeing import projection
-from ..splats import among_all, refuse_undrawable
+from ..splats import Splats, among_all, refuse_undrawable
+from ..views import ViewSet
+from ..visibility import projection
 from ..volumes import refuse_all
 from ..work import Progress, part, silent
 from .search import Search
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from ..views import ViewSet
 
 Sums = TypeVar("Sums")
 
@@ -63,22 +59,14 @@ class Cleaning:
     views: int = 64
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            If there is no such reason, or the number of views is negative.
-        """
+        """Check the values."""
         object.__setattr__(self, "reasons", tuple(self.reasons))
         unknown = [reason for reason in self.reasons if reason not in REASONS]
         if unknown or not self.reasons:
             got = repr(unknown[0]) if unknown else "none"
-            msg = f"reason is {got}, expected some of {', '.join(REASONS)}"
-            raise RefineError(msg)
+            raise RefineError(f"reason is {got}, expected some of {', '.join(REASONS)}")
         if self.views < 0:
-            msg = f"views is {self.views}, expected 0 (all) or more"
-            raise RefineError(msg)
+            raise RefineError(f"views is {self.views}, expected 0 (all) or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +155,7 @@ class Cleaned:
         return [f"{self.undrawable} splats cannot be drawn: no view shows them, and they stay"]
 
 
-def clean(  # noqa: PLR0913 - as `pipeline.prune`
+def clean(
     splats: Splats,
     views: ViewSet,
     settings: Cleaning = Cleaning(),
@@ -225,8 +213,7 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
     by_reason = {name: search.of_all(mask) & may_go for name, mask in reasons.items()}
     keep = ~np.any([by_reason[name] for name in settings.reasons], axis=0)
     if len(splats) and not keep.any():
-        msg = f"cleaning would remove all {len(splats)} splats; nothing was removed"
-        raise RefineError(msg)
+        raise RefineError(f"cleaning would remove all {len(splats)} splats; nothing was removed")
     return Cleaned(
         keep, by_reason, search.of_all(search.evidence.past.astype(np.int32)),
         search.of_all(search.seen.astype(np.int32)), search.of_all(search.sure.astype(np.float32)),

@@ -7,14 +7,12 @@ those left out.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .clusters import connected
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 VIEW_PARTS = 4
 """So many groups of views are asked whether they agree on a clump."""

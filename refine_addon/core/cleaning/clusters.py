@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
-from ..absorbing.neighbours import nearest
+from ..merging.neighbours import nearest
+from ..visibility.projection import Gaussians
 from ..work import Progress, silent
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..seeing.projection import Gaussians
 
 NEIGHBOURS = 8
 """How many near neighbours of a splat are tested for whether they touch it."""

@@ -9,28 +9,23 @@ vouches for itself.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..seeing import projection
-from ..seeing.measuring import VIEW_GROUPS
+from ..splats import Splats
+from ..views import View, ViewSet
+from ..visibility import projection
+from ..visibility.measuring import VIEW_GROUPS
+from ..visibility.projection import Gaussians
+from ..visibility.scene import Scene
 from ..work import Progress, for_chunks, part
 from .clumps import VIEW_PARTS, Looks, judge
 from .clusters import cluster_sizes, touching
-from .support import Evidence, Support, hits_of_view
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from ..seeing.projection import Gaussians
-    from ..seeing.scene import Scene
-    from ..splats import Splats
-    from ..views import View, ViewSet
-    from .support import ViewHits
+from .support import Evidence, Support, ViewHits, hits_of_view
 
 Sums = TypeVar("Sums")
 
@@ -254,12 +249,11 @@ class Search:
         for support in self._in_groups(of_group, progress, "casting rays"):
             total.merge(support)
         if count and not total.width.any():
-            msg = (
+            raise RefineError(
                 f"no camera sees the splats: none of {count} that show is hit by a ray of "
                 f"any of {len(self.views)} views; check that cameras and splats share "
                 "their frame and unit"
             )
-            raise RefineError(msg)
         return total
 
     def _aim(

@@ -16,23 +16,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..seeing import projection
-from ..seeing.cast import aimed, cast, depth_complexity, pixels
-from ..seeing.ray_sums import in_front
-
-if TYPE_CHECKING:
-    from typing import Self
-
-    from numpy.typing import NDArray
-
-    from ..seeing.projection import Footprints, Gaussians
-    from ..seeing.rays import Rays
-    from ..seeing.scene import Scene
-    from ..views import View
+from ..views import View
+from ..visibility import projection
+from ..visibility.cast import aimed, cast, depth_complexity, pixels
+from ..visibility.projection import Footprints, Gaussians
+from ..visibility.ray_sums import in_front
+from ..visibility.rays import Rays
+from ..visibility.scene import Scene
 
 RAYS = 2500
 """Rays of a view."""

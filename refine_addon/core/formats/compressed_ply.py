@@ -10,14 +10,16 @@ are near each other and their ranges small.
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 import plyfile
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..rendering import MODELS
-from ..splats import SH_C0, above_constant, opacity, opacity_logits, unit_quaternions
+from ..splats import SH_C0, Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
     Format,
     Sizes,
@@ -40,14 +42,6 @@ from .ply_header import (
     shown,
     with_model,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import BinaryIO
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
 
 NAME = "compressed PLY"
 
@@ -96,8 +90,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     """
     header = read_header(path, io.BytesIO(data[:HEADER_LIMIT].tobytes()))
     if header.order == TEXT:
-        msg = f"{path}: a compressed PLY in ASCII, expected a binary one"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: a compressed PLY in ASCII, expected a binary one")
     body = data[len(header.raw) :]
     check_counts(header, len(body))
     elements = _elements(header, body)
@@ -109,8 +102,9 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         _expect(path, "chunk", chunks, _COLOR, "f4")
     needed = -(-len(packed) // SPLATS)
     if len(chunks) < needed:
-        msg = f"{path}: {len(chunks)} chunks, expected {needed} for {len(packed)} splats"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: {len(chunks)} chunks, expected {needed} for {len(packed)} splats"
+        )
     rest = _rest(path, elements, len(packed))
     degree = REST_COUNTS[rest.shape[1]]
     file, splats = new_file(
@@ -137,8 +131,9 @@ def _elements(header: Header, body: NDArray[np.uint8]) -> dict[str, NDArray[Any]
     elements, at = {}, 0
     for element, count in zip(header.elements, header.counts, strict=True):
         if any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties):
-            msg = f"{header.path}: element {shown(element.name)} has a list, expected numbers"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{header.path}: element {shown(element.name)} has a list, expected numbers"
+            )
         kind = np.dtype(element.dtype(header.order))
         # All these bytes are there: without lists, the size that `check_counts` tests is exact.
         end = at + count * kind.itemsize
@@ -149,8 +144,7 @@ def _elements(header: Header, body: NDArray[np.uint8]) -> dict[str, NDArray[Any]
 
 def _named(path: Path, elements: dict[str, NDArray[Any]], name: str) -> NDArray[Any]:
     if name not in elements:
-        msg = f"{path}: a compressed PLY without an element '{name}'"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: a compressed PLY without an element '{name}'")
     return elements[name]
 
 
@@ -161,8 +155,9 @@ def _expect(
     for name in names:
         stored = rows.dtype[name].str[1:] if name in (rows.dtype.names or ()) else "none"
         if stored != kind:
-            msg = f"{path}: element '{element}': property '{name}' is {stored}, expected {kind}"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{path}: element '{element}': property '{name}' is {stored}, expected {kind}"
+            )
 
 
 def _rest(path: Path, elements: dict[str, NDArray[Any]], count: int) -> NDArray[np.uint8]:
@@ -172,11 +167,10 @@ def _rest(path: Path, elements: dict[str, NDArray[Any]], count: int) -> NDArray[
         return np.empty((count, 0), np.uint8)
     names = tuple(f"f_rest_{index}" for index in range(len(rows.dtype.names or ())))
     if len(rows) != count or len(names) not in REST_COUNTS:
-        msg = (
+        raise RefineError(
             f"{path}: element 'sh' has {len(rows)} rows of {len(names)} properties, expected "
             f"{count} rows of 9, 24, 45 or 72"
         )
-        raise RefineError(msg)
     _expect(path, "sh", rows, names, "u1")
     table = rows.view(np.uint8).reshape(count, len(names))
     if rows.dtype.names == names:

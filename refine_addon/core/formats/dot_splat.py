@@ -6,22 +6,16 @@ signature and are known by their name alone.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..splats import SH_C0, base_color, opacity, opacity_logits, scales, unit_quaternions
+from ..splats import SH_C0, Splats, base_color, opacity, opacity_logits, scales, unit_quaternions
 from .format import Format, Sizes, codes, new_file, pieces
 from .ply import Origin, SplatFile
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import BinaryIO
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
 
 NAME = ".splat"
 
@@ -49,11 +43,10 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     size = _ROW.itemsize
     count, beyond = divmod(len(data), size)
     if beyond:
-        msg = (
+        raise RefineError(
             f"{path}: truncated: splat {count} at byte {count * size} has {beyond} bytes, "
             f"expected {size}"
         )
-        raise RefineError(msg)
     stored = data.view(_ROW)
     file, splats = new_file(path, Origin(NAME, len(data)), count, 0)
     # Scales that are 0 or no sizes at all become logarithms that are not finite, as in a PLY.

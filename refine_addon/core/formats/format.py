@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..rendering import MODELS
-from ..seeing.scene import spatial_order
+from ..rendering import MODELS, Model
+from ..splats import Splats
+from ..visibility.scene import spatial_order
 from ..work import chunks
 from .ply import Origin, SplatFile
 from .ply_columns import empty_rows
 from .ply_header import new_header, with_model
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-    from typing import BinaryIO
-
-    from numpy.typing import NDArray
-
-    from ..rendering import Model
-    from ..splats import Splats
 
 CHUNK = 1 << 15
 """Splats that are converted at a time: 8 MB at degree 3. A multiple of `compressed_ply.SPLATS`."""
@@ -132,8 +126,9 @@ def codes(shares: NDArray[Any]) -> NDArray[np.uint8]:
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
     """Raise `RefineError` if a file of `available` bytes is too short for what it announces."""
     if needed > available:
-        msg = f"{path}: truncated: {what} need {needed} bytes, the file has {available}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: truncated: {what} need {needed} bytes, the file has {available}"
+        )
 
 
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

@@ -8,14 +8,17 @@ about z into each other, which changes signs only. What nodes do to a primitive 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..affine import transformed
 from ..errors import RefineError
-from ..place import described
+from ..place import Place, described
 from ..splats import (
     ARRAYS,
     SINGLE_MARGIN,
@@ -41,15 +44,6 @@ from .glb_document import (
     opened,
 )
 from .ply import Origin, SplatFile
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
-    from typing import BinaryIO
-
-    from numpy.typing import NDArray
-
-    from ..place import Place
 
 NAME = "GLB"
 EXTENSION = "KHR_gaussian_splatting"
@@ -85,8 +79,9 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     document = opened(path, data)
     meshes = _shown(document, len(data))
     if not meshes:
-        msg = f"{path}: no splats: no node of its scene shows a primitive with {EXTENSION}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: no splats: no node of its scene shows a primitive with {EXTENSION}"
+        )
     count = sum(len(mesh) * len(mesh.nodes) for mesh in meshes)
     degree = max(mesh.degree for mesh in meshes)
     file, splats = new_file(path, Origin(f"{NAME} with {EXTENSION}", len(data)), count, degree)
@@ -164,7 +159,7 @@ def _matrix(node: dict[str, Any], place: Place) -> NDArray[np.float64]:
     return matrix
 
 
-def _refuse_unread(extension: Any, place: Place) -> None:  # noqa: ANN401 - from JSON
+def _refuse_unread(extension: Any, place: Place) -> None:
     """Refuse splats of another kernel, and compressed ones."""
     held = extension if isinstance(extension, dict) else {}
     kernel = held.get("kernel", "ellipse")
@@ -380,8 +375,9 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         body = len(splats) * sum(attribute.row for attribute in attributes)
         total = HEADER.size + 2 * CHUNK.size + len(text) + body
         if total > _LONGEST:
-            msg = f"{len(splats)} splats are {total} bytes as {NAME}, which holds {_LONGEST}"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{len(splats)} splats are {total} bytes as {NAME}, which holds {_LONGEST}"
+            )
         stream.write(HEADER.pack(MAGIC, VERSION, total) + CHUNK.pack(len(text), JSON) + text)
         stream.write(CHUNK.pack(body, BINARY))
         for attribute in attributes:

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..place import Place, described, is_whole
 from .format import refuse_short
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 HEADER = struct.Struct("<4sII")
 """Magic, version, bytes of all."""
@@ -49,7 +46,7 @@ class Document:
     content: dict[str, Any]
     binary: NDArray[np.uint8]
 
-    def item(self, group: str, index: Any, place: Place) -> tuple[dict[str, Any], Place]:  # noqa: ANN401
+    def item(self, group: str, index: Any, place: Place) -> tuple[dict[str, Any], Place]:
         """Return an item of a list such as ``nodes``, and its place; `place` names the index."""
         items = self.content.get(group, [])
         count = len(items) if isinstance(items, list) else 0
@@ -58,7 +55,7 @@ class Document:
         where = self.place.at(f"{group}[{index}]")
         return where.members(items[index]), where
 
-    def accessor(self, index: Any, place: Place, width: int) -> NDArray[Any]:  # noqa: ANN401
+    def accessor(self, index: Any, place: Place, width: int) -> NDArray[Any]:
         """Return the values of an accessor, (n, width): numbers as they are stored.
 
         Raises
@@ -88,7 +85,7 @@ class Document:
             (count, width), dtype, self.binary.data, start + offset, (stride, dtype.itemsize)
         )
 
-    def _buffer_view(self, index: Any, place: Place) -> tuple[int, int, int]:  # noqa: ANN401
+    def _buffer_view(self, index: Any, place: Place) -> tuple[int, int, int]:
         """Return first byte, bytes and stride (0: none is given) of a part of the binary chunk."""
         view, place = self.item("bufferViews", index, place)
         buffer, _ = self.item("buffers", view.get("buffer"), place)
@@ -121,8 +118,7 @@ def opened(path: Path, data: NDArray[np.uint8]) -> Document:
     refuse_short(path, HEADER.size + CHUNK.size, len(data), "the first bytes of a GLB file")
     _, version, length = HEADER.unpack(data[: HEADER.size].tobytes())
     if version != VERSION:
-        msg = f"{path}: glTF version {version}, expected {VERSION}"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: glTF version {version}, expected {VERSION}")
     refuse_short(path, length, len(data), "all chunks")
     chunks: dict[bytes, NDArray[np.uint8]] = {}
     at = HEADER.size

@@ -9,16 +9,13 @@ from __future__ import annotations
 import importlib
 import io
 import warnings
-from typing import TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 
 class Codec(Protocol):
@@ -92,5 +89,6 @@ def codec_for(path: Path) -> Codec:
     try:
         return _Pillow()
     except ImportError as error:
-        msg = f"{path}: WebP images need a library: run this in Blender, or 'pip install pillow'"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"{path}: WebP images need a library: run this in Blender, or 'pip install pillow'"
+        ) from error

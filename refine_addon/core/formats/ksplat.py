@@ -8,23 +8,18 @@ float16. The files have no signature and are known by their name alone.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..place import Place
-from ..splats import SH_C0, above_constant, opacity_logits, unit_quaternions
+from ..splats import SH_C0, Splats, above_constant, opacity_logits, unit_quaternions
 from .format import Reader, new_file, pieces, refuse_short
 from .ply import Origin, SplatFile
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
 
 NAME = ".ksplat"
 
@@ -151,7 +146,7 @@ def _sections(path: Path, data: NDArray[np.uint8], header: _Header) -> Iterator[
             place.fail(f"harmonics of degree {section.degree}, expected 0 to {_DEGREES - 1}")
         if section.splats > section.room:
             place.fail(f"{section.splats} splats, expected at most {section.room}, its room")
-        if header.level and section.bucket_bytes != 12:  # noqa: PLR2004 - three float32
+        if header.level and section.bucket_bytes != 12:
             place.fail(f"{section.bucket_bytes} bytes of a bucket, expected 12")
         start += section.before_rows + header.row(section.degree).itemsize * section.room
         refuse_short(path, start, len(data), f"section {number} and what is before it")
@@ -205,7 +200,7 @@ def _buckets(
 def _harmonics(stored: NDArray[Any], header: _Header) -> NDArray[Any]:
     """Return harmonics (n, K, 3): each band is stored red, then green, then blue."""
     values = stored.astype(np.float32)
-    if header.level == 2:  # noqa: PLR2004 - 8 bits between two ends
+    if header.level == 2:
         low, high = np.float32(header.least), np.float32(header.largest)
         values = low + values / np.float32(255.0) * (high - low)
     bands: list[NDArray[np.float32]] = []

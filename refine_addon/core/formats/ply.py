@@ -8,15 +8,20 @@ from __future__ import annotations
 
 import mmap
 import stat
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 import plyfile
+from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..rendering import MODELS, Model
+from ..splats import Splats
 from ..splats import with_model as drawn_as
+from ..urls import Url
 from ..whole_file import expanded, refuse_mapped, whole_file
 from .ply_body import check_counts, read_text, vertex_range
 from .ply_columns import (
@@ -38,15 +43,6 @@ from .ply_header import (
     with_properties,
 )
 from .ply_write import declarations, longest_line, text_lines, write_rows
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from ..urls import Url
 
 __all__ = [
     "REQUIRED",
@@ -195,11 +191,11 @@ class SplatFile:
         if model is None or model == self.model:
             return self
         if model not in MODELS:
-            msg = f"model is {model!r}, expected one of {', '.join(MODELS)}"
-            raise RefineError(msg)
+            raise RefineError(f"model is {model!r}, expected one of {', '.join(MODELS)}")
         if THIRD_SCALE not in (self.rows.dtype.names or ()):
-            msg = f"{self.path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{self.path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
+            )
         return replace(self, header=with_model(self.header, model))
 
     def without_third_scale(self) -> SplatFile:
@@ -254,11 +250,10 @@ class SplatFile:
         """
         path, columns = expanded(path), columns or {}
         if keep is not None and (keep.shape != self.rows.shape or keep.dtype != np.bool_):
-            msg = (
+            raise RefineError(
                 f"{self.path}: keep is {keep.dtype} {keep.shape}, "
                 f"expected one bool for each of {len(self)} splats"
             )
-            raise RefineError(msg)
         header = self._new_header(keep, columns)
         if self.lines is None and not self.rows.flags.writeable:
             refuse_mapped(path, self.path)
@@ -330,14 +325,14 @@ def _mapped(path: Path) -> tuple[Header, int, NDArray[np.uint8]]:
     """Return a file's header, which of its elements are splats, and its body, mapped."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for a writer
-            msg = f"{path}: is a {'folder' if path.is_dir() else 'device'}, expected a PLY file"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{path}: is a {'folder' if path.is_dir() else 'device'}, expected a PLY file"
+            )
         with path.open("rb") as stream:
             header, vertex = splat_header(path, stream)
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be read ({reason_of(error)})"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error
     return header, vertex, np.frombuffer(whole, np.uint8)[len(header.raw) :]
 
 
@@ -359,11 +354,10 @@ def _vertex_index(header: Header) -> int:
     """Return the index of the vertex element; refuse files without one."""
     names = [element.name for element in header.elements]
     if "vertex" not in names:
-        msg = (
+        raise RefineError(
             f"{header.path}: not a splat file: expected an element 'vertex', "
             f"got {_listed(names) or 'none'}"
         )
-        raise RefineError(msg)
     return names.index("vertex")
 
 
@@ -379,36 +373,33 @@ def _check_properties(header: Header, vertex: int) -> None:
         for prop in header.elements[vertex].properties
     }
     if "packed_position" in kinds:
-        msg = (
+        raise RefineError(
             f"{header.path}: a compressed splat PLY, which 'refine convert IN OUT.ply' makes a "
             "plain one of"
         )
-        raise RefineError(msg)
     missing = [name for name in REQUIRED if name not in kinds]
     if missing and missing != [THIRD_SCALE]:
         present = _listed([*kinds])
         present += ", ..." if len(kinds) > _NAMES_SHOWN else ""
-        msg = (
+        raise RefineError(
             f"{header.path}: {_guess(header, kinds)}: vertex lacks {', '.join(missing)} "
             f"(it has {present or 'no property'})"
         )
-        raise RefineError(msg)
     rest = [name for name in kinds if name.startswith("f_rest_")]
     if len(rest) not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(len(rest))):
-        msg = (
+        raise RefineError(
             f"{header.path}: found {len(rest)} f_rest properties, "
             "expected f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
         )
-        raise RefineError(msg)
     for name, kind in kinds.items():
         if kind == "list":
-            msg = f"{header.path}: property {shown(name)} is a list, expected one number a splat"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{header.path}: property {shown(name)} is a list, expected one number a splat"
+            )
         if kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
-            msg = (
+            raise RefineError(
                 f"{header.path}: property {shown(name)} is of type {kind}, expected float or double"
             )
-            raise RefineError(msg)
 
 
 def _guess(header: Header, kinds: Mapping[str, str]) -> str:

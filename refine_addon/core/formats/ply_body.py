@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import struct
 import warnings
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import plyfile
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from .ply_header import TEXT, Header, shown
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 
 def check_counts(header: Header, available: int) -> None:
@@ -37,19 +34,19 @@ def check_counts(header: Header, available: int) -> None:
     for element, count in zip(header.elements, header.counts, strict=True):
         row = _least_bytes(element, text=text)
         if not row and count:
-            msg = f"{header.path}: element {shown(element.name)} has {count} rows and no property"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{header.path}: element {shown(element.name)} has {count} rows and no property"
+            )
         least += row * count
         if least > available + text:  # plus 1 for text, whose last line may lack its line end
-            msg = (
+            raise RefineError(
                 f"{header.path}: truncated: the header announces {count} rows of "
                 f"{shown(element.name)}, at least {least} bytes so far, but only {available} bytes "
                 "follow it"
             )
-            raise RefineError(msg)
 
 
-def _least_bytes(element: Any, *, text: bool) -> int:  # noqa: ANN401 - plyfile has no types
+def _least_bytes(element: Any, *, text: bool) -> int:
     """Return the least bytes that one row of an element takes."""
     if text:  # one digit and one separator for each number; lists may be empty, but have a length
         return 2 * len(element.properties)
@@ -59,7 +56,7 @@ def _least_bytes(element: Any, *, text: bool) -> int:  # noqa: ANN401 - plyfile 
     )
 
 
-def has_lists(element: Any) -> bool:  # noqa: ANN401 - plyfile has no types
+def has_lists(element: Any) -> bool:
     """Return whether an element has lists, so that its rows differ in length."""
     return any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties)
 
@@ -91,17 +88,16 @@ def vertex_range(header: Header, vertex: int, body: NDArray[np.uint8]) -> tuple[
     if end > len(body):
         row = max(len(body) - start, 0) // size
         total = len(header.raw)
-        msg = (
+        raise RefineError(
             f"{header.path}: truncated: the file ends in vertex row {row} of {count} "
             f"({total + len(body)} bytes, expected at least {total + end})"
         )
-        raise RefineError(msg)
     return start, end
 
 
 def _behind_lists(
     header: Header,
-    element: Any,  # noqa: ANN401 - plyfile has no types
+    element: Any,
     count: int,
     body: NDArray[np.uint8],
     at: int,
@@ -121,34 +117,31 @@ def _behind_lists(
                     (length,) = reader.unpack_from(data, at)
                     at += reader.size
                 if length < 0:
-                    msg = (
+                    raise RefineError(
                         f"{header.path}: element {shown(element.name)} row {row}: "
                         f"a list of {length} numbers, expected 0 or more"
                     )
-                    raise RefineError(msg)
                 at += length * size
         except struct.error:
             at = len(data) + 1
         if at > len(data):
-            msg = (
+            raise RefineError(
                 f"{header.path}: truncated: the file ends in row {row} of {count} of "
                 f"{shown(element.name)}"
             )
-            raise RefineError(msg)
     return at
 
 
-def _length_reader(header: Header, element: Any, prop: Any) -> struct.Struct | None:  # noqa: ANN401
+def _length_reader(header: Header, element: Any, prop: Any) -> struct.Struct | None:
     """Return how to read the length of a list, or None for a single number."""
     if not isinstance(prop, plyfile.PlyListProperty):
         return None
     kind = np.dtype(prop.len_dtype)
     if kind.kind == "f":
-        msg = (
+        raise RefineError(
             f"{header.path}: element {shown(element.name)}: the length of list "
             f"{shown(prop.name)} is of type {kind}, expected a whole number"
         )
-        raise RefineError(msg)
     return struct.Struct(header.order + kind.char)
 
 
@@ -184,17 +177,16 @@ def read_text(
     before = 0
     for element, count in zip(header.elements, header.counts, strict=True):
         if len(lines) < before + count:
-            msg = (
+            raise RefineError(
                 f"{header.path}: truncated: the file ends in row {len(lines) - before} of {count} "
                 f"of {shown(element.name)}"
             )
-            raise RefineError(msg)
         before += count
     rows = _numbers(header, header.elements[vertex], lines[start:end])
     return rows, lines[start:end], (b"".join(lines[:start]), b"".join(lines[end:]))
 
 
-def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[Any]:  # noqa: ANN401
+def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[Any]:
     """Return the numbers in lines of text; refuse the first line that is wrong."""
     dtype = element.dtype(TEXT)
     try:
@@ -210,8 +202,7 @@ def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[An
             f"property {shown(dtype.names[index])}: expected a number of type {dtype[index]}, "
             f"got {words[index][:40].decode('ascii', 'backslashreplace')!r}"
         )
-    msg = f"{header.path}: vertex row {row}: {problem}"
-    raise RefineError(msg)
+    raise RefineError(f"{header.path}: vertex row {row}: {problem}")
 
 
 _WRONG = (ValueError, DeprecationWarning)
@@ -221,13 +212,12 @@ _NO_SPACES = bytes.maketrans(b"\x1c\x1d\x1e\x1f", b"????")
 """Replaces four control characters: str splits words at them, bytes and the header do not."""
 
 
-def _parsed(lines: Sequence[bytes], dtype: Any) -> NDArray[Any]:  # noqa: ANN401
+def _parsed(lines: Sequence[bytes], dtype: Any) -> NDArray[Any]:
     """Return the numbers in lines of text; raise one of `_WRONG` if a line is wrong."""
     if not lines:
         return np.empty(0, dtype)
     if not all(map(bytes.strip, lines)):
-        msg = "an empty line, which NumPy would skip"
-        raise ValueError(msg)
+        raise ValueError("an empty line, which NumPy would skip")
     with warnings.catch_warnings():
         # NumPy only deprecates 1.5 for an integer property.
         warnings.simplefilter("error", DeprecationWarning)
@@ -235,7 +225,7 @@ def _parsed(lines: Sequence[bytes], dtype: Any) -> NDArray[Any]:  # noqa: ANN401
         return np.loadtxt(text, dtype, comments=None, ndmin=1)
 
 
-def _is_number(word: bytes, dtype: Any) -> bool:  # noqa: ANN401
+def _is_number(word: bytes, dtype: Any) -> bool:
     """Return whether a word is a number of a type."""
     try:
         _parsed([word], dtype)
@@ -244,7 +234,7 @@ def _is_number(word: bytes, dtype: Any) -> bool:  # noqa: ANN401
     return True
 
 
-def _first_wrong(lines: Sequence[bytes], dtype: Any) -> int:  # noqa: ANN401
+def _first_wrong(lines: Sequence[bytes], dtype: Any) -> int:
     """Return the index of the first wrong line, by bisection; at least one line is wrong."""
     first, beyond = 0, len(lines)
     while beyond - first > 1:  # the first wrong line is one of first..beyond - 1

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..splats import LOG_ZERO, Splats, above_constant
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from numpy.typing import NDArray
 
 REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -211,7 +207,7 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
         chunk[rows] = changed
 
 
-def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:  # noqa: ANN401
+def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:
     """Return the named columns as (N, len(names)); a view if they are adjacent in each row."""
     first = columns[names[0]]
     if isinstance(columns, np.ndarray) and columns.dtype.fields and columns.ndim == 1:

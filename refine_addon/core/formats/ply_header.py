@@ -8,20 +8,17 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import plyfile
 
 from ..errors import RefineError
 from ..foreign_files import refuse_foreign_splats
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
-    from ..rendering import Model
-    from ..urls import Url
+from ..rendering import Model
+from ..urls import Url
 
 HEADER_LIMIT = 1 << 20
 """Longest header that is read, bytes."""
@@ -82,22 +79,22 @@ def read_header(path: Path | Url, stream: BinaryIO) -> Header:
     """
     head = stream.read(HEADER_LIMIT)
     if not head:
-        msg = f"{path}: the file is empty, expected a PLY"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: the file is empty, expected a PLY")
     if not re.match(rb"ply[\r\n]", head):
         refuse_foreign_splats(path, head)
-        msg = f"{path}: not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
+        )
     raw = raw_header(head)
     if raw is None:
-        msg = f"{path}: header without end: no 'end_header' line in the first {len(head)} bytes"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: header without end: no 'end_header' line in the first {len(head)} bytes"
+        )
     plain, counts = _plain(path, raw)
     try:
         data = plyfile.PlyData.read(io.BytesIO(plain))
     except (plyfile.PlyParseError, ValueError) as error:
-        msg = f"{path}: header: {str(error)[:200]}"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: header: {str(error)[:200]}") from error
     order = TEXT if data.text else data.byte_order
     return Header(path, raw, tuple(data.elements), tuple(counts), order)
 
@@ -222,9 +219,10 @@ def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
         if keyword in (b"comment", b"obj_info"):
             words = []
         elif not re.fullmatch(rb"[\t -~]*\r?", line):
-            msg = f"{path}: header line {number}: expected ASCII text, got {line[:80]!r}"
-            raise RefineError(msg)
-        elif keyword == b"element" and len(words) == 3:  # noqa: PLR2004 - keyword, name, count
+            raise RefineError(
+                f"{path}: header line {number}: expected ASCII text, got {line[:80]!r}"
+            )
+        elif keyword == b"element" and len(words) == 3:
             counts.append(_count(path, number, words[2]))
             _refuse_double(path, number, words[1], elements)
             names = set()
@@ -238,14 +236,16 @@ def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
 def _count(path: Path | Url, number: int, word: bytes) -> int:
     """Return the number of rows in a word of header line `number`."""
     if not re.fullmatch(rb"[0-9]{1,30}", word):
-        msg = f"{path}: header line {number}: expected a number of rows, got {shown(word)}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: header line {number}: expected a number of rows, got {shown(word)}"
+        )
     return int(word)
 
 
 def _refuse_double(path: Path | Url, number: int, name: bytes, known: set[bytes]) -> None:
     """Refuse a name that is in `known`; add it otherwise."""
     if name in known:
-        msg = f"{path}: header line {number}: {shown(name)} is declared twice, expected once"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: header line {number}: {shown(name)} is declared twice, expected once"
+        )
     known.add(name)

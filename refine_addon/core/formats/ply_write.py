@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..work import chunks, each_chunk
 from .ply_columns import ChangedColumns
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
-    from typing import BinaryIO
-
-    from numpy.typing import NDArray
 
 PLY_TYPES = {
     "i1": "char",
@@ -143,7 +139,7 @@ def text_lines(
         yield _edited(lines[index], words, more) if words or more else lines[index]
 
 
-def _word(value: Any) -> bytes:  # noqa: ANN401 - a number of NumPy's
+def _word(value: Any) -> bytes:
     """Return the shortest text that reads back as a number, which `str` makes of NumPy's."""
     return str(value).encode()
 
@@ -208,21 +204,20 @@ def declarations(
         values = columns[name]
         kind = PLY_TYPES.get(values.dtype.str[1:])
         if values.shape != rows.shape:
-            msg = f"{path}: column '{name}' has shape {values.shape}, expected {rows.shape}"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{path}: column '{name}' has shape {values.shape}, expected {rows.shape}"
+            )
         if name in present:
             if not np.can_cast(values.dtype, present[name][0], "same_kind"):
-                msg = (
+                raise RefineError(
                     f"{path}: property '{name}' is there already, of type {present[name][0]}; "
                     f"expected one that holds {values.dtype}"
                 )
-                raise RefineError(msg)
         elif kind is None or not re.fullmatch(r"[!-~]+", name):
-            msg = (
+            raise RefineError(
                 f"{path}: column '{name}' of type {values.dtype} cannot be a property, expected "
                 f"ASCII without spaces and one of {', '.join(PLY_TYPES)}"
             )
-            raise RefineError(msg)
         else:
             lines.append(f"property {kind} {name}".encode())
     return lines

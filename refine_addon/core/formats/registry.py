@@ -5,29 +5,24 @@ from __future__ import annotations
 import math
 import mmap
 import stat
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..foreign_files import refuse_pointer
-from ..splats import drawable, with_model
+from ..rendering import Model
+from ..splats import Splats, drawable, with_model
+from ..urls import Url
 from ..whole_file import expanded, whole_file
 from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
+from .format import Format, Reader, Sizes
 from .ply import SplatFile, read_ply
 from .ply_columns import other_properties, splats_from_columns
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ..rendering import Model
-    from ..splats import Splats
-    from ..urls import Url
-    from .format import Format, Reader, Sizes
 
 FORMATS: tuple[Format, ...] = (
     compressed_ply.FORMAT,
@@ -106,16 +101,14 @@ def _read(path: Path, level: int) -> SplatFile:
     refuse_pointer(path, head)
     form = next((form for form in READERS if form.matches(path, head)), None)
     if level and form is not streamed_sog.READER:
-        msg = f"{path}: has no level {level}: only {streamed_sog.INDEX} has levels"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: has no level {level}: only {streamed_sog.INDEX} has levels")
     if form is None:
         return read_ply(path)
     try:
         with path.open("rb") as stream:
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be read ({reason_of(error)})"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error
     data = np.frombuffer(whole, np.uint8)
     return streamed_sog.read(path, data, level) if level else form.read(path, data)
 
@@ -197,11 +190,10 @@ def refuse_unknown_size(form: Format) -> None:
     """Raise `RefineError` if the size of a file does not follow from the number of its splats."""
     if form.sizes is None:
         fixed = ", ".join(other.suffix for other in FORMATS if other.sizes)
-        msg = (
+        raise RefineError(
             f"a size cannot be kept to in {form.suffix}, which is compressed as a whole: choose "
             f"another budget, or write .ply, {fixed}"
         )
-        raise RefineError(msg)
 
 
 def as_written(file: SplatFile, path: Path | None) -> SplatFile | Packed:
@@ -303,7 +295,7 @@ class Packed:
         *,
         columns: Mapping[str, NDArray[Any]] | None = None,
         overwrite: bool = False,
-        threads: int | None = 1,  # noqa: ARG002 - formats are written by one
+        threads: int | None = 1,
     ) -> None:
         """Write the kept splats; those that cannot be drawn are left out.
 
@@ -332,14 +324,16 @@ class Packed:
             rows = rows.copy()
             for name, values in columns.items():
                 if name not in (rows.dtype.names or ()):
-                    msg = f"{path}: {self.form.suffix} holds no property '{name}'; write to a .ply"
-                    raise RefineError(msg)
+                    raise RefineError(
+                        f"{path}: {self.form.suffix} holds no property '{name}'; write to a .ply"
+                    )
                 rows[name] = values if keep is None else values[keep]
         splats = with_model(splats_from_columns(rows), self.file.model)
         good = drawable(splats)
         if not good.any():
-            msg = f"{path}: none of the {len(splats)} splats can be drawn: nothing to write"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{path}: none of the {len(splats)} splats can be drawn: nothing to write"
+            )
         if not good.all():
             splats = splats.take(good)
         return splats.up_to_degree(self.form.degree)

@@ -16,29 +16,22 @@ import stat
 import zipfile
 import zlib
 from dataclasses import dataclass, replace
-from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
+from pathlib import Path, PurePosixPath
+from typing import Any, NoReturn, Protocol, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..foreign_files import is_sog
 from ..place import Place, described
-from ..rendering import MODELS
-from ..splats import above_constant, opacity_logits
+from ..rendering import MODELS, Model
+from ..splats import Splats, above_constant, opacity_logits
 from ..whole_file import mode_of
 from .format import Format, Reader, join_largest, new_file, pieces
 from .images import Codec, codec_for
 from .ply import Origin, SplatFile
 from .sog_write import ACROSS, COORDINATE, LABEL_BITS, META, NAME, ROTATIONS, TABLE, VERSION, write
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ..rendering import Model
-    from ..splats import Splats
 
 _DEGREES = 3
 
@@ -83,11 +76,11 @@ class _Archived:
             with self.archive.open(self.folder + name) as stream:
                 data = stream.read(limit + 1)
         except _BROKEN as error:
-            msg = f"{self.path}: {label!r} in the archive cannot be read ({str(error)[:100]})"
-            raise RefineError(msg) from error
+            raise RefineError(
+                f"{self.path}: {label!r} in the archive cannot be read ({str(error)[:100]})"
+            ) from error
         if len(data) > limit:
-            msg = f"{self.path}: {label!r} in the archive has more than {limit} bytes"
-            raise RefineError(msg)
+            raise RefineError(f"{self.path}: {label!r} in the archive has more than {limit} bytes")
         return data
 
 
@@ -269,8 +262,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         names = (name for name in archive.namelist() if name.split("/")[-1] == META)
         name = next(names, None)
         if name is None:
-            msg = f"{path}: no {META} in the archive, which a SOG file has"
-            raise RefineError(msg)
+            raise RefineError(f"{path}: no {META} in the archive, which a SOG file has")
         files = _Archived(path, archive, name.removesuffix(META))
         return read_bundle(
             _bundle(Place(path, META), files, files.read(META, _META_LIMIT), len(data))
@@ -281,8 +273,7 @@ def _opened(path: Path, data: NDArray[np.uint8]) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(io.BytesIO(data.tobytes()))
     except _BROKEN as error:
-        msg = f"{path}: the archive cannot be read ({str(error)[:100]})"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: the archive cannot be read ({str(error)[:100]})") from error
 
 
 def matches_meta(path: Path, head: bytes) -> bool:

@@ -5,24 +5,18 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..rendering import MODELS
-from ..splats import opacity, unit_quaternions
+from ..splats import Splats, opacity, unit_quaternions
 from .format import codes, near_ones_together, split_largest
 from .images import codec_for
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from typing import BinaryIO
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
 
 NAME, VERSION = "SOG", 2
 GENERATOR = "REFINE for Blender"
@@ -115,8 +109,7 @@ def _image_size(count: int) -> tuple[int, int]:
     """Return height and width of images for `count` pixels: nearly square, width divisible by 4."""
     width = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)
     if width > _MOST_PIXELS:
-        msg = f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}"
-        raise RefineError(msg)
+        raise RefineError(f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}")
     return -(-count // width), width
 
 

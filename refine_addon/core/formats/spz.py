@@ -12,24 +12,18 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..foreign_files import GZIP, SPZ, is_spz
-from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
+from ..rendering import Model
+from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
 from .ply import Origin, SplatFile
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import BinaryIO
-
-    from numpy.typing import NDArray
-
-    from ..rendering import Model
-    from ..splats import Splats
 
 NAME = "SPZ"
 
@@ -132,17 +126,19 @@ def _parsed(path: Path, head: bytes) -> _Header:
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
     magic, version, count, degree, fraction, flags, streams = _HEADER.unpack(head)
     if magic != SPZ:
-        msg = f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {SPZ!r}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {SPZ!r}"
+        )
     if version not in _VERSIONS:
-        msg = f"{path}: SPZ version {version}, expected {', '.join(map(str, _VERSIONS))}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: SPZ version {version}, expected {', '.join(map(str, _VERSIONS))}"
+        )
     if degree >= _DEGREES:
-        msg = f"{path}: byte 12: harmonics of degree {degree}, expected 0 to {_DEGREES - 1}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{path}: byte 12: harmonics of degree {degree}, expected 0 to {_DEGREES - 1}"
+        )
     if fraction > _LARGEST_CODE.bit_length():
-        msg = f"{path}: byte 13: {fraction} fractional bits, expected 0 to 23"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: byte 13: {fraction} fractional bits, expected 0 to 23")
     model: Model = "antialiased" if flags & _ANTIALIASED else "default"
     return _Header(version, count, degree, fraction, streams, model)
 
@@ -151,11 +147,10 @@ def _refuse_many(path: Path, header: _Header, size: int) -> None:
     """Raise `RefineError` if a file of `size` bytes cannot hold the splats that it announces."""
     needed, most = sum(header.blocks().values()), _INFLATION * size
     if needed > most:
-        msg = (
+        raise RefineError(
             f"{path}: truncated: {header.count} splats need {needed} bytes unpacked, a file of "
             f"{size} bytes holds at most {most}"
         )
-        raise RefineError(msg)
 
 
 def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, NDArray[np.uint8]]]:
@@ -164,8 +159,9 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, N
     try:
         header = _parsed(path, engine.decompress(data.data, _HEADER.size))
         if header.version == _ZSTD:
-            msg = f"{path}: SPZ version 4 inside of gzip, expected its own header first"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{path}: SPZ version 4 inside of gzip, expected its own header first"
+            )
         _refuse_many(path, header, len(data))
         needed = sum(header.blocks().values())
         body = engine.decompress(engine.unconsumed_tail, needed) if needed else b""
@@ -173,16 +169,16 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, N
             _test_checksum(engine)
     except zlib.error as error:
         at = _damaged_at(data)
-        msg = f"{path}: a damaged SPZ file: its gzip stream breaks at byte {at} ({error})"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"{path}: a damaged SPZ file: its gzip stream breaks at byte {at} ({error})"
+        ) from error
     blocks = _split(path, header, np.frombuffer(body, np.uint8))
     if not engine.eof:
-        msg = f"{path}: truncated: the gzip stream has no end"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: truncated: the gzip stream has no end")
     return header, blocks
 
 
-def _test_checksum(engine: Any) -> None:  # noqa: ANN401 - zlib's type has no name
+def _test_checksum(engine: Any) -> None:
     """Unpack the rest of a gzip stream, extensions that are not read: its end has the checksum."""
     rest = memoryview(engine.unconsumed_tail)
     for at in range(0, len(rest) + 1, _STEP):  # no bytes at last: what zlib still holds comes out
@@ -229,8 +225,7 @@ def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, 
     _refuse_many(path, header, len(data))
     lengths = {name: length for name, length in header.blocks().items() if length}
     if header.streams < len(lengths):
-        msg = f"{path}: byte 15: {header.streams} streams, expected {len(lengths)}"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: byte 15: {header.streams} streams, expected {len(lengths)}")
     start = at + header.streams * _STREAM.size
     refuse_short(path, start, len(data), "the table of streams")
     blocks = {name: np.empty((header.count, 0), np.uint8) for name in header.blocks()}
@@ -238,8 +233,9 @@ def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, 
         packed, announced = _STREAM.unpack(data[at : at + _STREAM.size].tobytes())
         at += _STREAM.size
         if announced != length:
-            msg = f"{path}: stream '{name}' announces {announced} bytes, expected {length}"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{path}: stream '{name}' announces {announced} bytes, expected {length}"
+            )
         end = start + packed
         refuse_short(path, end, len(data), f"stream '{name}' and what is before it")
         content = _zstd(path, name, data[start:end].tobytes(), length)
@@ -253,22 +249,19 @@ def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
     try:
         reader, failure = _zstd_reader(packed)
     except ImportError as error:
-        msg = (
+        raise RefineError(
             f"{path}: SPZ version 4 needs a module for zstd: run this in Blender, which brings "
             "one, or 'pip install zstandard'; or write the file as version 3"
-        )
-        raise RefineError(msg) from error
+        ) from error
     content = bytearray()
     try:
         while len(content) <= length and (piece := reader.read(_PIECE)):
             content += piece
     except (failure, EOFError) as error:
-        msg = f"{path}: stream '{name}' is damaged ({error})"
-        raise RefineError(msg) from error
+        raise RefineError(f"{path}: stream '{name}' is damaged ({error})") from error
     if len(content) != length:
         held = "more" if len(content) > length else str(len(content))
-        msg = f"{path}: stream '{name}' holds {held} bytes, expected {length}"
-        raise RefineError(msg)
+        raise RefineError(f"{path}: stream '{name}' holds {held} bytes, expected {length}")
     return content
 
 
@@ -292,7 +285,7 @@ def _positions(block: NDArray[np.uint8], fraction: int) -> NDArray[np.float64]:
 
 def _rotations(block: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return quaternions w x y z; in the file they are x y z w."""
-    if block.shape[1] == 3:  # noqa: PLR2004 - version 2: x, y and z; w is positive
+    if block.shape[1] == 3:
         others = block / 127.5 - 1.0
         return join_largest(np.zeros(len(block), np.intp), others)
     packed = np.ascontiguousarray(block).view("<u4")[:, 0]
@@ -351,8 +344,9 @@ def _fraction(splats: Splats) -> int:
     if np.rint(math.ldexp(farthest, most)) > _LARGEST_CODE:
         most -= 1
     if most < 0:
-        msg = f"a coordinate is {farthest:.10g}: {NAME} holds coordinates up to {_LARGEST_CODE}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"a coordinate is {farthest:.10g}: {NAME} holds coordinates up to {_LARGEST_CODE}"
+        )
     return min(max(_USUAL_FRACTION, _LEAST_STEPS - bits), most, _LARGEST_CODE.bit_length())
 
 

@@ -7,25 +7,20 @@ finest, with the environment, which viewers always show.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..place import Place, described
-from ..splats import ARRAYS
+from ..splats import ARRAYS, Splats
 from .format import Reader, new_file
-from .ply import Origin
+from .ply import Origin, SplatFile
 from .sog import Bundle, beside, bundle_beside, read_bundle
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from .ply import SplatFile
 
 NAME, VERSION = "streamed SOG", 1
 INDEX = "lod-meta.json"
@@ -122,7 +117,7 @@ def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[_Unit]:
     spans = _spans(place.at("tree"), meta.get("tree"), level, len(names))
     opened: set[Path] = set()
 
-    def bundle(where: Place, name: Any) -> Bundle:  # noqa: ANN401 - from JSON
+    def bundle(where: Place, name: Any) -> Bundle:
         path = beside(where, where.text(name)).resolve()
         if path in opened:
             where.fail(f"{described(name)} is named twice")
@@ -143,7 +138,7 @@ def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[_Unit]:
         yield _Unit(around, [_Span(0, around.count)])
 
 
-def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[_Span]]:  # noqa: ANN401 - from JSON
+def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[_Span]]:
     """Return the rows of a level by the number of their file; those without splats do not count."""
     spans: dict[int, list[_Span]] = {}
     left, number = [tree], 0

@@ -12,27 +12,22 @@ import contextlib
 import json
 import re
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..place import Place
-from ..splats import rotation_matrices, scales
+from ..splats import Splats, rotation_matrices, scales
 from ..whole_file import mode_of, new_folder, refuse_existing, whole_file
 from ..work import checkpoint
 from .format import near_ones_together, pieces
 from .sog_write import GENERATOR, IMAGES, META, contents
 from .streamed_sog import INDEX, VERSION
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
 
 UNIT = 1 << 19
 """A folder is closed once it holds more splats than this; a chunk of the finest level has at most
@@ -168,8 +163,9 @@ class StreamedSog:
                 (self._folder / name / file).write_bytes(data)
                 size += len(data)
         except OSError as error:
-            msg = f"{self._folder / name}: cannot be written ({reason_of(error)})"
-            raise RefineError(msg) from error
+            raise RefineError(
+                f"{self._folder / name}: cannot be written ({reason_of(error)})"
+            ) from error
         return size
 
     def publish(self, path: Path, *, overwrite: bool) -> None:
@@ -194,8 +190,7 @@ class StreamedSog:
                 for file in (self._folder / name).parent.iterdir():
                     file.replace(there / file.name)
         except OSError as error:
-            msg = f"{path}: cannot be written ({reason_of(error)})"
-            raise RefineError(msg) from error
+            raise RefineError(f"{path}: cannot be written ({reason_of(error)})") from error
         with whole_file(path, overwrite=overwrite) as stream:
             stream.write(json.dumps(self._index(), allow_nan=False).encode() + b"\n")
 
@@ -255,14 +250,12 @@ def folder_for(path: Path, *, overwrite: bool) -> Iterator[Path]:
         old = {path.parent / name for name in _folders_of(path)}
         for entry in path.parent.iterdir():
             if _OURS.fullmatch(entry.name) and entry not in old:
-                msg = f"{entry}: exists already; write to another folder"
-                raise RefineError(msg)
+                raise RefineError(f"{entry}: exists already; write to another folder")
         try:
             with tempfile.TemporaryDirectory(prefix=".refine-", dir=path.parent) as made:
                 yield Path(made)
         except OSError as error:
-            msg = f"{path}: cannot be written ({reason_of(error)})"
-            raise RefineError(msg) from error
+            raise RefineError(f"{path}: cannot be written ({reason_of(error)})") from error
 
 
 def _folders_of(path: Path) -> list[str]:

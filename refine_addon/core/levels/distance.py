@@ -10,21 +10,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..estimate.psnr import MIN_RAYS_WITH_HITS
-from ..estimate.quality import PSNR_CAP
-from ..seeing import projection
-from ..seeing.ray_sample import cast_colored
+from ..quality.curve import PSNR_CAP
+from ..quality.psnr import MIN_RAYS_WITH_HITS
+from ..splats import Splats
+from ..views import ViewSet
+from ..visibility import projection
+from ..visibility.ray_sample import cast_colored
 from ..work import Progress, for_chunks, part, silent
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from ..views import ViewSet
 
 FACTORS = (1, 2, 4, 8, 16)
 """Times the distance of the views from which pictures are compared; powers of two."""

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import RefineError
-from ..estimate.quality import PSNR_CAP
 from ..formats import sog
+from ..formats.format import Format
 from ..formats.images import codec_for
 from ..formats.registry import Packed, as_written, scene_name
 from ..formats.streamed_sog import INDEX
 from ..formats.streamed_sog_write import StreamedSog, folder_for
 from ..operation.files import FileSource
-from ..operation.run import Request, Written, run
+from ..operation.loaded import Loaded
+from ..operation.run import Request, Runtime, Written, run
+from ..quality.curve import PSNR_CAP
+from ..rendering import Model
 from ..report import held, scoring_notes, seen_by
 from ..selection import Budget
-from ..task import DEFAULTS, Task
+from ..task import DEFAULTS, Settings, Task
+from ..views import ViewSet
+from ..volumes import Zone
 from ..whole_file import (
     expanded,
     mode_of,
@@ -30,22 +38,7 @@ from ..whole_file import (
     refuse_one_file,
 )
 from ..work import Progress, silent
-from .lod import MAX_LEVELS, each_level, short
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from contextlib import AbstractContextManager
-    from pathlib import Path
-    from typing import Any
-
-    from ..formats.format import Format
-    from ..operation.loaded import Loaded
-    from ..operation.run import Runtime
-    from ..rendering import Model
-    from ..task import Settings
-    from ..views import ViewSet
-    from ..volumes import Zone
-    from .lod import Level, Levels
+from .lod import MAX_LEVELS, Level, Levels, each_level, short
 
 GOAL = 40.0
 """The PSNR from which on a level is hard to tell from the original, dB."""
@@ -72,8 +65,9 @@ def is_streamed(target: Path) -> bool:
 def check_goal(goal: float) -> None:
     """Raise `RefineError` if no PSNR for a distance can be `goal`, dB."""
     if not 0.0 < goal < PSNR_CAP:
-        msg = f"PSNR for a distance is {goal}, expected more than 0 and less than {PSNR_CAP:g} dB"
-        raise RefineError(msg)
+        raise RefineError(
+            f"PSNR for a distance is {goal}, expected more than 0 and less than {PSNR_CAP:g} dB"
+        )
 
 
 @dataclass(frozen=True, eq=False)

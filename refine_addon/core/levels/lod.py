@@ -8,38 +8,30 @@ levels. Either way the rows of a level are among those of the level before.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .. import costs
+from ..costs import Plan
 from ..errors import RefineError
-from ..estimate.quality import PSNR_CAP
+from ..merging.absorb import Absorbed
 from ..pace import phases
 from ..pipeline import decide, planned, score, scoring_plans
+from ..quality.curve import PSNR_CAP
+from ..scores import Scores
 from ..selection import Budget
-from ..splats import among_all
-from ..survivor_choice import SURVIVORS, refuse_unknown
-from ..task import DEFAULTS, Origin, Task
+from ..splats import Splats, among_all
+from ..survivor_choice import SURVIVORS, Became, refuse_unknown
+from ..task import DEFAULTS, Origin, Result, Settings, Task
+from ..views import ViewSet
 from ..work import Progress, silent
-from .distance import VIEWS, OriginalPictures
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from typing import Any
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from ..absorbing.absorb import Absorbed
-    from ..costs import Plan
-    from ..scores import Scores
-    from ..splats import Splats
-    from ..survivor_choice import Became
-    from ..task import Result, Settings
-    from ..views import ViewSet
-    from .distance import Reach
+from .distance import VIEWS, OriginalPictures, Reach
 
 MAX_LEVELS = 16
 """No more levels than this: the last of so many halvings would hold .0015 % of the splats."""
@@ -71,32 +63,26 @@ class Levels:
     survivors: Became = "absorb"
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            With the value and what was expected.
-        """
+        """Check the values."""
         refuse_unknown(self.survivors, SURVIVORS)
         for name in ("shares", "psnr"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if bool(self.shares) == bool(self.psnr):
             got = "both" if self.shares else "none"
-            msg = f"levels are given by the shares that stay or by PSNR, got {got} of them"
-            raise RefineError(msg)
+            raise RefineError(
+                f"levels are given by the shares that stay or by PSNR, got {got} of them"
+            )
         values, most, unit = (self.shares, 1.0, "") if self.shares else (self.psnr, PSNR_CAP, " dB")
         bad = next((value for value in values if not 0.0 < value < most), None)
         if bad is not None:
-            msg = f"level is {bad}, expected more than 0 and less than {most:g}{unit}"
-            raise RefineError(msg)
+            raise RefineError(f"level is {bad}, expected more than 0 and less than {most:g}{unit}")
         rising = next((pair for pair in pairwise(values) if pair[0] <= pair[1]), None)
         if rising:
-            msg = f"level {rising[1]} comes after {rising[0]}, expected less: the finest first"
-            raise RefineError(msg)
+            raise RefineError(
+                f"level {rising[1]} comes after {rising[0]}, expected less: the finest first"
+            )
         if len(values) > MAX_LEVELS:
-            msg = f"got {len(values)} levels, expected at most {MAX_LEVELS}"
-            raise RefineError(msg)
+            raise RefineError(f"got {len(values)} levels, expected at most {MAX_LEVELS}")
 
     def __len__(self) -> int:
         """Return the number of levels."""
@@ -211,7 +197,7 @@ def short(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def lod(  # noqa: PLR0913 - as `pipeline.prune`
+def lod(
     splats: Splats,
     views: ViewSet,
     levels: Levels,
@@ -299,8 +285,7 @@ def each_level(
         )  # fmt: skip
         yield level if forced is None else level.for_all(~forced)
     if not number:
-        msg = f"no level has fewer splats than the input, which has {total}"
-        raise RefineError(msg)
+        raise RefineError(f"no level has fewer splats than the input, which has {total}")
 
 
 def _plans(scene: Task, budgets: Sequence[Budget]) -> list[Plan]:
@@ -361,7 +346,7 @@ def _absorbing(
         result = decide(replace(task, budget=budget), progress=of_level, threads=threads)
         if result.stopped is not None:
             raise result.stopped
-        assert result.absorbed is not None  # noqa: S101 - the task says so
+        assert result.absorbed is not None
         whole = result.absorbed if whole is None else _both(whole, result.absorbed)
         yield _Made(whole.keep, whole.splats, result, whole)
         scores = result.scores if scores is None else scores

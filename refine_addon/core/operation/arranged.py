@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..affine import transformed
 from ..errors import RefineError
-from ..formats.format import near_ones_together, new_file
-from ..formats.ply import Origin
+from ..formats.format import Format, near_ones_together, new_file
+from ..formats.ply import Origin, SplatFile
 from ..formats.ply_columns import other_properties
 from ..formats.registry import read_splats
 from ..formats.streamed_sog import INDEX
+from ..rendering import Model
 from ..splats import ARRAYS, joined
 from ..volumes import FREE
 from ..whole_file import expanded
 from .files import FileSink, file_to_file
 from .loaded import Loaded, RowSizes
+from .requests import ConvertRequest, Kept
 from .run import run
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ..formats.format import Format
-    from ..formats.ply import SplatFile
-    from ..rendering import Model
-    from .requests import ConvertRequest, Kept
 
 
 @dataclass(frozen=True)
@@ -59,11 +53,9 @@ class Move:
     def __post_init__(self) -> None:
         """Check the values."""
         if not all(map(math.isfinite, (*self.translate, *self.rotate, self.scale))):
-            msg = f"expected finite numbers to move by, got {self}"
-            raise RefineError(msg)
+            raise RefineError(f"expected finite numbers to move by, got {self}")
         if self.scale <= 0.0:
-            msg = f"scale is {self.scale:g}, expected more than 0"
-            raise RefineError(msg)
+            raise RefineError(f"scale is {self.scale:g}, expected more than 0")
 
     @property
     def matrix(self) -> NDArray[np.float64]:
@@ -180,11 +172,10 @@ class ArrangedSource:
         ]
         for file in files:
             if file.model != files[0].model:
-                msg = (
+                raise RefineError(
                     f"{file.path}: its splats are {file.model}, those of {files[0].path} "
                     f"{files[0].model}; expected one model, or say which (--model)"
                 )
-                raise RefineError(msg)
         return files
 
 

@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from ..formats.format import Format
 from ..formats.registry import as_written, format_named, read_splats
+from ..rendering import Model
 from ..report import files_facts, held
-from ..volumes import forced
+from ..task import Result
+from ..volumes import Zone, forced
 from ..whole_file import expanded, refuse_existing, refuse_mapped
 from ..work import Progress, report, silent
 from .loaded import Loaded, RowSizes
-from .requests import Kept
-from .run import Written, run
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from ..formats.format import Format
-    from ..rendering import Model
-    from ..task import Result
-    from ..volumes import Zone
-    from .requests import PruneRequest
-    from .run import Request, Runtime
-
+from .requests import Kept, PruneRequest
+from .run import Request, Runtime, Written, run
 
 ChoiceT = TypeVar("ChoiceT", bound="Result | Kept")
 

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..formats.format import Format
+from ..formats.ply import SplatFile
+from ..formats.ply_columns import Columns
 from ..formats.registry import Packed
+from ..merging.absorb import Absorbed
+from ..selection import Budget, RowBytes
+from ..splats import Splats
 from ..survivors import survivor_columns
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from numpy.typing import NDArray
-
-    from ..absorbing.absorb import Absorbed
-    from ..formats.format import Format
-    from ..formats.ply import SplatFile
-    from ..formats.ply_columns import Columns
-    from ..selection import Budget, RowBytes
-    from ..splats import Splats
-    from ..volumes import Forced
+from ..volumes import Forced
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,41 +3,31 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..cleaning.clean import Cleaning, clean
-from ..costs import Cost, joined
+from ..cleaning.clean import Cleaned, Cleaning, clean
+from ..costs import Cost, Plan, joined
+from ..formats.format import Format
 from ..formats.registry import refuse_unknown_size
 from ..pace import phases
-from ..picture_files import chosen
+from ..picture_files import PictureFiles, chosen
 from ..pipeline import decide, planned, score, scoring_plans
+from ..rendering import Model
 from ..report import kept_and_removed, prices, scoring_notes, seen_by, what_was_seen
-from ..survivor_choice import refuse_unknown
-from ..task import DEFAULTS, Settings, Task, may_absorb
-from .run import Request
+from ..selection import Budget
+from ..survivor_choice import SurvivorChoice, refuse_unknown
+from ..task import DEFAULTS, Result, Settings, Task, may_absorb
+from ..views import ViewSet
+from ..volumes import Zone
+from .loaded import Loaded
+from .run import Request, Runtime
 from .written import written_facts, written_splats
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ..cleaning.clean import Cleaned
-    from ..costs import Plan
-    from ..formats.format import Format
-    from ..picture_files import PictureFiles
-    from ..rendering import Model
-    from ..selection import Budget
-    from ..survivor_choice import SurvivorChoice
-    from ..task import Result
-    from ..views import ViewSet
-    from ..volumes import Zone
-    from .loaded import Loaded
-    from .run import Runtime
 
 PROPERTY = "refine_score"
 """The property of a PLY that holds the scores."""
@@ -77,13 +67,7 @@ class PruneRequest(Request["Loaded", "Result"]):
     dry_run: bool = False
 
     def __post_init__(self) -> None:
-        """Check what survivors may become.
-
-        Raises
-        ------
-        RefineError
-            If there is no such choice.
-        """
+        """Check what survivors may become."""
         refuse_unknown(self.survivors)
 
     @property

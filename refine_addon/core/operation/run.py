@@ -16,23 +16,19 @@ A request says what is to be done, a source where the splats are, a sink where t
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
 
+from ..costs import Plan
+from ..formats.format import Format
 from ..pace import phases
+from ..rendering import Model
 from ..report import Clock
+from ..volumes import Zone
 from ..work import Cancelled, Progress, part, silent
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from contextlib import AbstractContextManager
-    from pathlib import Path
-
-    from ..costs import Plan
-    from ..formats.format import Format
-    from ..rendering import Model
-    from ..volumes import Zone
 
 
 @dataclass(frozen=True, eq=False)

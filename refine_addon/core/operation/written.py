@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..affine import is_uniform, transformed
-from ..estimate.psnr import psnr_against
 from ..formats.registry import format_named, read_written
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from ..scores import Scores
-    from ..splats import Splats
-    from ..views import ViewSet
+from ..quality.psnr import psnr_against
+from ..scores import Scores
+from ..splats import Splats
+from ..views import ViewSet
 
 
 def written_facts(

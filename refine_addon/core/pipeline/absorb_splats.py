@@ -4,39 +4,34 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import costs
-from ..absorbing import absorb as absorbing
-from ..absorbing.merge_field import ViewSums
-from ..estimate.psnr import psnr_against
-from ..estimate.quality import left_to_lose
+from ..costs import Plan
+from ..merging import absorb as absorbing
+from ..merging.absorb import Absorbed
+from ..merging.field import ViewSums
 from ..pace import phases
-from ..refitting.round_rays import limits
+from ..quality.curve import left_to_lose
+from ..quality.psnr import psnr_against
+from ..refit.round_rays import limits
+from ..scores import Scores
 from ..scoring import occlusion
-from ..seeing.ray_sample import VALIDATION_VIEWS
 from ..selection import Budget, quality_of, select
-from ..task import DEFAULTS, Settings
+from ..splats import Splats
+from ..survivor_choice import Became
+from ..task import DEFAULTS, Settings, Task
+from ..views import ViewSet
+from ..visibility.measuring import Measured
+from ..visibility.ray_sample import VALIDATION_VIEWS
 from ..work import Progress, part, silent
 from .refit_splats import Made, refit_made
 from .score_splats import score_once, with_quality
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from ..absorbing.absorb import Absorbed
-    from ..costs import Plan
-    from ..scores import Scores
-    from ..seeing.measuring import Measured
-    from ..splats import Splats
-    from ..survivor_choice import Became
-    from ..task import Task
-    from ..views import ViewSet
 
 TRIES = 3
 """How often absorbing is done at most to reach a PSNR."""
@@ -222,7 +217,7 @@ def _absorb_to_psnr(
         gone = _between(tried, goal, total) or curve.share(
             goal - made.psnr + curve.at(gone, way), way
         )
-    assert best is not None  # noqa: S101 - every try gives one
+    assert best is not None
     return best
 
 
@@ -251,7 +246,7 @@ def _between(tried: Sequence[_Try], goal: float, total: int) -> float | None:
     return float(1.0 / (1.0 + np.exp(-place)))
 
 
-def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`
+def absorb_removed(
     splats: Splats,
     views: ViewSet,
     count: int,

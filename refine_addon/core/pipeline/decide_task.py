@@ -8,16 +8,18 @@ splats are merged until as many are left as were selected, and those are refitte
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import selection
 from ..costs import Cost, Plan, joined
-from ..estimate.cost import expected_seconds
-from ..estimate.psnr import psnr_kept
-from ..estimate.quality import AS_GOOD, PLAIN, deletion_will_do, in_words, needed
+from ..merging.absorb import Absorbed
 from ..pace import phases
+from ..quality.cost import expected_seconds
+from ..quality.curve import AS_GOOD, PLAIN, deletion_will_do, in_words, needed
+from ..quality.psnr import psnr_kept
 from ..report import (
     MEASURES,
     Clock,
@@ -28,31 +30,23 @@ from ..report import (
     make_report,
     remark,
 )
+from ..scores import Scores
+from ..selection import Budget, RowBytes
+from ..splats import Splats
+from ..survivor_choice import Became, SurvivorChoice
 from ..task import DEFAULTS, Result, Settings, Task
-from ..views import refuse_other
+from ..views import ViewSet, refuse_other
+from ..visibility.measuring import Measured
 from ..work import Progress, report, silent
 from .absorb_splats import CLOSE, absorb_task, absorbing_plans
-from .refit_splats import unchanged_note
+from .refit_splats import Made, unchanged_note
 from .score_splats import score, score_once, scoring_plans, with_quality
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..absorbing.absorb import Absorbed
-    from ..scores import Scores
-    from ..seeing.measuring import Measured
-    from ..selection import Budget, RowBytes
-    from ..splats import Splats
-    from ..survivor_choice import Became, SurvivorChoice
-    from ..views import ViewSet
-    from .refit_splats import Made
-
 
 TYPICAL = 0.5
 """Share of the splats that is expected to go where only scores tell it."""
 
 
-def prune(  # noqa: PLR0913 - the main function of core; all but three are optional
+def prune(
     splats: Splats,
     views: ViewSet,
     budget: Budget,
@@ -233,18 +227,7 @@ def _delete(task: Task, clock: Clock, progress: Progress, threads: int | None) -
 
 
 def _absorbed(task: Task, scores: Scores, plain: float | None, made: Made, clock: Clock) -> Result:
-    """Return the result of what survivors became.
-
-    Parameters
-    ----------
-    task : Task
-    scores : Scores
-        Those that decided how many survive, or what was deleted first.
-    plain : float or None
-        The estimate for plain deletion, dB.
-    made : Made
-    clock : Clock
-    """
+    """Return the result of what survivors became."""
     absorbed = made.absorbed
     facts = _facts(task, scores, absorbed.keep, made.psnr, clock, absorbed)
     conclude_between(facts, made.psnr_between, scores.seen)
@@ -336,17 +319,7 @@ def _will_do(task: Task, scores: Scores, plain: float | None) -> bool:
 
 
 def _as_good(task: Task, keep: NDArray[np.bool_], plain: float | None, made: Made) -> bool:
-    """Return whether plain deletion is about as good as what was made by absorbing.
-
-    Parameters
-    ----------
-    task : Task
-    keep : (N,) bool
-        Which splats plain deletion keeps.
-    plain : float or None
-        The estimate with the others deleted, dB.
-    made : Made
-    """
+    """Return whether plain deletion is about as good as what was made by absorbing."""
     if plain is None or made.psnr is None:
         return True
     if task.budget.psnr is not None:

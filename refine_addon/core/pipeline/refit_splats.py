@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..estimate.quality import in_words
+from ..merging.absorb import Absorbed
 from ..pace import named
-from ..refitting.refit import refit_rounds
-from ..work import Cancelled, return_freed
-
-if TYPE_CHECKING:
-    from ..absorbing.absorb import Absorbed
-    from ..refitting.refit import Refitted
-    from ..survivor_choice import Became
-    from ..task import Task
-    from ..work import Progress
+from ..quality.curve import in_words
+from ..refit.refit import Refitted, refit_rounds
+from ..survivor_choice import Became
+from ..task import Task
+from ..work import Cancelled, Progress, return_freed
 
 DOING = "refitting"
 """What a progress callback is told while survivors are refitted: from here on a cancelled prune
@@ -146,7 +142,7 @@ def refit_made(task: Task, made: Made, progress: Progress, threads: int | None) 
         stopped = _noted(stop, 0 if done is None else done.rounds)
         if done is None or not done.rounds:
             return replace(made, stopped=stopped)
-    assert done is not None  # noqa: S101 - what is to be refitted is yielded first
+    assert done is not None
     seconds = time.perf_counter() - start
     return replace(made, psnr=done.psnr, refitted=done, seconds=seconds, stopped=stopped)
 

@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import costs
-from ..estimate.alignment import alignment
-from ..estimate.psnr import psnr_after, quality_curve
+from ..costs import Plan
 from ..pace import phases
+from ..quality.alignment import alignment
+from ..quality.psnr import psnr_after, quality_curve
+from ..scores import Scores
 from ..scoring import auto, closed_form, occlusion
-from ..seeing.ray_sample import validation_rays
+from ..splats import Splats
 from ..task import DEFAULTS, Settings
-from ..views import refuse_other
+from ..views import ViewSet, refuse_other
+from ..visibility.measuring import Measured
+from ..visibility.ray_sample import validation_rays
 from ..volumes import refuse_all
 from ..work import Progress, silent
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
-    from ..costs import Plan
-    from ..scores import Scores
-    from ..seeing.measuring import Measured
-    from ..splats import Splats
-    from ..views import ViewSet
-
-
-def score(  # noqa: PLR0913 - as `pipeline.prune`
+def score(
     splats: Splats,
     views: ViewSet,
     settings: Settings = DEFAULTS,

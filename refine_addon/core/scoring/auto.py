@@ -12,25 +12,20 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .. import costs
-from ..estimate.psnr import psnr_by_views
-from ..estimate.quality import UNSEEN
 from ..pace import phases
+from ..quality.curve import UNSEEN
+from ..quality.psnr import psnr_by_views
+from ..scores import Scores
+from ..splats import Splats
+from ..views import ViewSet
 from ..work import Progress, silent
-from .occlusion import MemoryScoring, OcclusionScoring, survivors_of_rounds
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..scores import Scores
-    from ..splats import Splats
-    from ..views import ViewSet
-    from .occlusion import Occlusion
+from .occlusion import MemoryScoring, Occlusion, OcclusionScoring, survivors_of_rounds
 
 RATIOS = (0.3, 0.5, 0.7, 0.9)
 """Shares removed at which rankings are compared; the largest loss counts."""
@@ -43,7 +38,7 @@ FIRST, MORE, VALIDATING = (0, 1, 2, 3), (4,), (5, 6)
 validate. The latter and the eighth group measure too if the others are not enough."""
 
 
-def score(  # noqa: PLR0913 - as `occlusion.score`, and the tolerance
+def score(
     splats: Splats,
     views: ViewSet,
     tolerance: float,
@@ -169,7 +164,7 @@ def _measure(
     """
     groups, rays = scoring.measuring.groups, scoring.validation_rays
     validating = [number for k in VALIDATING for number in groups[k]]
-    assert rays is not None  # noqa: S101 - a scoring of several views has them
+    assert rays is not None
     few, more, every = (
         sum(len(groups[k]) for k in chosen) for chosen in (FIRST, FIRST + MORE, range(len(groups)))
     )

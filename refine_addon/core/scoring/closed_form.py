@@ -17,32 +17,26 @@ with D in units of its mean, and m_i its mean over the splats in the same cell o
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import radix
 from ..errors import RefineError
 from ..rendering import NEAR_RELATIVE
 from ..scores import Scores
-from ..seeing.scene import principal_axes, size_of
-from ..splats import refuse_undrawable
+from ..splats import Splats, refuse_undrawable
+from ..views import ViewSet
+from ..visibility.scene import principal_axes, size_of
 from ..work import Progress, chunks, default_threads, for_chunks, part, silent
 from . import adaptive
-from .closed_form_block import CELLS, HIGHEST, ROWS, Frame, RowBlock
+from .closed_form_block import CELLS, HIGHEST, ROWS, Frame, NeighbourhoodSums, RowBlock
 from .closed_form_settings import DEFAULTS, ETA_RELATIVE, ClosedForm
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from ..views import ViewSet
-    from .closed_form_block import NeighbourhoodSums
-
-    Each = Callable[..., Iterable[Any]]
+Each = Callable[..., Iterable[Any]]
 
 SHARES = {"read": 0.2, "count": 0.0, "sum_views": 0.75, "add": 0.0, "compare": 0.0}
 """How much of the time each step takes, for progress; the other steps are too short to tell."""
@@ -93,7 +87,7 @@ def score(
     ]
     done = 0.0
 
-    def each(step: str, *arguments: Any) -> list[Any]:  # noqa: ANN401 - of each step its own
+    def each(step: str, *arguments: Any) -> list[Any]:
         nonlocal done
         progress_of_step = part(progress, done, done + SHARES[step])
         done += SHARES[step]
@@ -168,8 +162,7 @@ def steps(
         See `score`.
     """
     if not total:
-        msg = "there are no splats to score"
-        raise RefineError(msg)
+        raise RefineError("there are no splats to score")
     tallies, moments, highest = _joined(each("read"))
     good = int(tallies[:, 0].sum())
     refuse_undrawable(good, total)
@@ -178,11 +171,10 @@ def steps(
     )
     sums = np.concatenate([*each("sum_views", Frame(axes, float(eta), float(near)))])
     if settings.frustum and not sums[:, 3].any():
-        msg = (
+        raise RefineError(
             f"no camera sees the splats: none of {total} lies in the frustum of any of "
             f"{len(views)} views; check that cameras and splats share their frame and unit"
         )
-        raise RefineError(msg)
     statistics = _statistics(tallies)
     lambdas = _lambdas(statistics, settings)
     means = np.sum(sums[:, :3], axis=0) / total  # of H G, for each of the three G
@@ -249,7 +241,7 @@ def _powers(
         return None, 0.0
     powers, count, end = np.zeros(CELLS**3), np.zeros(CELLS**3, np.int64), 0
     for of_block in neighbourhoods:
-        assert of_block is not None  # noqa: S101 - `local` is in the blocks' settings
+        assert of_block is not None
         cells, sums, counts = of_block
         powers[cells] += sums
         count[cells] += counts

@@ -7,29 +7,22 @@ disk in between, or on several machines.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import radix
-from ..seeing.frustum import Frustums
-from ..splats import base_color, drawable, opacity
-from ..work import for_chunks, part, silent
+from ..splats import Splats, base_color, drawable, opacity
+from ..views import ViewSet
+from ..visibility.frustum import Frustums
+from ..work import Progress, for_chunks, part, silent
 from . import adaptive
+from .closed_form_settings import ClosedForm
 from .nearness import near_order
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from ..views import ViewSet
-    from ..work import Progress
-    from .closed_form_settings import ClosedForm
 
 LUMA = (0.299, 0.587, 0.114)
 """Factors of red, green and blue in the luma (Rec. 601)."""
@@ -211,7 +204,7 @@ class RowBlock:
         self.origin, self.view_variance = middle
         vars(self).update(arrays or {})
 
-    def step(self, name: str, *arguments: Any) -> Any:  # noqa: ANN401 - of each step its own
+    def step(self, name: str, *arguments: Any) -> Any:
         """Do a step, and forget what none after it needs; return what it returns."""
         result = getattr(self, name)(*arguments)
         for array in STEPS[name][2]:
@@ -229,7 +222,7 @@ class RowBlock:
         prefixes, places, counts
             `count` of the highest digit, which the first pass needs anyway.
         """
-        assert self.splats is not None  # noqa: S101 - whoever calls this gave them
+        assert self.splats is not None
         count = len(self.splats)
         self.good = np.empty(count, np.bool_)
         kind = self.splats.take(slice(0, 0)).means.dtype.newbyteorder("=")
@@ -245,17 +238,7 @@ class RowBlock:
         return np.array(tallies), np.array(moments), *self.count([0], HIGHEST)
 
     def _read(self, piece: slice) -> tuple[tuple[float, ...], NDArray[np.float64]]:
-        """Activate one slice of splats.
-
-        Returns
-        -------
-        count, ratios, translucency, luma, squares : tuple of float
-            Over the drawable splats: their number, the sums of the axis ratio and of
-            4 alpha (1 - alpha), the mean of the luma and the sum of its squared deviations.
-        moments : (4, 3) float64
-            Over the drawable splats, weighted by 1 / `squared`: the sums of the products of their
-            coordinates from the origin, and of the coordinates.
-        """
+        """Activate one slice of splats."""
         chunk = self.splats.take(piece).by_columns()  # type: ignore[union-attr]
         good = self.good[piece] = drawable(chunk)  # (n,)
         if not good.all():
@@ -543,7 +526,7 @@ class RowBlock:
             values *= np.exp(weight * powers[self.cells[piece]])
             self._store(self.values, values, piece)
 
-    def _in_chunks(self, work: Any) -> None:  # noqa: ANN401 - a function of a slice
+    def _in_chunks(self, work: Any) -> None:
         for_chunks(work, len(self.good), 4 * _CHUNK, threads=self.threads)
 
     def _store(self, into: NDArray[np.float32], values: NDArray[np.float64], piece: slice) -> None:

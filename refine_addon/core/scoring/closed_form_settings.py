@@ -45,24 +45,16 @@ class ClosedForm:
     equal_weights: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            If a value is out of range.
-        """
+        """Check the values."""
         if self.depth not in ("z", "distance"):
-            msg = f"depth is {self.depth!r}, expected 'z' or 'distance'"
-            raise RefineError(msg)
+            raise RefineError(f"depth is {self.depth!r}, expected 'z' or 'distance'")
         for name in ("eta", "anisotropy_offset"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < np.inf:
-                msg = f"{name} is {value}, expected a positive number"
-                raise RefineError(msg)
+                raise RefineError(f"{name} is {value}, expected a positive number")
 
     @classmethod
-    def published(cls, depth: Literal["z", "distance"], **changes: Any) -> ClosedForm:  # noqa: ANN401
+    def published(cls, depth: Literal["z", "distance"], **changes: Any) -> ClosedForm:
         """Return the published constants: the paper's for "z", its authors' code's otherwise."""
         eta, offset = (0.05, 0.05) if depth == "z" else (0.5, 1e-6)
         return cls(depth, eta, offset, frustum=False, local=False, **changes)

@@ -17,19 +17,14 @@ rest of it is worth nothing. So from half removed on the weight is at least `LEA
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..costs import SAMPLE
-from ..seeing.scene import MIX, fingerprint
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..seeing.projection import Gaussians
+from ..visibility.projection import Gaussians
+from ..visibility.scene import MIX, fingerprint
 
 FLOOR_WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
 """Weights that are tried. At weight 1, a splat of average prior that lies in no view gets a floor

@@ -19,33 +19,27 @@ splats.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import costs, processes
 from ..errors import RefineError
 from ..pace import phases
 from ..scores import Scores, shares_gone
-from ..seeing import projection
-from ..seeing.measuring import SECONDS, Measured, Measuring, Sampling
-from ..seeing.ray_sample import RaySample
-from ..splats import refuse_undrawable
+from ..splats import Splats, refuse_undrawable
 from ..views import ViewSet
 from ..views_between import views_between
+from ..visibility import projection
+from ..visibility.measuring import SECONDS, Measured, Measuring, Sampling
+from ..visibility.projection import Gaussians
+from ..visibility.ray_sample import RaySample
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage
 from .closed_form_settings import ClosedForm
 from .removal_rounds import RemovalRounds
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..seeing.projection import Gaussians
-    from ..splats import Splats
 
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
@@ -75,17 +69,10 @@ class Occlusion(Sampling):
     rounds: int = 8
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            If a value is out of range.
-        """
+        """Check the values."""
         super().__post_init__()
         if self.rounds < 1:
-            msg = f"rounds is {self.rounds}, expected 1 or more"
-            raise RefineError(msg)
+            raise RefineError(f"rounds is {self.rounds}, expected 1 or more")
 
 
 def score(
@@ -179,7 +166,7 @@ def score_once(
     return scoring.rank(ranking), measured.for_all(scoring.gaussians.index, len(splats))
 
 
-def measure_part(  # noqa: PLR0913 - as `score`, and which part
+def measure_part(
     splats: Splats,
     views: ViewSet,
     settings: Occlusion,
@@ -325,12 +312,11 @@ class OcclusionScoring:
         """
         measured, removal = self.measured(), self._removal()
         if not measured.contribution.any():
-            msg = (
+            raise RefineError(
                 f"no camera sees the splats: none of {len(self.prior)} reaches into the image of "
                 f"any of {len(self.measuring.views)} views; check that cameras and splats share "
                 "their frame and unit"
             )
-            raise RefineError(msg)
         seen = np.zeros(len(self.prior), np.int32)
         seen[self.gaussians.index] = measured.seen
         threads = self.measuring.threads
@@ -443,7 +429,7 @@ class MemoryScoring(OcclusionScoring):
 
     validation_rays: RaySample
 
-    def __init__(  # noqa: PLR0913 - all but three are optional
+    def __init__(
         self,
         splats: Splats,
         views: ViewSet,
@@ -455,8 +441,7 @@ class MemoryScoring(OcclusionScoring):
         threads: int | None = None,
     ) -> None:
         if not len(splats):
-            msg = "there are no splats to score"
-            raise RefineError(msg)
+            raise RefineError("there are no splats to score")
         processes.start(SECONDS * len(splats) * len(views), threads)
         activating, scoring = phases(progress, *costs.preparing(len(splats), len(views)))
         gaussians, scene, good = projection.prepare(

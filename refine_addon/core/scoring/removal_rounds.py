@@ -15,20 +15,16 @@ n_i is how many rays hit the splat while all were there. A measured sum grows as
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..seeing.measuring import Measured
+from ..visibility.measuring import Measured
+from ..visibility.ray_sample import RaySample
+from ..visibility.rays import Rays
 from ..work import Progress, for_chunks, part
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..seeing.ray_sample import RaySample
-    from ..seeing.rays import Rays
-
-    Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
+Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 KNOWN = 10.0
 """What was measured counts as much as so many rays."""
@@ -91,7 +87,7 @@ class RemovalRounds:
         def with_colors(piece: slice) -> _ViewRays:
             number: int = numbers[piece.start]
             rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
-            assert rays is not None  # noqa: S101 - as `numbers` says
+            assert rays is not None
             with np.errstate(under="ignore"):
                 colors = scoring_rays.colors(number, rays).astype(np.float32)
             return _ViewRays(rays, colors, weight * view.width * view.height / rays.count)

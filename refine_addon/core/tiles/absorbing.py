@@ -10,18 +10,21 @@ merge in the next stage. A splat is in one region in each stage.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..absorbing.absorb import Counts, patience, stages
 from ..costs import Images
 from ..costs import absorbing as plan_stages
+from ..merging.absorb import Counts, patience, stages
 from ..pipeline.absorb_splats import FIRST, PARTS
-from ..seeing.measuring import Measured
 from ..selection import Budget, select
-from .gaussians import store_gaussians
+from ..task import Settings
+from ..visibility.measuring import Measured
+from .folder import Folder
+from .gaussians import SceneContext, store_gaussians
 from .regions import (
     MEANS,
     SURVIVORS,
@@ -34,19 +37,10 @@ from .regions import (
     SettleUnit,
     StageContext,
 )
+from .scoring import MeasuredTiles
 from .seeing import StoredRays, TileMeasuring
+from .units import Source, Unit
 from .workers import Runner
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..task import Settings
-    from .folder import Folder
-    from .gaussians import SceneContext
-    from .scoring import MeasuredTiles
-    from .units import Source, Unit
 
 REGION = 1 << 20
 """Splats of a region at most; absorbing takes about 900 bytes of each."""

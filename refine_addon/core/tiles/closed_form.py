@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..operation.run import Runtime
 from ..scores import Scores
 from ..scoring import closed_form
 from ..scoring.closed_form_block import STEPS, RowBlock
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..operation.run import Runtime
-    from ..scoring.closed_form_settings import ClosedForm
-    from ..views import ViewSet
-    from .folder import Folder
-    from .units import Unit
-    from .workers import Runner
+from ..scoring.closed_form_settings import ClosedForm
+from ..views import ViewSet
+from .folder import Folder
+from .units import Unit
+from .workers import Runner
 
 SHARES: Mapping[str, tuple[float, float]] = {
     "read": (0.0, 0.24),
@@ -64,7 +60,7 @@ class ComputeRows:
     step: str
     arguments: tuple[Any, ...]
 
-    def run(self, context: ClosedFormContext, runtime: Runtime) -> Any:  # noqa: ANN401 - of each step its own
+    def run(self, context: ClosedFormContext, runtime: Runtime) -> Any:
         """Do the step, unless it is done; return what came of it."""
         folder, index = context.folder, self.unit.index
         if self.step in _REPEATED:
@@ -74,7 +70,7 @@ class ComputeRows:
         folder.drop(index, STEPS[self.step][2])
         return result
 
-    def _computed(self, context: ClosedFormContext, runtime: Runtime) -> Any:  # noqa: ANN401 - of each step its own
+    def _computed(self, context: ClosedFormContext, runtime: Runtime) -> Any:
         folder, unit = context.folder, self.unit
         needed, made, _ = STEPS[self.step]
         # From a disk a unit is read chunk by chunk; behind a URL each chunk would be a request.
@@ -103,14 +99,14 @@ class _Steps:
     runner: Runner
     stored: int = 0  # arguments that lie in the folder
 
-    def each(self, step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
+    def each(self, step: str, *arguments: Any) -> Iterator[Any]:
         """Do a step with each unit."""
         small = tuple(map(self._small, arguments))
         steps = [ComputeRows(unit, step, small) for unit in self.units]
         what, sizes = _NAMES.get(step, "scoring"), [*map(len, self.units)]
         return self.runner.part(*SHARES[step]).run(self.context, steps, what, sizes)
 
-    def _small(self, argument: Any) -> Any:  # noqa: ANN401 - as given
+    def _small(self, argument: Any) -> Any:
         """Return an argument, or where it lies if it is large."""
         if not isinstance(argument, np.ndarray) or argument.nbytes <= _SMALL:
             return argument

@@ -16,23 +16,18 @@ import threading
 import time
 import uuid
 from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import resource_tracker
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...version import VERSION
 from ..errors import RefineError
 from ..operation.run import Runtime
 from ..work import report
-from .folder import Interrupted
-from .units import header_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from .folder import Folder
-    from .units import Tile
-    from .workers import Batch, Context, Result
+from .folder import Folder, Interrupted
+from .units import Tile, header_of
+from .workers import Batch, Context, Result
 
 _AHEAD = 3
 """Groups of steps a thread of a worker that are handed out ahead: so many wait here at most."""
@@ -81,16 +76,15 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
         If Dask is not installed, or the scheduler not to be found.
     """
     try:
-        import dask  # noqa: PLC0415 - an optional extra
-        import distributed  # noqa: PLC0415
+        import dask
+        import distributed
     except ImportError as error:
-        msg = "workers need Dask: pip install 'refine-addon[distributed]'"
-        raise RefineError(msg) from error
+        raise RefineError("workers need Dask: pip install 'refine-addon[distributed]'") from error
     with contextlib.ExitStack() as held:
         if scheduler is None:
             held.enter_context(dask.config.set(_MEMORY))
 
-            def start() -> Any:  # noqa: ANN401 - Dask has no types
+            def start() -> Any:
                 return distributed.LocalCluster(
                     n_workers=workers, threads_per_worker=1, processes=True,
                     dashboard_address=None, memory_limit=None, silence_logs=50,
@@ -99,17 +93,17 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
             try:
                 scheduler = held.enter_context(_uninterrupted(start))
             except Exception as error:
-                msg = f"workers ended while they were started ({error}); try again"
-                raise Interrupted(msg) from error
+                raise Interrupted(
+                    f"workers ended while they were started ({error}); try again"
+                ) from error
         try:
             client = held.enter_context(distributed.Client(scheduler, timeout=_CONNECT))
         except (OSError, ValueError) as error:
-            msg = f"{scheduler}: no Dask scheduler answers there ({error})"
-            raise RefineError(msg) from error
+            raise RefineError(f"{scheduler}: no Dask scheduler answers there ({error})") from error
         yield Cluster(client)
 
 
-def _uninterrupted(make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made
+def _uninterrupted(make: Callable[[], Any]) -> Any:
     """Return what `make` returns, which is called on a thread, where no Ctrl-C arrives.
 
     A cluster that is interrupted while it starts cannot close what it has started. So it starts,
@@ -143,7 +137,7 @@ class Cluster:
     client : distributed.Client
     """
 
-    def __init__(self, client: Any) -> None:  # noqa: ANN401 - Dask has no types
+    def __init__(self, client: Any) -> None:
         self._client = client
 
     def check(self, folder: Folder, tiles: Sequence[Tile]) -> None:
@@ -162,8 +156,9 @@ class Cluster:
             if isinstance(answer, BaseException):
                 wrong = f"it cannot run refine {VERSION}: {answer}"
             if wrong:
-                msg = f"worker {worker}: {wrong}; workers need the same files under the same paths"
-                raise RefineError(msg)
+                raise RefineError(
+                    f"worker {worker}: {wrong}; workers need the same files under the same paths"
+                )
 
     def _answers(self, folder: Folder, tiles: Sequence[Tile]) -> dict[str, Any]:
         """Return what each worker answers to `_answer`, but for those that were lost meanwhile."""
@@ -172,11 +167,9 @@ class Cluster:
                 self._client.wait_for_workers(1, timeout=_CONNECT)
                 answers = self._client.run(_answer, VERSION, folder, tiles, on_error="return")
             except TimeoutError as error:
-                msg = "the scheduler has no workers"
-                raise RefineError(msg) from error
+                raise RefineError("the scheduler has no workers") from error
             except Exception as error:
-                msg = f"the workers do not answer: {error}"
-                raise Interrupted(msg) from error
+                raise Interrupted(f"the workers do not answer: {error}") from error
             there = {
                 worker: answer
                 for worker, answer in answers.items()
@@ -184,8 +177,7 @@ class Cluster:
             }
             if there:
                 return there
-        msg = "the workers were lost again and again"
-        raise Interrupted(msg)
+        raise Interrupted("the workers were lost again and again")
 
     def run(self, batch: Batch[Context, Result]) -> Iterator[Result]:
         """Do steps; see `Workers.run`.
@@ -195,8 +187,8 @@ class Cluster:
         Interrupted
             If workers were lost again and again.
         """
-        from distributed import CancelledError, KilledWorker  # noqa: PLC0415 - as above
-        from distributed.comm import CommClosedError  # noqa: PLC0415
+        from distributed import CancelledError, KilledWorker
+        from distributed.comm import CommClosedError
 
         # Once: the arrays of all views take Dask some milliseconds.
         packed = pickle.dumps(batch.context)
@@ -216,23 +208,16 @@ class Cluster:
                     done += next(shares)
                     yield result
         except (KilledWorker, CancelledError, CommClosedError) as error:
-            msg = f"workers were lost ({error})"
-            raise Interrupted(msg) from error
+            raise Interrupted(f"workers were lost ({error})") from error
         finally:
             self._client.cancel([*waiting])
 
-    def _submit(self, packed: bytes, group: Sequence[Any]) -> Any:  # noqa: ANN401 - Dask's future
+    def _submit(self, packed: bytes, group: Sequence[Any]) -> Any:
         key = f"{type(group[0]).__name__}-{uuid.uuid4().hex}"
         return self._client.submit(_run, packed, [*group], key=key)
 
-    def _result(self, future: Any, batch: Batch[Any, Any], done: float) -> Any:  # noqa: ANN401
-        """Return the result of a future, and ask meanwhile whether to go on.
-
-        Raises
-        ------
-        Interrupted
-            If there is no worker any more; those that are lost are started again, if not at once.
-        """
+    def _result(self, future: Any, batch: Batch[Any, Any], done: float) -> Any:
+        """Return the result of a future, and ask meanwhile whether to go on."""
         ended, seen = threading.Event(), time.monotonic()
         future.add_done_callback(lambda _: ended.set())
         report(batch.progress, done, batch.what)
@@ -242,8 +227,7 @@ class Cluster:
             if alone > _ALONE / 10.0 and self._client.nthreads():
                 seen = time.monotonic()
             elif alone > _ALONE:
-                msg = "all workers were lost"
-                raise Interrupted(msg)
+                raise Interrupted("all workers were lost")
         return future.result()
 
 
@@ -255,7 +239,7 @@ def _run(packed: bytes, group: Sequence[Any]) -> list[Any]:
 
 @functools.lru_cache(maxsize=2)
 def _unpacked(packed: bytes) -> object:
-    return pickle.loads(packed)  # noqa: S301 - Dask itself sends pickles
+    return pickle.loads(packed)
 
 
 async def _answer(version: str, folder: Folder, tiles: Sequence[Tile]) -> str:

@@ -12,7 +12,7 @@ import secrets
 import shutil
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,17 +23,16 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
-    from pathlib import Path
-    from typing import BinaryIO
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO
 
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 _DAMAGE = (ValueError, EOFError)  # what NumPy raises for a file that is not a whole array
 
 
-class Interrupted(RefineError):  # noqa: N818 - the input is not at fault
+class Interrupted(RefineError):
     """Raised where workers, a disk or a storage failed: what is done stays for the next run."""
 
 
@@ -76,7 +75,7 @@ class Folder:
         for name in names:
             self._array(index, name).unlink(missing_ok=True)
 
-    def once(self, name: str, make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made, or `noted`
+    def once(self, name: str, make: Callable[[], Any]) -> Any:
         """Return the noted result of that name; if there is none, make and note it.
 
         Where `make` saves arrays, the name begins with their number in six digits and a dot: if one
@@ -98,8 +97,7 @@ class Folder:
             if done:
                 return result
             self._forget("")
-            msg = f"{error.filename}: is gone"
-            raise Interrupted(msg) from error
+            raise Interrupted(f"{error.filename}: is gone") from error
         self.note(name, result)
         return result
 
@@ -113,7 +111,7 @@ class Folder:
             raise Interrupted(_not_written(folder.path, error)) from error
         return folder
 
-    def note(self, name: str, result: Any) -> None:  # noqa: ANN401 - an array, a tuple of some, None
+    def note(self, name: str, result: Any) -> None:
         """Note a result: from then on it is done."""
         alone = isinstance(result, np.ndarray)
         arrays = [result] if alone else [np.asarray(each) for each in result or ()]
@@ -178,16 +176,16 @@ class Folder:
         except OSError as error:
             if fresh:
                 self.remove()
-            msg = f"{self.path}: cannot be made ({error.strerror or error})"
-            raise RefineError(msg) from error
+            raise RefineError(f"{self.path}: cannot be made ({error.strerror or error})") from error
         try:
             with stream:
                 if fcntl is not None:
                     try:
                         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     except BlockingIOError as error:
-                        msg = f"{self.path}: another run is at work on the same job"
-                        raise RefineError(msg) from error
+                        raise RefineError(
+                            f"{self.path}: another run is at work on the same job"
+                        ) from error
                     except OSError:
                         pass  # this file system has no locks
                 yield
@@ -211,13 +209,11 @@ class Folder:
             return _read(path, mode)
         except _DAMAGE as error:
             self._forget(start)
-            msg = f"{path}: is damaged"
-            raise Interrupted(msg) from error
+            raise Interrupted(f"{path}: is damaged") from error
         except FileNotFoundError:
             raise
         except OSError as error:
-            msg = f"{path}: cannot be read ({error.strerror})"
-            raise Interrupted(msg) from error
+            raise Interrupted(f"{path}: cannot be read ({error.strerror})") from error
 
     def _forget(self, start: str) -> None:
         """Remove the notes whose names start so: what they stand for is then done again."""
@@ -237,7 +233,7 @@ def _write(stream: BinaryIO, array: NDArray[Any]) -> None:
     np.save(only_write, array, allow_pickle=False)
 
 
-def _read(path: Path, mode: Any = None) -> NDArray[Any]:  # noqa: ANN401 - as `numpy.load`
+def _read(path: Path, mode: Any = None) -> NDArray[Any]:
     """Return an array, mapped if `mode` is "r"."""
     return np.asarray(np.load(path, mmap_mode=mode, allow_pickle=False))
 

@@ -8,29 +8,23 @@ together, as in memory: what it finds is the same to the bit, wherever the tiles
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..seeing import projection
-from ..seeing.projection import Gaussians
-from ..seeing.scene import code_order, moments, spatial_code, splat_fingerprint
+from ..operation.run import Runtime
+from ..rendering import Model
 from ..splats import drawable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..operation.run import Runtime
-    from ..rendering import Model
-    from ..seeing.measuring import Sampling
-    from ..seeing.scene import Scene
-    from ..views import View, ViewSet
-    from .folder import Folder
-    from .units import Source
-    from .workers import Runner
+from ..views import View, ViewSet
+from ..visibility import projection
+from ..visibility.measuring import Sampling
+from ..visibility.projection import Gaussians
+from ..visibility.scene import Scene, code_order, moments, spatial_code, splat_fingerprint
+from .folder import Folder
+from .units import Source
+from .workers import Runner
 
 CHUNK = 1 << 16
 """Splats of a chunk, 3.7 MB."""

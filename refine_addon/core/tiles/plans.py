@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from .. import costs
-from ..absorbing.absorb import ALONE, stages
-from ..costs import Cost
+from ..costs import Cost, Images, Plan
+from ..merging.absorb import ALONE, stages
 from ..pipeline.absorb_splats import FIRST
-from ..refitting.round_rays import limits
+from ..refit.refit import Refit
+from ..refit.round_rays import limits
 from ..scoring.occlusion import survivors_of_rounds
+from ..task import Settings
 from . import absorbing
-
-if TYPE_CHECKING:
-    from ..costs import Images, Plan
-    from ..refitting.refit import Refit
-    from ..task import Settings
 
 
 def scoring(

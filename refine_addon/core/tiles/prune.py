@@ -7,19 +7,24 @@ import functools
 import hashlib
 import tempfile
 import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...version import VERSION
-from ..costs import Cost, Images, joined
+from ..costs import Cost, Images, Plan, joined
 from ..errors import RefineError
-from ..estimate.psnr import psnr_kept
-from ..estimate.quality import needed
+from ..formats.format import Format
 from ..formats.ply_header import with_count
-from ..operation.run import Request, Written, run
+from ..operation.requests import PruneRequest
+from ..operation.run import Request, Runtime, Written, run
+from ..quality.curve import needed
+from ..quality.psnr import psnr_kept
+from ..refit.refit import Gains, Refit
 from ..report import (
     MEASURES,
     conclude,
@@ -29,40 +34,25 @@ from ..report import (
     make_report,
     remark,
 )
+from ..scores import Scores
 from ..scoring.closed_form_block import ROWS
-from ..selection import refuse_none_left
+from ..selection import Budget, refuse_none_left
+from ..survivor_choice import Became
 from ..urls import Url
 from ..work import Cancelled, Progress, silent
 from . import absorbing
+from .absorbing import Survivors
 from .closed_form import ClosedFormContext, by_closed_form
 from .folder import Folder, Interrupted
 from .plans import making as plan_making
 from .plans import scoring as plan_scoring
 from .refitting import refit_survivors
-from .scoring import by_occlusion, measured_once
+from .scoring import MeasuredTiles, by_occlusion, measured_once
 from .selecting import ChooseByScore, removals, rule_of
 from .storage import located, new_folder
-from .units import header_of, pieces_of, tiles_at, units_of
-from .workers import InProcess, Runner
+from .units import Tile, Unit, header_of, pieces_of, tiles_at, units_of
+from .workers import InProcess, Runner, Workers
 from .writing import Outputs, WriteTile
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..costs import Plan
-    from ..formats.format import Format
-    from ..operation.requests import PruneRequest
-    from ..operation.run import Runtime
-    from ..refitting.refit import Gains, Refit
-    from ..scores import Scores
-    from ..selection import Budget
-    from ..survivor_choice import Became
-    from .absorbing import Survivors
-    from .scoring import MeasuredTiles
-    from .units import Tile, Unit
-    from .workers import Workers
 
 UNCHANGED = (
     "survivors stay unchanged: over tiles they absorb or are refitted where that is asked for by "
@@ -226,23 +216,21 @@ class TilesRequest(Request[TileScene, TileDecision]):
     prune: PruneRequest
 
     def __post_init__(self) -> None:
-        """Refuse what needs all splats at once.
-
-        Raises
-        ------
-        RefineError
-        """
+        """Refuse what needs all splats at once."""
         budget, settings = self.prune.budget, self.prune.settings
         if self.prune.zones or self.prune.cleaning or self.prune.pictures:
-            msg = "volumes, cleaning and pictures need all splats in memory: not over tiles"
-            raise RefineError(msg)
+            raise RefineError(
+                "volumes, cleaning and pictures need all splats in memory: not over tiles"
+            )
         if self.prune.absorb and (budget.threshold is not None or budget.psnr is not None):
             what = "a threshold" if budget.psnr is None else "a PSNR"
-            msg = f"{what} needs all splats in memory to absorb: over tiles choose another budget"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{what} needs all splats in memory to absorb: over tiles choose another budget"
+            )
         if budget.psnr is not None and not settings.estimates:
-            msg = f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
-            raise RefineError(msg)
+            raise RefineError(
+                f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
+            )
         budget.refuse_meaningless(settings.method, frustum=settings.frustum)
 
     def costs(self, scene: TileScene) -> list[Plan]:
@@ -425,8 +413,9 @@ class TileSink:
             except Interrupted as error:
                 if self._outputs is None:
                     raise
-                msg = f"{error}; the same command goes on where this one was"
-                raise Interrupted(msg) from error
+                raise Interrupted(
+                    f"{error}; the same command goes on where this one was"
+                ) from error
             except (RefineError, Cancelled):
                 scene.folder.remove()
                 if self._outputs:

@@ -7,31 +7,24 @@ they were before.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..refitting.refit import Gains, Refit, refit, refit_on
-from ..splats import ARRAYS, joined
+from ..operation.run import Runtime
+from ..refit.refit import Gains, Refit, refit, refit_on
+from ..splats import ARRAYS, Splats, joined
+from ..views import ViewSet
 from . import absorbing
+from .absorbing import Survivors
+from .folder import Folder
 from .region_rays import RegionRays, StoredSplats
 from .regions import Region, StageContext
-from .units import packed, unpacked
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from ..operation.run import Runtime
-    from ..splats import Splats
-    from ..views import ViewSet
-    from .absorbing import Survivors
-    from .folder import Folder
-    from .scoring import MeasuredTiles
-    from .units import Source, Unit
-    from .workers import Runner
+from .scoring import MeasuredTiles
+from .units import Source, Unit, packed, unpacked
+from .workers import Runner
 
 _DENSER = 2  # a refitted survivor takes so many times the memory of one that is absorbed
 

@@ -5,12 +5,13 @@ Splats of other regions are drawn as they are, in front and behind, and do not c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..refitting.round_rays import (
+from ..refit.round_rays import (
     InMemory,
     RoundRays,
     Window,
@@ -18,21 +19,13 @@ from ..refitting.round_rays import (
     limits,
     steps_of,
 )
-from ..seeing import projection
-from ..views import ViewSet
-from .regions import taken
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from ..seeing.projection import Footprints, Gaussians
-    from ..seeing.scene import Scene
-    from ..splats import Splats
-    from ..views import View
-    from .gaussians import SceneContext
-    from .regions import Region
+from ..splats import Splats
+from ..views import View, ViewSet
+from ..visibility import projection
+from ..visibility.projection import Footprints, Gaussians
+from ..visibility.scene import Scene
+from .gaussians import SceneContext
+from .regions import Region, taken
 
 _SAMPLE = 1 << 12  # splats of a region that tell where it is in each view
 _EDGE = 0.005  # share of them that may lie outside on each side

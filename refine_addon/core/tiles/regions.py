@@ -3,36 +3,29 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..absorbing import merge_field
-from ..absorbing.absorb import mergeable, reduced
-from ..absorbing.merge_field import Field, ViewSums
-from ..absorbing.merge_graph import MergeGraph
+from ..merging.absorb import mergeable, reduced
+from ..merging.field import Field, MeasuredField, ViewSums, measured_field
+from ..merging.graph import MergeGraph
+from ..operation.run import Runtime
 from ..pipeline.absorb_splats import absorb_removed
 from ..rendering import MODELS
 from ..scores import Scores
-from ..seeing.measuring import Measured
-from ..splats import joined
+from ..splats import Splats, joined
+from ..task import Settings
+from ..views import ViewSet
+from ..visibility.measuring import Measured
+from ..visibility.scene import Scene
+from .folder import Folder
 from .selecting import save_kept
-from .units import packed, unpacked
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from ..operation.run import Runtime
-    from ..seeing.scene import Scene
-    from ..splats import Splats
-    from ..task import Settings
-    from ..views import ViewSet
-    from .folder import Folder
-    from .units import Source, Unit
+from .units import Source, Unit, packed, unpacked
 
 SURVIVORS = ("survivors", "places", "changed")
 """Names of what is noted of survivors: their rows among all splats, ascending; where each is among
@@ -127,7 +120,7 @@ class GatherRegion:
     index: int
 
     def run(self, context: StageContext, runtime: Runtime) -> NDArray[np.float64]:
-        """Save the region; return `merge_field.MeasuredField.seen_and_whole`, (2, 2)."""
+        """Save the region; return `MeasuredField.seen_and_whole`, (2, 2)."""
         name = f"{self.index:06d}.gathered"
         sums = context.folder.once(name, lambda: self._gathered(context, runtime))
         return np.asarray(sums)
@@ -137,7 +130,7 @@ class GatherRegion:
         table, origin, members = context.gathered(rows)
         splats = unpacked(table)
         places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
-        measured = merge_field.measured_field(
+        measured = measured_field(
             splats, places, context.views, context.scene, ViewSums(*sums),
             progress=runtime.progress, threads=runtime.threads,
         )  # fmt: skip
@@ -164,7 +157,7 @@ class PriceRegion:
         folder = context.folder
         arrays = folder.load(self.index, (*_FIELD, "mass", "seen_by", "rows", "mergeable"))
         field = _field(*(arrays[name] for name in _FIELD))
-        measured = merge_field.MeasuredField(field, arrays["mass"], arrays["seen_by"])
+        measured = MeasuredField(field, arrays["mass"], arrays["seen_by"])
         graph = MergeGraph(
             measured.with_allowance(self.whole), context.scene, context.factor,
             threads=runtime.threads,

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .. import costs
 from ..pace import phases
 from ..pipeline.score_splats import with_quality
+from ..scores import Scores
 from ..scoring import auto
-from ..scoring.occlusion import PRIOR, OcclusionScoring, survivors_of_rounds
-from ..seeing.scene import Scene, principal_axes
-from .closed_form import by_closed_form
+from ..scoring.occlusion import PRIOR, Occlusion, OcclusionScoring, survivors_of_rounds
+from ..task import Settings
+from ..visibility.measuring import Measured
+from ..visibility.scene import Scene, principal_axes
+from ..work import Progress
+from .closed_form import ClosedFormContext, by_closed_form
 from .gaussians import SceneContext, SumMoments, store_gaussians
 from .seeing import StoredRays, TileMeasuring
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ..scores import Scores
-    from ..scoring.occlusion import Occlusion
-    from ..seeing.measuring import Measured
-    from ..task import Settings
-    from ..work import Progress
-    from .closed_form import ClosedFormContext
-    from .units import Unit
-    from .workers import Runner
+from .units import Unit
+from .workers import Runner
 
 
 @dataclass(frozen=True, eq=False)

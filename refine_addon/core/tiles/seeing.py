@@ -1,4 +1,4 @@
-"""What views see of splats that no memory holds at once: `core.seeing`, with its sums on a disk.
+"""What views see of splats that no memory holds at once, with its sums on a disk.
 
 The sums of groups of views and the hits of rays lie in the folder of the job.
 """
@@ -6,38 +6,29 @@ The sums of groups of views and the hits of rays lie in the folder of the job.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..estimate.psnr import mean_psnr
+from ..operation.run import Runtime
 from ..processes import for_each
-from ..seeing.cast import cast
-from ..seeing.measuring import SECONDS, Measured, Measuring, measure_footprints
-from ..seeing.ray_sample import RaySample, cast_view
-from ..seeing.rays import Rays
-from ..splats import joined
-from .units import unpacked
+from ..quality.psnr import mean_psnr
+from ..splats import Splats, joined
+from ..visibility.cast import cast
+from ..visibility.measuring import SECONDS, Measured, Measuring, ViewMeasurement, measure_footprints
+from ..visibility.projection import Footprints, Gaussians
+from ..visibility.ray_sample import RaySample, cast_view
+from ..visibility.rays import Rays
+from ..visibility.scene import Scene
+from ..work import Progress
+from .folder import Folder
+from .gaussians import SceneContext, StoredGaussians
+from .units import Source, unpacked
 from .workers import Runner
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..operation.run import Runtime
-    from ..seeing.measuring import ViewMeasurement
-    from ..seeing.projection import Footprints, Gaussians
-    from ..seeing.scene import Scene
-    from ..splats import Splats
-    from ..work import Progress
-    from .folder import Folder
-    from .gaussians import SceneContext, StoredGaussians
-    from .units import Source
-
-    Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
+Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
@@ -189,7 +180,7 @@ class TileMeasuring(Measuring):
 
     def measure_groups(  # type: ignore[override]
         self,
-        gaussians: StoredGaussians,  # noqa: ARG002 - the folder holds them
+        gaussians: StoredGaussians,
         groups: Sequence[int],
         sample: NDArray[np.int64],
         progress: Progress,
@@ -202,7 +193,7 @@ class TileMeasuring(Measuring):
         steps = [MeasureViews(group, self.groups[group], kinds) for group in groups]
         replace(self._runner, progress=progress).run_all(self._context, steps, "scoring")
         for rays in ray_samples:
-            assert isinstance(rays, StoredRays)  # noqa: S101 - as those of `_TileScoring` are
+            assert isinstance(rays, StoredRays)
             rays.noted.update(itertools.chain(*(self.groups[group] for group in groups)))
         errors = {group: folder.noted(_sums_name(group))[1][3] for group in groups}
         return StoredSums(folder, groups), errors
@@ -251,10 +242,10 @@ class StoredRays(RaySample):
     def cast(
         self,
         numbers: Sequence[int],
-        gaussians: Gaussians,  # noqa: ARG002 - as for splats in memory
-        scene: Scene,  # noqa: ARG002
+        gaussians: Gaussians,
+        scene: Scene,
         progress: Progress,
-        threads: int | None,  # noqa: ARG002
+        threads: int | None,
     ) -> None:
         """Cast the rays of some views, and load what they hit."""
         runner = replace(self._runner, progress=progress)
@@ -280,7 +271,7 @@ class StoredRays(RaySample):
 
         def cast_again(number: int, _rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
             rays = other.rays[number]
-            assert rays is not None  # noqa: S101 - just cast
+            assert rays is not None
             return rays, other.colors(number, rays)
 
         return mean_psnr(self, cast_again)

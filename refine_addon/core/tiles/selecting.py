@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import radix
-from ..selection import least_seen, lowest, quality_of, single
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..operation.run import Runtime
-    from ..scores import Scores
-    from ..selection import Budget
-    from .folder import Folder
-    from .units import Tile, Unit
-    from .workers import Runner
+from ..operation.run import Runtime
+from ..scores import Scores
+from ..selection import Budget, least_seen, lowest, quality_of, single
+from .folder import Folder
+from .units import Tile, Unit
+from .workers import Runner
 
 
 class Rule(NamedTuple):

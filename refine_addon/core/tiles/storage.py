@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import contextlib
 import secrets
+from collections.abc import Hashable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import whole_file
 from ..errors import RefineError
 from ..urls import Url, is_url
 from ..whole_file import expanded
 from .folder import Interrupted
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterator
-
-    from numpy.typing import NDArray
 
 _FLEETING = ("url", "access")
 """Parts of the names of facts about a file that change though it does not: where a server sends
@@ -67,11 +64,9 @@ def state(path: Path | Url) -> tuple[int, int | str]:
     with _opened(path, "cannot be read") as (system, inner):
         facts = system.info(inner)
         if facts.get("type") == "directory":
-            msg = f"{path}: is a folder, expected a PLY file"
-            raise RefineError(msg)
+            raise RefineError(f"{path}: is a folder, expected a PLY file")
         if facts.get("size") is None:
-            msg = f"{path}: the server does not say how long it is, which a tile needs"
-            raise RefineError(msg)
+            raise RefineError(f"{path}: the server does not say how long it is, which a tile needs")
         lasting = {
             name: str(fact)
             for name, fact in facts.items()
@@ -146,11 +141,11 @@ def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
         return
     with _opened(path, "cannot be written") as (system, inner):
         if system.isdir(inner):
-            msg = f"{path}: is a folder, expected a file name to write to"
-            raise RefineError(msg)
+            raise RefineError(f"{path}: is a folder, expected a file name to write to")
         if not overwrite and system.exists(inner):
-            msg = f"{path}: exists already; choose another name or overwrite it (--overwrite)"
-            raise RefineError(msg)
+            raise RefineError(
+                f"{path}: exists already; choose another name or overwrite it (--overwrite)"
+            )
 
 
 def upload(made: Path, url: Url) -> None:
@@ -168,7 +163,7 @@ def publish(made: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
     if isinstance(made, Path) and isinstance(path, Path):
         whole_file.publish(made, path, overwrite=overwrite)
         return
-    assert isinstance(path, Url)  # noqa: S101 - both are
+    assert isinstance(path, Url)
     refuse_existing(path, overwrite=overwrite)
     with _opened(path, "cannot be written") as (system, inner):
         system.mv(_split(Url(made))[1], inner)
@@ -200,10 +195,11 @@ def _opened(url: Url, problem: str) -> Iterator[tuple[Any, str]]:
 def _split(url: Url) -> tuple[Any, str]:
     """Return the file system of a URL, and the path there."""
     try:
-        from fsspec.core import url_to_fs  # noqa: PLC0415 - an optional extra
+        from fsspec.core import url_to_fs
     except ImportError as error:
-        msg = f"{url}: URLs need fsspec: pip install 'refine-addon[distributed]'"
-        raise RefineError(msg) from error
+        raise RefineError(
+            f"{url}: URLs need fsspec: pip install 'refine-addon[distributed]'"
+        ) from error
     system, inner = url_to_fs(url)
     return system, inner
 
@@ -218,5 +214,8 @@ def _explained(path: Path | Url, problem: str) -> Iterator[None]:
     except Exception as error:  # each storage has errors of its own
         missing = isinstance(error, FileNotFoundError)
         said = getattr(error, "strerror", None) or (_NO_SUCH if missing else str(error))
-        msg = f"{path}: {problem} ({said or type(error).__name__})"
-        raise (Interrupted if isinstance(path, Url) else RefineError)(msg) from error
+        raise (
+            Interrupted
+            if isinstance(path, Url)
+            else RefineError(f"{path}: {problem} ({said or type(error).__name__})")
+        ) from error

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 import itertools
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..formats.ply import splat_header, stated_model
@@ -15,20 +18,11 @@ from ..formats.ply_body import check_counts, has_lists, vertex_range
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..formats.registry import read_splats
-from ..rendering import MODELS
+from ..rendering import MODELS, Model
 from ..scoring.closed_form_block import ROWS
 from ..splats import Splats, joined, with_model
 from ..urls import Url
 from . import storage
-
-if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterator, Sequence
-    from pathlib import Path
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..rendering import Model
 
 _HEADER = 1 << 16
 """Bytes that are fetched of a tile behind a URL for its header, which hardly ever has more."""
@@ -203,14 +197,12 @@ def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Ti
             raise RefineError(msg if first.path == tile.path else f"{msg}, also as {first.path}")
         tiles.append(tile)
         if tile.model != tiles[0].model:
-            msg = (
+            raise RefineError(
                 f"{tile.path}: its splats are {tile.model}, those of {tiles[0].path} "
                 f"{tiles[0].model}; expected one model in all tiles"
             )
-            raise RefineError(msg)
     if not any(tile.splats for tile in tiles):
-        msg = f"none of {len(tiles)} tiles has a splat: there is nothing to prune"
-        raise RefineError(msg)
+        raise RefineError(f"none of {len(tiles)} tiles has a splat: there is nothing to prune")
     return tiles
 
 
@@ -219,8 +211,9 @@ def _drawn_as(tile: Tile, model: Model | None) -> Tile:
     if model is None or model == tile.model:
         return tile
     if not tile.model_can_change:
-        msg = f"{tile.path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{tile.path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
+        )
     return tile._replace(model=model)
 
 
@@ -255,8 +248,7 @@ def _tile_behind(url: Url) -> Tile:
     """Look at a file of splats behind a URL."""
     size, changed = storage.state(url)
     if url.name in ("", ".", ".."):
-        msg = f"{url}: names no file"
-        raise RefineError(msg)
+        raise RefineError(f"{url}: names no file")
     head = storage.beginning(url, _HEADER, size)
     if b"end_header" not in head:
         head = storage.beginning(url, HEADER_LIMIT, size)
@@ -265,8 +257,9 @@ def _tile_behind(url: Url) -> Tile:
         raise _no_tile(url, format_of(header.raw))
     before = zip(header.elements[:vertex], header.counts, strict=False)
     if any(count and has_lists(element) for element, count in before):
-        msg = f"{url}: has lists before the splats, expected none in a tile behind a URL"
-        raise RefineError(msg)
+        raise RefineError(
+            f"{url}: has lists before the splats, expected none in a tile behind a URL"
+        )
     body = np.broadcast_to(np.uint8(0), size - len(header.raw))  # only its length matters
     check_counts(header, len(body))
     start, _ = vertex_range(header, vertex, body)
@@ -314,14 +307,12 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
     """Read an array from a tile; see `storage.array`."""
     sent = storage.array(tile.place, dtype, count, begin)
     if storage.state(tile.place) != (tile.size, tile.changed):
-        msg = f"{tile.path}: was changed while it was worked on; nothing was written"
-        raise RefineError(msg)
+        raise RefineError(f"{tile.path}: was changed while it was worked on; nothing was written")
     if len(sent) != count:
-        msg = (
+        raise RefineError(
             f"{tile.path}: {sent.nbytes} bytes were sent, expected the {count * dtype.itemsize} "
             f"from {begin} on"
         )
-        raise RefineError(msg)
     return sent
 
 

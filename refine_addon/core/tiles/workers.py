@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
+from ..costs import Plan
 from ..operation.run import Runtime
 from ..pace import phases
 from ..work import Progress, part, report, silent
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from ..costs import Plan
-    from .folder import Folder
-    from .units import Tile
+from .folder import Folder
+from .units import Tile
 
 Context = TypeVar("Context")
 _Context_contra = TypeVar("_Context_contra", contravariant=True)

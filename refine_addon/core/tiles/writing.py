@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..formats.ply_columns import ChangedColumns, splats_from_columns
 from ..formats.ply_header import with_count, with_model
 from ..formats.ply_write import write_rows
+from ..operation.run import Runtime
 from ..urls import Url
 from ..whole_file import refuse_one_file
 from . import storage
-from .folder import Interrupted
-from .units import bytes_of, header_of, rows_of, unpacked
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from ..operation.run import Runtime
-    from .folder import Folder
-    from .units import Piece, Tile
+from .folder import Folder, Interrupted
+from .units import Piece, Tile, bytes_of, header_of, rows_of, unpacked
 
 RENAMED = "renamed"
 """Name of the note of all tiles, made before the first is renamed: bytes and times, (tiles, 2)."""
@@ -102,8 +96,7 @@ class Outputs:
         targets = {folder / tile.name: tile for tile in tiles}
         if len(targets) < len(tiles):
             name = next(tile.name for tile in tiles if targets[folder / tile.name] is not tile)
-            msg = f"{targets[folder / name].path}: another tile is called {name} too"
-            raise RefineError(msg)
+            raise RefineError(f"{targets[folder / name].path}: another tile is called {name} too")
         waiting: list[Path | Url] = [
             folder / f"{job.path.name}-{number:06d}"
             if isinstance(folder, Url)
@@ -115,8 +108,9 @@ class Outputs:
         read = {storage.identity(tile.place) for tile in tiles}
         for target in targets:
             if storage.identity(target) in read:
-                msg = f"{target}: is read until all tiles are written; write to another folder"
-                raise RefineError(msg)
+                raise RefineError(
+                    f"{target}: is read until all tiles are written; write to another folder"
+                )
         outputs.refuse_existing()
         return outputs
 
@@ -193,8 +187,7 @@ def _refuse_other_disk(target: Path | Url) -> None:
     if isinstance(target, Path):
         behind = Path(os.path.realpath(target)).parent
         if behind.stat().st_dev != target.parent.stat().st_dev:
-            msg = f"{target}: is a link to another disk, {behind}; remove the link"
-            raise RefineError(msg)
+            raise RefineError(f"{target}: is a link to another disk, {behind}; remove the link")
 
 
 def _state(path: Path | Url) -> tuple[int, int]:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import importlib
 import threading
 import time
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import extension
 import window
-
-if TYPE_CHECKING:
-    from collections.abc import Generator, Iterator
 
 NAME = "Splats"
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import extension
@@ -10,9 +11,6 @@ from mathutils import Quaternion, Vector
 from selecting import thin
 from view import Show
 from window import Hand
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 
 def main(cloud: str, blend: str, picture: str) -> Generator[float, None, dict[str, Any]]:

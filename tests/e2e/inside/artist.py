@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import extension
@@ -13,9 +14,6 @@ import xserver
 from selecting import NAME, Tools, count
 from view import Show
 from window import at_work, picture, price, until
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 IMAGE = "Render with Splats"
 AROUND = (0.42, 0.33), (0.6, 0.33), (0.6, 0.6), (0.42, 0.6)
@@ -99,7 +97,7 @@ class Walk:
         def dropped() -> None:
             try:
                 xserver.drop(path, x, self.hand.window.height - y)
-            except Exception as error:  # noqa: BLE001 - raised where the step is run
+            except Exception as error:
                 raised.append(error)
 
         thread = threading.Thread(target=dropped)

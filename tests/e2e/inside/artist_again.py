@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import extension
 from artist import Walk
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 
 def main(pictures: str, asset: str) -> Generator[float, None, dict[str, Any]]:

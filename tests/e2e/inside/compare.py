@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import extension
 import numpy as np
 from window import Hand, picture, until
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 NAMES = ["Compare: before", "Compare: after", "Compare: difference"]
 

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import importlib
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Generator
 
 import bpy
 import extension
 import xserver
 from render import invoke, prepare, processor, rendering
 from window import until
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 _WAITS = (0.8, 1.1, 1.4, 1.7)
 """Seconds from the start of a render to Esc, by turns: it is at something else each time."""

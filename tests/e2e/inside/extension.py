@@ -19,13 +19,11 @@ def enable() -> None:
     """Enable the installed extension, as the check box in the preferences does."""
     bpy.ops.preferences.addon_enable(module=MODULE)
     if not is_enabled():
-        message = f"{MODULE} cannot be enabled"
-        raise RuntimeError(message)
+        raise RuntimeError(f"{MODULE} cannot be enabled")
 
 
 def disable() -> None:
     """Disable the extension."""
     bpy.ops.preferences.addon_disable(module=MODULE)
     if addon_utils.check(MODULE)[1]:
-        message = f"{MODULE} cannot be disabled"
-        raise RuntimeError(message)
+        raise RuntimeError(f"{MODULE} cannot be disabled")

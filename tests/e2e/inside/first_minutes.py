@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import extension
 from adjust import adjust
 from view import Show
 from window import Hand, at_work, picture, price, until
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 NAME = "point_cloud"
 

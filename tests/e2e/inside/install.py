@@ -19,6 +19,5 @@ def main(archive: str) -> None:
         repo="user_default", filepath=archive, enable_on_install=True, overwrite=True
     )
     if not is_enabled():
-        message = f"{archive} was installed, but {MODULE} is not enabled"
-        raise RuntimeError(message)
+        raise RuntimeError(f"{archive} was installed, but {MODULE} is not enabled")
     bpy.ops.wm.save_userpref()

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import importlib
 import time
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import extension
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _LEAST = 0.001
 """Seconds; less is not told."""
@@ -57,7 +55,7 @@ def main(
     cloud: str,
     folder: str,
     views: int,
-    refit: bool,  # noqa: FBT001 - by name
+    refit: bool,
 ) -> dict[str, list[tuple[float, float]]]:
     """Return the stretches of each operator, seconds: see `Clock`.
 
@@ -174,7 +172,7 @@ def on_a_thread(clock: Clock, on_thread: Any) -> Callable[..., set[str]]:
     return execute
 
 
-def slide(_how: str, _undo: bool, *, ratio: float) -> None:  # noqa: FBT001 - as operators are called
+def slide(_how: str, _undo: bool, *, ratio: float) -> None:
     """Move the slider of the budget."""
     bpy.context.scene.refine.ratio = ratio
 

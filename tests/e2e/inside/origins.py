@@ -11,7 +11,7 @@ from extension import MODULE, enable
 def main() -> dict[str, str]:
     """Enable the extension; return the files of it and of the wheel it brings."""
     enable()
-    import plyfile  # noqa: PLC0415 - there from now on
+    import plyfile
 
     return {
         "extension": sys.modules[MODULE].__file__,

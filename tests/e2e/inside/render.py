@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 import os
 import time
+from collections.abc import Generator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import extension
@@ -14,9 +15,6 @@ import numpy as np
 import xserver
 from mathutils import Vector
 from window import picture, until
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 IMAGE = "Render with Splats"
 
@@ -102,7 +100,7 @@ def escape(found: dict[str, Any], *, animation: bool) -> Generator[float, None, 
     heard: list[float] = []
 
     class Watch(operators._Watch):
-        def __setattr__(self, name: str, value: bool) -> None:  # noqa: FBT001 - of Python
+        def __setattr__(self, name: str, value: bool) -> None:
             super().__setattr__(name, value)
             if name == "escaped" and value:
                 heard.append(processor() - time.thread_time())

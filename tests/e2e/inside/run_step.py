@@ -36,7 +36,7 @@ def drive(steps, answer: str) -> None:
             return next(steps)
         except StopIteration as end:
             answer_with(answer, end.value)
-        except Exception:  # noqa: BLE001 - whatever it is, Blender has to end
+        except Exception:
             traceback.print_exc()
             sys.stderr.flush()
             os._exit(1)
@@ -62,7 +62,7 @@ def run() -> None:
 
 try:
     run()
-except Exception:  # noqa: BLE001 - a window would stay open
+except Exception:
     traceback.print_exc()
     sys.stderr.flush()
     os._exit(1)

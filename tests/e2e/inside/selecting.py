@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Generator
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import extension
 import numpy as np
 from view import Show, plain
 from window import Hand, until
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 NAME = "point_cloud"
 BOX = (0.3, 0.3), (0.6, 0.7)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import extension
@@ -11,9 +12,6 @@ import mathutils
 import numpy as np
 from view import Show, plain
 from window import Hand, until
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 PLACE = mathutils.Matrix.LocRotScale(
     (1.0, -2.0, 0.5), mathutils.Euler((0.4, -0.7, 1.1)), (1.3, 1.3, 1.3)

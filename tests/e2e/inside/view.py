@@ -5,13 +5,11 @@ from __future__ import annotations
 import importlib
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import extension
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 PATIENCE = 60.0  # seconds
 
@@ -123,8 +121,9 @@ class Show:
         yield 0.5
         while not self.draw.drawn(self.region) or not self.draw.complete():
             if time.monotonic() > end:
-                message = f"after {PATIENCE} s the view is not complete: {self.draw.failure()}"
-                raise TimeoutError(message)
+                raise TimeoutError(
+                    f"after {PATIENCE} s the view is not complete: {self.draw.failure()}"
+                )
             yield 0.1
         return self.draw.drawn(self.region)
 

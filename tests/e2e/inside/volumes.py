@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import extension
 import numpy as np
 from view import Show
 from window import Hand
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 
 def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[str, Any]]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Generator
+from typing import Any
 
 import bpy
 import extension
 from view import Show
 from window import Hand
-
-if TYPE_CHECKING:
-    from collections.abc import Generator
 
 
 def main(

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import importlib
 import subprocess
+from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import extension
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
 
 TAB = "REFINE"
 
@@ -129,8 +127,7 @@ def until(is_so: Callable[[], bool], what: str) -> Generator[float, None, None]:
         if is_so():
             return
         yield A_MOMENT
-    message = f"after {PATIENCE} s it is still not so that {what}"
-    raise TimeoutError(message)
+    raise TimeoutError(f"after {PATIENCE} s it is still not so that {what}")
 
 
 class Hand:
@@ -178,8 +175,7 @@ class Hand:
             if region.active_panel_category == TAB:
                 yield 0.5
                 return
-        message = f"the sidebar of the 3D view has no tab {TAB}"
-        raise LookupError(message)
+        raise LookupError(f"the sidebar of the 3D view has no tab {TAB}")
 
     def click(self, call: str) -> Generator[float, None, None]:
         """Click the button whose Python call begins like this, found by asking everywhere.
@@ -198,8 +194,7 @@ class Hand:
                 if self.button().startswith(f"bpy.ops.{call}"):
                     yield from self.press("LEFTMOUSE")
                     return
-        message = f"the tab {TAB} has no button for {call}"
-        raise LookupError(message)
+        raise LookupError(f"the tab {TAB} has no button for {call}")
 
     def scroll(self, *, down: bool) -> Generator[float, None, None]:
         """Turn the wheel over the sidebar as far as it goes."""
@@ -230,8 +225,7 @@ class Hand:
                 self.window.event_simulate(type="LEFTMOUSE", value="RELEASE", **self.at)
                 yield A_MOMENT
                 return
-        message = f"the tab {TAB} has no slider for {path}"
-        raise LookupError(message)
+        raise LookupError(f"the tab {TAB} has no slider for {path}")
 
     def button(self) -> str:
         """Return the Python call of the button under the mouse, empty where there is none."""

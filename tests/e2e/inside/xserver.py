@@ -122,7 +122,7 @@ class _Server:
     def __init__(self, stream: socket.socket) -> None:
         self.stream, self.events = stream, []
         number = os.environ["DISPLAY"].partition(":")[2].partition(".")[0]
-        stream.connect(f"/tmp/.X11-unix/X{number}")  # noqa: S108 - where X servers listen
+        stream.connect(f"/tmp/.X11-unix/X{number}")
         name, cookie = b"MIT-MAGIC-COOKIE-1", _cookie()
         hello = struct.pack("<BxHHHHxx", ord("l"), 11, 0, len(name), len(cookie))
         stream.sendall(hello + _padded(name) + _padded(cookie))
@@ -155,32 +155,18 @@ class _Server:
         return int(struct.unpack_from("<I", answer, 8)[0])
 
     def event(self, patience: float) -> bytes:
-        """Return the next event, waiting for it.
-
-        Raises
-        ------
-        TimeoutError
-            If none comes.
-        """
+        """Return the next event, waiting for it."""
         if self.events:
             return self.events.pop(0)
         if not select.select([self.stream], [], [], max(0.0, patience))[0]:
-            message = "the window does not answer"
-            raise TimeoutError(message)
+            raise TimeoutError("the window does not answer")
         return self._packet()
 
     def _packet(self) -> bytes:
-        """Receive an answer or an event.
-
-        Raises
-        ------
-        OSError
-            If it is an error.
-        """
+        """Receive an answer or an event."""
         packet = self._received(32)
         if packet[0] == 0:
-            message = f"X error {packet[1]} of request {packet[10]}"
-            raise OSError(message)
+            raise OSError(f"X error {packet[1]} of request {packet[10]}")
         if packet[0] == 1:
             (length,) = struct.unpack_from("<I", packet, 4)
             packet += self._received(4 * length)
@@ -198,7 +184,7 @@ class _Server:
 
 def _cookie() -> bytes:
     """Return the password of the server: of the last entry of the file, its last field."""
-    with open(os.environ["XAUTHORITY"], "rb") as stream:  # noqa: PTH123
+    with open(os.environ["XAUTHORITY"], "rb") as stream:
         return stream.read()[-16:]
 
 

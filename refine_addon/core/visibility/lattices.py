@@ -8,12 +8,10 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """How many points a lattice may have along an axis."""
@@ -73,7 +71,7 @@ def _lattice(major: Axis, minor: Axis) -> Lattice:
     place = np.broadcast_arrays(major[0][:, None], minor[0])  # (k_major, k_minor) each
     extent = WIDE_EXTENT if max(product.shape) >= _WIDE else _EXTENT
     keep = np.hypot(*place) <= extent + _CORNER
-    keep |= product.size <= 4  # noqa: PLR2004 - 2 x 2 points are all corners
+    keep |= product.size <= 4
     shares = product[keep] / product[keep].sum()  # (k,)
     points = np.stack([axis[keep] for axis in place])  # (2, k)
     variance = (points * points) @ shares

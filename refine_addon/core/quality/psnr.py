@@ -8,26 +8,20 @@ picture, and nothing is assumed about which splats go together or what lies behi
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..seeing import projection
-from ..seeing.ray_sample import cast_colored
+from ..splats import Splats
+from ..views import View, ViewSet
+from ..visibility import projection
+from ..visibility.ray_sample import RaySample, cast_colored
+from ..visibility.rays import Rays
 from ..work import Progress, for_chunks, part, silent
-from .quality import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
+from .curve import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..seeing.ray_sample import RaySample
-    from ..seeing.rays import Rays
-    from ..splats import Splats
-    from ..views import View, ViewSet
-
-    Compare = Callable[[int, Rays], Sequence[float]]
+Compare = Callable[[int, Rays], Sequence[float]]
 
 MIN_RAYS_WITH_HITS = 256
 """So many rays must hit a splat at least, or nothing is estimated."""
@@ -122,7 +116,7 @@ def quality_curve(
     gains = _of_each_view(
         sample, _gaining(sample, place, absorbed), validating, part(progress, 0.5, 1.0), threads
     )
-    assert gains is not None  # noqa: S101 - the same rays tell it
+    assert gains is not None
     psnr = np.minimum.accumulate(_mean(sample, of_views, views))
     names = [sample.views[number][0].name for number in views]
     return Quality(
@@ -309,7 +303,7 @@ def _of_each_view(
     def compare_one(piece: slice) -> Sequence[float]:
         number = numbers[piece.start]
         rays = sample.rays[number]
-        assert rays is not None  # noqa: S101 - these views see something
+        assert rays is not None
         with np.errstate(under="ignore"):
             return compare(number, rays)
 

@@ -28,25 +28,18 @@ standard deviation of the viewing directions to either side of their mean (`cost
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..affine import quaternion
-from ..rendering import ALPHA_MAX, LOW_PASS
-from ..seeing.projection import disc_axes
+from ..rendering import ALPHA_MAX, LOW_PASS, Model
 from ..splats import LOG_ZERO, rotation_matrices
-from .merge_field import Field, across, footprint, normalized
+from ..visibility.projection import disc_axes
+from .field import Array, Field, Footprint, Index, across, footprint, normalized
 
-if TYPE_CHECKING:
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..rendering import Model
-    from .merge_field import Array, Footprint, Index
-
-    Real = NDArray[np.floating[Any]]
+Real = NDArray[np.floating[Any]]
 
 FLATTEST = 1e-14
 """Least eigenvalue of a covariance over the sum of the three; rounding hides smaller ones."""
@@ -129,15 +122,7 @@ def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> R
 
 
 class _Side(NamedTuple):
-    """One splat of each of M pairs.
-
-    Attributes
-    ----------
-    covariances : (6, M) floating
-        See `Field`; in units of the pair, see `_Ends`.
-    opacity, contribution, error : (M,) floating
-        See `Field`.
-    """
+    """One splat of each of M pairs."""
 
     covariances: Real
     opacity: Real
@@ -150,23 +135,6 @@ class _Ends(NamedTuple):
 
     Costs and results of merges do not depend on the unit of length. That of a pair is the root of
     the sum of its variances, low-pass included, so that squares of areas fit into float32.
-
-    Attributes
-    ----------
-    model : {"default", "antialiased", "2dgs"}
-        How they are drawn, see `rendering.Model`.
-    one, two : _Side
-        The first and the second splats.
-    color, rest : (M,) floating
-        Shares of the first and of the second splat in the colour.
-    step : (3, M) floating
-        From the mean of the first to that of the second.
-    direction, deviation : (3, M) floating
-        From where the pair is viewed; see `merge_field.Viewing`.
-    blur : (M,) floating
-        Variance of the low-pass.
-    apart : (M,) floating
-        Squared difference of their colours.
     """
 
     model: Model
@@ -270,18 +238,7 @@ def _products(
 
 
 class _Signal(NamedTuple):
-    """M splats in the plane viewed: f in the equations, but for their places.
-
-    Attributes
-    ----------
-    footprint : Footprint
-        Covariances in the plane, low-pass included; of discs see `_disc_as_drawn`.
-    area, base : (M,) float64
-        See `_area`, with the low-pass; and of what the opacity is meant for: of antialiased splats
-        without the low-pass.
-    mass : (M,) float64
-        Opacity times `base`.
-    """
+    """M splats in the plane viewed: f in the equations, but for their places."""
 
     footprint: Footprint
     area: Array
@@ -299,20 +256,7 @@ class _Signal(NamedTuple):
 
 
 class _Plane(NamedTuple):
-    """M pairs and their merged splats in the plane viewed; arrays are (M,).
-
-    Attributes
-    ----------
-    one, two, merged : _Signal
-    step
-        xx, xy, yy: products of the step from the centre of the first to that of the second.
-    position, other
-        Shares of the first and of the second in the mass.
-    growth
-        Factor that the merged footprint contains, so that its opacity is at most `ALPHA_MAX`.
-    overlap
-        Inner product of the two.
-    """
+    """M pairs and their merged splats in the plane viewed; arrays are (M,)."""
 
     one: _Signal
     two: _Signal
@@ -469,7 +413,7 @@ def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Ar
     ----------
     covariances : (M, 6) float64
     direction, deviation : (M, 3) float64
-        See `merge_field.Viewing`; `ASIDE` is the least standard deviation.
+        See `field.Viewing`; `ASIDE` is the least standard deviation.
     """
     beside = deviation - np.einsum("ij,ij->i", deviation, direction)[:, None] * direction
     size = np.maximum(np.sqrt(np.einsum("ij,ij->i", beside, beside)), ASIDE)

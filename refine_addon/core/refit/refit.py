@@ -23,26 +23,21 @@ loses is undone, and the next is damped more. Rounds end where little is gained,
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import costs
 from ..errors import RefineError
 from ..pace import phases
-from ..splats import rotation_matrices, unit_quaternions
+from ..splats import Splats, rotation_matrices, unit_quaternions
+from ..views import ViewSet
 from ..work import Progress, part, silent
 from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, LinearRays
 from .round_rays import LARGEST, RoundRays, limits
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from ..views import ViewSet
 
 STEPS = 8
 """Steps of conjugate gradients in a round."""
@@ -94,16 +89,9 @@ class Refit:
     geometry: bool = True
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            If a value is out of range.
-        """
+        """Check the values."""
         if self.rounds is not None and self.rounds < 1:
-            msg = f"rounds is {self.rounds}, expected 1 or more"
-            raise RefineError(msg)
+            raise RefineError(f"rounds is {self.rounds}, expected 1 or more")
 
     def expected_rounds(self, count: int) -> int:
         """Return how many rounds it takes to refit so many survivors, if all of them gain."""
@@ -160,7 +148,7 @@ class Refitted(Gains):
     psnr: float
 
 
-def refit(  # noqa: PLR0913 - all but three are optional
+def refit(
     survivors: Splats,
     original: Splats,
     views: ViewSet,
@@ -209,7 +197,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
     return last
 
 
-def refit_rounds(  # noqa: PLR0913 - as `refit`
+def refit_rounds(
     survivors: Splats,
     original: Splats,
     views: ViewSet,
@@ -299,15 +287,7 @@ def refit_on(
 
 
 class _Told(NamedTuple):
-    """What rounds have told of the parameters of N survivors, and the next one goes on from.
-
-    Attributes
-    ----------
-    diagonal : (22, N) float32
-        K; see the top of this file.
-    left : (22, N) float32
-        What is left of J'r.
-    """
+    """What rounds have told of the parameters of N survivors, and the next one goes on from."""
 
     diagonal: NDArray[np.float32]
     left: NDArray[np.float32]
@@ -322,20 +302,7 @@ def _solve(
     progress: Progress,
     threads: int | None,
 ) -> tuple[NDArray[np.float32], _Told]:
-    """Return by how much to change the parameters of N survivors, (22, N), and what rays told.
-
-    Parameters
-    ----------
-    linear : LinearRays
-    movable : (22, N) bool
-        Which parameters may change.
-    damping : float
-        k; see the top of this file.
-    before : _Told
-        By the rounds before.
-    progress : callable
-    threads : int, optional
-    """
+    """Return by how much to change the parameters of N survivors, (22, N), and what rays told."""
     index = linear.shapes.gaussians.index
     moving = movable[:, index]
     steps = [part(progress, k / STEPS, (k + 1) / STEPS) for k in range(STEPS)]
@@ -381,14 +348,6 @@ def _conjugate_gradients(
     """Return about the solution x of ``product(x) = residual``, by a few steps from 0.
 
     And what it leaves of the residual.
-
-    Parameters
-    ----------
-    product : callable
-    residual, inverse : (22, N) float32
-        The right side, and the preconditioner: 0 where x stays 0.
-    steps : list of callable
-        The progress of each step.
     """
     solution = np.zeros_like(residual)
     direction = inverse * residual
@@ -423,10 +382,6 @@ def _worthwhile(change: NDArray[np.float32]) -> NDArray[np.float32]:
     and others are shortened by less the longer they are (Breiman's garrote)::
 
         m <- m max(1 - (LEAST_MOVE / |m|)^2, 0)
-
-    Parameters
-    ----------
-    change : (22, N) float32
     """
     means = change[MEAN]
     squared = np.maximum(np.square(means).sum(axis=0), np.float32(_NOTHING))
@@ -437,13 +392,7 @@ def _worthwhile(change: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
-    """Return splats with changed parameters; those that do not change keep their bits.
-
-    Parameters
-    ----------
-    splats : Splats
-    change : (22, N) floating
-    """
+    """Return splats with changed parameters; those that do not change keep their bits."""
     rows = np.flatnonzero(change.any(axis=0))
     some, change = splats.take(rows), change[:, rows].astype(np.float64)
     quaternions = unit_quaternions(some.quaternions)
@@ -485,15 +434,7 @@ def _turned(quaternions: NDArray[np.float64], vectors: NDArray[np.float64]) -> N
 
 
 def _product(quaternions: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return unit quaternions, (n, 4), of splats that are turned about their own axes first.
-
-    Parameters
-    ----------
-    quaternions : (n, 4) float64
-        w x y z, of length 1.
-    turns : (3, n) float64
-        Rotation vectors, radians.
-    """
+    """Return unit quaternions, (n, 4), of splats that are turned about their own axes first."""
     angle = np.linalg.norm(turns, axis=0)
     sine = 0.5 * np.sinc(angle / (2.0 * np.pi))  # sin(angle / 2) / angle
     w, x, y, z = quaternions.T

@@ -7,20 +7,16 @@ on the order of its splats.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..splats import Splats
+from ..views import ViewSet
 from ..work import chunks, concatenated, for_chunks
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from ..views import ViewSet
 
 MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: its multiples spread numbers that differ little."""

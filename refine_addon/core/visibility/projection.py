@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..rendering import ALPHA_CUT, DISC_LOW_PASS, LOW_PASS, NEAR_RELATIVE
-from ..splats import SH_C0, drawable, opacity, rotation_matrices
+from ..rendering import ALPHA_CUT, DISC_LOW_PASS, LOW_PASS, NEAR_RELATIVE, Model
+from ..splats import SH_C0, Splats, drawable, opacity, rotation_matrices
+from ..views import View, ViewSet
 from ..work import Progress, checkpoint, for_chunks, part, report, silent
 from . import frustum
 from .scene import Scene, scene_of, spatial_order, splat_fingerprint
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from ..rendering import Model
-    from ..splats import Splats
-    from ..views import View, ViewSet
 
 FloatT = TypeVar("FloatT", np.float32, np.float64)
 
@@ -482,24 +476,7 @@ def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
 def _ellipses(
     local: NDArray[np.float32], shape: NDArray[np.float32], view: View
 ) -> tuple[NDArray[np.float32], _Axes, NDArray[np.float32]]:
-    """Return the footprints of Gaussians, and how much of their opacity antialiasing keeps.
-
-    Parameters
-    ----------
-    local : (3, n) float32
-        Camera coordinates of the centres, scene sizes.
-    shape : (6, n) float32
-        Covariances in camera coordinates, squared scene sizes.
-    view : View
-
-    Returns
-    -------
-    centers : (2, n) float32
-    axes : three (2, n) float32
-        Major and minor half axes and their lengths, pixels.
-    kept : (n,) float32
-        ``sqrt(det C / det(C + LOW_PASS I))``.
-    """
+    """Return the footprints of Gaussians, and how much of their opacity antialiasing keeps."""
     x, y, z = local
     across, down = x / z, y / z
     centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
@@ -603,23 +580,6 @@ def _discs(
     as for Gaussians, n the normal and r the ray to the centre, of depth 1, in camera coordinates::
 
         u^2 + v^2 = d' C^-1 d / (1 + g d)^2        g = (n_x / fx, n_y / fy) / (n r)
-
-    Parameters
-    ----------
-    local, shape, view
-        See `_ellipses`.
-    normals : (3, n) float32
-        In camera coordinates.
-    near : float
-        Depth of the near plane, scene sizes; what rays hit before it is not drawn.
-
-    Returns
-    -------
-    centers, axes
-        See `_ellipses`; the ellipse is that of `disc_axes`.
-    discs : (7, n) float32
-        Two vectors p with ``d' C^-1 d = (p_1 d)^2 + (p_2 d)^2``, 1/px, g, 1/px, and the largest
-        ``1 + g d`` that is drawn: the depth of the centre over that of the near plane.
     """
     x, y, z = local
     across, down = x / z, y / z

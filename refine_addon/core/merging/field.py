@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import spherical_harmonics
-from ..rendering import LOW_PASS, NEAR_RELATIVE
-from ..seeing import frustum
-from ..splats import opacity, rotation_matrices
+from ..rendering import LOW_PASS, NEAR_RELATIVE, Model
+from ..splats import Splats, opacity, rotation_matrices
+from ..views import View, ViewSet
+from ..visibility import frustum
+from ..visibility.scene import Scene
 from ..work import Progress, for_chunks, part, silent
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from ..rendering import Model
-    from ..seeing.scene import Scene
-    from ..splats import Splats
-    from ..views import View, ViewSet
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64] | NDArray[np.int32]
-    Footprint = tuple[Array, Array, Array]
-    ColorOf = Callable[[Index, Array], Array]
+Array = NDArray[np.float64]
+Index = NDArray[np.int64] | NDArray[np.int32]
+Footprint = tuple[Array, Array, Array]
+ColorOf = Callable[[Index, Array], Array]
 
 DIRECTION_VIEWS = 32
 """At most so many views, spread evenly, decide from which directions splats are viewed."""
@@ -225,7 +219,7 @@ def _deviation(direction: Array, second: Array) -> Array:
     return deviation.T
 
 
-def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
+def measured_field(
     splats: Splats,
     rows: Index,
     views: ViewSet,

@@ -9,18 +9,14 @@ space filling curves"). The work is the same for every point of any cloud. In tr
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..seeing.scene import spatial_order
 from ..splats import rotation_matrices
+from ..visibility.scene import spatial_order
 from ..work import Progress, for_chunks, part, silent
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
 
 CURVES = np.array(
     [[1.0, 0, 0, 0], [0.8, 0.3, 0.4, 0.3], [0.5, -0.6, 0.1, 0.6], [0.3, 0.5, -0.7, 0.4]]

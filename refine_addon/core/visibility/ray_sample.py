@@ -9,25 +9,20 @@ look better on them than it is, so the *validation rays* tell how good the pictu
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import spherical_harmonics
+from ..splats import Splats
+from ..views import View, ViewSet
 from ..work import Progress, for_chunks, part, silent
 from . import projection
 from .cast import cast, depth_complexity, pixels
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from ..splats import Splats
-    from ..views import View, ViewSet
-    from .projection import Footprints, Gaussians
-    from .rays import Rays
-    from .scene import Scene
+from .projection import Footprints, Gaussians
+from .rays import Rays
+from .scene import Scene
 
 VALIDATION_RAYS = 1 << 14
 """How many validation rays all views together have."""

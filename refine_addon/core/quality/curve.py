@@ -7,19 +7,14 @@ itself, at most 100, and of these the mean. `estimate.psnr` estimates it.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..survivor_choice import SURVIVORS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from ..survivor_choice import Became
+from ..survivor_choice import SURVIVORS, Became
 
 PSNR_CAP = 100.0
 """PSNR of equal pictures, dB, and the highest that an estimate may be."""

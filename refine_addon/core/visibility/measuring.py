@@ -11,29 +11,23 @@ which REFINE's Hessian approximates.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..processes import for_each
-from ..work import for_chunks
+from ..views import View, ViewSet
+from ..work import Progress, for_chunks
 from . import froxels, projection
 from .points import cell_size, scatter
-from .ray_sample import cast_view
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..views import View, ViewSet
-    from ..work import Progress
-    from .projection import Footprints, Gaussians
-    from .ray_sample import RaySample
-    from .rays import Rays
-    from .scene import Scene
+from .projection import Footprints, Gaussians
+from .ray_sample import RaySample, cast_view
+from .rays import Rays
+from .scene import Scene
 
 VIEW_GROUPS = 8
 """Views are measured in so many groups; sums are added group by group, so they do not depend on
@@ -62,18 +56,11 @@ class Sampling:
     density: float = 3.7
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            If a value is not a positive number.
-        """
+        """Check the values."""
         for name in ("cell", "density"):
             value = getattr(self, name)
             if not 0.0 < value < np.inf:
-                msg = f"{name} is {value}, expected a positive number"
-                raise RefineError(msg)
+                raise RefineError(f"{name} is {value}, expected a positive number")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +91,7 @@ class Measured:
         for other in parts:
             total = total or cls.zero(len(other.seen))
             total.add(other)
-        assert total is not None  # noqa: S101 - callers pass at least one
+        assert total is not None
         return total
 
     def for_all(self, index: NDArray[np.int64], count: int) -> Measured:

@@ -12,17 +12,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..work import checkpoint
 from .ray_sums import behind, in_front, paired
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from numpy.typing import NDArray
 
 LOG_OPAQUE = -9.3
 """Logarithm of the transmittance below which nothing is seen, 1e-4."""

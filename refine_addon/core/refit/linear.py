@@ -30,30 +30,24 @@ and a splat of a view keeps J W.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
-from ..seeing import projection
-from ..seeing.cast import BEHIND
-from ..seeing.rays import LEAST_LEFT
 from ..spherical_harmonics import basis
-from ..splats import SH_C0, rotation_matrices
+from ..splats import SH_C0, Splats, rotation_matrices
+from ..views import View
+from ..visibility import projection
+from ..visibility.cast import BEHIND
+from ..visibility.projection import Footprints, Gaussians
+from ..visibility.rays import LEAST_LEFT, Rays, VisibleRays
+from ..visibility.scene import Scene
 from ..work import Progress, each_chunk
 from .stored import Stored
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..seeing.projection import Footprints, Gaussians
-    from ..seeing.rays import Rays, VisibleRays
-    from ..seeing.scene import Scene
-    from ..splats import Splats
-    from ..views import View
 
 COLOR, DEGREE_1, OPACITY, MEAN, SCALE, TURN = (
     slice(0, 3), slice(3, 12), slice(12, 13), slice(13, 16), slice(16, 19), slice(19, 22)
@@ -421,15 +415,7 @@ def _dot(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> NDArray[
 def _squared(
     polynomial: NDArray[np.float32], sums: Sequence[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """Return the sums over hits of squared polynomials, (u,).
-
-    Parameters
-    ----------
-    polynomial : (3, u) float32
-        Coefficients of x^2, x y and y^2.
-    sums : list of (u,) float32
-        Of x^4, x^3 y, x^2 y^2, x y^3 and y^4 over the hits of each splat.
-    """
+    """Return the sums over hits of squared polynomials, (u,)."""
     a, b, c = polynomial
     result = a * a * sums[0] + (b * b + 2.0 * a * c) * sums[2] + c * c * sums[4]
     result += 2.0 * b * (a * sums[1] + c * sums[3])

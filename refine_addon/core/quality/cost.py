@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from ..survivor_choice import Became
+from ..survivor_choice import Became
 
 ROUNDS = 2.5
 """Scoring by *auto* or *occlusion* takes so many times as long as measuring all splats once."""

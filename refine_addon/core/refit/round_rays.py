@@ -9,33 +9,28 @@ Views are cast in processes of their own, as they are measured (`processes`).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import costs
-from ..estimate.quality import PSNR_CAP
+from ..costs import Plan
 from ..processes import for_each
-from ..seeing import projection
-from ..seeing.cast import cast_visible, depth_complexity, pixels
-from ..seeing.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, VALIDATION_VIEWS
+from ..quality.curve import PSNR_CAP
 from ..spherical_harmonics import single_colors
-from ..views import ViewSet
+from ..splats import Splats
+from ..views import View, ViewSet
+from ..visibility import projection
+from ..visibility.cast import cast_visible, depth_complexity, pixels
+from ..visibility.projection import Footprints, Gaussians
+from ..visibility.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, VALIDATION_VIEWS
+from ..visibility.scene import Scene
 from ..work import Progress, chunks, part, return_freed
 from .linear import LEAST_WEIGHT, LinearRays, SeenView, Shapes, linear_view
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..costs import Plan
-    from ..seeing.projection import Footprints, Gaussians
-    from ..seeing.scene import Scene
-    from ..splats import Splats
-    from ..views import View
 
 Result = TypeVar("Result")
 

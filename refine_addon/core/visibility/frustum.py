@@ -13,16 +13,13 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..views import View, ViewSet
 from ..work import Progress, for_chunks, silent
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from ..views import View, ViewSet
 
 _STACK = 16
 """Rows of one matrix product: so few that BLAS starts no threads, which would slow down ours."""

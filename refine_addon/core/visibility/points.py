@@ -8,23 +8,18 @@ sorted by depth: `froxels` tells what hides them.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..views import View
 from ..work import checkpoint
 from .lattices import COUNTS, FLAT, WIDE_EXTENT, lattice_table, lattices
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..views import View
-    from .projection import Footprints
+from .projection import Footprints
 
 FEW_CELLS = 10_000
 """An image may always have this many cells, even with few footprints."""

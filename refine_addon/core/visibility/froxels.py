@@ -12,19 +12,15 @@ each other transmit ``prod (1 - a)``, so each has the optical thickness ``-log(1
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..work import checkpoint
+from .points import Points
+from .projection import Footprints
 from .ray_sums import behind, in_front, paired
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from .points import Points
-    from .projection import Footprints
 
 GAMMA_SHAPE = 2.3
 """Shape of the gamma distribution of the thickness in front of a point. The larger it is, the

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..seeing.scene import MIX
+from ..visibility.scene import MIX, Scene
 from ..work import Progress, chunks, concatenated, for_chunks, part, report, silent
-from . import merging
+from . import pairs as pricing
+from .field import Array, Field, Index
 from .neighbours import nearest
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from ..seeing.scene import Scene
-    from .merge_field import Array, Field, Index
-
-    Rows = NDArray[np.int32]
-    Costs = NDArray[np.float32]
+Rows = NDArray[np.int32]
+Costs = NDArray[np.float32]
 
 NEIGHBOURS = 8
 """How many nearest neighbours each splat may be merged with."""
@@ -171,7 +166,7 @@ class MergeGraph:
             first, second = self.first[rows], self.second[rows]
             least = np.minimum(self.field.error.take(first), self.field.error.take(second))
             with np.errstate(under="ignore"):
-                cost = merging.costs(self.field, first, second, least / self.patience)
+                cost = pricing.costs(self.field, first, second, least / self.patience)
             self.cost[rows] = self.patience * cost
 
         for_chunks(
@@ -292,8 +287,8 @@ class MergeGraph:
 
         def merge(piece: slice) -> None:
             with np.errstate(under="ignore"):
-                pairs = merging.price(field, first[piece], second[piece])
-                field.put(into[piece], merging.merge(field, first[piece], second[piece], pairs))
+                pairs = pricing.price(field, first[piece], second[piece])
+                field.put(into[piece], pricing.merge(field, first[piece], second[piece], pairs))
             share[piece] = np.where(swap[piece], 1.0 - pairs.color, pairs.color)
 
         for_chunks(merge, len(edges), _CHUNK, threads=self.threads)

@@ -10,27 +10,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import costs, spherical_harmonics
 from ..pace import phases
-from ..seeing.scene import scene_of, spatial_order, splat_fingerprint
 from ..splats import ARRAYS, Splats, drawable
+from ..views import ViewSet
+from ..visibility.scene import Scene, scene_of, spatial_order, splat_fingerprint
 from ..work import Progress, for_chunks, part, report, return_freed, silent
-from . import merge_field, merging
-from .merge_field import ViewSums
-from .merge_graph import MergeGraph
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..seeing.scene import Scene
-    from ..views import ViewSet
-    from .merge_field import Array, ColorOf, Field, Index
+from .field import Array, ColorOf, Field, Index, ViewSums, measured_field
+from .graph import MergeGraph
+from .pairs import axes, flattened
 
 Measure = Callable[[Splats, "ViewSums | None", Progress], ViewSums]
 """``measure(splats, expected, progress)`` returns what the views see of each of these splats.
@@ -129,7 +122,7 @@ def patience(share: float) -> float:
     return PATIENCE * math.sqrt((1.0 - share) / share)
 
 
-def absorb(  # noqa: PLR0913 - three keywords are optional
+def absorb(
     splats: Splats,
     views: ViewSet,
     measure: Measure,
@@ -198,19 +191,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
 
 
 class _Lineage:
-    """What became of splats, and their harmonics: they are looked up, and never copied as a whole.
-
-    Parameters
-    ----------
-    splats : Splats
-    rows : (M,) int64
-        Which of them are there before the first stage.
-
-    Attributes
-    ----------
-    origin : (K,) int64
-        Which of `splats` those that are left were.
-    """
+    """What became of splats, and their harmonics, which are never copied as a whole."""
 
     def __init__(self, splats: Splats, rows: Index) -> None:
         self.splats = splats
@@ -333,7 +314,7 @@ class Stage(NamedTuple):
     color: Array | None
 
 
-def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
+def absorb_once(
     splats: Splats,
     views: ViewSet,
     scene: Scene,
@@ -358,14 +339,14 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     factor : float
         On the cost of merging, see `patience`.
     color_of : callable
-        See `merge_field.measured_field`.
+        See `field.measured_field`.
     """
     sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
     rows = mergeable(splats, scene, protected, threads=threads)
     report(progress, 0.0, "absorbing")
 
     def make_graph() -> MergeGraph:
-        measured = merge_field.measured_field(
+        measured = measured_field(
             splats, rows, views, scene, sums, color_of,
             progress=part(progress, 0.0, 0.3), threads=threads,
         )  # fmt: skip
@@ -392,7 +373,7 @@ def mergeable(
     ]
 
 
-def reduced(  # noqa: PLR0913 - as `absorb_once`
+def reduced(
     splats: Splats,
     sums: ViewSums,
     rows: Index,
@@ -507,13 +488,13 @@ def _put_shapes(
     logs, quaternions = np.empty((len(target), 3)), np.empty((len(target), 4))
 
     def fill(piece: slice) -> None:
-        logs[piece], quaternions[piece] = merging.axes(merged.covariances[piece])
+        logs[piece], quaternions[piece] = axes(merged.covariances[piece])
 
     opacity = merged.opacity
     with np.errstate(under="ignore"):
         for_chunks(fill, len(target), _CHUNK, progress=progress, what="absorbing", threads=threads)
         if left.model == "2dgs":
-            logs, quaternions, opacity = merging.flattened(merged, logs, quaternions)
+            logs, quaternions, opacity = flattened(merged, logs, quaternions)
         left.means[target], left.log_scales[target] = merged.means, logs
         left.quaternions[target] = quaternions
         left.opacity_logits[target] = np.log(opacity) - np.log1p(-opacity)

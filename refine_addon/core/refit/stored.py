@@ -7,15 +7,12 @@ import os
 import tempfile
 import threading
 import weakref
+from collections.abc import Callable
 from contextlib import suppress
-from typing import IO, TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import IO, Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 Item = TypeVar("Item")
 
@@ -63,7 +60,7 @@ class Stored(Generic[Item]):
         place = self._places[number]
         if not isinstance(place, _Place):
             return place
-        assert self._file is not None  # noqa: S101 - it lies there
+        assert self._file is not None
         with self._lock:
             self._file.seek(place.start)
             read = np.frombuffer(self._file.read(place.size), np.uint8)
@@ -75,13 +72,7 @@ class Stored(Generic[Item]):
         return self._make(**arrays)
 
     def _written(self, arrays: dict[str, NDArray[Any]]) -> _Place:
-        """Write arrays to the end of the file, one after the other.
-
-        Raises
-        ------
-        OSError
-            If there is no room for them.
-        """
+        """Write arrays to the end of the file, one after the other."""
         if self._file is None:
             # Without a buffer, so that nothing is left to be written when it closes.
             self._file = tempfile.TemporaryFile("w+b", 0, prefix="refine-")  # noqa: SIM115

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
+from ..views import View
 from ..work import checkpoint
+from .projection import Footprints
 from .rays import LOG_OPAQUE, Rays, VisibleRays
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..views import View
-    from .projection import Footprints
 
 MIN_RAYS_OF_VIEW = 16
 """A view has at least this many rays, if it has as many pixels."""
@@ -304,18 +299,7 @@ def _bounding_boxes(
     axis: int,
     places: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first of some columns or rows in each footprint's bounding box, and how many.
-
-    Parameters
-    ----------
-    footprints : Footprints
-    squared_radius : (n,) float32
-        Squared Mahalanobis distance to which a footprint is followed.
-    axis : int
-        0 for columns, 1 for rows.
-    places : (C,) int64
-        Numbers of the columns or rows, ascending; their centres are at + 0.5.
-    """
+    """Return the first of some columns or rows in each footprint's bounding box, and how many."""
     center = footprints.centers[axis] - np.float32(0.5)
     if footprints.discs is None:
         half = np.sqrt(squared_radius * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))

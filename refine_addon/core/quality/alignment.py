@@ -16,26 +16,21 @@ in a small part of its picture.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..affine import QUARTERS
-from ..seeing import frustum, projection
-from ..seeing.cast import cast, pixels
+from ..splats import Splats
+from ..views import View, ViewSet
+from ..visibility import frustum, projection
+from ..visibility.cast import cast, pixels
+from ..visibility.projection import Gaussians
+from ..visibility.scene import Scene
 from ..work import Progress, for_chunks, part, report, silent
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from typing import Any
-
-    from numpy.typing import NDArray
-
-    from ..seeing.projection import Gaussians
-    from ..seeing.scene import Scene
-    from ..splats import Splats
-    from ..views import View, ViewSet
 
 SAMPLE = 4096
 """About so many splats are a sample of all; each is enlarged to the area of those it stands for."""

@@ -6,14 +6,10 @@ at once and restart at each column, which costs no loop over columns.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 
 def paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[Any]:
