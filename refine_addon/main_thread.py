@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, wait
 from typing import Any, TypeVar
 
-from .core.work import Cancelled, checkpoint
+from .core.execute import Cancelled, checkpoint
 
 Answer = TypeVar("Answer")
 
@@ -27,7 +27,7 @@ def call(function: Callable[[], Answer]) -> Answer:
     Raises
     ------
     Cancelled
-        See `work.checkpoint`. The function may have been called or not.
+        See `execute.checkpoint`. The function may have been called or not.
     Exception
         What the function raises.
     """

@@ -3,7 +3,7 @@
     python -m benchmarks.speed.scaling SCENE_DIR [--ways absorb refit ...] [--ratio 0.9]
 
 One thread does everything; counted are seconds of the processor, so that other work on the machine
-does not matter. Every piece of work that several cores could do at once (`work.each_chunk`) is
+does not matter. Every piece of work that several cores could do at once (`execute.run`) is
 timed, and the pieces of each call are dealt out to 1, 2, 4, 8 and 16 cores, in their order, each to
 the core that is free first; all else is serial (Amdahl's law). That is what is possible: pieces on
 threads also wait for the interpreter's lock, and all of them for the memory. ``--functions`` tells
@@ -24,11 +24,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from refine_addon.core import Budget, prune_file, read_cameras, work
+from refine_addon.core import Budget, execute, prune_file, read_cameras
+from refine_addon.core.execute import Progress
 from refine_addon.core.operation.requests import PruneRequest
 from refine_addon.core.survivor_choice import SurvivorChoice
 from refine_addon.core.task import Settings
-from refine_addon.core.work import Progress
 
 CORES = (2, 4, 8, 16)
 WAYS: dict[str, tuple[str, SurvivorChoice]] = {
@@ -61,7 +61,7 @@ class Division:
 
     def watch(self) -> None:
         """Time the pieces of all calls from now on; of pieces within pieces the outer ones."""
-        in_turn = work._in_turn
+        in_turn = execute._in_turn
 
         def timed(
             whole: Callable[[slice], Result],
@@ -88,7 +88,7 @@ class Division:
 
             return in_turn(of_piece, pieces, step, progress, what)
 
-        work._in_turn = timed
+        execute._in_turn = timed
 
 
 def spread(seconds: Sequence[float], cores: int) -> float:
@@ -108,7 +108,7 @@ def spread(seconds: Sequence[float], cores: int) -> float:
 def modelled(scene: Path, request: PruneRequest) -> tuple[Division, float]:
     """Return how a prune is divided, done by one thread, and seconds of the processor."""
     division = Division()
-    in_turn = work._in_turn
+    in_turn = execute._in_turn
     division.watch()
     try:
         with tempfile.TemporaryDirectory() as made:
@@ -118,7 +118,7 @@ def modelled(scene: Path, request: PruneRequest) -> tuple[Division, float]:
             division.serial.disable()
             return division, time.process_time() - start
     finally:
-        work._in_turn = in_turn
+        execute._in_turn = in_turn
 
 
 def clocked(scene: Path, request: PruneRequest, threads: int) -> float:

@@ -30,7 +30,7 @@ from refine_addon.core import (
     read_ply,
     score,
 )
-from refine_addon.core.work import default_threads
+from refine_addon.core.execute import default_threads
 
 from ..baselines import splat_transform
 

@@ -39,12 +39,12 @@ from refine_addon.core.cleaning.search import (
     Search,
     _Suspects,
 )
+from refine_addon.core.execute import silent
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.splats import SH_C0, Splats, joined, opacity
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.ray_sample import validation_rays
-from refine_addon.core.work import silent
 
 from .evaluate import Evaluator, read_scene
 

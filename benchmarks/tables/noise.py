@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refine_addon.core import Settings
+from refine_addon.core.execute import silent
 from refine_addon.core.pipeline.absorb_splats import absorb_removed
 from refine_addon.core.pipeline.score_splats import score_once
 from refine_addon.core.quality.psnr import psnr_against
@@ -31,7 +32,6 @@ from refine_addon.core.splats import Splats
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import cast, points, projection, ray_sample
 from refine_addon.core.visibility.ray_sample import RaySample
-from refine_addon.core.work import silent
 
 from .evaluate import read_scene
 

@@ -27,13 +27,13 @@ import numpy as np
 
 from refine_addon import core
 from refine_addon.core import Settings
+from refine_addon.core.execute import silent
 from refine_addon.core.refit.refit import SIMPLER, Refit, Refitted, refit_on
 from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
 from refine_addon.core.survivor_choice import Became
 from refine_addon.core.views import ViewSet
-from refine_addon.core.work import silent
 
 from ..speed import capture
 from .evaluate import Evaluator, read_scene

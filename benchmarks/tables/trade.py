@@ -28,7 +28,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from refine_addon.core import processes
+from refine_addon.core import execute
 from refine_addon.core.errors import RefineError
 from refine_addon.core.scores import Scores
 from refine_addon.core.selection import Budget, select
@@ -111,7 +111,7 @@ def measured(work: Callable[[], Any], runs: int) -> tuple[Any, Cost]:
         result = work()
         seconds.append(time.perf_counter() - start)
         after = splat_transform.memory("VmHWM")
-        processes.end_idle()  # the next run starts them too
+        execute.end_idle()  # the next run starts them too
         busy.append(_busy() - worked)
         if before is not None and after is not None:
             peak = max(peak or 0, after - before)

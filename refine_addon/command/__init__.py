@@ -37,7 +37,7 @@ def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -
     with Listener(last=last) as listener:
         try:
             # Loads all of core, and with it NumPy: a signal waits until that is there.
-            from ..core.work import share_heap
+            from ..core.execute import share_heap
             from . import flow
 
             if last:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..core import RefineError
-from ..core.work import Cancelled
+from ..core.execute import Cancelled
 from ..render import frames
 from ..render.engine import Shared
 from .run import Run

@@ -11,11 +11,11 @@ from typing import Any
 
 from ..core import RefineError, ViewSet, read_cameras, with_views_between
 from ..core.errors import printable
+from ..core.execute import Progress
 from ..core.pace import Pace
 from ..core.report import MANY_UNSEEN
 from ..core.urls import Url
 from ..core.whole_file import new_folder
-from ..core.work import Progress
 from . import report
 from .terminal import Terminal, complain, described
 from .words import saved

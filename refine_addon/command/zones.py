@@ -8,7 +8,6 @@ from typing import Any
 
 from ..core import RefineError, Zone
 from ..core.volumes import Role, Volume, parse
-from ..objects.demands import Demands
 
 ROLES: dict[str, Role] = {"protect": "protect", "remove_inside": "remove", "keep_inside": "keep"}
 """Options -> what becomes of the splats in a volume."""
@@ -102,7 +101,7 @@ def of_files(options: argparse.Namespace) -> tuple[Zone, ...]:
     return tuple(_zone(role, item, "") for role, item in _items(options))
 
 
-def of_object(options: argparse.Namespace) -> Demands:
+def of_object(options: argparse.Namespace) -> Any:
     """Return what is demanded of the splats of --object: by the options, and by the scene.
 
     Raises

@@ -11,6 +11,7 @@ In short::
 from .cameras.read import read_cameras
 from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
 from .errors import RefineError
+from .execute import Cancelled
 from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import LevelsRequest, lod_file
@@ -33,7 +34,6 @@ from .tiles.prune import prune_tiles
 from .views import View, ViewSet
 from .views_between import with_views_between
 from .volumes import Box, MovedVolume, Sphere, Zone, forced
-from .work import Cancelled
 
 __all__ = [
     "CHOICES",

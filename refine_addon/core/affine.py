@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from . import spherical_harmonics
 from .errors import RefineError
+from .execute import chunks
 from .splats import Splats, rotation_matrices
-from .work import chunks
 
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spherical_harmonics
+from .execute import Progress, chunks, part, run_all, silent
 from .splats import SH_C0, Splats
 from .views import View, ViewSet
 from .visibility import projection
@@ -24,7 +25,6 @@ from .visibility.ray_sample import colors_from
 from .visibility.ray_sums import in_front
 from .visibility.rays import LOG_OPAQUE
 from .visibility.scene import Scene
-from .work import Progress, for_chunks, part, silent
 
 _PIXELS = 1 << 15  # drawn at a time, about, which limits temporary memory
 _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
@@ -178,7 +178,9 @@ def picture(
         return strip.reshape(4, len(rows), view.width)
 
     rows = max(_PIXELS // view.width, 1)
-    strips = for_chunks(work, view.height, rows, progress=progress, what="drawing", threads=threads)
+    strips = run_all(
+        work, chunks(view.height, rows), progress=progress, what="drawing", threads=threads
+    )
     return np.concatenate(strips, axis=1).clip(0.0, 1.0)
 
 

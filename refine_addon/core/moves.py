@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .affine import moved
-from .work import chunks
+from .execute import chunks
 
 LEAST = 6
 """Points that a map is found of at least: any four have one in common."""

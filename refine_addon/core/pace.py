@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 
 from .costs import Plan, by_views
-from .work import Progress, default_threads, silent
+from .execute import Progress, default_threads, silent
 
 _MINUTE, _TENS_TO = 60, 300  # seconds; up to the latter, times are told in tens of seconds
 

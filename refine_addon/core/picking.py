@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .execute import Progress, silent
 from .merging.neighbours import nearest
-from .work import Progress, silent
 
 Mode = Literal["SET", "ADD", "SUBTRACT", "INTERSECT"]
 """What becomes of a selection when some splats are taken."""

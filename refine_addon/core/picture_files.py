@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from .errors import RefineError
+from .execute import Progress, silent
 from .pictures import AMPLIFIED, CAMERAS, Comparison, compare
 from .png import png
 from .splats import Splats
 from .views import ViewSet
 from .whole_file import new_folder, refuse_existing, whole_file
-from .work import Progress, silent
 
 KINDS = ("before", "after", "difference")
 """The three pictures of a view; each is the end of a file name."""

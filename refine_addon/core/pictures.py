@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .drawing import picture
+from .execute import Progress, part, silent
 from .quality.psnr import psnr_of
 from .rendering import NEAR_RELATIVE
 from .splats import Splats
@@ -19,7 +20,6 @@ from .visibility import frustum, projection
 from .visibility.projection import Gaussians
 from .visibility.ray_sample import colors_from
 from .visibility.scene import Scene
-from .work import Progress, part, silent
 
 LONGEST = 960
 """Pixels along the longer side of a picture, at most: views of more are drawn smaller."""

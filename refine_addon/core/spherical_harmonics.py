@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .work import chunks
+from .execute import chunks
 
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 

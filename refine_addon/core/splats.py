@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError
+from .execute import chunks, run_all
 from .rendering import Model
-from .work import chunks, for_chunks
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -351,7 +351,7 @@ def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
     def fill(piece: slice) -> None:
         good[piece] = _drawable(splats.take(piece))
 
-    for_chunks(fill, len(splats), _CHECKED, threads=threads)
+    run_all(fill, chunks(len(splats), _CHECKED), threads=threads)
     return good
 
 

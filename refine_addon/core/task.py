@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError
+from .execute import Cancelled
 from .merging.absorb import Absorbed
 from .refit.refit import Refit
 from .scores import Scores
@@ -21,7 +22,6 @@ from .survivor_choice import SurvivorChoice, refuse_unknown
 from .views import ViewSet, refuse_other
 from .visibility.ray_sample import RaySample
 from .volumes import refuse_all
-from .work import Cancelled
 
 METHODS = ("auto", "occlusion", "closed-form")
 """The first is the default."""

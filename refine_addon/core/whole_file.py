@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from .errors import RefineError, reason_of
+from .execute import REPLACES_MAPPED, checkpoint
 from .urls import refuse_url
-from .work import REPLACES_MAPPED, checkpoint
 
 try:
     import fcntl
@@ -148,7 +148,7 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     RefineError
         If the file exists and may not be replaced, or the system cannot write it.
     Cancelled
-        See `work.checkpoint`; the file stays as it was.
+        See `execute.checkpoint`; the file stays as it was.
     """
     refuse_existing(path, overwrite=overwrite)
     try:

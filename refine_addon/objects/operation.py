@@ -12,6 +12,7 @@ import bpy
 
 from ..cameras.objects import world_matrix
 from ..core.errors import RefineError
+from ..core.execute import Progress, silent
 from ..core.formats.format import Format
 from ..core.operation.files import FileSink
 from ..core.operation.loaded import Loaded, RowSizes
@@ -19,7 +20,6 @@ from ..core.operation.requests import PruneRequest, ScoreRequest
 from ..core.operation.run import Runtime, Written, run
 from ..core.task import Result
 from ..core.whole_file import expanded
-from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -62,7 +62,7 @@ def prune_object(
     save : bool
         Whether to delete the splats from the object and save the .blend.
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
 
     Returns
     -------

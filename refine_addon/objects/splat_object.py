@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..cameras.objects import world_matrix
 from ..core.affine import baked, check_affine, is_uniform, transformed
 from ..core.errors import RefineError
+from ..core.execute import chunks, run_all
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
 from ..core.levels.lod import Level
@@ -31,7 +32,6 @@ from ..core.survivor_choice import SurvivorChoice
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.views import ViewSet
 from ..core.volumes import FREE, Forced
-from ..core.work import for_chunks
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -445,7 +445,7 @@ def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> 
             for name, column in columns.items():
                 column[rows] = values[name]
 
-    for_chunks(move_some, len(move.rows), _ROWS)
+    run_all(move_some, chunks(len(move.rows), _ROWS))
 
 
 def _turned_normals(normals: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[Any]:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ..cameras.objects import snapped, world_matrix
 from ..core.affine import is_flat
 from ..core.errors import RefineError
+from ..core.execute import Progress, report
 from ..core.formats.ply import REST_COUNTS
 from ..core.moves import Move
 from ..core.splats import above_constant, refuse_mixed
-from ..core.work import Progress, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 import bpy
 
 from ..core.errors import RefineError
-from ..core.work import Cancelled
+from ..core.execute import Cancelled
 from . import copies, engine
 from .engine import Shared
 from .meshes import Meshes, drawn_by_us

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.work import Cancelled
+from ..core.execute import Cancelled
 from ..mesh import native
 from ..mesh.layout import looks_like_splats
 from . import copies, see_through

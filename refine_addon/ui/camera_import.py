@@ -15,10 +15,10 @@ from ..cameras.objects import SHEAR, SOURCE, UPRIGHT
 from ..cameras.sets import create_cameras, known_turn
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError
+from ..core.execute import Progress
 from ..core.formats.registry import INDEX_NAMES
 from ..core.quality.alignment import Alignment
 from ..core.views import ViewSet
-from ..core.work import Progress
 from ..mesh import layout as mesh_layout
 from . import preferences
 from .on_thread import AskedFirst

@@ -13,13 +13,13 @@ import numpy as np
 
 from ..cameras.sets import CameraChoice
 from ..core import pipeline
+from ..core.execute import Progress, part
 from ..core.picture_files import KINDS
 from ..core.pictures import AMPLIFIED, Comparison, compare
 from ..core.quality.curve import in_words
 from ..core.splats import Splats
 from ..core.task import Task
 from ..core.views import ViewSet
-from ..core.work import Progress, part
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 from ..mesh.records import parsed

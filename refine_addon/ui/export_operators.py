@@ -12,13 +12,13 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
+from ..core.execute import Progress, report
 from ..core.formats import sog
 from ..core.formats.ply import SplatFile
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed, as_written, without_suffix
 from ..core.formats.streamed_sog import INDEX
 from ..core.formats.streamed_sog_write import StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
-from ..core.work import Progress, report
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject

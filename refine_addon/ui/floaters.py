@@ -8,10 +8,10 @@ import bpy
 import numpy as np
 
 from ..core.cleaning.clean import Cleaned, Cleaning, clean
+from ..core.execute import Progress
 from ..core.splats import Splats
 from ..core.views import ViewSet
 from ..core.volumes import Forced
-from ..core.work import Progress
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout

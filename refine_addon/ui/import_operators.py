@@ -14,11 +14,11 @@ from bpy_extras.io_utils import ImportHelper
 from ..cameras.objects import SOURCE, UPRIGHT
 from ..core.cameras.read import read_cameras
 from ..core.errors import RefineError
+from ..core.execute import Progress, part, report
 from ..core.formats.ply import SplatFile
 from ..core.formats.registry import INDEX_NAMES, READ_SUFFIXES, read_splats
 from ..core.formats.streamed_sog import INDEX
 from ..core.views import ViewSet
-from ..core.work import Progress, part, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..viewport import draw

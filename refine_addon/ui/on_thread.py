@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from .. import main_thread
-from ..core.work import Cancelled, silent
+from ..core.execute import Cancelled, silent
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from . import running as at_work

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..cameras.sets import CameraChoice
 from ..core import pipeline
+from ..core.execute import Progress, part
 from ..core.levels.lod import Level, Levels, lod
 from ..core.pipeline.refit_splats import DOING
 from ..core.quality.curve import in_words
@@ -27,7 +28,6 @@ from ..core.task import Result, Settings, Task, may_absorb
 from ..core.views import ViewSet
 from ..core.visibility import frustum
 from ..core.volumes import Forced
-from ..core.work import Progress, part
 from ..mesh import convert
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores

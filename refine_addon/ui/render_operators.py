@@ -11,7 +11,7 @@ import numpy as np
 from bpy.props import BoolProperty
 
 from .. import main_thread
-from ..core.work import Cancelled
+from ..core.execute import Cancelled
 from ..render import card, frames
 from ..render.engine import Shared
 from ..render.frames import Step

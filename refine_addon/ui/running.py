@@ -10,8 +10,8 @@ from typing import Any, Literal
 import bpy
 from bpy.app.handlers import persistent
 
+from ..core.execute import Progress
 from ..core.pace import Pace
-from ..core.work import Progress
 from ..mesh.layout import SplatObject
 from .target import Target
 from .worker import Worker

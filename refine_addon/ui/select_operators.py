@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ..core import picking
 from ..core.errors import RefineError
+from ..core.execute import Progress
 from ..core.picking import Axis
 from ..core.splats import opacity
-from ..core.work import Progress
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, selection

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ..cameras.objects import world_matrix
 from ..core import picking, sight
 from ..core.affine import transformed
+from ..core.execute import Progress
 from ..core.picking import Mode
 from ..core.sight import Prepared, Sight, Surface
 from ..core.splats import Splats
-from ..core.work import Progress
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import selection

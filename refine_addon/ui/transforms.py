@@ -11,7 +11,7 @@ from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 
 from ..core.errors import RefineError
-from ..core.work import Progress, report
+from ..core.execute import Progress, report
 from ..mesh import drift as mesh_drift
 from ..mesh import layout as mesh_layout
 from ..mesh.drift import Drift

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from ..core.work import Cancelled, Progress, checked_by
+from ..core.execute import Cancelled, Progress, checked_by
 
 Result = TypeVar("Result")
 

@@ -42,7 +42,7 @@ def gate(addon, monkeypatch):
     def held(splats, views, settings, *, progress, **options):
         if threading.current_thread().name == "refine" and settings.method != "closed-form":
             while not gate.open.wait(0.01):
-                addon.core.work.report(progress, 0.4, "looking")
+                addon.core.execute.report(progress, 0.4, "looking")
             if gate.error:
                 raise gate.error
         return score(splats, views, settings, progress=progress, **options)

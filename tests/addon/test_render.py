@@ -408,7 +408,7 @@ def test_a_render_that_is_stopped_leaves_nothing(addon, shot, monkeypatch):
     before = settings(shot)
 
     def stopped(*_, **__):
-        raise addon.core.work.Cancelled
+        raise addon.core.execute.Cancelled
 
     monkeypatch.setattr(addon.render.engine, "draw", stopped)
 

@@ -329,7 +329,7 @@ def held_join(addon, imported, monkeypatch):
 
         def work(progress):
             while not go.wait(0.01):
-                addon.core.work.report(progress, 0.0, "")
+                addon.core.execute.report(progress, 0.0, "")
             return move(progress)
 
         return work

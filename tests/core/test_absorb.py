@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core.affine import transformed
+from refine_addon.core.execute import Cancelled
 from refine_addon.core.merging import field as merge_field
 from refine_addon.core.merging import graph as merge_graph
 from refine_addon.core.merging import pairs as merging
@@ -20,7 +21,6 @@ from refine_addon.core.rendering import ALPHA_MAX
 from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility.scene import Scene, scene_of
-from refine_addon.core.work import Cancelled
 
 SCENE = Scene(np.zeros(3), 1.0, np.eye(3))
 

@@ -9,8 +9,8 @@ import pytest
 
 from refine_addon.core.cleaning.clumps import VIEW_PARTS, Looks, judge
 from refine_addon.core.cleaning.search import Search
+from refine_addon.core.execute import silent
 from refine_addon.core.visibility import projection
-from refine_addon.core.work import silent
 
 from .test_cleaning import SIDE, cameras, joined, made, wall
 from .test_cleaning_reasons import clump

@@ -25,11 +25,11 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
 )
+from refine_addon.core.execute import silent
 from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.tiles import absorbing, cluster, units
 from refine_addon.core.tiles.folder import Folder, Interrupted
 from refine_addon.core.tiles.workers import Batch
-from refine_addon.core.work import silent
 from tests.tiles import told_by_plan
 
 ROOM = Path(__file__).parents[2] / "tests/data/room_small"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from refine_addon.core.execute import Cancelled
 from refine_addon.core.merging.neighbours import nearest
-from refine_addon.core.work import Cancelled
 
 
 def brute_force(points, count):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, work
+from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.scoring.occlusion import Occlusion

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from refine_addon.core.costs import SECONDS, Cost
+from refine_addon.core.execute import silent
 from refine_addon.core.pace import Pace, named, phases
-from refine_addon.core.work import silent
 
 RUNS = json.loads((Path(__file__).parents[1] / "data/paces.json").read_text())
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Budget, RefineError, Splats, prune
+from refine_addon.core.execute import Cancelled
 from refine_addon.core.picture_files import KINDS, PictureFiles, chosen, in_words
 from refine_addon.core.pictures import AMPLIFIED, Comparison, compare, fitted
 from refine_addon.core.png import png
@@ -19,7 +20,6 @@ from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import cast
 from refine_addon.core.visibility.ray_sample import colors_from
-from refine_addon.core.work import Cancelled
 
 C0 = 0.28209479177387814
 

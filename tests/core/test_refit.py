@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from refine_addon import core
-from refine_addon.core import ViewSet, processes, spherical_harmonics
+from refine_addon.core import ViewSet, execute, spherical_harmonics
+from refine_addon.core.execute import Cancelled, silent
 from refine_addon.core.refit import linear, refit, round_rays, stored
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS
 from refine_addon.core.splats import rotation_matrices, with_model
@@ -19,7 +20,6 @@ from refine_addon.core.visibility import cast as casting
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import cast, cast_visible, pixels
 from refine_addon.core.visibility.ray_sample import colors_from
-from refine_addon.core.work import Cancelled, silent
 from tests.core.test_invariance import moved, rotation
 from tests.core.test_occlusion import cloud, ring
 
@@ -774,7 +774,7 @@ def test_processes_change_no_bit(monkeypatch):
     splats, here = cloud(300), []
     expected = refit.refit(splats.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2))
     for name in ("WORTH", "WORTH_READY"):
-        monkeypatch.setattr(processes, name, 0.0)
+        monkeypatch.setattr(execute, name, 0.0)
     monkeypatch.setattr(round_rays, "cast_visible", lambda *some: here.append(some))
 
     found = refit.refit(

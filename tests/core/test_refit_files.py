@@ -25,6 +25,7 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
 )
+from refine_addon.core.execute import Cancelled
 from refine_addon.core.pipeline import decide
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.refit.refit import Refit
@@ -32,7 +33,6 @@ from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
 from refine_addon.core.visibility.ray_sample import validation_rays
-from refine_addon.core.work import Cancelled
 from tests.strategies import ply_of
 
 ROOM = Path(__file__).parents[1] / "data/room_small"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import ViewSet
+from refine_addon.core.execute import Cancelled, silent
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.scoring.removal_rounds import KNOWN, RemovalRounds
 from refine_addon.core.visibility import cast, projection, ray_sample
@@ -16,7 +17,6 @@ from refine_addon.core.visibility import rays as rays_module
 from refine_addon.core.visibility.measuring import Measured
 from refine_addon.core.visibility.ray_sample import RaySample
 from refine_addon.core.visibility.rays import Rays
-from refine_addon.core.work import Cancelled, silent
 from tests.core.test_occlusion import cloud, ring
 
 RANDOM = np.random.default_rng(5)

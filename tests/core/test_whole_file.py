@@ -19,9 +19,9 @@ import pytest
 
 from refine_addon.core import RefineError, read_ply
 from refine_addon.core import whole_file as whole_files
+from refine_addon.core.execute import Cancelled, checked_by
 from refine_addon.core.formats import ply
 from refine_addon.core.whole_file import expanded, refuse_existing, whole_file
-from refine_addon.core.work import Cancelled, checked_by
 from tests.strategies import plain_header, plain_ply, splat_names
 from tests.users import NOBODY, closed_folder
 

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
+from ..execute import Progress, part, silent
 from ..splats import Splats, among_all, refuse_undrawable
 from ..views import ViewSet
 from ..visibility import projection
 from ..volumes import refuse_all
-from ..work import Progress, part, silent
 from .search import Search
 
 Sums = TypeVar("Sums")
@@ -178,7 +178,7 @@ def clean(
     forced_out : (N,) bool, optional
         Splats that go, unless they are protected, and are no evidence: as if they had gone before.
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
     threads : int, optional
 
     Raises

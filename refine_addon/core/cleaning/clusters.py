@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, silent
 from ..merging.neighbours import nearest
 from ..visibility.projection import Gaussians
-from ..work import Progress, silent
 
 NEIGHBOURS = 8
 """How many near neighbours of a splat are tested for whether they touch it."""

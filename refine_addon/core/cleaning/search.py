@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
+from ..execute import Progress, chunks, part, run_all
 from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import projection
 from ..visibility.measuring import VIEW_GROUPS
 from ..visibility.projection import Gaussians
 from ..visibility.scene import Scene
-from ..work import Progress, for_chunks, part
 from .clumps import VIEW_PARTS, Looks, judge
 from .clusters import cluster_sizes, touching
 from .support import Evidence, Support, ViewHits, hits_of_view
@@ -318,9 +318,9 @@ class Search:
     ) -> list[Sums]:
         """Return what `work` makes of the numbers of the views in each of some groups."""
         count = min(VIEW_GROUPS, len(self.views))
-        return for_chunks(
+        return run_all(
             lambda piece: work(range(piece.start, len(self.views), count)),
-            count, 1, progress=progress, what=what, threads=self.threads,
+            chunks(count, 1), progress=progress, what=what, threads=self.threads,
         )  # fmt: skip
 
     def _floats(self, suspects: _Suspects) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

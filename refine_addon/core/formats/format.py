@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
+from ..execute import chunks
 from ..rendering import MODELS, Model
 from ..splats import Splats
 from ..visibility.scene import spatial_order
-from ..work import chunks
 from .ply import Origin, SplatFile
 from .ply_columns import empty_rows
 from .ply_header import new_header, with_model
@@ -113,7 +113,7 @@ def new_file(
     return file, splats
 
 
-def pieces(count: int) -> Iterator[slice]:
+def pieces(count: int) -> list[slice]:
     """Return the slices of ``range(count)`` that are converted at a time."""
     return chunks(count, CHUNK)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..work import chunks, each_chunk
+from ..execute import chunks, run
 from .ply_columns import ChangedColumns
 
 PLY_TYPES = {
@@ -75,7 +75,7 @@ def write_rows(
             return bytes_of(pieces[begin + number.start])
 
         count = batch.stop - batch.start
-        made = each_chunk(of_batch, count, 1, what="writing", threads=threads)
+        made = run(of_batch, chunks(count, 1), what="writing", threads=threads)
         stream.writelines(chunk.data for chunk in made)
 
 

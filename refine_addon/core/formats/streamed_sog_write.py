@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
+from ..execute import checkpoint
 from ..place import Place
 from ..splats import Splats, rotation_matrices, scales
 from ..whole_file import mode_of, new_folder, refuse_existing, whole_file
-from ..work import checkpoint
 from .format import near_ones_together, pieces
 from .sog_write import GENERATOR, IMAGES, META, contents
 from .streamed_sog import INDEX, VERSION
@@ -178,7 +178,7 @@ class StreamedSog:
         RefineError
             If the index may not be replaced, or the system cannot write it.
         Cancelled
-            See `work.checkpoint`; all is as it was.
+            See `execute.checkpoint`; all is as it was.
         """
         checkpoint()
         refuse_existing(path, overwrite=overwrite)

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, chunks, part, run_all, silent
 from ..quality.curve import PSNR_CAP
 from ..quality.psnr import MIN_RAYS_WITH_HITS
 from ..splats import Splats
 from ..views import ViewSet
 from ..visibility import projection
 from ..visibility.ray_sample import cast_colored
-from ..work import Progress, for_chunks, part, silent
 
 FACTORS = (1, 2, 4, 8, 16)
 """Times the distance of the views from which pictures are compared; powers of two."""
@@ -75,7 +75,7 @@ class OriginalPictures:
         In the frame of the views.
     views : ViewSet
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
     threads : int, optional
 
     Attributes
@@ -148,8 +148,8 @@ class OriginalPictures:
                 np.bincount(owner, weight, len(means)).astype(np.float64),
             )
 
-        return for_chunks(
-            of_view, len(self._views), 1,
+        return run_all(
+            of_view, chunks(len(self._views), 1),
             progress=part(progress, 0.2, 1.0), what="comparing", threads=self._threads,
         )  # fmt: skip
 

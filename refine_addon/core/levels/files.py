@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import RefineError
+from ..execute import Progress, silent
 from ..formats import sog
 from ..formats.format import Format
 from ..formats.images import codec_for
@@ -37,7 +38,6 @@ from ..whole_file import (
     refuse_mapped,
     refuse_one_file,
 )
-from ..work import Progress, silent
 from .lod import MAX_LEVELS, Level, Levels, each_level, short
 
 GOAL = 40.0

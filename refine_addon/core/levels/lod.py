@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from .. import costs
 from ..costs import Plan
 from ..errors import RefineError
+from ..execute import Progress, silent
 from ..merging.absorb import Absorbed
 from ..pace import phases
 from ..pipeline import decide, planned, score, scoring_plans
@@ -30,7 +31,6 @@ from ..splats import Splats, among_all
 from ..survivor_choice import SURVIVORS, Became, refuse_unknown
 from ..task import DEFAULTS, Origin, Result, Settings, Task
 from ..views import ViewSet
-from ..work import Progress, silent
 from .distance import VIEWS, OriginalPictures, Reach
 
 MAX_LEVELS = 16
@@ -224,7 +224,7 @@ def lod(
         Splats that are in no level, unless they are protected. They count as removed, and levels
         are compared with the pictures of the others.
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
 
     Returns
     -------

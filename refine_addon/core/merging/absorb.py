@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import costs, spherical_harmonics
+from ..execute import Progress, chunks, part, report, return_freed, run_all, silent
 from ..pace import phases
 from ..splats import ARRAYS, Splats, drawable
 from ..views import ViewSet
 from ..visibility.scene import Scene, scene_of, spatial_order, splat_fingerprint
-from ..work import Progress, for_chunks, part, report, return_freed, silent
 from .field import Array, ColorOf, Field, Index, ViewSums, measured_field
 from .graph import MergeGraph
 from .pairs import axes, flattened
@@ -154,7 +154,7 @@ def absorb(
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
     threads : int, optional
 
     Raises
@@ -213,7 +213,7 @@ class _Lineage:
                 values[piece] = getattr(chunk, name) if name != "sh_rest" else 0.0
             columns["sh_dc"][piece][~drawable(chunk)] = np.nan
 
-        for_chunks(fill, count, _CHUNK, progress=part(progress, 0.0, 0.0), what="absorbing",
+        run_all(fill, chunks(count, _CHUNK), progress=part(progress, 0.0, 0.0), what="absorbing",
                    threads=threads)  # fmt: skip
         return replace(base, **columns)
 
@@ -463,7 +463,7 @@ def _rows(values: NDArray[Any], rows: Index, threads: int | None) -> NDArray[Any
     def copy(piece: slice) -> None:
         taken[piece] = values[rows[piece]]
 
-    for_chunks(copy, len(rows), _CHUNK, threads=threads)
+    run_all(copy, chunks(len(rows), _CHUNK), threads=threads)
     return taken
 
 
@@ -492,7 +492,9 @@ def _put_shapes(
 
     opacity = merged.opacity
     with np.errstate(under="ignore"):
-        for_chunks(fill, len(target), _CHUNK, progress=progress, what="absorbing", threads=threads)
+        run_all(
+            fill, chunks(len(target), _CHUNK), progress=progress, what="absorbing", threads=threads
+        )
         if left.model == "2dgs":
             logs, quaternions, opacity = flattened(merged, logs, quaternions)
         left.means[target], left.log_scales[target] = merged.means, logs
@@ -524,4 +526,4 @@ class _Blend:
             kept[self.targets, piece.start] = np.add.reduceat(weighted, self.starts)
 
         harmonics = values.shape[1] if len(self.starts) else 0
-        for_chunks(fill, harmonics, 1, progress=progress, what="absorbing", threads=threads)
+        run_all(fill, chunks(harmonics, 1), progress=progress, what="absorbing", threads=threads)

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import spherical_harmonics
+from ..execute import Progress, chunks, part, run_all, silent
 from ..rendering import LOW_PASS, NEAR_RELATIVE, Model
 from ..splats import Splats, opacity, rotation_matrices
 from ..views import View, ViewSet
 from ..visibility import frustum
 from ..visibility.scene import Scene
-from ..work import Progress, for_chunks, part, silent
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64] | NDArray[np.int32]
@@ -163,7 +163,7 @@ def viewing(
         for values, chunk in zip(result, of_piece, strict=True):
             values[piece] = chunk
 
-    for_chunks(fill, count, _CHUNK, progress=progress, what="absorbing", threads=threads)
+    run_all(fill, chunks(count, _CHUNK), progress=progress, what="absorbing", threads=threads)
     return result
 
 
@@ -247,7 +247,7 @@ def measured_field(
         ``color_of(rows, directions)`` returns the colours of some splats, seen along directions; by
         default those of their harmonics.
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
     threads : int, optional
 
     Raises
@@ -279,8 +279,8 @@ def measured_field(
             area = np.sqrt(np.maximum(xx * yy - xy * xy, 0.0))
             mass[piece] = alphas[piece] * area / viewed.pixel[piece]
 
-    for_chunks(
-        fill, len(rows), _CHUNK, progress=part(progress, 0.5, 1.0), what="absorbing",
+    run_all(
+        fill, chunks(len(rows), _CHUNK), progress=part(progress, 0.5, 1.0), what="absorbing",
         threads=threads,
     )  # fmt: skip
     field = Field(

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, chunks, concatenated, part, report, run_all, silent
 from ..visibility.scene import MIX, Scene
-from ..work import Progress, chunks, concatenated, for_chunks, part, report, silent
 from . import pairs as pricing
 from .field import Array, Field, Index
 from .neighbours import nearest
@@ -146,8 +146,8 @@ class MergeGraph:
             first = np.broadcast_to(of_piece, others.shape)[once]
             return rows[first].astype(np.int32), rows[others[once]].astype(np.int32)
 
-        found = for_chunks(
-            pairs, len(rows), _CHUNK,
+        found = run_all(
+            pairs, chunks(len(rows), _CHUNK),
             progress=part(progress, 0.5, 0.6), what="absorbing", threads=self.threads,
         )  # fmt: skip
         none = np.empty(0, np.int32)
@@ -169,8 +169,12 @@ class MergeGraph:
                 cost = pricing.costs(self.field, first, second, least / self.patience)
             self.cost[rows] = self.patience * cost
 
-        for_chunks(
-            price, len(edges), _CHUNK, progress=progress, what="absorbing", threads=self.threads
+        run_all(
+            price,
+            chunks(len(edges), _CHUNK),
+            progress=progress,
+            what="absorbing",
+            threads=self.threads,
         )
 
     def _round(self, quota: int, progress: Progress = silent) -> int:
@@ -271,7 +275,7 @@ class MergeGraph:
 
     def _joined(self, of_pairs: Callable[[slice], Any]) -> list[NDArray[Any]]:
         """Return what a function returns for slices of the pairs, one array or more, joined."""
-        parts = for_chunks(of_pairs, max(len(self.first), 1), _SCANNED, threads=self.threads)
+        parts = run_all(of_pairs, chunks(max(len(self.first), 1), _SCANNED), threads=self.threads)
         several = [part if isinstance(part, tuple) else (part,) for part in parts]
         return [concatenated(each, self.threads) for each in zip(*several, strict=True)]
 
@@ -291,7 +295,7 @@ class MergeGraph:
                 field.put(into[piece], pricing.merge(field, first[piece], second[piece], pairs))
             share[piece] = np.where(swap[piece], 1.0 - pairs.color, pairs.color)
 
-        for_chunks(merge, len(edges), _CHUNK, threads=self.threads)
+        run_all(merge, chunks(len(edges), _CHUNK), threads=self.threads)
         self.merges.append((into, gone, share))
         return into, gone
 
@@ -308,7 +312,7 @@ def _smallest(arrays: Sequence[Costs], rank: int, threads: int | None) -> float:
         def work(number: slice) -> NDArray[Any]:
             return of_piece(pieces[number.start])
 
-        return for_chunks(work, len(pieces), 1, threads=threads)
+        return run_all(work, chunks(len(pieces), 1), threads=threads)
 
     def upper(values: Costs) -> NDArray[np.uint32]:
         return np.asarray((values.view(np.uint32) & _UNSIGNED) >> _HALF)

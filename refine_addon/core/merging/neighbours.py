@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, chunks, part, run_all, silent
 from ..splats import rotation_matrices
 from ..visibility.scene import spatial_order
-from ..work import Progress, for_chunks, part, silent
 
 CURVES = np.array(
     [[1.0, 0, 0, 0], [0.8, 0.3, 0.4, 0.3], [0.5, -0.6, 0.1, 0.6], [0.3, 0.5, -0.7, 0.4]]
@@ -54,7 +54,7 @@ def nearest(
     count : int
         How many neighbours, up to 16; fewer where there are not as many other points.
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
     threads : int, optional
 
     Returns
@@ -78,8 +78,8 @@ def nearest(
     def search(piece: slice) -> None:
         near[piece] = _nearest_of(points, piece, candidates(piece), count)
 
-    for_chunks(
-        search, total, _CHUNK,
+    run_all(
+        search, chunks(total, _CHUNK),
         progress=part(progress, 0.2, 1.0), what="finding neighbours", threads=threads,
     )  # fmt: skip
     return near
@@ -106,8 +106,8 @@ def _candidates(
         # At either end of a curve the window lies to one side.
         return order, np.clip(place - window, 0, total - 1 - 2 * window)
 
-    curves = for_chunks(
-        along, len(CURVES), 1, progress=progress, what="finding neighbours", threads=threads
+    curves = run_all(
+        along, chunks(len(CURVES), 1), progress=progress, what="finding neighbours", threads=threads
     )
 
     def around(piece: slice) -> NDArray[np.int32]:

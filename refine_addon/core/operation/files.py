@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from ..execute import Progress, report, silent
 from ..formats.format import Format
 from ..formats.registry import as_written, format_named, read_splats
 from ..rendering import Model
@@ -17,7 +18,6 @@ from ..report import files_facts, held
 from ..task import Result
 from ..volumes import Zone, forced
 from ..whole_file import expanded, refuse_existing, refuse_mapped
-from ..work import Progress, report, silent
 from .loaded import Loaded, RowSizes
 from .requests import Kept, PruneRequest
 from .run import Request, Runtime, Written, run

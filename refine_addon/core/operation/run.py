@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from ..costs import Plan
+from ..execute import Cancelled, Progress, part, silent
 from ..formats.format import Format
 from ..pace import phases
 from ..rendering import Model
 from ..report import Clock
 from ..volumes import Zone
-from ..work import Cancelled, Progress, part, silent
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from .. import costs
 from ..costs import Plan
+from ..execute import Progress, part, silent
 from ..merging import absorb as absorbing
 from ..merging.absorb import Absorbed
 from ..merging.field import ViewSums
@@ -29,7 +30,6 @@ from ..task import DEFAULTS, Settings, Task
 from ..views import ViewSet
 from ..visibility.measuring import Measured
 from ..visibility.ray_sample import VALIDATION_VIEWS
-from ..work import Progress, part, silent
 from .refit_splats import Made, refit_made
 from .score_splats import score_once, with_quality
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .. import selection
 from ..costs import Cost, Plan, joined
+from ..execute import Progress, report, silent
 from ..merging.absorb import Absorbed
 from ..pace import phases
 from ..quality.cost import expected_seconds
@@ -37,7 +38,6 @@ from ..survivor_choice import Became, SurvivorChoice
 from ..task import DEFAULTS, Result, Settings, Task
 from ..views import ViewSet, refuse_other
 from ..visibility.measuring import Measured
-from ..work import Progress, report, silent
 from .absorb_splats import CLOSE, absorb_task, absorbing_plans
 from .refit_splats import Made, unchanged_note
 from .score_splats import score, score_once, scoring_plans, with_quality

@@ -6,13 +6,13 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from ..execute import Cancelled, Progress, return_freed
 from ..merging.absorb import Absorbed
 from ..pace import named
 from ..quality.curve import in_words
 from ..refit.refit import Refitted, refit_rounds
 from ..survivor_choice import Became
 from ..task import Task
-from ..work import Cancelled, Progress, return_freed
 
 DOING = "refitting"
 """What a progress callback is told while survivors are refitted: from here on a cancelled prune

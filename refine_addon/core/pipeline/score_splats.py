@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from .. import costs
 from ..costs import Plan
+from ..execute import Progress, silent
 from ..pace import phases
 from ..quality.alignment import alignment
 from ..quality.psnr import psnr_after, quality_curve
@@ -20,7 +21,6 @@ from ..views import ViewSet, refuse_other
 from ..visibility.measuring import Measured
 from ..visibility.ray_sample import validation_rays
 from ..volumes import refuse_all
-from ..work import Progress, silent
 
 
 def score(

@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..affine import QUARTERS
+from ..execute import Progress, chunks, part, report, run_all, silent
 from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import frustum, projection
 from ..visibility.cast import cast, pixels
 from ..visibility.projection import Gaussians
 from ..visibility.scene import Scene
-from ..work import Progress, for_chunks, part, report, silent
 
 SAMPLE = 4096
 """About so many splats are a sample of all; each is enlarged to the area of those it stands for."""
@@ -244,8 +244,8 @@ def _fineness(
         view = ordered[number].turned(rotations[turn])
         return _fineness_of(gaussians, scene, view, columns_and_rows, stand_for)
 
-    fineness = for_chunks(
-        fineness_of_turned, len(QUARTERS) * count, 1,
+    fineness = run_all(
+        fineness_of_turned, chunks(len(QUARTERS) * count, 1),
         progress=part(progress, 0.2, 1.0), what="checking", threads=threads,
     )  # fmt: skip
     return tuple(np.reshape(fineness, (len(QUARTERS), count)).mean(axis=1).tolist())

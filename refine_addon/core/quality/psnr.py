@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, chunks, part, run_all, silent
 from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import projection
 from ..visibility.ray_sample import RaySample, cast_colored
 from ..visibility.rays import Rays
-from ..work import Progress, for_chunks, part, silent
 from .curve import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
 
 Compare = Callable[[int, Rays], Sequence[float]]
@@ -307,8 +307,8 @@ def _of_each_view(
         with np.errstate(under="ignore"):
             return compare(number, rays)
 
-    values = for_chunks(
-        compare_one, len(numbers), 1, progress=progress, what="estimating", threads=threads
+    values = run_all(
+        compare_one, chunks(len(numbers), 1), progress=progress, what="estimating", threads=threads
     )
     return np.array(values)
 

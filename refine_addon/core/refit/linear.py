@@ -37,6 +37,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, chunks, run
 from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..spherical_harmonics import basis
 from ..splats import SH_C0, Splats, rotation_matrices
@@ -46,7 +47,6 @@ from ..visibility.cast import BEHIND
 from ..visibility.projection import Footprints, Gaussians
 from ..visibility.rays import LEAST_LEFT, Rays, VisibleRays
 from ..visibility.scene import Scene
-from ..work import Progress, each_chunk
 from .stored import Stored
 
 COLOR, DEGREE_1, OPACITY, MEAN, SCALE, TURN = (
@@ -467,8 +467,12 @@ class LinearRays:
             with np.errstate(under="ignore"):
                 return view.hit, view.normal(in_scene)
 
-        for hit, values in each_chunk(
-            of_view, len(self.views), 1, progress=progress, what="refitting", threads=threads
+        for hit, values in run(
+            of_view,
+            chunks(len(self.views), 1),
+            progress=progress,
+            what="refitting",
+            threads=threads,
         ):
             _add(total, hit, values)
         return self.shapes.by_parameter(total)

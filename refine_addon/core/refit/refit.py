@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 
 from .. import costs
 from ..errors import RefineError
+from ..execute import Progress, part, silent
 from ..pace import phases
 from ..splats import Splats, rotation_matrices, unit_quaternions
 from ..views import ViewSet
-from ..work import Progress, part, silent
 from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, LinearRays
 from .round_rays import LARGEST, RoundRays, limits
 
@@ -172,7 +172,7 @@ def refit(
     protected : (N,) bool, optional
         Survivors that do not change.
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
     threads : int, optional
 
     Returns

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .. import costs
 from ..costs import Plan
-from ..processes import for_each
+from ..execute import Progress, chunks, part, return_freed, run
 from ..quality.curve import PSNR_CAP
 from ..spherical_harmonics import single_colors
 from ..splats import Splats
@@ -29,7 +29,6 @@ from ..visibility.cast import cast_visible, depth_complexity, pixels
 from ..visibility.projection import Footprints, Gaussians
 from ..visibility.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, VALIDATION_VIEWS
 from ..visibility.scene import Scene
-from ..work import Progress, chunks, part, return_freed
 from .linear import LEAST_WEIGHT, LinearRays, SeenView, Shapes, linear_view
 
 Result = TypeVar("Result")
@@ -385,8 +384,8 @@ class RoundRays:
         """Yield what is found on the rays of windows, cast into `count` splats."""
         seconds = SECONDS * (count + self.around) * len(windows)
         seconds += SECONDS_OF_RAY * sum(window.rays for window in windows)
-        return for_each(
-            work, len(windows), seconds,
+        return run(
+            work, range(len(windows)), cost=seconds,
             progress=progress, what="refitting", threads=self._threads,
         )  # fmt: skip
 

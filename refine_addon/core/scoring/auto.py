@@ -18,13 +18,13 @@ from dataclasses import replace
 import numpy as np
 
 from .. import costs
+from ..execute import Progress, silent
 from ..pace import phases
 from ..quality.curve import UNSEEN
 from ..quality.psnr import psnr_by_views
 from ..scores import Scores
 from ..splats import Splats
 from ..views import ViewSet
-from ..work import Progress, silent
 from .occlusion import MemoryScoring, Occlusion, OcclusionScoring, survivors_of_rounds
 
 RATIOS = (0.3, 0.5, 0.7, 0.9)

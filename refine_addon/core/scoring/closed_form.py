@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from .. import radix
 from ..errors import RefineError
+from ..execute import Progress, chunks, default_threads, part, run_all, silent
 from ..rendering import NEAR_RELATIVE
 from ..scores import Scores
 from ..splats import Splats, refuse_undrawable
 from ..views import ViewSet
 from ..visibility.scene import principal_axes, size_of
-from ..work import Progress, chunks, default_threads, for_chunks, part, silent
 from . import adaptive
 from .closed_form_block import CELLS, HIGHEST, ROWS, Frame, NeighbourhoodSums, RowBlock
 from .closed_form_settings import DEFAULTS, ETA_RELATIVE, ClosedForm
@@ -63,7 +63,7 @@ def score(
         All of them are used.
     settings : ClosedForm
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
     threads : int, optional
 
     Returns
@@ -93,8 +93,8 @@ def score(
         done += SHARES[step]
         if len(blocks) == 1:
             blocks[0].progress = progress_of_step
-        return for_chunks(
-            lambda piece: blocks[piece.start].step(step, *arguments), len(blocks), 1,
+        return run_all(
+            lambda piece: blocks[piece.start].step(step, *arguments), chunks(len(blocks), 1),
             progress=progress_of_step, what=WHAT.get(step, "scoring"), threads=threads,
         )  # fmt: skip
 

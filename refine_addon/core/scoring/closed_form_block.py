@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import radix
+from ..execute import Progress, chunks, part, run_all, silent
 from ..splats import Splats, base_color, drawable, opacity
 from ..views import ViewSet
 from ..visibility.frustum import Frustums
-from ..work import Progress, for_chunks, part, silent
 from . import adaptive
 from .closed_form_settings import ClosedForm
 from .nearness import near_order
@@ -229,8 +229,8 @@ class RowBlock:
         self.means = np.empty((count, 3), kind)
         self.squared, self.alpha, self.area, self.reach = (np.empty(count) for _ in range(4))
         self.luma = np.empty(count, np.float32)
-        statistics = for_chunks(
-            self._read, count, 4 * _CHUNK,
+        statistics = run_all(
+            self._read, chunks(count, 4 * _CHUNK),
             progress=self.progress, what="reading", threads=self.threads,
         )  # fmt: skip
         self.splats = None
@@ -315,15 +315,14 @@ class RowBlock:
         self.cells = np.zeros(count, np.int32)
         # Without a frustum every view counts for all, wherever they lie.
         order = near_order(self.means) if self.settings.frustum else np.arange(count)
-        for_chunks(
-            partial(self._sum_visibility, order), count, 8 * _CHUNK,
+        run_all(
+            partial(self._sum_visibility, order), chunks(count, 8 * _CHUNK),
             progress=part(self.progress, 0.0, 0.9), what="scoring", threads=self.threads,
         )  # fmt: skip
         return np.array(
-            for_chunks(
+            run_all(
                 self._sum,
-                count,
-                _CHUNK,
+                chunks(count, _CHUNK),
                 progress=part(self.progress, 0.9, 1.0),
                 what="scoring",
                 threads=self.threads,
@@ -527,7 +526,7 @@ class RowBlock:
             self._store(self.values, values, piece)
 
     def _in_chunks(self, work: Any) -> None:
-        for_chunks(work, len(self.good), 4 * _CHUNK, threads=self.threads)
+        run_all(work, chunks(len(self.good), 4 * _CHUNK), threads=self.threads)
 
     def _store(self, into: NDArray[np.float32], values: NDArray[np.float64], piece: slice) -> None:
         """Set the scores of some splats; call it where underflow is ignored."""

@@ -25,8 +25,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import costs, processes
+from .. import costs, execute
 from ..errors import RefineError
+from ..execute import Progress, part, report, silent
 from ..pace import phases
 from ..scores import Scores, shares_gone
 from ..splats import Splats, refuse_undrawable
@@ -36,7 +37,6 @@ from ..visibility import projection
 from ..visibility.measuring import SECONDS, Measured, Measuring, Sampling
 from ..visibility.projection import Gaussians
 from ..visibility.ray_sample import RaySample
-from ..work import Progress, part, report, silent
 from . import closed_form, coverage
 from .closed_form_settings import ClosedForm
 from .removal_rounds import RemovalRounds
@@ -97,7 +97,7 @@ def score(
         How many splats to put in their final order, the first to be removed first; the others get
         scores of the last round that this takes. By default all.
     progress : callable, optional
-        See `refine_addon.core.work.Progress`.
+        See `refine_addon.core.execute.Progress`.
     threads : int, optional
 
     Returns
@@ -442,7 +442,7 @@ class MemoryScoring(OcclusionScoring):
     ) -> None:
         if not len(splats):
             raise RefineError("there are no splats to score")
-        processes.start(SECONDS * len(splats) * len(views), threads)
+        execute.start(SECONDS * len(splats) * len(views), threads)
         activating, scoring = phases(progress, *costs.preparing(len(splats), len(views)))
         gaussians, scene, good = projection.prepare(
             splats, views, progress=activating, threads=threads

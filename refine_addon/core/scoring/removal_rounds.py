@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, chunks, part, run_all
 from ..visibility.measuring import Measured
 from ..visibility.ray_sample import RaySample
 from ..visibility.rays import Rays
-from ..work import Progress, for_chunks, part
 
 Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -92,8 +92,8 @@ class RemovalRounds:
                 colors = scoring_rays.colors(number, rays).astype(np.float32)
             return _ViewRays(rays, colors, weight * view.width * view.height / rays.count)
 
-        self._views: list[_ViewRays] = for_chunks(
-            with_colors, len(numbers), 1,
+        self._views: list[_ViewRays] = run_all(
+            with_colors, chunks(len(numbers), 1),
             progress=part(progress, 0.0, _LOADING), what="scoring", threads=threads,
         )  # fmt: skip
         self._rays_hitting = np.zeros(len(measured.seen), np.int64)  # (M,), n_i
@@ -141,8 +141,8 @@ class RemovalRounds:
             with np.errstate(under="ignore"):
                 return view.removal_errors()
 
-        of_views = for_chunks(
-            removal_errors, len(self._views), 1,
+        of_views = run_all(
+            removal_errors, chunks(len(self._views), 1),
             progress=progress, what="scoring", threads=self._threads,
         )  # fmt: skip
         error, contribution = np.zeros(len(keep)), np.zeros(len(keep))

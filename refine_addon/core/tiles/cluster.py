@@ -23,8 +23,8 @@ from typing import Any
 
 from ...version import VERSION
 from ..errors import RefineError
+from ..execute import report
 from ..operation.run import Runtime
-from ..work import report
 from .folder import Folder, Interrupted
 from .units import Tile, header_of
 from .workers import Batch, Context, Result

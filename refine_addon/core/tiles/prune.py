@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...version import VERSION
 from ..costs import Cost, Images, Plan, joined
 from ..errors import RefineError
+from ..execute import Cancelled, Progress, silent
 from ..formats.format import Format
 from ..formats.ply_header import with_count
 from ..operation.requests import PruneRequest
@@ -39,7 +40,6 @@ from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, refuse_none_left
 from ..survivor_choice import Became
 from ..urls import Url
-from ..work import Cancelled, Progress, silent
 from . import absorbing
 from .absorbing import Survivors
 from .closed_form import ClosedFormContext, by_closed_form

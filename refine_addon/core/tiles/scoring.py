@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import costs
+from ..execute import Progress
 from ..pace import phases
 from ..pipeline.score_splats import with_quality
 from ..scores import Scores
@@ -16,7 +17,6 @@ from ..scoring.occlusion import PRIOR, Occlusion, OcclusionScoring, survivors_of
 from ..task import Settings
 from ..visibility.measuring import Measured
 from ..visibility.scene import Scene, principal_axes
-from ..work import Progress
 from .closed_form import ClosedFormContext, by_closed_form
 from .gaussians import SceneContext, SumMoments, store_gaussians
 from .seeing import StoredRays, TileMeasuring

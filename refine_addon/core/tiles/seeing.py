@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, run
 from ..operation.run import Runtime
-from ..processes import for_each
 from ..quality.psnr import mean_psnr
 from ..splats import Splats, joined
 from ..visibility.cast import cast
@@ -22,7 +22,6 @@ from ..visibility.projection import Footprints, Gaussians
 from ..visibility.ray_sample import RaySample, cast_view
 from ..visibility.rays import Rays
 from ..visibility.scene import Scene
-from ..work import Progress
 from .folder import Folder
 from .gaussians import SceneContext, StoredGaussians
 from .units import Source, unpacked
@@ -46,9 +45,9 @@ class MeasureViews:
             return
         sample, count = folder.noted("sample")[1], int(folder.noted("count")[1])
         total, errors = Measured.zero(count), []
-        measurements = for_each(
-            _OneView(context, self.numbers, self.kinds), len(self.numbers),
-            SECONDS * count * len(self.numbers),
+        measurements = run(
+            _OneView(context, self.numbers, self.kinds), range(len(self.numbers)),
+            cost=SECONDS * count * len(self.numbers),
             progress=runtime.progress, what="scoring", threads=runtime.threads,
         )  # fmt: skip
         for measurement, weight in measurements:

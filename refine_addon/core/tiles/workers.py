@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from ..costs import Plan
+from ..execute import Progress, part, report, silent
 from ..operation.run import Runtime
 from ..pace import phases
-from ..work import Progress, part, report, silent
 from .folder import Folder
 from .units import Tile
 
@@ -72,7 +72,7 @@ class InProcess:
     Parameters
     ----------
     threads : int, optional
-        See `refine_addon.core.work.for_chunks`.
+        See `refine_addon.core.execute.run`.
     """
 
     def __init__(self, threads: int | None = None) -> None:
@@ -100,7 +100,7 @@ class Runner:
     progress: Progress = silent
 
     def part(self, start: float, end: float) -> Runner:
-        """Return a runner whose steps are a part of this one's, see `work.part`."""
+        """Return a runner whose steps are a part of this one's, see `execute.part`."""
         return replace(self, progress=part(self.progress, start, end))
 
     def phases(self, *plans: Plan) -> list[Runner]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import checkpoint
 from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..views import View
-from ..work import checkpoint
 from .projection import Footprints
 from .rays import LOG_OPAQUE, Rays, VisibleRays
 

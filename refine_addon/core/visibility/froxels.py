@@ -16,8 +16,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import checkpoint
 from ..rendering import ALPHA_CUT, ALPHA_MAX
-from ..work import checkpoint
 from .points import Points
 from .projection import Footprints
 from .ray_sums import behind, in_front, paired

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, chunks, run_all, silent
 from ..views import View, ViewSet
-from ..work import Progress, for_chunks, silent
 
 _STACK = 16
 """Rows of one matrix product: so few that BLAS starts no threads, which would slow down ours."""
@@ -240,7 +240,7 @@ def census(
             inside = between & (beyond <= 0.0)
         counts[piece.start // _POINTS] = np.count_nonzero(inside, axis=1)
 
-    for_chunks(count_in_views, len(points), _POINTS, progress=progress, what="counting")
+    run_all(count_in_views, chunks(len(points), _POINTS), progress=progress, what="counting")
     return np.asarray(counts.sum(axis=0))
 
 

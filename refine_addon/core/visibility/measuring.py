@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..processes import for_each
+from ..execute import Progress, chunks, run, run_all
 from ..views import View, ViewSet
-from ..work import Progress, for_chunks
 from . import froxels, projection
 from .points import cell_size, scatter
 from .projection import Footprints, Gaussians
@@ -124,7 +123,7 @@ class Measured:
                 self.contribution[rows] += weight * measurement.contribution[piece]
                 self.error[rows] += weight * measurement.error[piece]
 
-        for_chunks(add, len(measurement.rows), _ADDED, threads=threads)
+        run_all(add, chunks(len(measurement.rows), _ADDED), threads=threads)
 
 
 class ViewMeasurement(NamedTuple):
@@ -233,9 +232,9 @@ class Measuring:
             WantedRays(rays.scoring, {number for number in numbers if rays.wants(number)})
             for rays in ray_samples
         ]
-        measurements = for_each(
+        measurements = run(
             _MeasureAndCast(gaussians, self.scene, self.views, self.sampling, numbers, wanted),
-            len(numbers), SECONDS * len(gaussians) * len(numbers),
+            range(len(numbers)), cost=SECONDS * len(gaussians) * len(numbers),
             progress=progress, what="scoring", threads=self.threads,
         )  # fmt: skip
         sums: dict[int, Measured] = {}

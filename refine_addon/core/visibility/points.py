@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import checkpoint
 from ..views import View
-from ..work import checkpoint
 from .lattices import COUNTS, FLAT, WIDE_EXTENT, lattice_table, lattices
 from .projection import Footprints
 

@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import Progress, checkpoint, chunks, part, report, run_all, silent
 from ..rendering import ALPHA_CUT, DISC_LOW_PASS, LOW_PASS, NEAR_RELATIVE, Model
 from ..splats import SH_C0, Splats, drawable, opacity, rotation_matrices
 from ..views import View, ViewSet
-from ..work import Progress, checkpoint, for_chunks, part, report, silent
 from . import frustum
 from .scene import Scene, scene_of, spatial_order, splat_fingerprint
 
@@ -186,8 +186,9 @@ def classify(
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
         opaque[piece] = opacity(logits) > ALPHA_CUT
 
-    for_chunks(
-        classify_chunk, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads
+    run_all(
+        classify_chunk, chunks(len(splats), 4 * _CHUNK),
+        progress=progress, what="reading", threads=threads,
     )  # fmt: skip
     return good, opaque
 
@@ -254,7 +255,7 @@ def activate(
         result.colors[piece] = colors.clip(0.0, BRIGHTEST)
 
     with np.errstate(under="ignore"):
-        for_chunks(fill, count, _CHUNK, progress=progress, what="reading", threads=threads)
+        run_all(fill, chunks(count, _CHUNK), progress=progress, what="reading", threads=threads)
     return result
 
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import spherical_harmonics
+from ..execute import Progress, chunks, part, run_all, silent
 from ..splats import Splats
 from ..views import View, ViewSet
-from ..work import Progress, for_chunks, part, silent
 from . import projection
 from .cast import cast, depth_complexity, pixels
 from .projection import Footprints, Gaussians
@@ -121,8 +121,12 @@ class RaySample:
                         self.views, number, footprints, scoring=self.scoring, share=self.share
                     )
 
-        for_chunks(
-            cast_one, len(numbers), 1, progress=progress, what="casting rays", threads=threads
+        run_all(
+            cast_one,
+            chunks(len(numbers), 1),
+            progress=progress,
+            what="casting rays",
+            threads=threads,
         )
 
     def cast_all(

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..work import checkpoint
+from ..execute import checkpoint
 from .ray_sums import behind, in_front, paired
 
 LOG_OPAQUE = -9.3

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..execute import chunks, concatenated, run_all
 from ..splats import Splats
 from ..views import ViewSet
-from ..work import chunks, concatenated, for_chunks
 
 MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: its multiples spread numbers that differ little."""
@@ -84,7 +84,7 @@ class Scene:
             product = (means[chosen] - self.origin) @ turn
             places[piece] = product[piece.start - begin :]
 
-        for_chunks(fill, count, _CHUNK, threads=threads)
+        run_all(fill, chunks(count, _CHUNK), threads=threads)
         return places
 
 
@@ -130,13 +130,13 @@ def scene_of(
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
             squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
 
-    for_chunks(measure, len(means), _CHUNK, threads=threads)
+    run_all(measure, chunks(len(means), _CHUNK), threads=threads)
     median = float(np.median(squared[drawable])) if drawable.any() else 0.0
     unturned = Scene(origin, size_of(median), np.eye(3))
     total = sum(
-        for_chunks(
+        run_all(
             lambda piece: _moments(means[piece][drawable[piece]], unturned),
-            len(means), _CHUNK, threads=threads,
+            chunks(len(means), _CHUNK), threads=threads,
         ),
         np.zeros((4, 3)),
     )  # fmt: skip
@@ -238,7 +238,7 @@ def spatial_order(
     def fill(piece: slice) -> None:
         code[piece] = spatial_code(positions[piece])
 
-    for_chunks(fill, len(positions), _CHUNK, threads=threads)
+    run_all(fill, chunks(len(positions), _CHUNK), threads=threads)
     return code_order(code, ties, threads=threads)
 
 
@@ -295,4 +295,4 @@ def _stable_order(keys: NDArray[np.int64], threads: int | None) -> NDArray[np.in
         rows = np.flatnonzero(within)
         return rows[np.argsort(keys[rows], kind="stable")]
 
-    return concatenated(for_chunks(sort, pieces, 1, threads=threads), threads)
+    return concatenated(run_all(sort, chunks(pieces, 1), threads=threads), threads)

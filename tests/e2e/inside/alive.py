@@ -193,7 +193,7 @@ class Gate:
     def __init__(self) -> None:
         self.running = importlib.import_module(f"{extension.MODULE}.ui.running")
         scoring = importlib.import_module(f"{extension.MODULE}.core.pipeline")
-        work = importlib.import_module(f"{extension.MODULE}.core.work")
+        work = importlib.import_module(f"{extension.MODULE}.core.execute")
         self.opened, score = threading.Event(), scoring.score
 
         def held(splats: Any, views: Any, settings: Any, *, progress: Any, **options: Any) -> Any:

@@ -12,7 +12,7 @@ def main(cloud: str, cameras: str) -> dict[str, object]:
     """Score by occlusion; return how many processes did it, and Blender's Python."""
     enable()
     core = importlib.import_module(f"{MODULE}.core")
-    processes = importlib.import_module(f"{MODULE}.core.processes")
+    processes = importlib.import_module(f"{MODULE}.core.execute")
     core.score(
         core.read_ply(cloud).splats(),
         core.read_cameras(cameras),

@@ -15,15 +15,14 @@ import numpy as np
 import pytest
 
 # Of modules, not of the package: a process that runs `row` imports these too, from the same places.
-from refine_addon.core import processes
+from refine_addon.core import execute
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
+from refine_addon.core.execute import Cancelled, run
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.pipeline import prune
-from refine_addon.core.processes import for_each
 from refine_addon.core.selection import Budget
 from refine_addon.core.task import Settings
-from refine_addon.core.work import Cancelled
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +34,7 @@ MUCH = 1e3  # seconds of work: worth processes
 @pytest.fixture(autouse=True)
 def _no_process_stays():
     yield
-    processes.end_idle()
+    execute.end_idle()
 
 
 def row(array: np.ndarray, number: int) -> tuple[int, np.ndarray]:
@@ -94,7 +93,7 @@ def test_processes_return_what_this_one_would_in_order(order):
     """Eleven rows by two processes: each row is doubled, and none was doubled here."""
     array = np.asarray(np.random.default_rng(0).random((11, 1000)), order=order)
 
-    where, rows = zip(*for_each(partial(row, array), 11, MUCH, threads=2), strict=True)
+    where, rows = zip(*run(partial(row, array), range(11), cost=MUCH, threads=2), strict=True)
 
     np.testing.assert_array_equal(rows, array * 2)
     assert len(set(where)) == 2
@@ -105,8 +104,10 @@ def test_processes_are_kept_for_the_next_work():
     """Once they are there, a tenth of the work is worth them too."""
     array = np.zeros((4, 1))
 
-    first = {pid for pid, _ in for_each(partial(row, array), 4, MUCH, threads=2)}
-    again = {pid for pid, _ in for_each(partial(row, array), 4, processes.WORTH / 2, threads=2)}
+    first = {pid for pid, _ in run(partial(row, array), range(4), cost=MUCH, threads=2)}
+    again = {
+        pid for pid, _ in run(partial(row, array), range(4), cost=execute.WORTH / 2, threads=2)
+    }
 
     assert again == first
 
@@ -114,7 +115,7 @@ def test_processes_are_kept_for_the_next_work():
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="asks Linux what is mapped")
 def test_processes_forget_the_work_when_it_is_done():
     """The arrays are no longer mapped, so they take neither memory nor disk."""
-    found = for_each(partial(row, np.zeros((4, 1))), 4, MUCH, threads=2)
+    found = run(partial(row, np.zeros((4, 1))), range(4), cost=MUCH, threads=2)
     pid, _ = next(found)
     maps = Path(f"/proc/{pid}/maps")
     assert "/arrays" in maps.read_text(encoding="utf-8")
@@ -130,7 +131,7 @@ def test_processes_forget_the_work_when_it_is_done():
 )
 def test_idle_processes_return_the_memory_that_their_work_took():
     """Of 40 MB that glibc would keep for the next call, less than a quarter is left."""
-    took = dict(for_each(filled, 8, MUCH, threads=2))
+    took = dict(run(filled, range(8), cost=MUCH, threads=2))
 
     for pid, before in took.items():
         assert memory_of(pid) < before - 30_000_000
@@ -138,9 +139,9 @@ def test_idle_processes_return_the_memory_that_their_work_took():
 
 def test_processes_that_were_started_ahead_do_the_work():
     """They are there, so little work is worth them too."""
-    processes.start(MUCH, 2)
+    execute.start(MUCH, 2)
 
-    found = for_each(partial(row, np.zeros((4, 1))), 4, processes.WORTH / 2, threads=2)
+    found = run(partial(row, np.zeros((4, 1))), range(4), cost=execute.WORTH / 2, threads=2)
 
     assert os.getpid() not in {pid for pid, _ in found}
 
@@ -155,7 +156,7 @@ def test_work_stays_here_if_processes_are_not_worth_it_or_not_to_be_had(
     """One core; little work; and a program that is no Python, so starting it again is no way."""
     monkeypatch.setattr(sys, "executable", python)
 
-    found = for_each(partial(row, np.zeros((4, 1))), 4, seconds, threads=threads)
+    found = run(partial(row, np.zeros((4, 1))), range(4), cost=seconds, threads=threads)
 
     assert {pid for pid, _ in found} == {os.getpid()}
 
@@ -168,7 +169,7 @@ def test_where_no_process_can_be_started_threads_do_the_work(monkeypatch):
 
     monkeypatch.setattr(subprocess, "Popen", full)
 
-    assert list(for_each(refuse, 2, MUCH, threads=2)) == [0, 1]
+    assert list(run(refuse, range(2), cost=MUCH, threads=2)) == [0, 1]
 
 
 def test_where_the_file_has_no_room_threads_do_the_work(monkeypatch):
@@ -177,19 +178,21 @@ def test_where_the_file_has_no_room_threads_do_the_work(monkeypatch):
     def full(*_arguments: object, **_options: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(processes.tempfile, "TemporaryDirectory", full)
+    monkeypatch.setattr(execute.tempfile, "TemporaryDirectory", full)
 
-    assert list(for_each(refuse, 2, MUCH, threads=2)) == [0, 1]
+    assert list(run(refuse, range(2), cost=MUCH, threads=2)) == [0, 1]
 
 
 def test_the_work_of_a_process_that_was_killed_is_done_here():
     """Number 1 ends every process that tries it; the results are complete all the same."""
-    assert list(for_each(partial(end_elsewhere, os.getpid()), 5, MUCH, threads=2)) == [*range(5)]
+    assert list(run(partial(end_elsewhere, os.getpid()), range(5), cost=MUCH, threads=2)) == [
+        *range(5)
+    ]
 
 
 def test_what_the_work_raises_is_raised_here():
     """Numbers 0 and 1 come first, as in this thread; then the error with its words."""
-    found = for_each(refuse, 4, MUCH, threads=2)
+    found = run(refuse, range(4), cost=MUCH, threads=2)
 
     assert [next(found), next(found)] == [0, 1]
     with pytest.raises(RefineError, match="broken"):
@@ -202,14 +205,22 @@ def test_cancelling_ends_processes_at_once():
     start = time.monotonic()
 
     with pytest.raises(Cancelled):
-        list(for_each(slow, 4, MUCH, progress=lambda _fraction, _what: next(calls) < 3, threads=2))
+        list(
+            run(
+                slow,
+                range(4),
+                cost=MUCH,
+                progress=lambda _fraction, _what: next(calls) < 3,
+                threads=2,
+            )
+        )
 
     assert time.monotonic() - start < LONG / 10
 
 
 def test_results_that_nobody_fetches_leave_no_process():
     """A caller that fails between two results gives up the rest."""
-    found = for_each(partial(row, np.zeros((9, 1))), 9, MUCH, threads=2)
+    found = run(partial(row, np.zeros((9, 1))), range(9), cost=MUCH, threads=2)
     pid, _ = next(found)
 
     found.close()
@@ -224,9 +235,9 @@ def test_a_process_that_is_killed_leaves_no_other_and_no_file(tmp_path):
 import os
 from functools import partial
 import numpy as np
-from refine_addon.core.processes import for_each
-from tests.core.test_processes import MUCH, row
-pid, _ = next(for_each(partial(row, np.zeros((9, 1))), 9, MUCH, threads=2))
+from refine_addon.core.execute import run
+from tests.core.test_execute_processes import MUCH, row
+pid, _ = next(run(partial(row, np.zeros((9, 1))), range(9), cost=MUCH, threads=2))
 os.write(1, str(pid).encode())
 os.kill(os.getpid(), 9)
 """
@@ -243,7 +254,7 @@ def test_odd_entries_of_the_path_of_modules_do_not_matter(monkeypatch):
     """Imports ignore what is no string, and folders that are not there."""
     monkeypatch.setattr(sys, "path", [*sys.path, 5, b"/x", Path("/y"), "/nowhere"])
 
-    found = for_each(partial(row, np.zeros((4, 1))), 4, MUCH, threads=2)
+    found = run(partial(row, np.zeros((4, 1))), range(4), cost=MUCH, threads=2)
 
     assert os.getpid() not in {pid for pid, _ in found}
 
@@ -255,12 +266,12 @@ def test_work_that_no_other_process_can_load_is_done_here(monkeypatch):
     module.double.__module__ = "made_here"
     monkeypatch.setitem(sys.modules, "made_here", module)
 
-    assert list(for_each(module.double, 4, MUCH, threads=2)) == [0, 2, 4, 6]
+    assert list(run(module.double, range(4), cost=MUCH, threads=2)) == [0, 2, 4, 6]
 
 
 def test_no_work_has_no_results():
     """As in a scoring of which every block is known already."""
-    assert list(for_each(refuse, 0, MUCH, threads=2)) == []
+    assert list(run(refuse, range(0), cost=MUCH, threads=2)) == []
 
 
 def test_an_addon_under_another_name_finds_itself():
@@ -272,11 +283,11 @@ for name in ("bl_ext", "bl_ext.user_default"):
     sys.modules[name].__path__ = []
 name = "bl_ext.user_default.refine"
 package = sys.modules[name] = types.ModuleType(name)
-package.__path__ = [{str(Path(processes.__file__).parents[1])!r}]
-processes = importlib.import_module(name + ".core.processes")
+package.__path__ = [{str(Path(execute.__file__).parents[1])!r}]
+processes = importlib.import_module(name + ".core.execute")
 Budget = importlib.import_module(name + ".core.selection").Budget
 number_of = importlib.import_module(name + ".core.report").size_in_words
-print(*processes.for_each(number_of, 3, {MUCH}, threads=2), sep=";")
+print(*processes.run(number_of, range(3), cost={MUCH}, threads=2), sep=";")
 print(len(processes._idle))
 """
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
@@ -288,8 +299,8 @@ print(len(processes._idle))
 @pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
 def test_processes_keep_the_same_splats_as_one_thread(survivors, monkeypatch):
     """To the bit, with every view measured in a process however little work it is."""
-    monkeypatch.setattr(processes, "WORTH", 0.0)
-    monkeypatch.setattr(processes, "WORTH_READY", 0.0)
+    monkeypatch.setattr(execute, "WORTH", 0.0)
+    monkeypatch.setattr(execute, "WORTH_READY", 0.0)
     splats = read_ply(ROOM / "point_cloud.ply").splats().take(np.arange(0, 39755, 20))
     views = read_cameras(ROOM / "cameras.json").spread(20)
 
@@ -298,6 +309,6 @@ def test_processes_keep_the_same_splats_as_one_thread(survivors, monkeypatch):
         for threads in (1, 2)
     )
 
-    assert len(processes._idle) == 2
+    assert len(execute._idle) == 2
     assert one.scores.values.tobytes() == two.scores.values.tobytes()
     assert one.keep.tobytes() == two.keep.tobytes()

@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from refine_addon.core.work import Cancelled, checkpoint, concatenated, for_chunks
+from refine_addon.core.execute import Cancelled, checkpoint, chunks, concatenated, run_all
 
 LONG = 600.0  # seconds; a tenth of it is more than any machine needs to notice
 
@@ -31,7 +31,7 @@ def test_work_that_takes_long_is_cancelled_within_a_chunk(threads):
     start = time.monotonic()
 
     with pytest.raises(Cancelled):
-        for_chunks(endless, 2, 1, progress=lambda _fraction, _what: next(calls) < 1,
+        run_all(endless, chunks(2, 1), progress=lambda _fraction, _what: next(calls) < 1,
                    threads=threads)  # fmt: skip
 
     assert time.monotonic() - start < LONG / 10
@@ -44,10 +44,12 @@ def test_work_within_a_chunk_is_cancelled_between_its_own_chunks(threads):
     begun = []
 
     def within(_piece: slice) -> None:
-        for_chunks(lambda piece: begun.append(piece.start) or time.sleep(0.05), 100, 1, threads=1)
+        run_all(
+            lambda piece: begun.append(piece.start) or time.sleep(0.05), chunks(100, 1), threads=1
+        )
 
     with pytest.raises(Cancelled):
-        for_chunks(within, 2, 1, progress=lambda _fraction, _what: next(calls) < 1,
+        run_all(within, chunks(2, 1), progress=lambda _fraction, _what: next(calls) < 1,
                    threads=threads)  # fmt: skip
 
     assert len(begun) < 100
@@ -69,7 +71,7 @@ def test_an_error_stops_the_chunks_that_run(threads):
     start = time.monotonic()
 
     with pytest.raises(ValueError, match="broken"):
-        for_chunks(work, 2, 1, threads=threads)
+        run_all(work, chunks(2, 1), threads=threads)
 
     assert time.monotonic() - start < LONG / 10
 
@@ -78,7 +80,7 @@ def test_an_error_stops_the_chunks_that_run(threads):
 def test_after_the_work_nothing_is_left_to_cancel(threads):
     """A checkpoint outside of chunked work does nothing, though the last work was cancelled."""
     with pytest.raises(Cancelled):
-        for_chunks(endless, 2, 1, progress=lambda *_: False, threads=threads)
+        run_all(endless, chunks(2, 1), progress=lambda *_: False, threads=threads)
 
     checkpoint()
 
@@ -86,14 +88,14 @@ def test_after_the_work_nothing_is_left_to_cancel(threads):
 @pytest.mark.parametrize("threads", [1, 3])
 def test_results_come_in_the_order_of_the_slices(threads):
     """Whatever the number of threads; the last slice is what is left."""
-    found = for_chunks(lambda piece: (piece.start, piece.stop), 10, 4, threads=threads)
+    found = run_all(lambda piece: (piece.start, piece.stop), chunks(10, 4), threads=threads)
 
     assert found == [(0, 4), (4, 8), (8, 10)]
 
 
 IN_A_THREAD = """
 import ctypes, threading
-from refine_addon.core.work import share_heap
+from refine_addon.core.execute import share_heap
 if {share}:
     share_heap()
 libc, found = ctypes.CDLL(None), []

@@ -1,0 +1,593 @@
+"""The one way to run work: in this thread, on threads, in processes; and how far it is.
+
+NumPy's loops run without Python's lock, so threads share large arrays and speed them up. Work of
+many short loops keeps passing the lock on: two threads of it are a fifth faster than one, two
+processes nearly twice as fast. The processes run this same Python and this same package under the
+name that it has here (in Blender an extension is part of other packages), and nothing of the
+calling program, so no script needs a guard around its main part. They are kept for the next call
+and end when they have had nothing to do for `IDLE` seconds, or when this process ends.
+`concurrent.futures.ProcessPoolExecutor` would import the caller's main module in each, and cannot
+find an extension's modules.
+
+Progress is told as ``progress(fraction, what)``. A run is divided into stages (`stages`), each as
+long as `seconds` expects by a constant times what it works through.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import json
+import math
+import mmap
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Progress = Callable[[float, str], "bool | None"]
+"""Called as ``progress(fraction, what)``; returning ``False`` cancels."""
+
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
+
+SECONDS = {
+    "read": 2.5e-6,
+    "closed form": 6e-9,
+    "measure": 0.36e-6,
+    "cast": 0.08e-6,
+    "order": 0.15e-6,
+    "compare": 0.15e-6,
+    "merge": 11e-6,
+    "refit": 1.0e-6,
+    "clean": 1.5e-6,
+    "draw": 1e-6,
+    "write": 0.5e-6,
+}
+"""Seconds of one core for each splat, of the lower kinds for each splat in each view. By processor
+time of runs of 40,000 to 2 million splats."""
+
+REPLACES_MAPPED = os.name != "nt"
+"""Whether a file that is mapped into memory can be replaced; Windows refuses."""
+
+IDLE = 8.0
+"""Seconds without work after which a process ends, and gives back its memory; others start fast."""
+
+WORTH, WORTH_READY = 2.0, 0.2
+"""Seconds of work, on one core, from which on it is worth doing in processes: if they are yet to be
+started, which takes each a third of a second, and if they are there."""
+
+_HEAPS = -8  # M_ARENA_MAX of glibc's malloc.h
+_HELD = 30_000_000  # bytes; above 32 MB, freeing a block does not raise glibc's threshold
+_INTERVAL = 0.1  # seconds between two reports while a piece of work takes long
+_ALIGNED = 64  # bytes, of arrays in a file
+_PACKAGE, _FOLDER = __name__.rpartition(".core.")[0], Path(__file__).resolve().parents[1]
+
+_BEGIN = """
+import importlib, json, sys, types
+name, folder, sys.path[:] = json.loads(sys.argv[1])
+above = name.split(".")[:-1]
+places = {".".join(above[: i + 1]): [] for i in range(len(above))}
+places |= {name: [folder], name + ".core": [folder + "/core"]}
+for package, place in places.items():
+    module = sys.modules[package] = types.ModuleType(package)
+    module.__path__ = place
+importlib.import_module(name + ".core.execute").serve()
+"""
+"""What a process runs: it finds modules under the names that they have here, and runs none of the
+packages' own code."""
+
+_own = threading.local()  # `checkpoint` calls the `check` of its own thread
+_idle: list[_Process] = []
+_lock = threading.Lock()
+
+
+class Cancelled(Exception):
+    """Raised between two pieces of work when the progress callback returns ``False``."""
+
+
+class _LostError(Exception):
+    """A process could not be started, or ended too early."""
+
+
+def silent(_fraction: float, _what: str) -> None:
+    """Show nothing: the default progress callback."""
+
+
+def report(progress: Progress, fraction: float, what: str) -> None:
+    """Tell `progress`, and raise `Cancelled` if it answers ``False``."""
+    if progress(fraction, what) is False:
+        raise Cancelled
+
+
+def part(progress: Progress, start: float, end: float) -> Progress:
+    """Map fractions 0..1 to `start`..`end` of `progress`."""
+    if progress is silent:
+        return silent
+    return lambda fraction, what: progress(start + (end - start) * fraction, what)
+
+
+def seconds(kind: str, splats: float, views: float = 1) -> float:
+    """Expected time of a stage on one core: a constant of `SECONDS` times splats and views."""
+    return SECONDS[kind] * splats * views
+
+
+def stages(progress: Progress, *expected: float) -> list[Progress]:
+    """Divide `progress` into consecutive stages, each with its share of the expected seconds.
+
+    Examples
+    --------
+    >>> first, second = stages(lambda fraction, what: print(what, fraction), 1.0, 3.0)
+    >>> first(1.0, "reading"), second(0.5, "scoring")
+    reading 0.25
+    scoring 0.625
+    (None, None)
+    """
+    total = sum(expected) or 1.0
+    ends = np.cumsum([0.0, *expected]) / total
+    return [
+        part(progress, *pair) for pair in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+    ]
+
+
+class TimeLeft:
+    """How long a run still takes, from the share that is done; rises only if it was far too low.
+
+    Parameters
+    ----------
+    clock : callable, optional
+        Returns seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock, self._start, self._last = clock, clock(), math.inf
+
+    def seconds(self, fraction: float) -> float | None:
+        """Seconds left; None in the first two seconds, and where nothing or all is done."""
+        passed = self._clock() - self._start
+        if passed < 2.0 or not 0.0 < fraction < 1.0:
+            return None
+        left = passed * (1.0 - fraction) / fraction
+        if not self._last < left < 1.3 * self._last:
+            self._last = left
+        return self._last
+
+
+def in_time(duration: float) -> str:
+    """Write seconds in the unit that suits them, rounded up.
+
+    >>> in_time(2.1), in_time(61.0), in_time(301.0)
+    ('3 s', '1 min 10 s', '6 min')
+    """
+    if duration <= 60:
+        return f"{math.ceil(duration)} s"
+    if duration <= 300:
+        minutes, tens = divmod(math.ceil(duration / 10.0), 6)
+        return f"{minutes} min {tens}0 s" if tens else f"{minutes} min"
+    hours, minutes = divmod(math.ceil(duration / 60.0), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+def checkpoint() -> None:
+    """Let work be cancelled here; work with long pieces calls this several times a second.
+
+    Raises
+    ------
+    Cancelled
+        If the progress callback given to `run` answers ``False``. Outside of `run` nothing happens.
+    """
+    check: Callable[[], None] | None = getattr(_own, "check", None)
+    if check is not None:
+        check()
+
+
+@contextmanager
+def checked_by(check: Callable[[], None]) -> Iterator[None]:
+    """Make `checkpoint` call `check` in this thread, within the block."""
+    before = getattr(_own, "check", None)
+    _own.check = check
+    try:
+        yield
+    finally:
+        _own.check = before
+
+
+def default_threads() -> int:
+    """How many threads to use: the cores that this process may run on, at most 8."""
+    if hasattr(os, "sched_getaffinity"):
+        return min(len(os.sched_getaffinity(0)), 8)
+    return min(os.cpu_count() or 1, 8)
+
+
+def return_freed() -> None:
+    """Return freed memory to the system; only glibc, which keeps it, needs to be asked."""
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+def share_heap() -> None:
+    """Let all threads of this process allocate from one heap, for a process of our own.
+
+    Each thread would have one of its own, which keeps what the thread freed even if all others need
+    memory: 70 MB of 300 while 160,000 splats are merged. Only glibc does that.
+    """
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).mallopt(_HEAPS, 1)
+
+
+def chunks(total: int, size: int) -> list[slice]:
+    """Divide ``range(total)`` into consecutive slices, all but the last of one length.
+
+    Examples
+    --------
+    >>> chunks(5, 2)
+    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
+    """
+    return [slice(start, min(start + size, total)) for start in range(0, total, size)]
+
+
+def concatenated(parts: Sequence[NDArray[Any]], threads: int | None = None) -> NDArray[Any]:
+    """Join arrays along their first axis, one at least, copied on several threads."""
+    ends = np.cumsum([len(part) for part in parts])
+    whole = np.empty((ends[-1], *parts[0].shape[1:]), parts[0].dtype)
+
+    def copy(number: int) -> None:
+        whole[ends[number] - len(parts[number]) : ends[number]] = parts[number]
+
+    run_all(copy, range(len(parts)), threads=threads)
+    return whole
+
+
+def run_all(work: Callable[[Item], Outcome], items: Iterable[Item], **how: Any) -> list[Outcome]:
+    """Do the same as `run`, and return all results at once."""
+    return list(run(work, items, **how))
+
+
+def run(
+    work: Callable[[Item], Outcome],
+    items: Iterable[Item],
+    *,
+    progress: Progress = silent,
+    what: str = "",
+    threads: int | None = None,
+    cost: float = 0.0,
+) -> Iterator[Outcome]:
+    """Call ``work(item)`` for each item, and yield the results in order.
+
+    Parameters
+    ----------
+    work : callable
+        Its results must not depend on where it runs.
+    items : iterable
+    progress, what
+        Called from this thread between items, and ten times a second while one takes long; in one
+        thread, the latter only if the work calls `checkpoint`.
+    threads : int, optional
+        How many cores to use; 1 does everything in this thread. By default `default_threads`.
+    cost : float
+        About how many seconds all of it takes on one core, where it is worth doing in processes;
+        `work`, items and results are then pickled, and what the work changes is lost.
+
+    Yields
+    ------
+    object
+        Each result as soon as those before it are there.
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``. Items that have not begun are dropped; those that have
+        begun end at their next `checkpoint`, processes at once.
+    """
+    # Freeing one 30 MB block raises glibc's mmap threshold, so that buffers are reused instead of
+    # page-faulted. No effect on other systems.
+    np.empty(_HELD, np.uint8)
+    todo, done = list(items), 0
+    threads = min(default_threads() if threads is None else threads, max(len(todo), 1))
+    if threads > 1 and cost and cost >= _least(threads) and _possible():
+        try:
+            for result in _in_processes(work, todo, threads, progress, what):
+                yield result
+                done += 1
+            return
+        except _LostError:  # no room for a process or a file: threads need neither
+            progress = part(progress, done / len(todo), 1.0)
+    left = todo[done:]
+    if threads <= 1 or len(left) <= 1:
+        yield from _in_turn(work, left, progress, what)
+    else:
+        yield from _side_by_side(work, left, threads, progress, what)
+
+
+def _in_turn(work: Callable, items: list, progress: Progress, what: str) -> Iterator:
+    """Do work in this thread."""
+    step, done, told = max(len(items) // 100, 1), 0, 0.0  # enough reports for a progress bar
+
+    def tell() -> None:
+        nonlocal told
+        told = time.monotonic()
+        report(progress, done / len(items), what)
+
+    def check() -> None:
+        if time.monotonic() - told >= _INTERVAL:
+            tell()
+
+    for done, item in enumerate(items):
+        if done % step == 0:
+            checkpoint()  # what this is a part of may be cancelled
+            tell()
+        with checked_by(check):
+            result = work(item)
+        yield result
+
+
+def _side_by_side(
+    work: Callable,
+    items: list,
+    threads: int,
+    progress: Progress,
+    what: str,
+    stop: Callable[[], None] = lambda: None,
+) -> Iterator:
+    """Do work on several threads; `stop` ends what no `checkpoint` does."""
+    cancelled, step = threading.Event(), max(len(items) // 100, 1)
+
+    def check() -> None:
+        if cancelled.is_set():
+            raise Cancelled
+
+    def checked(item: Any) -> Any:
+        with checked_by(check):
+            return work(item)
+
+    with ThreadPoolExecutor(threads) as pool:
+        futures = deque(pool.submit(checked, item) for item in items)
+        try:
+            for index in range(len(items)):
+                if index % step == 0:
+                    report(progress, index / len(items), what)
+                future = futures.popleft()  # and forget the result once it is used
+                while not future.done() and not wait([future], _INTERVAL).done:
+                    report(progress, index / len(items), what)
+                yield future.result()
+                del future
+        except BaseException:
+            cancelled.set()
+            for future in futures:
+                future.cancel()
+            stop()
+            raise
+
+
+def start(cost: float, threads: int | None = None) -> None:
+    """Start the processes that `run` will want soon, so that they are there by then."""
+    number = default_threads() if threads is None else threads
+    if number > 1 and cost >= _least(number) and _possible():
+        with suppress(_LostError):
+            team = _taken(number)
+            with _lock:
+                _idle.extend(team)
+
+
+def _least(number: int) -> float:
+    """Seconds of work from which on it is worth having `number` processes."""
+    with _lock:
+        return WORTH_READY if sum(process.ready for process in _idle) >= number else WORTH
+
+
+def _possible() -> bool:
+    """Whether this process was started by a Python that can be started again."""
+    frozen = getattr(sys, "frozen", False)
+    return not frozen and Path(sys.executable or "").name.lower().startswith("python")
+
+
+def _in_processes(
+    work: Callable, items: list, number: int, progress: Progress, what: str
+) -> Iterator:
+    """Do work in `number` processes; raise `_LostError` if they, or their file, cannot be had."""
+    with _shared(work) as (task, folder):
+        team = _taken(number)
+        free: queue.SimpleQueue[_Process] = queue.SimpleQueue()
+        for process in team:
+            free.put(process)
+
+        def call(item: Any) -> Any:
+            process = free.get()
+            try:
+                process.tell(("call", item))
+                return process.answer()
+            finally:
+                free.put(process)
+
+        def stop() -> None:
+            for process in team:
+                process.kill()
+
+        try:
+            _tell_all(team, ("task", task))
+            if REPLACES_MAPPED:
+                folder.cleanup()  # nothing is left if this process is killed now
+            yield from _side_by_side(call, items, number, progress, what, stop)
+            _tell_all(team, ("task", None))
+        except BaseException:
+            stop()
+            raise
+    with _lock:
+        _idle.extend(team)
+
+
+def _tell_all(team: list[_Process], message: tuple[str, Any]) -> None:
+    """Tell all of a team what to call from now on, and wait until they know."""
+    for process in team:
+        process.tell(message)
+    for process in team:
+        try:
+            process.answer()
+        except Exception as error:  # it has ended, or lacks a module that this process has
+            raise _LostError from error
+
+
+def _taken(number: int) -> list[_Process]:
+    """Processes that nobody else uses: idle ones, and new ones; or raise `_LostError`."""
+    with _lock:
+        team = [process for process in _idle if process.ready]
+        for process in set(_idle) - set(team):
+            process.kill()
+        _idle[:] = team[number:]
+        team = team[:number]
+    try:
+        while len(team) < number:
+            team.append(_Process())
+    except OSError as error:
+        for process in team:
+            process.kill()
+        raise _LostError from error
+    return team
+
+
+@atexit.register
+def end_idle() -> None:
+    """End the processes that have nothing to do."""
+    with _lock:
+        for process in _idle:
+            process.kill()
+        _idle.clear()
+
+
+class _Process:
+    """One process, as seen from here; `OSError` if it cannot be started."""
+
+    def __init__(self) -> None:
+        away: dict[str, Any] = {"start_new_session": True}  # Ctrl-C reaches this process alone
+        if sys.platform == "win32":
+            flags = subprocess.CREATE_NO_WINDOW | subprocess.CREATE_NEW_PROCESS_GROUP
+            away = {"creationflags": flags}
+        # Imports ignore what is no string. `Path.resolve` raises on loops of links, this does not.
+        path = [os.path.abspath(each) for each in sys.path if isinstance(each, str)]
+        unwritten = ["-B"] * sys.dont_write_bytecode
+        # Each uses one core.
+        single = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
+        self._popen = subprocess.Popen(
+            [sys.executable, "-I", "-S", *unwritten, "-c", _BEGIN,
+             json.dumps([_PACKAGE, str(_FOLDER), path])],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            env={**os.environ, **single}, **away,
+        )  # fmt: skip
+        assert self._popen.stdin and self._popen.stdout
+        self._to, self._from = self._popen.stdin, self._popen.stdout
+        self._used = time.monotonic()
+
+    @property
+    def ready(self) -> bool:
+        """Whether it will still be there when it gets something to do."""
+        return self._popen.poll() is None and time.monotonic() - self._used < IDLE / 2
+
+    def tell(self, message: tuple[str, Any]) -> None:
+        """Send a task or an item; see `answer`. Raise `_LostError` if the process has ended."""
+        self._used = time.monotonic()
+        try:
+            pickle.dump(message, self._to, protocol=5)
+            self._to.flush()
+        except (OSError, ValueError) as error:  # ended, or killed here
+            raise _LostError from error
+
+    def answer(self) -> Any:
+        """Wait for what the work returns; raise its error, or `_LostError` if the process ended."""
+        try:
+            done, result = pickle.load(self._from)
+        except Exception as error:
+            raise _LostError from error
+        self._used = time.monotonic()
+        if not done:
+            raise result
+        return result
+
+    def kill(self) -> None:
+        """End it now, whatever it does."""
+        self._popen.kill()
+        self._popen.wait()
+        for pipe in (self._to, self._from):
+            with suppress(OSError):  # what was still to be told
+                pipe.close()
+
+
+@contextmanager
+def _shared(work: object) -> Iterator[tuple[tuple, tempfile.TemporaryDirectory[str]]]:
+    """Write the arrays of `work` to a file that all processes map; yield task and folder."""
+    arrays: list[pickle.PickleBuffer] = []
+    pickled = pickle.dumps(work, protocol=5, buffer_callback=arrays.append)
+    places = []
+    try:
+        folder = tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise _LostError from error
+    with folder:
+        path = Path(folder.name) / "arrays"
+        try:
+            with path.open("wb") as stream:
+                for array in arrays:
+                    stream.write(bytes(-stream.tell() % _ALIGNED))
+                    begin = stream.tell()
+                    stream.write(array.raw())
+                    places.append((begin, stream.tell()))
+                stream.write(bytes(1))  # an empty file cannot be mapped
+        except OSError as error:
+            raise _LostError from error
+        arrays.clear()  # copies, where what is pickled made some
+        return_freed()
+        yield (pickled, str(path), places), folder
+
+
+def _unpacked(pickled: bytes, path: str, places: list[tuple[int, int]]) -> Callable[[Any], Any]:
+    """The work that `_shared` has written."""
+    with Path(path).open("rb") as stream:
+        mapped = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY))
+    arrays = [mapped[begin:end] for begin, end in places]
+    work: Callable[[Any], Any] = pickle.loads(pickled, buffers=arrays)
+    return work
+
+
+def serve() -> None:
+    """Do what another process asks for, until it ends or falls silent."""
+    told, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever is printed is no answer
+    work: Callable[[Any], Any] | None = None
+    while True:
+        watch = threading.Timer(IDLE, os._exit, (0,))
+        watch.daemon = True
+        watch.start()
+        try:
+            kind, message = pickle.load(told)
+        except EOFError:
+            sys.exit()
+        finally:
+            watch.cancel()
+        try:
+            if kind == "call":
+                assert work is not None  # it is told first
+                result = True, run_all(work, [message], threads=1)[0]
+            else:
+                work = None  # first, so that the arrays of both never are there at once
+                work = _unpacked(*message) if message else None
+                if work is None:
+                    return_freed()
+                result = True, None
+        except BaseException as error:  # raised again where it was asked for
+            result = False, error
+        pickle.dump(result, answers, protocol=5)
+        answers.flush()
