@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet
+from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, execute
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.scoring.occlusion import Occlusion
@@ -821,7 +821,7 @@ def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):
     """
     monkeypatch.setattr(projection, "_CHUNK", 50)
     monkeypatch.setattr(points_module, "_BLOCK", 50)
-    monkeypatch.setattr(work, "_REPORT_INTERVAL", 0.0)
+    monkeypatch.setattr(execute, "_INTERVAL", 0.0)
     steps = []
 
     def scoring(last=10**6):
