@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from refine_addon.core.execute import Cancelled, checked_by
 from refine_addon.core.formats import ply
 from refine_addon.core.whole_file import expanded, refuse_existing, whole_file
 from tests.strategies import plain_header, plain_ply, splat_names
-from tests.users import NOBODY, closed_folder
+from tests.users import closed_folder
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs fork, links and signals")
 
@@ -332,27 +333,32 @@ def test_nobody_else_may_read_a_file_that_is_not_whole(tmp_path, monkeypatch, ov
 
 
 @posix
-@pytest.mark.skipif(os.name == "posix" and os.geteuid() != 0, reason="needs the root user")
-@pytest.mark.parametrize("root", [True, False])
-def test_a_file_of_somebody_else_stays_theirs_or_loses_its_powers(root):
-    """The root user gives it back with its mode; nobody may not, and a setuid file would be his."""
+def test_a_file_that_is_replaced_loses_setuid():
+    """The new file is its writer's, who did not ask for one that runs in the writer's name."""
     with tempfile.TemporaryDirectory() as made:
-        Path(made).chmod(0o777)
         path = Path(made) / "tool"
         path.write_bytes(b"old")
-        os.chown(path, 1234, 1235)
         path.chmod(0o6755)
-        os.seteuid(0 if root else NOBODY)
-        try:
-            with whole_file(path, overwrite=True) as stream:
-                stream.write(b"new")
-        finally:
-            os.seteuid(0)
-        found = path.stat()
+        with whole_file(path, overwrite=True) as stream:
+            stream.write(b"new")
 
-    owner = (1234, 1235) if root else (NOBODY, os.getegid())
-    assert (found.st_uid, found.st_gid) == owner
-    assert stat.S_IMODE(found.st_mode) == (0o6755 if root else 0o755)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o755
+
+
+def test_what_killed_runs_left_is_removed_a_day_later_and_nothing_else(tmp_path):
+    """Not what may still be written, nor files of other names."""
+    old, new, other = (tmp_path / name for name in (".refine-1.tmp", ".refine-2.tmp", "a.tmp"))
+    for path in (old, new, other):
+        path.write_bytes(b"half of")
+    for path in (old, other):
+        os.utime(path, (0.0, time.time() - whole_files.ABANDONED - 60.0))
+    (tmp_path / ".refine-folder.tmp").mkdir()
+    os.utime(tmp_path / ".refine-folder.tmp", (0.0, 0.0))
+    with whole_file(tmp_path / "out", overwrite=False) as stream:
+        stream.write(b"all")
+
+    assert contents(tmp_path) == {"out": b"all", new.name: b"half of", "a.tmp": b"half of"}
+    assert (tmp_path / ".refine-folder.tmp").is_dir()
 
 
 @posix
@@ -535,105 +541,6 @@ def test_killed_at_any_moment_the_old_file_or_the_new_one_is_there_whole(tmp_pat
     names = {name for name in contents(tmp_path) if not name.startswith(".refine-")}
     assert names <= {"in.ply", "out.ply"}
     assert seen  # which of the two came about is the clock's business
-    file.write(path, overwrite=True)
-    assert set(contents(tmp_path)) == {"in.ply", "out.ply"}
-
-
-def held(path: Path) -> int:
-    """Return the id of a process that is in the midst of writing `path`."""
-    reader, writer = os.pipe()
-
-    def work():
-        with whole_file(path, overwrite=True) as stream:
-            stream.write(b"half of")
-            stream.flush()
-            os.write(writer, b"x")
-            signal.pause()
-
-    child = forked(work)
-    os.read(reader, 1)
-    os.close(reader)
-    os.close(writer)
-    return child
-
-
-@posix
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of fork, with threads
-def test_the_next_run_removes_what_a_killed_one_left_of_its_target_and_nothing_else(tmp_path):
-    """Not what a living run writes, what another target's run left, nor what looks alike."""
-    path = tmp_path / "out"
-    killed, other, living = (held(tmp_path / name) for name in ("out", "other", "out"))
-    for child in (killed, other):
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-    theirs, ours = set(tmp_path.iterdir()), whole_files._prefix(path)
-    (left,) = {file for file in theirs if file.name.startswith(ours) and not locked(file)}
-    for name in (f"{'0' * 16}", f"{'0' * 15}.tmp", f"{'0' * 16}.tmp.bak", f"{'G' * 16}.tmp"):
-        (tmp_path / f"{ours}{name}").write_bytes(b"mine")
-    (tmp_path / f"{ours}{'1' * 16}.tmp").symlink_to(tmp_path / f"{ours}{'0' * 16}")
-    os.mkfifo(tmp_path / f"{ours}{'2' * 16}.tmp")
-    before = set(tmp_path.iterdir())
-
-    with whole_file(path, overwrite=True) as stream:
-        stream.write(b"new")
-    after = set(tmp_path.iterdir())
-    os.kill(living, signal.SIGKILL)
-    os.waitpid(living, 0)
-
-    assert len(theirs) == 3
-    assert len(before) == 9
-    assert after == before - {left} | {path}
-
-
-@posix
-def test_a_temporary_file_that_another_run_took_for_abandoned_is_made_anew(tmp_path, monkeypatch):
-    """Between making and locking it: the other has the lock, or has removed it already."""
-    locking, taken = whole_files.fcntl.flock, []
-
-    def flock(descriptor, how):
-        (path,) = tmp_path.glob(".refine-*")
-        if len(taken) < 2:
-            path.unlink()
-            taken.append(path)
-            if len(taken) == 1:
-                raise BlockingIOError
-        locking(descriptor, how)
-
-    monkeypatch.setattr(whole_files.fcntl, "flock", flock)
-    with whole_file(tmp_path / "out", overwrite=False) as stream:
-        stream.write(b"all")
-
-    assert len(set(taken)) == 2
-    assert contents(tmp_path) == {"out": b"all"}
-
-
-@pytest.mark.parametrize("system", ["without locks", "whose locks fail"])
-def test_where_nobody_can_tell_what_is_abandoned_it_stays(tmp_path, monkeypatch, system):
-    """Windows, and some network drives: files are written all the same."""
-
-    def refuse(*_):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    left = f"{whole_files._prefix(tmp_path / 'out')}{'0' * 16}.tmp"
-    (tmp_path / left).write_bytes(b"half of")
-    if system == "without locks":
-        monkeypatch.setattr(whole_files, "fcntl", None)
-    elif whole_files.fcntl:
-        monkeypatch.setattr(whole_files.fcntl, "flock", refuse)
-    with whole_file(tmp_path / "out", overwrite=False) as stream:
-        stream.write(b"all")
-
-    assert contents(tmp_path) == {"out": b"all", left: b"half of"}
-
-
-def locked(path: Path) -> bool:
-    """Tell whether a process holds the lock of a file."""
-    with path.open("rb+") as stream:
-        try:
-            whole_files.fcntl.flock(stream, whole_files.fcntl.LOCK_EX | whole_files.fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        return False
 
 
 def forked(work) -> int:
