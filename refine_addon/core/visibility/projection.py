@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import secrets
+import shutil
+import weakref
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, checkpoint, chunks, part, report, run_all, silent
+from ..execute import Progress, checkpoint, chunks, part, report, run, run_all, silent
+from ..mapped import write
 from ..rendering import ALPHA_CUT, DISC_LOW_PASS, LOW_PASS, NEAR_RELATIVE, Model
-from ..splats import SH_C0, Splats, drawable, opacity, rotation_matrices
+from ..splats import SH_C0, Splats, drawable, folder_of, opacity, rotation_matrices
 from ..views import View, ViewSet
 from . import frustum
 from .scene import Scene, scene_of, spatial_order, splat_fingerprint
@@ -28,6 +32,9 @@ BRIGHTEST = 16.0
 
 LOG_SCALE_RANGE = (-16.0, 5.0)
 """Logarithms of scales over the size of the scene; beyond them float32 would overflow."""
+
+CHUNK = 1 << 16
+"""Gaussians in files that have one box, 3.7 MB; a multiple of those that are projected together."""
 
 _CHUNK = 1 << 14
 _FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
@@ -66,6 +73,9 @@ class Gaussians:
         Of discs: unit vectors at right angles to them, in the scene's frame.
     model : {"default", "antialiased", "2dgs"}
         How they are drawn, see `rendering.Model`.
+    boxes : (C, 7) float32 or None
+        Of Gaussians in files (`mapped`), see `boxes_touch`: a box for each `CHUNK` of them, so that
+        a view reads only what it may show. Means, covariances and normals are then (C, k, CHUNK).
     """
 
     index: NDArray[np.int64]
@@ -76,10 +86,30 @@ class Gaussians:
     colors: NDArray[np.float32]
     normals: NDArray[np.float32] | None = None
     model: Model = "default"
+    boxes: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         """Return the number of splats."""
         return len(self.index)
+
+    def parts(self, scene: Scene, view: View, window: View) -> Iterator[tuple[int, Gaussians]]:
+        """Yield Gaussians in memory that may reach into a window, and the row of the first."""
+        if self.boxes is None:
+            yield 0, self
+            return
+        for number in np.flatnonzero(boxes_touch(self.boxes, scene, view, window)).tolist():
+            rows = slice(number * CHUNK, (number + 1) * CHUNK)
+            largest = self.largest[rows]
+            # What is not projected stays in its file.
+            arrays: dict[str, Any] = {
+                name: None if (values := getattr(self, name)) is None
+                else values[number][:, : len(largest)]
+                for name in ("means", "covariances", "normals")
+            }  # fmt: skip
+            yield rows.start, replace(
+                self, index=np.arange(len(largest)), largest=largest, alphas=self.alphas[rows],
+                boxes=None, **arrays,
+            )  # fmt: skip
 
     def take(self, keep: NDArray[Any]) -> Gaussians:
         """Return the splats at `keep` (a mask or integers)."""
@@ -168,10 +198,43 @@ def prepare(
     order = spatial_order(
         positions, lambda rows: splat_fingerprint(splats, index[rows]), threads=threads
     )
-    gaussians = activate(
-        splats, index[order], positions[order], scene, part(progress, 0.4, 1.0), threads
-    )
-    return gaussians, scene, good
+    make = activate if folder_of(splats) is None else _activate_on_disk
+    told = part(progress, 0.4, 1.0)
+    return make(splats, index[order], positions[order], scene, told, threads), scene, good
+
+
+def _activate_on_disk(
+    splats: Splats,
+    index: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    scene: Scene,
+    progress: Progress,
+    threads: int | None,
+) -> Gaussians:
+    """Gaussians in files beside those of the splats; the files go when these Gaussians do."""
+    bare = splats.up_to_degree(0)
+
+    def columns(piece: slice) -> dict[str, NDArray[Any]]:
+        part = activate(bare, index[piece], positions[piece], scene, silent, 1)
+        low, high = part.means.min(axis=1), part.means.max(axis=1)
+        made = {name: getattr(part, name) for name in ("index", "largest", "alphas", "colors")}
+        made["boxes"] = np.concatenate([low, high, [part.largest.max()]])[None]
+        for name in ("means", "covariances", "normals"):
+            if (values := getattr(part, name)) is not None:
+                made[name] = np.zeros((1, len(values), CHUNK), np.float32)
+                made[name][0, :, : len(part)] = values
+        return made
+
+    if not len(index):
+        return activate(bare, index, positions, scene, progress, threads)
+    made = run(columns, chunks(len(index), CHUNK), progress=progress, what="reading",
+               threads=threads)  # fmt: skip
+    folder = folder_of(splats) / f"gaussians-{secrets.token_hex(4)}"  # type: ignore[operator]
+    arrays = write(folder, made)
+    arrays["boxes"] = arrays["boxes"][...]
+    gaussians = Gaussians(**arrays, model=splats.model)
+    weakref.finalize(gaussians, shutil.rmtree, folder, ignore_errors=True)
+    return gaussians
 
 
 def classify(
@@ -290,24 +353,29 @@ def footprints_and_depths(
     rotation = _rotation6(view.rotation @ scene.axes.T)
     low_pass = LOW_PASS if gaussians.normals is None else DISC_LOW_PASS
     pieces = []
-    for start in range(0, len(gaussians), _CHUNK):
+    pairs = (
+        (first, chunk, start)
+        for first, chunk in gaussians.parts(scene, view, window or view)
+        for start in range(0, len(chunk), _CHUNK)
+    )
+    for first, chunk, start in pairs:
         checkpoint()
         piece = slice(start, start + _CHUNK)
-        local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
+        local = _local(chunk.means[:, piece], scene, view)  # (3, n of the piece)
         touching = np.flatnonzero(
-            _touches(local, gaussians.largest[piece], (view, window or view), planes, low_pass)
+            _touches(local, chunk.largest[piece], (view, window or view), planes, low_pass)
         )
         if len(touching):
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
             shape = _product(
-                rotation, np.take(gaussians.covariances[:, piece], touching, axis=1)
+                rotation, np.take(chunk.covariances[:, piece], touching, axis=1)
             )  # (6, n)
             inside = frustum.contains(view, local, planes)
-            index = touching + start
-            alphas = gaussians.alphas.take(index)
+            rows = touching + start
+            index, alphas = rows + first, chunk.alphas.take(rows)
             discs = None
-            if gaussians.normals is not None:
-                normals = _product(turned, np.take(gaussians.normals, index, axis=1))
+            if chunk.normals is not None:
+                normals = _product(turned, np.take(chunk.normals, rows, axis=1))
                 centers, axes, discs = _discs(local, shape, normals, view, planes[0])
             else:
                 centers, axes, kept = _ellipses(local, shape, view)

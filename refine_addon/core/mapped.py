@@ -1,0 +1,134 @@
+"""Arrays in files: indexing reads them, so scenes larger than memory are scored by the same code.
+
+Each access maps the file, copies what is asked for and lets the map go: pages that stay mapped
+count as memory of the process. Pickled, an array is its file's name, type and shape, so processes
+that see the file share it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import RefineError, reason_of
+
+
+class Interrupted(RefineError):
+    """Workers, a disk or a storage failed: what is done stays for the next run."""
+
+
+class Mapped:
+    """An array in a file, read-only, in C order.
+
+    Parameters
+    ----------
+    path : Path
+    dtype : dtype
+    shape : tuple of int
+
+    Raises
+    ------
+    Interrupted
+        If the file is not as long as the array; from indexing also if it cannot be read.
+    """
+
+    def __init__(self, path: Path, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+        self.path, self.dtype, self.shape = path, dtype, shape
+        self.ndim, self.size = len(shape), math.prod(shape)
+        self.nbytes = self.size * dtype.itemsize
+        with reading(path):
+            if path.stat().st_size != self.nbytes:
+                raise Interrupted(f"{path}: is damaged")
+
+    def __reduce__(self) -> tuple[type[Mapped], tuple[Any, ...]]:
+        return Mapped, (self.path, self.dtype, self.shape)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> Any:
+        if not self.size:
+            return np.empty(self.shape, self.dtype)[key]
+        with reading(self.path):
+            return np.array(np.memmap(self.path, self.dtype, "r", 0, self.shape)[key])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[...], dtype)
+
+    def take(self, rows: NDArray[np.int64], axis: int = 0) -> NDArray[Any]:
+        """Some rows; the axis is the first."""
+        return np.asarray(self[rows])
+
+
+def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, Any]:
+    """Write arrays into a new folder, a piece of each at a time along the first axis.
+
+    Parameters
+    ----------
+    folder : Path
+        It is there with all arrays or not at all; one that is there already is replaced.
+    pieces : iterable of dict of str to array
+        At least one, all with the names, types and further axes of the first.
+
+    Returns
+    -------
+    dict of str to Mapped
+
+    Raises
+    ------
+    Interrupted
+        If the disk is full or fails.
+    """
+    unfinished = folder.with_name(f"{folder.name}-{secrets.token_hex(4)}.tmp")
+    files: dict[str, BinaryIO] = {}
+    kinds: dict[str, tuple[Any, int, tuple[int, ...]]] = {}  # type, rows, further axes
+    try:
+        with contextlib.ExitStack() as held:
+            for piece in pieces:
+                for name, values in piece.items():
+                    with writing(folder):
+                        if name not in files:
+                            unfinished.mkdir(parents=True, exist_ok=True)
+                            files[name] = held.enter_context((unfinished / name).open("wb"))
+                        files[name].write(np.ascontiguousarray(values).data)
+                    dtype, rows, further = kinds.get(name, (values.dtype, 0, values.shape[1:]))
+                    kinds[name] = dtype, rows + len(values), further
+        with writing(folder):
+            if folder.exists():
+                shutil.rmtree(folder)
+            unfinished.rename(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return {
+        name: Mapped(folder / name, dtype, (rows, *further))
+        for name, (dtype, rows, further) in kinds.items()
+    }
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Raise `Interrupted` where the system cannot read a file of a job."""
+    try:
+        yield
+    except OSError as error:
+        raise Interrupted(f"{path}: cannot be read ({reason_of(error)})") from error
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Raise `Interrupted` where the disk is full, or the system cannot write."""
+    try:
+        yield
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        reason = "no space left on the disk" if full else f"cannot be written ({reason_of(error)})"
+        raise Interrupted(f"{path}: {reason}") from error
