@@ -115,7 +115,7 @@ def prune_options(description: str) -> argparse.ArgumentParser:
     """Return a parser of which scene is pruned, and how."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("scene", type=Path, help="folder of point_cloud.ply and cameras.json")
-    parser.add_argument("--method", choices=METHODS, default="auto")
+    parser.add_argument("--method", choices=METHODS, default=METHODS[0])
     parser.add_argument("--survivors", choices=SURVIVORS, default="unchanged")
     parser.add_argument("--ratio", type=float, default=0.5)
     return parser

@@ -34,9 +34,8 @@ CORES = (2, 4, 8, 16)
 WAYS: dict[str, tuple[str, SurvivorChoice]] = {
     "closed-form": ("closed-form", "unchanged"),
     "occlusion": ("occlusion", "unchanged"),
-    "auto": ("auto", "unchanged"),
-    "absorb": ("auto", "absorb"),
-    "refit": ("auto", "refit"),
+    "absorb": ("occlusion", "absorb"),
+    "refit": ("occlusion", "refit"),
 }
 """Name -> method, and what survivors may become."""
 

@@ -49,7 +49,7 @@ def commands(folder: Path, count: int) -> Mapping[str, Sequence[str | Path]]:
     ours += ["--cameras", folder / "cameras.json", "--quiet", "--overwrite"]
     deleted = [*ours, "--ratio", "0.5", "--survivors", "unchanged", "--method"]
     found: dict[str, Sequence[str | Path]] = {"copy": ["cp", source, output]}
-    found |= {name: [*deleted, name] for name in ("closed-form", "auto", "occlusion")}
+    found |= {name: [*deleted, name] for name in ("closed-form", "occlusion")}
     for ratio in (0.5, 0.9):
         name = f"absorb {ratio:.0%}"
         found[name] = [*ours, "--ratio", str(ratio), "--survivors", "absorb"]

@@ -134,8 +134,7 @@ def measure(splats: Splats, views: ViewSet) -> Counts:
         ),
     }
     for name in get_args(get_type_hints(Settings)["method"]):
-        if name != "auto":  # occlusion by fewer views, which the scene decides
-            settings[name] = Settings(views=0, method=name)
+        settings[name] = Settings(views=0, method=name)
     if len(splats) > MOST_SPLATS:
         drawn = np.random.default_rng(0).choice(len(splats), MOST_SPLATS, replace=False)
         sample = splats.take(np.sort(drawn))

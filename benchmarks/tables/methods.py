@@ -183,7 +183,6 @@ def _published() -> list[Method]:
 CORE_ABOUT = {
     "closed-form": "closed form with frustum test, free of units: the instant answer",
     "occlusion": "froxels: transmittance and contrast without rendering, in rounds",
-    "auto": "occlusion with no more views than the pictures need",
 }
 
 
@@ -197,8 +196,8 @@ def _core() -> list[Method]:
     methods.append(Method("occlusion+absorb", OURS, about, reduce=partial(_made, "absorb")))
     about = "`--survivors refit`: then they learn on rays what the unpruned splats look like"
     methods.append(Method("occlusion+refit", OURS, about, reduce=partial(_made, "refit")))
-    about = "auto deletes, and the survivors are refitted: `core.refit`"
-    return [*methods, Method("auto+refit", OURS, about, reduce=_deleted_and_refitted)]
+    about = "occlusion deletes, and the rest is refitted: `core.refit`"
+    return [*methods, Method("deleted+refit", OURS, about, reduce=_deleted_and_refitted)]
 
 
 def _made(survivors: str, task: Task, keep_count: int, ratio: float) -> Splats:
@@ -211,7 +210,9 @@ def _made(survivors: str, task: Task, keep_count: int, ratio: float) -> Splats:
 
 def _deleted_and_refitted(task: Task, keep_count: int, ratio: float) -> Splats:
     del ratio
-    result = core.prune(task.splats, task.views, Budget(keep=keep_count), Settings(views=0))
+    result = core.prune(
+        task.splats, task.views, Budget(keep=keep_count), Settings(views=0), survivors="unchanged"
+    )
     return core.refit(task.splats.take(result.keep), task.splats, task.views).splats
 
 

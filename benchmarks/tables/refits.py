@@ -41,7 +41,7 @@ from .methods import Task
 
 STARTS: dict[str, tuple[str, Became]] = {
     "absorbed": ("occlusion", "absorb"),
-    "deleted by auto": ("auto", "unchanged"),
+    "deleted by occlusion": ("occlusion", "unchanged"),
     "deleted by the closed form": ("closed-form", "unchanged"),
 }
 """What refitting begins with: method and what survivors become before."""
@@ -154,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in options.scenes:
         splats, views, evaluator = _scene(name, options.compared)
         views = _scoring(views, options.views, near=options.near)
-        left, seconds = _left(splats, views, options.ratio, "auto", "absorb")
+        left, seconds = _left(splats, views, options.ratio, "occlusion", "absorb")
         told = f"{name}, {options.ratio:.0%}, {len(views)} views: absorbed in {seconds:.1f} s"
         print(told + _held_out(evaluator, left), flush=True)
         for way in options.ways:

@@ -96,7 +96,7 @@ def _check_settings(options: argparse.Namespace) -> None:
     if scoring.refit.rounds is not None and options.survivors != "refit":
         raise RefineError(f"rounds is {scoring.refit.rounds}, expected only with --survivors refit")
     if options.command == "prune":
-        budget(options).refuse_meaningless(scoring.method, frustum=scoring.frustum)
+        budget(options).refuse_meaningless(frustum=scoring.frustum)
 
 
 def open_blend() -> str:
@@ -221,9 +221,7 @@ def _check_together(parser: argparse.ArgumentParser, options: argparse.Namespace
             parser.error(f"{option} does not go with --together")
     changes = survivors(options) in ("absorb", "refit")
     if options.psnr is not None and (changes or options.method == "closed-form"):
-        parser.error(
-            "with --together, --psnr goes with --method auto or occlusion and unchanged survivors"
-        )
+        parser.error("with --together, --psnr goes with --method occlusion and unchanged survivors")
     if options.workers is not None and options.scheduler:
         parser.error("expected --workers or --scheduler, and not both")
     if options.workers is not None and options.workers < 1:

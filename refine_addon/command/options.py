@@ -151,9 +151,7 @@ def _add_prune(commands: Any) -> None:
     )
     amount.add_argument("--keep", type=int, metavar="N", help="how many splats stay")
     amount.add_argument("--max-mb", type=float, metavar="M", help="size of the file, in 1e6 bytes")
-    amount.add_argument(
-        "--threshold", type=float, metavar="S", help="remove scores below S; not with auto"
-    )
+    amount.add_argument("--threshold", type=float, metavar="S", help="remove scores below S")
     amount.add_argument(
         "--min-seen", type=float, metavar="P", help="remove what fewer than P %% of the views see"
     )
@@ -173,8 +171,8 @@ def _add_prune(commands: Any) -> None:
         "by what the cameras see of it, far better when much is removed (--method then only "
         "matters with --threshold and --min-seen); refit: they absorb and are then fitted to what "
         "all splats look like, some dB better still, in several times the time; auto, the "
-        "default (no way to score, as --method auto is): absorb, but unchanged where that is as "
-        "good, and with --method, --threshold, --min-seen or --together",
+        "default: absorb, but unchanged where that is as good, and with --method, --threshold, "
+        "--min-seen or --together",
     )
     _add_rounds(prune)
     becoming.add_argument(
@@ -452,17 +450,8 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=METHODS,
-        help="how splats are scored; default: auto (another than that of --survivors), which knows "
-        "what hides what, by no more views than --tolerance asks for; occlusion uses all of them; "
-        "closed-form takes nothing as hidden: far faster, worse",
-    )
-    parser.add_argument(
-        "--tolerance",
-        type=float,
-        default=Settings.tolerance,
-        metavar="DB",
-        help="with --method auto: by how much the PSNR may be lower than by all views, in dB "
-        f"(default {Settings.tolerance})",
+        help="how splats are scored: occlusion, the default, knows what hides what; closed-form "
+        "takes nothing as hidden: far faster, worse",
     )
     _add_views(parser)
 
@@ -590,7 +579,7 @@ def _path(text: str) -> Path:
 def settings(options: argparse.Namespace) -> Settings:
     """Return how to score and to refit, or raise `RefineError` where a value cannot be."""
     method, refit = options.method or Settings.method, Refit(getattr(options, "rounds", None))
-    return Settings(method, most_views(options), tolerance=options.tolerance, refit=refit)
+    return Settings(method, most_views(options), refit=refit)
 
 
 def most_views(options: argparse.Namespace) -> int:

@@ -18,7 +18,6 @@ from ..core.urls import Url
 from ..core.whole_file import new_folder
 from . import report
 from .terminal import Terminal, complain, described
-from .words import saved
 from .zones import words
 
 
@@ -81,8 +80,6 @@ class Run:
             self.terminal.say(f"  cameras: {cameras}")
         if demanded := words(done):
             self.terminal.say(f"  {demanded}")
-        if auto := saved(done.get("weights", {}).get("auto")):
-            self.terminal.say(f"  views: {auto}")
         splats = done["splats"]
         if splats["unseen"]:
             scored = splats["before"] - splats["forced"] - cleaned

@@ -19,35 +19,6 @@ def by(views: Mapping[str, int]) -> str:
     return f"by {views['used']} of {views['given']} views"
 
 
-def saved(auto: Mapping[str, Any] | None) -> str:
-    """Return what it saved that the method *auto* found out how many views are enough; or "".
-
-    Parameters
-    ----------
-    auto : mapping, optional
-        ``weights.auto`` of a report.
-
-    Examples
-    --------
-    >>> saved({"views": 40, "given": 64, "saved": 0.24})
-    '40 of 64 views were enough, which saved about 24% of the time of scoring by all'
-    >>> saved({"views": 64, "given": 64, "saved": -0.06})
-    'all 64 views were needed; finding that out took about 6% more time than scoring by them'
-    >>> saved({"views": 9, "given": 9, "saved": 0.0})
-    ''
-    """
-    if not auto:
-        return ""
-    views, given, share = auto["views"], auto["given"], auto["saved"]
-    if views < given:
-        enough = f"{views} of {given} views were enough"
-        return f"{enough}, which saved about {max(share, 0.0):.0%} of the time of scoring by all"
-    if not share:
-        return ""
-    more = f"finding that out took about {-share:.0%} more time than scoring by them"
-    return f"all {views} views were needed; {more}"
-
-
 def written(splats: Mapping[str, Any]) -> str:
     """Return how many splats a file holds, if its format left some out; else "".
 

@@ -150,37 +150,6 @@ def occlusion(count: int, images: Images, stays: Sequence[int] | None = None) ->
     ]
 
 
-def auto(
-    count: int, images: Images, validating: int, first: int, more: int, rest: int
-) -> list[Plan]:
-    """Return the costs of finding out how many of the views are needed, by numbers of views.
-
-    These are rays of the validation views, measuring twice, comparing, and measuring the rest: a
-    small part of it, as long as nobody knows whether it will be needed.
-    """
-    return [
-        [Cost("casting", count, validating)],
-        [images.measuring(count, first)],
-        [images.measuring(count, more)],
-        [weighing(count), Cost("sorting", count), Cost("estimating", count, validating)],
-        [images.measuring(count, rest // 8)],
-    ]
-
-
-def by_auto(count: int, images: Images, stays: Sequence[int]) -> list[Plan]:
-    """Return the costs of scoring by *auto*: as `occlusion`."""
-    used = 3 * images.views // 4  # between what is enough and all of them
-    finding_out = joined(auto(count, images, *auto_views(images.views)))
-    prepared, ranked = preparing(count, images.views), ranking(count, used, stays)
-    return [joined(prepared), finding_out, joined(ranked[1:])]  # the floor is weighed by then
-
-
-def auto_views(views: int) -> tuple[int, int, int, int]:
-    """Return about how many views validate, measure first and next, and are left."""
-    first, more = (views + 1) // 2, views // 8
-    return views // 4, first, more, views - first - more
-
-
 def scoring(count: int, images: Images, method: str, stays: Sequence[int]) -> list[Plan]:
     """Return the costs of scores by a method, of rays where it has none, of checks, of a curve."""
     views = images.views
@@ -188,8 +157,7 @@ def scoring(count: int, images: Images, method: str, stays: Sequence[int]) -> li
         rays = [Cost("activating", count), Cost("casting", count, views)]
         scored, by_rays = [Cost("closed form", count, views)], rays
     else:
-        plans = (occlusion if method == "occlusion" else by_auto)(count, images, stays)
-        scored, by_rays = joined(plans), []
+        scored, by_rays = joined(occlusion(count, images, stays)), []
     # The curve ends where the rounds do.
     share = 1.0 - (stays[-2] if len(stays) > 1 else count) / max(count, 1)
     curve = Cost("estimating", count, max(round((0.3 + 0.7 * share) * views), 1))

@@ -305,7 +305,7 @@ def prices(scores: Scores, scored: float) -> list[dict[str, Any]]:
     Parameters
     ----------
     scores : Scores
-        By *auto* or *occlusion*.
+        By *occlusion*.
     scored : float
         How long scoring took, seconds.
     """

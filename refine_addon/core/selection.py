@@ -82,19 +82,8 @@ class Budget:
         """Whether the number of splats that are removed depends on the scores of a method."""
         return self.threshold is not None or self.min_seen is not None
 
-    def refuse_meaningless(self, method: str, *, frustum: bool = True) -> None:
-        """Raise `RefineError` if this budget has no fixed meaning for the scores of a method.
-
-        Parameters
-        ----------
-        method, frustum
-            See `Scores`.
-        """
-        if method == "auto" and self.threshold is not None:
-            raise RefineError(
-                "a threshold means something else to each method: choose closed-form or occlusion "
-                "instead of auto, or another budget"
-            )
+    def refuse_meaningless(self, *, frustum: bool) -> None:
+        """Raise `RefineError` if this budget has no meaning; for `frustum` see `Scores`."""
         if self.min_seen is not None and not frustum:
             raise RefineError(
                 "without the frustum test every view sees every splat: min_seen would remove none"
@@ -195,7 +184,7 @@ def select(
         and the scores have no estimate of it, if it removes more than the scores were computed for
         (`Scores.settled`), or if no splat would be left.
     """
-    budget.refuse_meaningless(scores.method, frustum=scores.frustum)
+    budget.refuse_meaningless(frustum=scores.frustum)
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
@@ -277,7 +266,7 @@ class Tally:
             See `select`.
         """
         scores = self.scores
-        budget.refuse_meaningless(scores.method, frustum=scores.frustum)
+        budget.refuse_meaningless(frustum=scores.frustum)
         count = _removals(scores, budget, row_bytes, fixed_bytes)
         if budget.threshold is not None:
             count = int(np.searchsorted(self._values, single(budget.threshold)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -23,7 +22,7 @@ from .views import ViewSet, refuse_other
 from .visibility.ray_sample import RaySample
 from .volumes import refuse_all
 
-METHODS = ("auto", "occlusion", "closed-form")
+METHODS = ("occlusion", "closed-form")
 """The first is the default."""
 
 
@@ -33,33 +32,28 @@ class Settings:
 
     Attributes
     ----------
-    method : {"auto", "occlusion", "closed-form"}
-        Scoring method: "occlusion" takes into account what hides what; "auto" does so with no more
-        views than the pictures need; "closed-form" takes nothing as hidden, and is the fastest.
+    method : {"occlusion", "closed-form"}
+        Scoring method: "occlusion" takes into account what hides what; "closed-form" takes nothing
+        as hidden, and is the fastest.
     views : int
         Use at most this many views, spread evenly; 0 uses all.
     closed_form : ClosedForm
     occlusion : Occlusion
         Settings of these methods.
-    tolerance : float
-        For "auto": by how much the PSNR of the pictures may be lower than by all views, dB.
     refit : Refit
         Settings of refitting.
     """
 
-    method: Literal["auto", "occlusion", "closed-form"] = "auto"
+    method: Literal["occlusion", "closed-form"] = "occlusion"
     views: int = 64
     closed_form: ClosedForm = field(default_factory=ClosedForm)
     occlusion: Occlusion = field(default_factory=Occlusion)
-    tolerance: float = 0.5
     refit: Refit = field(default_factory=Refit)
 
     def __post_init__(self) -> None:
         """Check the values."""
         if self.method not in METHODS:
             raise RefineError(f"method is {self.method!r}, expected one of {', '.join(METHODS)}")
-        if not 0.0 <= self.tolerance < math.inf:
-            raise RefineError(f"tolerance is {self.tolerance}, expected a number of dB, 0 or more")
         if self.views < 0:
             raise RefineError(f"views is {self.views}, expected 0 (all) or more")
 

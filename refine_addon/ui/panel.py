@@ -216,8 +216,6 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         settings = context.scene.refine
         column = _named_column(layout)
         column.prop(settings, "method")
-        if settings.method == "auto":
-            column.prop(settings, "tolerance")
         column.prop(settings, "views")
         layout.operator("refine.score", icon="CAMERA_DATA")
         obj = context.object

@@ -374,7 +374,7 @@ def _key(settings: Any, objects: list[bpy.types.Object]) -> str:
 
 
 def _scored_s(mesh: bpy.types.Mesh) -> float | None:
-    """Return how long scoring by *auto* or *occlusion* took, seconds."""
+    """Return how long scoring by *occlusion* took, seconds."""
     record = mesh_scores.record(mesh) or {}
     seconds = None if record.get("method") == "closed-form" else record.get("seconds")
     return float(seconds) if isinstance(seconds, (int, float)) else None

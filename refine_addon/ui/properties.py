@@ -35,8 +35,7 @@ from .select_panel import SelectSettings
 from .volumes import RefineVolume
 
 METHODS = (
-    ("auto", "Auto", "Occlusion with no more views than the pictures need"),
-    ("occlusion", "Occlusion", "Knows which splats hide others; uses all views"),
+    ("occlusion", "Occlusion", "Knows which splats hide others"),
     (
         "closed-form",
         "Closed Form",
@@ -59,7 +58,7 @@ SURVIVORS = (
     (
         "auto",
         "Auto",
-        "Absorb, but unchanged where that is as good, or where Method, how to score, is not Auto",
+        "Absorb, but unchanged where that is as good, or where Method is Closed Form",
     ),
     ("unchanged", "Unchanged", "They stay what they are, to the bit"),
     (
@@ -294,13 +293,6 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         set=_set_model,
     )
     views: IntProperty(**VIEWS)
-    tolerance: FloatProperty(
-        name="Tolerance (dB)",
-        description="By how much the PSNR of the pictures may be lower than by Occlusion, in dB",
-        default=Settings.tolerance,
-        min=0.0,
-        max=20.0,
-    )
     source: EnumProperty(name="Cameras", description="Which cameras decide", items=SOURCES)
     collection: PointerProperty(
         name="Collection", description="The collection of the cameras", type=bpy.types.Collection
@@ -370,8 +362,7 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         RefineError
             If they cannot be.
         """
-        refit = Refit(self.rounds or None)
-        return Settings(self.method, self.views, tolerance=decimal(self.tolerance), refit=refit)
+        return Settings(self.method, self.views, refit=Refit(self.rounds or None))
 
     def to_budget(self) -> Budget:
         """Return the budget of core.

@@ -150,8 +150,7 @@ def _moved(then: dict[str, Any], scene: bpy.types.Scene, obj: bpy.types.Object) 
 
 def _deciding(settings: dict[str, Any]) -> dict[str, Any]:
     """Return those settings of core that a method looks at, as far as the panel has them."""
-    more = ["tolerance"] if settings["method"] == "auto" else []
-    return {name: settings[name] for name in ("method", "views", *more)}
+    return {name: settings[name] for name in ("method", "views")}
 
 
 def _cameras(context: bpy.types.Context) -> dict[str, Any]:

@@ -198,7 +198,7 @@ def test_by_default_survivors_absorb_unless_the_scale_is_uneven(
     """The panel, as the command: colours cannot follow a stretch, so that rows stay then."""
     room, budget = few
     bpy.context.scene.refine.property_unset("survivors")
-    bpy.context.scene.refine.method = "auto"
+    bpy.context.scene.refine.method = "occlusion"
     room.scale = (1.0, scale, 1.0)
     bpy.context.view_layer.update()
     request = addon.core.PruneRequest(room_views, budget, dry_run=True)

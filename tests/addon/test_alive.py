@@ -19,7 +19,7 @@ def few(addon, room, room_cameras):
     """Every tenth splat of the room, to be scored by four views with what hides what."""
     addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 10 != 0)
     settings = bpy.context.scene.refine
-    settings.method, settings.views = "auto", 4
+    settings.method, settings.views = "occlusion", 4
     return room
 
 
@@ -284,7 +284,7 @@ def test_a_renamed_object_gets_its_result(start, gate, addon, few):
     gate.open.set()
 
     assert until_over(operator, context) == {"FINISHED"}
-    assert noted(addon, few)["method"] == "auto"
+    assert noted(addon, few)["method"] == "occlusion"
     assert noted(addon, decoy) is None
 
 
@@ -299,12 +299,12 @@ def test_a_result_waits_until_edit_mode_is_left(start, gate, addon, few):
 
     assert waits == "Scoring splats: go back to object mode for the result (Esc cancels)"
     assert until_over(operator, context) == {"FINISHED"}
-    assert noted(addon, few)["method"] == "auto"
+    assert noted(addon, few)["method"] == "occlusion"
 
 
 def test_the_closed_form_is_shown_first_and_refined_in_place(start, gate, addon, few):
     """What is there in the end is what scoring at once writes, to the bit; it is one step."""
-    expected = {name: scored_by(few, name) for name in ("closed-form", "auto")}
+    expected = {name: scored_by(few, name) for name in ("closed-form", "occlusion")}
     plain = noted(addon, few)
     del few.data[addon.mesh.scores.RECORD]
     operator, context, _ = start()
@@ -316,10 +316,10 @@ def test_the_closed_form_is_shown_first_and_refined_in_place(start, gate, addon,
 
     assert np.array_equal(first, expected["closed-form"])
     assert np.array_equal(ranks, addon.core.selection.rank(first).astype(np.float32))
-    assert (note["method"], note["asked"]["method"]) == ("closed-form", "auto")
+    assert (note["method"], note["asked"]["method"]) == ("closed-form", "occlusion")
     assert addon.ui.staleness.changes(bpy.context, few) == []
     assert answer == {"FINISHED"}
-    assert np.array_equal(values(few), expected["auto"])
+    assert np.array_equal(values(few), expected["occlusion"])
     assert noted(addon, few) | {"seconds": plain["seconds"]} == plain
 
 
@@ -327,7 +327,7 @@ def test_the_closed_form_is_shown_first_and_refined_in_place(start, gate, addon,
 def test_what_stops_the_refinement_leaves_the_closed_form(start, gate, addon, few, how):
     """Named as such, with a step to undo; *Apply* goes by it."""
     expected = scored_by(few, "closed-form")
-    scored_by(few, "auto")
+    scored_by(few, "occlusion")
     operator, context, said = start()
     until(operator, context, lambda: addon.ui.running.now().stage == "shown")
     waits = bpy.ops.refine.apply.poll()
@@ -349,7 +349,7 @@ def test_what_stops_the_refinement_leaves_the_closed_form(start, gate, addon, fe
 
 def test_esc_before_anything_is_shown_leaves_the_old_scores(start, addon, few, monkeypatch):
     """To the bit, with their note."""
-    expected, note = scored_by(few, "auto"), noted(addon, few)
+    expected, note = scored_by(few, "occlusion"), noted(addon, few)
     module, tell = addon.ui.operators, threading.Event()
 
     def slow(_job, progress):
@@ -419,7 +419,7 @@ def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):
 
 def test_work_that_listens_to_nobody_is_left_behind(start, addon, few, monkeypatch):
     """It still waits when the operator is over; what it comes to later is dropped."""
-    free, expected = threading.Event(), scored_by(few, "auto")
+    free, expected = threading.Event(), scored_by(few, "occlusion")
     monkeypatch.setattr(addon.ui.operators, "_sketch", lambda _job, _progress: free.wait(600.0))
     operator, context, _ = start()
     operator.modal(context, event("ESC"))

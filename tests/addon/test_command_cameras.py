@@ -151,7 +151,7 @@ def test_frames_without_a_range_are_those_of_the_panel(addon, animated, tmp_path
 
 
 def test_the_other_settings_of_the_panel_do_not_count(addon, animated, tmp_path):
-    """Method, views, budget and tolerance are the command's: half of the splats, by closed form."""
+    """Method, views and budget are the command's: half of the splats, by closed form."""
     settings = bpy.context.scene.refine
     settings.source, settings.collection = "COLLECTION", animated
     before, _ = pruned(addon, tmp_path)

@@ -103,10 +103,9 @@ def test_settings_reach_core_as_they_were_typed(addon):
     assert settings.to_settings() == core.Settings()
     assert settings.to_budget() == core.Budget(ratio=0.5)
 
-    settings.method, settings.views, settings.tolerance = "auto", 7, 0.3
-    settings.rounds = 3
+    settings.method, settings.views, settings.rounds = "closed-form", 7, 3
     assert settings.to_settings() == core.Settings(
-        "auto", views=7, tolerance=0.3, refit=core.Refit(rounds=3)
+        "closed-form", views=7, refit=core.Refit(rounds=3)
     )
 
 
@@ -263,11 +262,6 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
     unchanged()
 
 
-@pytest.mark.parametrize(
-    "case",
-    [("auto", "threshold", "a threshold means something else"),
-     ("closed-form", "min_seen", "min_seen would remove none")],
-)  # fmt: skip
 @pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
 def test_a_budget_that_means_nothing_to_the_scores_is_refused(
     addon,
@@ -275,14 +269,13 @@ def test_a_budget_that_means_nothing_to_the_scores_is_refused(
     room_cameras,
     room_views,
     unchanged,
-    case,
     survivors,
 ):
     """As the command refuses it, by what made the scores, not by the panel's method now.
 
     Without a frustum test, as a script can ask for it, every view sees every splat.
     """
-    method, kind, reason = case
+    method, kind, reason = "closed-form", "min_seen", "min_seen would remove none"
     settings, core = bpy.context.scene.refine, addon.core
     settings.views, settings.survivors = 4, survivors
     checked = addon.mesh.layout.check(room)

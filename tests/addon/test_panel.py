@@ -335,18 +335,6 @@ def test_rounds_are_drawn_where_survivors_are_refitted(draw, name):
     assert (without, draw().count("rounds")) == (0, 1)
 
 
-@pytest.mark.parametrize(
-    ("method", "expected"),
-    [("closed-form", {"views"}), ("occlusion", {"views"}), ("auto", {"views", "tolerance"})],
-)
-def test_only_settings_that_the_method_looks_at_are_drawn(draw, method, expected):
-    """Only auto has one beside the number of views."""
-    bpy.context.scene.refine.method = method
-    drawn = draw()
-
-    assert {"views", "tolerance"} & set(drawn) == expected
-
-
 @pytest.mark.parametrize("source", ["VISIBLE", "ACTIVE", "SELECTED", "COLLECTION", "FRAMES"])
 def test_every_source_of_cameras_is_drawn(draw, source):
     """A shot of 250 frames, every tenth: 25."""

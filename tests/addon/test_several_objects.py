@@ -50,7 +50,7 @@ def test_the_object_that_cannot_be_scored_is_named(halves):
     ("method", "survivors"),
     [
         ("closed-form", "unchanged"),
-        pytest.param("auto", "unchanged", marks=pytest.mark.slow),
+        pytest.param("occlusion", "unchanged", marks=pytest.mark.slow),
         pytest.param("closed-form", "absorb", marks=pytest.mark.slow),
     ],
 )

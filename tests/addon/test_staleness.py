@@ -80,10 +80,10 @@ def test_what_changed_since_scoring_is_said(addon, room, room_cameras, change, e
 
 
 def test_what_does_not_decide_is_not_said(addon, room, room_cameras):
-    """Budgets, settings of other methods, other objects, the way the cameras are chosen."""
+    """Budgets, other objects, the way the cameras are chosen."""
     bpy.ops.refine.score()
     settings, scene = bpy.context.scene.refine, bpy.context.scene
-    settings.tolerance, settings.ratio, settings.protect = 0.2, 0.7, "x"
+    settings.ratio, settings.protect = 0.7, "x"
     scene.frame_current += 1
     scene.render.resolution_x = 1000  # imported cameras keep the size of their file
     other = bpy.data.objects.new("other", None)

@@ -50,12 +50,11 @@ def test_the_closed_form_beats_the_published_readings(scene, evaluator):
         assert default > quality(scene, evaluator, 0.5, published)
 
 
-@pytest.mark.parametrize("method", ["occlusion", "auto"])
-def test_occlusion_beats_rendering_methods_at_every_ratio(scene, evaluator, method):
+def test_occlusion_beats_rendering_methods_at_every_ratio(scene, evaluator):
     """LightGaussian, rendered: 46.1 / 34.4 / 25.6 / 16.8 dB; required: 47.5 / 36.5 / 27.5 / 18."""
     from refine_addon.core import score, select
 
-    scores = score(scene.splats, scene.train, Settings(method))
+    scores = score(scene.splats, scene.train, Settings("occlusion"))
     for ratio, least in ((0.3, 47.5), (0.5, 36.5), (0.7, 27.5), (0.9, 18.0)):
         left = scene.splats.take(select(scores, Budget(ratio=ratio)))
         assert evaluator.evaluate(left).renders.mean["psnr"] >= least, ratio

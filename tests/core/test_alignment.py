@@ -75,12 +75,12 @@ def test_cameras_of_another_up_axis_are_told_with_the_turn_that_helps(room, rota
 
 @pytest.mark.slow
 def test_the_note_says_how_much_finer_and_reaches_the_report(room):
-    """By auto; the closed form does not measure it, since that would take as long as scoring."""
+    """By occlusion; the closed form does not measure it: that would take as long as scoring."""
     splats, views = room
     wrong = turned(views, QUARTER).take(range(0, 72, 9))
     budget = Budget(ratio=0.5)
 
-    report = prune(splats, wrong, budget, Settings("auto")).report
+    report = prune(splats, wrong, budget, Settings("occlusion")).report
     plain = prune(splats, wrong, budget, Settings("closed-form")).report
 
     words = "cameras and splats do not seem to share an up axis: turned a quarter about X"

@@ -84,7 +84,7 @@ def test_a_tile_that_is_missing_stops_all(folder, capsys):
         ([*CLOSED, "--output-dir", "out", "--clean"], "--clean does not go with --together"),
         (
             [*CLOSED, "--output-dir", "out", "--psnr", "40"],
-            "--psnr goes with --method auto or occlusion",
+            "--psnr goes with --method occlusion",
         ),
         (["--output-dir", "out", "--psnr", "40", "--absorb"], "unchanged survivors"),
         (

@@ -143,7 +143,7 @@ def test_a_psnr_that_a_tenth_is_enough_for_is_kept_by_deletion(splats, views, mo
     ],
 )
 def test_who_says_how_to_delete_gets_rows(splats, views, settings, budget):
-    """A method other than auto, and a budget of scores or views."""
+    """The closed form, and a budget of scores or views."""
     result = prune(splats, views, budget, settings)
 
     assert result.absorbed is None
@@ -166,9 +166,9 @@ def test_scores_alone_can_only_delete(splats, views):
     ("options", "became"),
     [
         ([], "absorb"),
-        (["--method", "auto"], "unchanged"),
-        (["--method", "auto", "--survivors", "refit"], "refit"),
-        (["--survivors", "auto", "--method", "auto"], "absorb"),
+        (["--method", "occlusion"], "unchanged"),
+        (["--method", "occlusion", "--survivors", "refit"], "refit"),
+        (["--survivors", "auto", "--method", "occlusion"], "absorb"),
         (["--absorb"], "absorb"),
     ],
 )

@@ -125,7 +125,7 @@ def test_protection_wins_over_force(splats, views):
     assert (found.report["splats"]["protected"], found.report["splats"]["forced"]) == (10, 90)
 
 
-@pytest.mark.parametrize("method", ["auto", "occlusion", "closed-form"])
+@pytest.mark.parametrize("method", ["occlusion", "closed-form"])
 def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(
     splats, views, removed, method
 ):

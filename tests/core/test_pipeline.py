@@ -488,20 +488,6 @@ def test_without_the_frustum_test_no_number_of_views_is_counted(small, views):
         prune(read_ply(small).splats(), views, Budget(min_seen=3), published)
 
 
-def test_what_autos_scores_cannot_mean_is_refused_before_the_work(small, views):
-    """Nothing is scored first: the first report of progress would fail the test."""
-
-    def never(_fraction, what):
-        raise AssertionError(what)
-
-    for survivors in ("unchanged", "absorb"):
-        with pytest.raises(RefineError, match="a threshold means something else"):
-            prune(
-                read_ply(small).splats(), views, Budget(threshold=0.5), Settings("auto"),
-                survivors=survivors, progress=never,
-            )  # fmt: skip
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
 def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, survivors):
@@ -617,17 +603,16 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
 
 @pytest.fixture(
     scope="module",
-    params=itertools.product(["occlusion", "auto"], ["", "a seventh stays", "half stays"]),
-    ids=" ".join,
+    params=["", "a seventh stays", "half stays"],
 )
 def scored_for_all(request, small, views):
     """Return a task without scores, one with the scores for every budget, and what has to stay."""
-    method, zoned = request.param
+    zoned = request.param
     splats = read_ply(small).splats()
     every = np.arange(len(splats))
     held = every % 2 == 0 if zoned.startswith("half") else every % 7 == 0
     demands = {"protected": held, "forced_out": every % 11 == 0} if zoned else {}
-    settings = Settings(method, views=12)
+    settings = Settings("occlusion", views=12)
     task = Task(Budget(ratio=0.5), settings, splats, views, survivors="unchanged", **demands)
     return task, replace(task, scores=decide(replace(task, reusable=True)).scores), zoned
 

@@ -278,16 +278,6 @@ def test_only_a_threshold_and_a_number_of_views_need_scores_to_count_what_goes()
         assert budget.needs_scores == (budget.removals(10, 248) is None)
 
 
-def test_scores_of_auto_are_refused_a_threshold():
-    """Wherever the scores come from, as long as they say that auto made them."""
-    scores = replace(scored([1, 2]), method="auto")
-
-    with pytest.raises(RefineError, match="a threshold means something else to each method"):
-        select(scores, Budget(threshold=0.0))
-    assert select(replace(scores, method="occlusion"), Budget(threshold=0.0)).all()
-    assert np.count_nonzero(select(scores, Budget(ratio=0.5))) == 1
-
-
 def test_views_that_see_all_count_nothing():
     """Without the frustum test `seen` is the number of views for every splat."""
     scores = replace(scored([1, 2], [64, 64]), frustum=False)

@@ -36,7 +36,6 @@ from tests.strategies import plain_header, splat_names
 from tests.tiles import COUNT, ROOM, cut, room_rows, told_by_plan, write
 
 OCCLUSION = Settings(method="occlusion", views=12)
-AUTO = Settings(views=20)
 
 
 @pytest.fixture
@@ -75,17 +74,16 @@ def read(folder, paths):
     return np.concatenate([read_ply(folder / path.name).rows for path in paths])
 
 
-# Occlusion, auto and what they estimate.
+# Occlusion and what it estimates.
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [OCCLUSION, AUTO], ids=["occlusion", "auto"])
 @pytest.mark.parametrize(
     "budget", [Budget(ratio=0.7), Budget(psnr=36.0), Budget(min_seen=60)], ids=str
 )
-def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget, settings):
+def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget):
     """To the byte, and the estimates are the same but for how rounding adds up."""
-    request = PruneRequest(views, budget, settings, survivors="unchanged")
+    request = PruneRequest(views, budget, OCCLUSION, survivors="unchanged")
     told = prune_tiles(tiles, tmp_path / "out", request)
     whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", request)
 

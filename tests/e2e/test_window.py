@@ -182,7 +182,7 @@ def test_the_window_lives_while_splats_are_scored(binary: Binary, blend: Path, c
     assert found["orbited"] > 0.1
     assert found["zoomed"] < 0.95
     assert [found[what] for what in ("saved", "undone", "apply", "still")] == [False] * 3 + [True]
-    assert found["refined"] == ["auto", False]
+    assert found["refined"] == ["occlusion", False]
     assert found["stopped"] == ["closed-form", True]
     assert found["esc_s"] < 10.0  # at once, on a machine that may be busy
     assert found["ended by"] == {how: [True, 0] for how in ("load", "close_window", "disable")}

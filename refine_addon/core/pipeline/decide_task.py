@@ -364,7 +364,7 @@ def _scores_of(
             known = curve, known[1]
         return known[0], known
     # `select` checks this too, but only after the work.
-    task.budget.refuse_meaningless(task.settings.method, frustum=task.settings.frustum)
+    task.budget.refuse_meaningless(frustum=task.settings.frustum)
     scores = score(
         splats,
         views,

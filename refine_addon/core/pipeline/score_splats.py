@@ -14,7 +14,7 @@ from ..pace import phases
 from ..quality.alignment import alignment
 from ..quality.psnr import psnr_after, quality_curve
 from ..scores import Scores
-from ..scoring import auto, closed_form, occlusion
+from ..scoring import closed_form, occlusion
 from ..splats import Splats
 from ..task import DEFAULTS, Settings
 from ..views import ViewSet, refuse_other
@@ -89,11 +89,6 @@ def score(
         if settings.method == "occlusion":
             scores = occlusion.score(
                 splats, used, settings.occlusion,
-                settled=settled, progress=scoring, threads=threads,
-            )  # fmt: skip
-        elif settings.method == "auto":
-            scores = auto.score(
-                splats, used, settings.tolerance, settings.occlusion,
                 settled=settled, progress=scoring, threads=threads,
             )  # fmt: skip
         else:

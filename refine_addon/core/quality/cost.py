@@ -7,7 +7,7 @@ import numpy as np
 from ..survivor_choice import Became
 
 ROUNDS = 2.5
-"""Scoring by *auto* or *occlusion* takes so many times as long as measuring all splats once."""
+"""Scoring by *occlusion* takes so many times as long as measuring all splats once."""
 
 SHARES = (0.1, 0.3, 0.5, 0.55, 0.7, 0.9)
 """Shares removed for which the next two hold; between them they are interpolated."""
@@ -31,7 +31,7 @@ def expected_seconds(scored: float, share: float, *, once: bool) -> dict[Became,
     share : float
         Of the splats that goes.
     once : bool
-        Whether all splats were measured once; else they were scored by *auto* or *occlusion*.
+        Whether all splats were measured once; else they were scored by *occlusion*.
 
     Examples
     --------

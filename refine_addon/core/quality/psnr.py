@@ -108,7 +108,7 @@ def quality_curve(
         return None
     place, views = _places(values, protected)[sample.splat_rows], sample.seeing()
     of_views = _of_each_view(
-        sample, _removing(sample, [place], removed), views, part(progress, 0.0, 0.5), threads
+        sample, _removing(sample, place, removed), views, part(progress, 0.0, 0.5), threads
     )
     if of_views is None:
         return None
@@ -127,39 +127,6 @@ def quality_curve(
         dict(zip(names, np.minimum.accumulate(of_views, axis=1), strict=True)),
         sample.hits_of_ray(),
     )
-
-
-def psnr_by_views(
-    sample: RaySample,
-    rankings: Sequence[NDArray[np.float32]],
-    shares: Sequence[float],
-    numbers: Sequence[int],
-    *,
-    threads: int | None = None,
-) -> NDArray[np.float64] | None:
-    """Return the mean PSNR in some views by each of R rankings, (R, L), dB.
-
-    None if the rays of these views see too little.
-
-    Parameters
-    ----------
-    sample : RaySample
-        Of all N splats.
-    rankings : sequence of (N,) float32
-        The lowest are removed first.
-    shares : sequence of float
-        L shares of the splats that are removed, ascending.
-    numbers : sequence of int
-        Of the views.
-    threads : int, optional
-    """
-    if sample.hitting(numbers) < MIN_RAYS_WITH_HITS:
-        return None
-    seeing = sorted(set(numbers) & set(sample.seeing()))
-    counts = [math.floor(share * len(rankings[0])) for share in shares]
-    places = [_places(values)[sample.splat_rows] for values in rankings]
-    psnr = _of_each_view(sample, _removing(sample, places, counts), seeing, silent, threads)
-    return None if psnr is None else _mean(sample, psnr, seeing).reshape(len(rankings), -1)
 
 
 def psnr_against(
@@ -238,30 +205,26 @@ def _mean_after(
     `_removing`.
     """
     views = sample.seeing()
-    compare = _removing(sample, [places[sample.splat_rows]], counts)
+    compare = _removing(sample, places[sample.splat_rows], counts)
     psnr = _of_each_view(sample, compare, views, silent, threads)
     return None if psnr is None else np.minimum.accumulate(_mean(sample, psnr, views))
 
 
-def _removing(
-    sample: RaySample, places: Sequence[NDArray[np.int64]], counts: Sequence[int]
-) -> Compare:
+def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]) -> Compare:
     """Return a function that gives the PSNR of one view after each of L removals, dB.
 
-    Each of `places`, (M,), is that of each of the Gaussians in an order of removal: those whose
-    place is below one of the ascending `counts` are removed. The PSNR by one order follow those by
-    the one before.
+    `place`, (M,), is that of each of the Gaussians in the order of removal: those whose place is
+    below one of the ascending `counts` are removed.
     """
 
     def compare(number: int, rays: Rays) -> list[float]:
         view, colors = sample.views[number][0], sample.colors(number, rays)
         truth, psnr = rays.colors(colors), []
-        for place in places:
-            left, place_of_hit = rays, place.take(rays.hit)
-            for count in counts:
-                # What is removed stays removed: the lists of hits grow shorter.
-                left = left.keeping(place_of_hit >= count)
-                psnr.append(psnr_of(left.colors(colors), truth, view))
+        left, place_of_hit = rays, place.take(rays.hit)
+        for count in counts:
+            # What is removed stays removed: the lists of hits grow shorter.
+            left = left.keeping(place_of_hit >= count)
+            psnr.append(psnr_of(left.colors(colors), truth, view))
         return psnr
 
     return compare

@@ -279,23 +279,6 @@ class OcclusionScoring:
         chosen = sorted(self._sums if groups is None else groups)
         return Measured.sum(self._sums[k][k] for k in chosen)
 
-    def in_one_round(
-        self, groups: Sequence[int], progress: Progress = silent
-    ) -> NDArray[np.float32]:
-        """Return the values of all N splats, in one round, by some of the groups measured.
-
-        Raises
-        ------
-        Cancelled
-            If `progress` answers ``False``.
-        """
-        removal, measured = self._removal(), self.measured(groups)
-        weights = self._floor_weights(measured, groups, progress)
-        every = np.arange(len(self.gaussians))
-        order = self._order(every, measured, weights, removal, len(every))
-        removal.add(self.gaussians.index[order])
-        return removal.values
-
     def rank(self, progress: Progress, settled: int | None = None) -> Scores:
         """Return the scores, by the groups measured; can be called once.
 
@@ -416,8 +399,6 @@ class MemoryScoring(OcclusionScoring):
     ----------
     splats, views, settings, progress, threads
         See `score`.
-    groups : list of list of int, optional
-        See `Measuring`.
     few_views : bool
         See `RaySample`.
 
@@ -435,7 +416,6 @@ class MemoryScoring(OcclusionScoring):
         views: ViewSet,
         settings: Occlusion,
         *,
-        groups: list[list[int]] | None = None,
         few_views: bool = False,
         progress: Progress = silent,
         threads: int | None = None,
@@ -448,7 +428,7 @@ class MemoryScoring(OcclusionScoring):
             splats, views, progress=activating, threads=threads
         )
         refuse_undrawable(int(np.count_nonzero(good)), len(good))
-        measuring = Measuring(scene, views, settings, threads, groups)
+        measuring = Measuring(scene, views, settings, threads)
         prior = closed_form.score(splats, views, PRIOR, progress=scoring, threads=threads).values
         rays = RaySample(measuring.views, gaussians, splats, few_views=few_views)
         super().__init__(gaussians, measuring, settings.rounds, prior, ~good, rays)

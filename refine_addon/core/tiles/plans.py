@@ -36,8 +36,7 @@ def scoring(
     if settings.method == "closed-form" and not once:
         return [[], [Cost("closed form", count, views)], []]
     stays = [count] if once else survivors_of_rounds(count, settings.occlusion.rounds, settled)
-    plan = costs.by_auto if settings.method == "auto" and not once else costs.occlusion
-    ready, *scored = plan(count, images, stays)
+    ready, *scored = costs.occlusion(count, images, stays)
     *_, curve = costs.scoring(count, images, settings.method, stays)
     curve = [Cost("estimating", count, views)] if once else curve
     return [ready, costs.joined(scored), curve]

@@ -228,10 +228,8 @@ class TilesRequest(Request[TileScene, TileDecision]):
                 f"{what} needs all splats in memory to absorb: over tiles choose another budget"
             )
         if budget.psnr is not None and not settings.estimates:
-            raise RefineError(
-                f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
-            )
-        budget.refuse_meaningless(settings.method, frustum=settings.frustum)
+            raise RefineError(f"over tiles {settings.method} estimates no PSNR: choose occlusion")
+        budget.refuse_meaningless(frustum=settings.frustum)
 
     def costs(self, scene: TileScene) -> list[Plan]:
         """Return what the steps are expected to cost; see `Request.costs`."""

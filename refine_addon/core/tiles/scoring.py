@@ -1,4 +1,4 @@
-"""Scoring splats that no memory holds at once by occlusion and auto."""
+"""Scoring splats that no memory holds at once by occlusion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from ..execute import Progress
 from ..pace import phases
 from ..pipeline.score_splats import with_quality
 from ..scores import Scores
-from ..scoring import auto
 from ..scoring.occlusion import PRIOR, Occlusion, OcclusionScoring, survivors_of_rounds
 from ..task import Settings
 from ..visibility.measuring import Measured
@@ -42,7 +41,7 @@ def by_occlusion(
     settled: int | None,
     runners: Sequence[Runner],
 ) -> Scores:
-    """Score units by occlusion or auto: the same as in memory.
+    """Score units by occlusion: the same as in memory.
 
     The folder has ``values`` and ``seen`` of each unit afterwards.
 
@@ -68,15 +67,10 @@ def by_occlusion(
     `removal_rounds.RemovalRounds`. A worker needs 20 bytes a splat, and for each view at work about
     160 bytes for each splat that it shows, and its points, see `occlusion.score`.
     """
-    by_auto = settings.method == "auto"
-    groups = auto.groups_of(closed_form.views) if by_auto else None
     preparing, progress, saving = runners[0], runners[1].progress, runners[2].progress
-    scoring = _TileScoring(closed_form, units, settings.occlusion, groups, preparing)
+    scoring = _TileScoring(closed_form, units, settings.occlusion, preparing)
     with np.errstate(under="ignore"):
-        if by_auto:
-            scores = auto.finish(scoring, settings.tolerance, settled=settled, progress=progress)
-        else:
-            scores = scoring.finish(progress, settled)
+        scores = scoring.finish(progress, settled)
     return scoring.save(scores, saving)
 
 
@@ -88,7 +82,7 @@ def measured_once(
 ) -> MeasuredTiles:
     """Score units by occlusion in one round; parameters as `by_occlusion`."""
     how = replace(settings.occlusion, rounds=1)
-    scoring = _TileScoring(closed_form, units, how, None, runners[0])
+    scoring = _TileScoring(closed_form, units, how, runners[0])
     with np.errstate(under="ignore"):
         scores = scoring.finish(runners[1].progress)
         measured = scoring.measured().for_all(scoring.gaussians.index, len(scoring.prior))
@@ -97,10 +91,7 @@ def measured_once(
 
 
 class _TileScoring(OcclusionScoring):
-    """A scoring of units, got ready by the runner; the folder of `closed_form` is that of the job.
-
-    For `groups` see `measuring.Measuring`.
-    """
+    """A scoring of units, made ready by the runner; `closed_form` has the folder of the job."""
 
     validation_rays: StoredRays
 
@@ -109,7 +100,6 @@ class _TileScoring(OcclusionScoring):
         closed_form: ClosedFormContext,
         units: Sequence[Unit],
         settings: Occlusion,
-        groups: list[list[int]] | None,
         runner: Runner,
     ) -> None:
         self._job, self._units = closed_form.folder, units
@@ -126,7 +116,7 @@ class _TileScoring(OcclusionScoring):
         # They have what `OcclusionScoring` asks of Gaussians in memory.
         super().__init__(
             gaussians,  # type: ignore[arg-type]
-            TileMeasuring(context, runner, groups),
+            TileMeasuring(context, runner),
             settings.rounds,
             values,
             ~good,

@@ -167,14 +167,10 @@ class TileMeasuring(Measuring):
     context : SceneContext
     runner : Runner
         Only its workers count.
-    groups : list of list of int, optional
-        See `Measuring`.
     """
 
-    def __init__(
-        self, context: SceneContext, runner: Runner, groups: list[list[int]] | None = None
-    ) -> None:
-        super().__init__(context.scene, context.views, context.sampling, None, groups)
+    def __init__(self, context: SceneContext, runner: Runner) -> None:
+        super().__init__(context.scene, context.views, context.sampling, None)
         self._context, self._runner = context, runner
 
     def measure_groups(  # type: ignore[override]

@@ -153,15 +153,13 @@ class Measuring:
     views : ViewSet
     sampling : Sampling
     threads : int, optional
-    groups : list of list of int, optional
-        By default each group has every eighth view.
 
     Attributes
     ----------
     views : list of (View, float)
         Views and their weights, see `ViewSet.by_distance`.
     groups : list of list of int
-        The numbers of the views of each group.
+        The numbers of the views of each group: of eight groups, every eighth view.
     """
 
     def __init__(
@@ -170,13 +168,12 @@ class Measuring:
         views: ViewSet,
         sampling: Sampling,
         threads: int | None,
-        groups: list[list[int]] | None = None,
     ) -> None:
         self.scene, self.sampling, self.threads = scene, sampling, threads
         self.views = views.by_distance()
         total = len(self.views)
         count = min(VIEW_GROUPS, total)
-        self.groups = groups or [list(range(k, total, count)) for k in range(count)]
+        self.groups = [list(range(k, total, count)) for k in range(count)]
 
     @property
     def count(self) -> int:
