@@ -44,32 +44,30 @@ class Place:
     where: str = ""
 
     def at(self, where: str) -> Self:
-        """Return a place within this one."""
+        """A place within this one."""
         return replace(self, where=f"{self.where} {where}" if self.where else where)
 
     def fail(self, problem: str) -> NoReturn:
-        """Raise the error of this place.
-
-        Raises
-        ------
-        RefineError
-            Always.
-        """
+        """Raise the error of this place."""
         where = f"{self.where}: " if self.where else ""
         raise RefineError(f"{self.path}: {where}{problem}")
+
+    def expected(self, what: str, value: object) -> NoReturn:
+        """Raise the error of this place: what was expected there, and what was got."""
+        self.fail(f"expected {what}, got {described(value)}")
 
     def number(self, value: object) -> float:
         """Return `value` if it is a number of at most `LARGEST_NUMBER`."""
         if not isinstance(value, (int, float)) or isinstance(value, bool):
-            self.fail(f"expected a number, got {described(value)}")
+            self.expected("a number", value)
         if not abs(value) <= LARGEST_NUMBER:  # also refuses NaN, and integers too large for float
-            self.fail(f"expected a finite number up to 1e18, got {described(value)}")
+            self.expected("a finite number up to 1e18", value)
         return float(value) if abs(value) >= NEGLIGIBLE else 0.0
 
     def numbers(self, value: object, count: int) -> list[float]:
         """Return `value` if it is a list of `count` numbers."""
         if not isinstance(value, list) or len(value) != count:
-            self.fail(f"expected a list of {count} numbers, got {described(value)}")
+            self.expected(f"a list of {count} numbers", value)
         try:
             return [self.number(item) for item in value]
         except RefineError:
@@ -79,32 +77,32 @@ class Place:
     def whole(self, value: object, least: int = 0, most: int = LARGEST_COUNT) -> int:
         """Return `value` if it is a whole number of `least` to `most`."""
         if not is_whole(value) or not least <= value <= most:
-            self.fail(f"expected a whole number from {least} to {most}, got {described(value)}")
+            self.expected(f"a whole number from {least} to {most}", value)
         return value
 
     def text(self, value: object) -> str:
         """Return `value` if it is a string."""
         if not isinstance(value, str):
-            self.fail(f"expected a string, got {described(value)}")
+            self.expected("a string", value)
         return value
 
     def items(self, value: object) -> list[Any]:
         """Return `value` if it is a list."""
         if not isinstance(value, list):
-            self.fail(f"expected a list, got {described(value)}")
+            self.expected("a list", value)
         return value
 
     def members(self, value: object, required: Sequence[str] = ()) -> dict[str, Any]:
         """Return `value` if it is a JSON object with these keys."""
         if not isinstance(value, dict):
-            self.fail(f"expected an object, got {described(value)}")
+            self.expected("an object", value)
         missing = [key for key in required if key not in value]
         if missing:
             self.fail(f"missing {missing[0]!r}, expected the keys {', '.join(required)}")
         return value
 
     def parsed(self, text: bytes | str) -> Any:
-        """Return what a text in JSON says; errors name line and column."""
+        """Value of a text in JSON; errors name line and column."""
         try:
             return json.loads(text)
         except json.JSONDecodeError as error:
@@ -116,12 +114,12 @@ class Place:
 
 
 def is_whole(value: object) -> TypeGuard[int]:
-    """Return whether a JSON value is a whole number."""
+    """Whether a JSON value is a whole number."""
     return isinstance(value, int) and not isinstance(value, bool)
 
 
 def described(value: object) -> str:
-    """Return a short description of a JSON value, for messages."""
+    """Short description of a JSON value, for messages."""
     if isinstance(value, dict):
         return f"an object with {len(value)} keys"
     if isinstance(value, list):

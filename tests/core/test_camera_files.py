@@ -295,7 +295,9 @@ def test_bytes_that_are_no_utf8_are_named(tmp_path):
     path = tmp_path / "cameras.json"
     path.write_bytes(b'[{"img_name": "\xff"}]')
 
-    with pytest.raises(RefineError, match=r"cameras\.json: byte 15: not UTF-8 text"):
+    with pytest.raises(
+        RefineError, match=r"cameras\.json: invalid JSON: .* byte 0xff in position 15"
+    ):
         read_cameras(path)
 
 

@@ -293,7 +293,7 @@ def test_an_image_without_points_does_not_swallow_the_next(tmp_path):
 def test_an_empty_file_is_refused(tmp_path, suffix, file):
     write(tmp_path, suffix, **{file: b""})
 
-    assert "the file is empty, expected a COLMAP model" in refused(tmp_path, f"{file}{suffix}")
+    assert "the file is empty, expected cameras" in refused(tmp_path, f"{file}{suffix}")
 
 
 @both
@@ -472,8 +472,8 @@ def test_a_name_without_end_is_refused(tmp_path):
         ("1 PINHOLE 64 48 100 120 32", "4 parameters of PINHOLE, got 5 numbers"),
         ("1 PINHOLE 64 48 100 120 32 24 0", "4 parameters of PINHOLE, got 7 numbers"),
         ("1 PINHOLE 64 48 100 120 32 x", "expected a number, got 'x'"),
-        ("1.5 PINHOLE 64 48 100 120 32 24", "CAMERA_ID: expected a whole number, got '1.5'"),
-        (f"{'9' * 5000} PINHOLE 64 48 100 120 32 24", "CAMERA_ID: expected a whole number"),
+        ("1.5 PINHOLE 64 48 100 120 32 24", "expected a whole number as id, got '1.5'"),
+        (f"{'9' * 5000} PINHOLE 64 48 100 120 32 24", "expected a whole number as id"),
         ("1 PINHOLE 64.5 48 100 120 32 24", "width: expected a whole number of pixels"),
         ("\xff", "unknown camera model ''"),
     ],
@@ -491,8 +491,8 @@ def test_a_wrong_line_of_cameras_is_named(tmp_path, line, problem):
     ("line", "problem"),
     [
         ("1 1 0 0 0 0 0 0 1", "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"),
-        ("a 1 0 0 0 0 0 0 1 a.png", "IMAGE_ID: expected a whole number, got 'a'"),
-        ("1 1 0 0 0 0 0 0 a a.png", "CAMERA_ID: expected a whole number, got 'a'"),
+        ("a 1 0 0 0 0 0 0 1 a.png", "expected a whole number as id, got 'a'"),
+        ("1 1 0 0 0 0 0 0 a a.png", "expected a whole number as id, got 'a'"),
         ("1 1 0 0 zero 0 0 0 1 a.png", "expected a number, got 'zero'"),
     ],
 )

@@ -16,16 +16,14 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from ..errors import reason_of
-from ..foreign_files import refuse_pointer
 from ..splats import rotation_matrices
 from ..views import View, ViewSet
 from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
-from .place import CameraPlace, is_file
+from .place import CameraPlace, is_file, opened
 
 SUFFIXES = (".bin", ".txt")
 """Binary files are preferred, as in COLMAP itself."""
@@ -36,39 +34,39 @@ MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 POINT_BYTES = 24
 """Size of an observation in ``images.bin``: x, y (doubles) and the point's id (64 bit)."""
 
-IMAGE_FIELDS = 10
-"""Number of IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME."""
+POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
+IMAGE_FIELDS = ("IMAGE_ID", *POSE, "CAMERA_ID", "NAME")
 
 SHORT_LINE = 400
 """Only lines of points below this many bytes are checked: if the line of points is missing, the
 short line of the next image is in its place."""
 
 
-@dataclass(frozen=True)
-class Lens:
+class _Lens(NamedTuple):
     """A COLMAP camera as a pinhole, and whether it has distortion that is ignored."""
 
     model: Model
-    focal: tuple[float, float]
-    principal: tuple[float, float]
-    size: tuple[int, int]
+    focal: Sequence[float]
+    principal: Sequence[float]
+    size: Sequence[int]
     distorted: bool
 
 
-@dataclass(frozen=True)
-class Image:
-    """A registered image: its pose, world to camera, and its place in the file."""
+class _Image(NamedTuple):
+    """A registered image; its pose is world to camera."""
 
     place: CameraPlace
     image_id: int
-    quaternion: tuple[float, ...]
-    translation: tuple[float, ...]
+    pose: Sequence[object]
     camera_id: int
     name: str
 
 
+_Camera = tuple[CameraPlace, int, _Lens]  # with its id
+
+
 def find_colmap(folder: Path) -> tuple[Path, str] | None:
-    """Return the folder of a model and the suffix to read, or ``None``.
+    """Folder of a model and the suffix to read, or ``None``.
 
     Looks in the folder itself, then ``sparse/0``, ``sparse`` and ``colmap/sparse/0``.
 
@@ -85,7 +83,7 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
 
 
 def read_colmap(folder: Path, suffix: str) -> ViewSet:
-    """Return the views of a COLMAP model, sorted by image name.
+    """Views of a COLMAP model, sorted by image name.
 
     COLMAP writes images in the order of registration or of a hash, which may differ between text
     and binary. The 3DGS loader sorts them by name, too.
@@ -102,69 +100,60 @@ def read_colmap(folder: Path, suffix: str) -> ViewSet:
     RefineError
         If a file is missing, truncated or wrong; with the byte or the line.
     """
-    cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
-    if suffix == ".bin":
-        lenses, registered = _binary_cameras(cameras), _binary_images(images)
-    else:
-        lenses, registered = _text_cameras(cameras), _text_images(images)
+    cameras, images = (CameraPlace(folder / f"{stem}{suffix}") for stem in MODEL_FILES[:2])
+    binary = suffix == ".bin"
+    lenses: dict[int, _Lens] = {}
+    for place, camera_id, lens in (_binary_cameras if binary else _text_cameras)(cameras):
+        if camera_id in lenses:
+            place.fail(f"camera {camera_id} is there twice, expected each id once")
+        lenses[camera_id] = lens
+    registered = list((_binary_images if binary else _text_images)(images))
+    registered.sort(key=lambda image: (image.name, image.image_id))
     if not registered:
-        CameraPlace(images).fail("no registered image, expected at least one")
+        images.fail("no registered image, expected at least one")
+    views = []
     for image in registered:
         if image.camera_id not in lenses:
             image.place.fail(
                 f"refers to camera {image.camera_id}, expected one of the {len(lenses)} "
-                f"in {cameras.name}"
+                f"in {cameras.path.name}"
             )
-    registered.sort(key=lambda image: (image.name, image.image_id))
-    views = tuple(_view(image, lenses[image.camera_id]) for image in registered)
+        views.append(_view(image, lenses[image.camera_id]))
     used = (lenses[camera_id] for camera_id in sorted({image.camera_id for image in registered}))
     counts = Counter(lens.model for lens in used if lens.distorted)
-    return ViewSet(views, lens_note(counts, "camera"))
+    return ViewSet(tuple(views), lens_note(counts, "camera"))
 
 
-def _view(image: Image, lens: Lens) -> View:
-    """Return the view of an image."""
-    if not any(image.quaternion):
+def _view(image: _Image, lens: _Lens) -> View:
+    pose = [image.place.at(key).number(value) for key, value in zip(POSE, image.pose, strict=True)]
+    if not any(pose[:4]):
         image.place.fail("expected a quaternion (w, x, y, z) of a rotation, got all zeros")
-    rotation = rotation_matrices(np.array(image.quaternion))
-    center = -rotation.T @ np.array(image.translation)
+    rotation = rotation_matrices(np.array(pose[:4]))
+    center = -rotation.T @ np.array(pose[4:])
     return image.place.view(image.name, rotation, center, lens.focal, lens.principal, lens.size)
 
 
 def _lens(
     place: CameraPlace, model: Model, size: Sequence[object], values: Sequence[object]
-) -> Lens:
-    """Return the lens of a camera model, image size and parameters."""
+) -> _Lens:
     if not model.focals:
         place.fail(f"camera model {model.name} is a panorama, expected one with a focal length")
-    width, height = (
-        place.at(key).side(side) for key, side in zip(("width", "height"), size, strict=True)
-    )
+    sides = [place.at(key).side(side) for key, side in zip(("width", "height"), size, strict=True)]
     numbers = [place.at(f"parameter {index}").number(item) for index, item in enumerate(values)]
-    fx, fy = (place.at("focal length").focal(numbers[index]) for index in (0, model.focals - 1))
+    focal = [place.at("focal length").focal(numbers[index]) for index in (0, model.focals - 1)]
     cx, cy, *distortion = numbers[model.focals :]
     if model.name == "EUCM":
         distortion = distortion[:1]  # with alpha = 0 it is a pinhole for every beta
-    distorted = model.fisheye or any(distortion)
-    return Lens(model, (fx, fy), (cx, cy), (width, height), distorted)
+    return _Lens(model, focal, (cx, cy), sides, model.fisheye or any(distortion))
 
 
+@dataclass
 class _Binary:
     """A little-endian file, read from start to end; refused where it is truncated."""
 
-    def __init__(self, path: Path) -> None:
-        self.file = CameraPlace(path)
-        self.offset = 0
-        try:
-            with path.open("rb") as stream:
-                self.size = stream.seek(0, 2)
-                if not self.size:
-                    self.file.fail("the file is empty, expected a COLMAP model")
-                # Memory-mapped, since images.bin is mostly observations, which are skipped.
-                self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-                refuse_pointer(path, self.data[:SHORT_LINE])
-        except (OSError, ValueError) as error:
-            self.file.fail(f"cannot be read ({reason_of(error)})")
+    file: CameraPlace
+    data: mmap.mmap
+    offset: int = 0
 
     def take(self, layout: str, what: str) -> tuple[Any, ...]:
         """Return the next values, of a `struct` layout."""
@@ -174,8 +163,8 @@ class _Binary:
     def skip(self, count: int, what: str) -> int:
         """Skip `count` bytes; return where they start."""
         start = self.offset
-        if count > self.size - start:
-            self.truncated(what, f"expected {count} more bytes")
+        if count > len(self.data) - start:
+            self.truncated(f"{what}: expected {count} more bytes")
         self.offset += count
         return start
 
@@ -183,163 +172,106 @@ class _Binary:
         """Return the next text, which ends with a zero byte."""
         end = self.data.find(b"\0", self.offset)
         if end < 0:
-            self.truncated(what, "expected a zero byte after the name")
-        raw = self.data[self.offset : end]
-        self.offset = end + 1
-        return raw.decode("utf-8", "replace")
+            self.truncated(f"{what}: expected a zero byte after the name")
+        start = self.skip(end + 1 - self.offset, what)
+        return self.data[start:end].decode("utf-8", "replace")
 
-    def count(self, what: str, least: int) -> int:
-        """Return the next count of things that take at least `least` bytes each."""
-        (count,) = self.take("Q", f"number of {what}s")
-        if count * least > self.size - self.offset:
-            self.truncated(
-                f"number of {what}s",
-                f"{count} of at least {least} bytes each are announced",
+    def truncated(self, problem: str) -> NoReturn:
+        left = len(self.data) - self.offset
+        self.file.at(f"byte {self.offset}").fail(f"truncated: {problem}, got {left}")
+
+
+def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, str, CameraPlace]]:
+    """Yield the file at each of its rows, of at least so many bytes; its name; and its place."""
+    # Memory-mapped, since images.bin is mostly observations, which are skipped.
+    with (
+        opened(file) as (stream, _),
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as all_,
+    ):
+        data = _Binary(file, all_)
+        (count,) = data.take("Q", f"number of {thing}s")
+        if count * least > len(all_) - data.offset:
+            announced = f"{count} of at least {least} bytes each are announced"
+            data.truncated(f"number of {thing}s: {announced}")
+        for index in range(count):
+            row = f"{thing} row {index}"
+            yield data, row, file.at(f"{row} at byte {data.offset}")
+        if left := len(all_) - data.offset:
+            file.at(f"byte {data.offset}").fail(
+                f"expected the end of the file after {counted(count, thing)}, got {left} more bytes"
             )
-        return int(count)
-
-    def end(self, what: str, count: int) -> None:
-        """Refuse bytes after the last of `count` things: the file holds more than it announces."""
-        left = self.size - self.offset
-        if left:
-            self.file.at(f"byte {self.offset}").fail(
-                f"expected the end of the file after {counted(count, what)}, got {left} more bytes"
-            )
-
-    def truncated(self, what: str, expected: str) -> NoReturn:
-        """Raise the error of a file that ends early."""
-        left = self.size - self.offset
-        self.file.at(f"byte {self.offset}").fail(f"truncated: {what}: {expected}, got {left}")
 
 
-def _binary_cameras(path: Path) -> dict[int, Lens]:
-    """Return the lenses of ``cameras.bin`` by their id."""
-    data = _Binary(path)
-    with data.data:
-        lenses: dict[int, Lens] = {}
-        for row in range(data.count("camera", 24 + 8 * 2)):
-            place = data.file.at(f"camera row {row} at byte {data.offset}")
-            camera_id, model_id, *size = data.take("IiQQ", f"camera row {row}")
-            if model_id not in MODELS:
-                place.fail(f"unknown camera model {model_id}, expected 0 to {max(MODELS)}")
-            model = MODELS[model_id]
-            values = data.take(f"{model.count}d", f"parameters of camera row {row}")
-            _add(lenses, place, camera_id, _lens(place, model, size, values))
-        data.end("camera", len(lenses))
-        return lenses
+def _binary_cameras(file: CameraPlace) -> Iterator[_Camera]:
+    for data, row, place in _rows(file, "camera", 24 + 8 * 2):
+        camera_id, model_id, *size = data.take("IiQQ", row)
+        if model_id not in MODELS:
+            place.fail(f"unknown camera model {model_id}, expected 0 to {max(MODELS)}")
+        model = MODELS[model_id]
+        values = data.take(f"{model.count}d", f"parameters of {row}")
+        yield place, camera_id, _lens(place, model, size, values)
 
 
-def _binary_images(path: Path) -> list[Image]:
-    """Return the images of ``images.bin``."""
-    data = _Binary(path)
-    with data.data:
-        images: list[Image] = []
-        for row in range(data.count("image", 73)):
-            place = data.file.at(f"image row {row} at byte {data.offset}")
-            image_id, *pose, camera_id = data.take("I7dI", f"image row {row}")
-            name = data.name(f"name of image row {row}")
-            (points,) = data.take("Q", f"number of points of image row {row}")
-            data.skip(points * POINT_BYTES, f"{points} points of image row {row}")
-            images.append(_image(place, image_id, pose, camera_id, name))
-        data.end("image", len(images))
-        return images
+def _binary_images(file: CameraPlace) -> Iterator[_Image]:
+    for data, row, place in _rows(file, "image", 73):
+        image_id, *pose, camera_id = data.take("I7dI", row)
+        name = data.name(f"name of {row}")
+        (points,) = data.take("Q", f"number of points of {row}")
+        data.skip(points * POINT_BYTES, f"{points} points of {row}")
+        yield _Image(place, image_id, pose, camera_id, name)
 
 
-def _lines(path: Path) -> Iterator[tuple[CameraPlace, bytes]]:
+def _lines(file: CameraPlace) -> Iterator[tuple[CameraPlace, bytes]]:
     """Yield the lines of a text file, each with its place, without comments."""
-    file = CameraPlace(path)
-    empty = True
-    try:
-        with path.open("rb") as stream:
-            for number, text in enumerate(stream, 1):
-                line = text.strip()
-                if number == 1:
-                    refuse_pointer(path, line)
-                    line = line.removeprefix(codecs.BOM_UTF8)
-                empty = empty and not line
-                if not line.startswith(b"#"):
-                    yield file.at(f"line {number}"), line
-    except (OSError, ValueError) as error:
-        file.fail(f"cannot be read ({reason_of(error)})")
-    if empty:
-        file.fail("the file is empty, expected a COLMAP model")
+    with opened(file) as (stream, _):
+        for number, text in enumerate(stream, 1):
+            line = text.strip()
+            if number == 1:
+                line = line.removeprefix(codecs.BOM_UTF8)
+            if not line.startswith(b"#"):
+                yield file.at(f"line {number}"), line
 
 
-def _text_cameras(path: Path) -> dict[int, Lens]:
-    """Return the lenses of ``cameras.txt`` by their id."""
-    lenses: dict[int, Lens] = {}
-    for place, line in _lines(path):
+def _text_cameras(file: CameraPlace) -> Iterator[_Camera]:
+    for place, line in _lines(file):
         if not line:
             continue
-        fields = line.decode("utf-8", "replace").split()
-        name = fields[1] if len(fields) > 1 else ""
+        camera_id, name, *fields = [*line.decode("utf-8", "replace").split(), ""]
         model = MODELS_BY_NAME.get(name)
         if model is None:
             place.fail(f"unknown camera model {name[:40]!r}, expected {', '.join(MODELS_BY_NAME)}")
-        numbers = [_parsed(place, field) for field in fields[2:]]
+        numbers = [_parsed(place, field) for field in fields[:-1]]
         if len(numbers) != 2 + model.count:
             place.fail(
                 f"expected width, height and {model.count} parameters of {model.name}, "
                 f"got {len(numbers)} numbers"
             )
-        lens = _lens(place, model, numbers[:2], numbers[2:])
-        _add(lenses, place, _whole(place, "CAMERA_ID", fields[0]), lens)
-    return lenses
+        yield place, _parsed(place, camera_id, int), _lens(place, model, numbers[:2], numbers[2:])
 
 
-def _text_images(path: Path) -> list[Image]:
-    """Return the images of ``images.txt``."""
-    images: list[Image] = []
-    lines = _lines(path)
-    for place, line in lines:
-        if not line:
-            continue
-        fields = line.decode("utf-8", "replace").split(maxsplit=IMAGE_FIELDS - 1)
-        where = place.at(f"image row {len(images)}")
-        if len(fields) < IMAGE_FIELDS:
-            where.fail(
-                "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, "
-                f"got {len(fields)} fields"
-            )
-        pose = [_parsed(where, field) for field in fields[1:8]]
-        image_id = _whole(where, "IMAGE_ID", fields[0])
-        camera_id = _whole(where, "CAMERA_ID", fields[8])
-        images.append(_image(where, image_id, pose, camera_id, fields[9]))
+def _text_images(file: CameraPlace) -> Iterator[_Image]:
+    lines = _lines(file)
+    for row, (place, line) in enumerate(item for item in lines if item[1]):
+        fields = line.decode("utf-8", "replace").split(maxsplit=len(IMAGE_FIELDS) - 1)
+        where = place.at(f"image row {row}")
+        if len(fields) < len(IMAGE_FIELDS):
+            where.fail(f"expected {', '.join(IMAGE_FIELDS)}, got {len(fields)} fields")
+        image_id, *pose, camera_id, name = fields
+        numbers = [_parsed(where, field) for field in pose]
+        yield _Image(
+            where, _parsed(where, image_id, int), numbers, _parsed(where, camera_id, int), name
+        )
         place, points = next(lines, (place, b""))
         if len(points) < SHORT_LINE and len(points.split()) % 3:
             place.fail(
-                f"expected the points of image row {len(images) - 1} as X, Y, POINT3D_ID each "
+                f"expected the points of image row {row} as X, Y, POINT3D_ID each "
                 "(an image takes two lines, of which the second may be empty)"
             )
-    return images
 
 
-def _image(
-    place: CameraPlace, image_id: int, pose: Sequence[object], camera_id: int, name: str
-) -> Image:
-    numbers = [
-        place.at(key).number(value)
-        for key, value in zip(("QW", "QX", "QY", "QZ", "TX", "TY", "TZ"), pose, strict=True)
-    ]
-    return Image(place, image_id, tuple(numbers[:4]), tuple(numbers[4:]), camera_id, name)
-
-
-def _add(lenses: dict[int, Lens], place: CameraPlace, camera_id: int, lens: Lens) -> None:
-    """Add a lens; refuse an id that is there already."""
-    if camera_id in lenses:
-        place.fail(f"camera {camera_id} is there twice, expected each id once")
-    lenses[camera_id] = lens
-
-
-def _parsed(place: CameraPlace, field: str) -> float:
+def _parsed(place: CameraPlace, field: str, kind: Any = float) -> Any:
     try:
-        return float(field)
+        return kind(field)
     except ValueError:
-        place.fail(f"expected a number, got {field[:40]!r}")
-
-
-def _whole(place: CameraPlace, key: str, field: str) -> int:
-    try:
-        return int(field)
-    except ValueError:
-        place.fail(f"{key}: expected a whole number, got {field[:40]!r}")
+        what = "a whole number as id" if kind is int else "a number"
+        place.fail(f"expected {what}, got {field[:40]!r}")

@@ -22,7 +22,7 @@ FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Return width and height as stored (before any EXIF rotation), pixels.
+    """Width and height as stored (before any EXIF rotation), pixels.
 
     Parameters
     ----------
@@ -35,21 +35,19 @@ def image_size(path: Path) -> tuple[int, int] | None:
         ``None`` if the file does not exist, is neither PNG nor JPEG, or is truncated.
     """
     try:
-        if not path.is_file():
+        if not path.is_file():  # a pipe would be waited for
             return None
         with path.open("rb") as stream:
             head = stream.read(24)
             if head.startswith(PNG_START) and head[12:16] == b"IHDR":
                 return struct.unpack(">II", head[16:24])
-            if head.startswith(JPEG_START):
-                return _jpeg_size(stream)
+            return _jpeg_size(stream) if head.startswith(JPEG_START) else None
     except (OSError, ValueError, struct.error):
         return None
-    return None
 
 
 def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """Return the size in the first frame header; skip the segments before it."""
+    """Size in the first frame header; the segments before it are skipped."""
     stream.seek(len(JPEG_START))
     for _ in range(MOST_SEGMENTS):
         start, marker = stream.read(2)

@@ -64,12 +64,12 @@ PANORAMAS = {
 
 
 def counted(count: int, thing: str) -> str:
-    """Return a count and a noun, with a plural s if the count is not 1."""
+    """A count and a noun, with a plural s if the count is not 1."""
     return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
 
 
 def lens_note(counts: Mapping[Model, int], thing: str) -> str:
-    """Return a note about lenses that are not pinholes, or "" if there are none.
+    """Note about lenses that are not pinholes, or "" if there are none.
 
     Parameters
     ----------
@@ -78,12 +78,11 @@ def lens_note(counts: Mapping[Model, int], thing: str) -> str:
     thing : str
         What is counted, in the singular: "camera" or "frame".
     """
-    notes = []
-    for model, count in counts.items():
-        things = counted(count, thing)
-        if model.fisheye:
-            note = f"{things} (fisheye, {model.name}) taken as pinhole: wrong away from the centre"
-        else:
-            note = f"distortion of {things} ignored (model {model.name})"
-        notes.append(note)
-    return "; ".join(notes)
+    ways = {
+        True: "{} (fisheye, {}) taken as pinhole: wrong away from the centre",
+        False: "distortion of {} ignored (model {})",
+    }
+    return "; ".join(
+        ways[model.fisheye].format(counted(count, thing), model.name)
+        for model, count in counts.items()
+    )

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..foreign_files import foreign_kind, refuse_pointer
-from ..place import LARGEST_NUMBER, Place, described
+from ..place import LARGEST_NUMBER, Place
 from ..views import View, is_orthonormal
 from ..whole_file import mode_of
 
@@ -32,7 +34,7 @@ class CameraPlace(Place):
         """Return `value` if it is a number of 1e-6 to 1e18; `what` names it in messages."""
         number = self.number(value)
         if number < SMALLEST_LENGTH:
-            self.fail(f"expected a positive {what}, got {described(value)}")
+            self.expected(f"a positive {what}", value)
         return number
 
     def focal(self, value: object) -> float:
@@ -43,17 +45,21 @@ class CameraPlace(Place):
         """Return `value` if it is a whole number of pixels; it may be written as 800.0."""
         number = self.number(value)
         if not (number.is_integer() and 1 <= number <= LARGEST_SIDE):
-            self.fail(
-                f"expected a whole number of pixels from 1 to {LARGEST_SIDE}, "
-                f"got {described(value)}"
-            )
+            self.expected(f"a whole number of pixels from 1 to {LARGEST_SIDE}", value)
         return int(number)
+
+    def principal(self, values: Mapping[str, object], size: Sequence[int]) -> list[float]:
+        """Return ``cx`` and ``cy`` of some values, pixels; the middle of the image without them."""
+        return [
+            self.at(repr(key)).number(values.get(key, side / 2))
+            for key, side in zip(("cx", "cy"), size, strict=True)
+        ]
 
     def matrix(self, value: object, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
         """Return `value` if it is a list of rows of numbers; `rows` are the allowed counts."""
-        sizes = " or ".join(f"{count} x {columns}" for count in rows)
         if not isinstance(value, list) or len(value) not in rows:
-            self.fail(f"expected a {sizes} matrix, got {described(value)}")
+            sizes = " or ".join(f"{count} x {columns}" for count in rows)
+            self.expected(f"a {sizes} matrix", value)
         table = [self.at(f"row {index}").numbers(row, columns) for index, row in enumerate(value)]
         return np.array(table, np.float64)
 
@@ -68,11 +74,11 @@ class CameraPlace(Place):
         name: str,
         rotation: NDArray[np.float64],
         center: NDArray[np.float64],
-        focal: tuple[float, float],
-        principal: tuple[float, float],
-        size: tuple[int, int],
+        focal: Sequence[float],
+        principal: Sequence[float],
+        size: Sequence[int],
     ) -> View:
-        """Return a view; errors name this place.
+        """View of a camera; errors name this place.
 
         Parameters
         ----------
@@ -82,50 +88,68 @@ class CameraPlace(Place):
             World to camera (x right, y down, z forward).
         center : (3,) float64
             World units.
-        focal, principal : tuple of float
+        focal, principal : (2,) float
             fx, fy and cx, cy; pixels.
-        size : tuple of int
+        size : (2,) int
             Width, height; pixels.
         """
+        (fx, fy), (cx, cy), (width, height) = focal, principal, size
         if np.abs(center).max() > LARGEST_NUMBER:
             self.fail(f"the camera's centre is farther than 1e18: {center.tolist()}")
         printable = name.encode("utf-8", "replace").decode("utf-8")
         try:
-            return View(rotation, center, *focal, *principal, *size, name=printable)
+            return View(rotation, center, fx, fy, cx, cy, width, height, name=printable)
         except RefineError as error:
             self.fail(str(error))
 
 
-def is_file(path: Path) -> bool:
-    """Return whether `path` is an existing file.
+def kind_of(path: Path) -> int:
+    """Type of `path`, see `stat.S_IFMT`; 0 if it does not exist.
 
     Raises
     ------
     RefineError
         If the system cannot tell: a name too long, a folder that may not be entered.
     """
-    return stat.S_ISREG(_mode(path))
-
-
-def is_folder(path: Path) -> bool:
-    """Return whether `path` is an existing folder; see `is_file`."""
-    return stat.S_ISDIR(_mode(path))
-
-
-def exists(path: Path) -> bool:
-    """Return whether there is anything at `path`; see `is_file`."""
-    return bool(_mode(path))
-
-
-def _mode(path: Path) -> int:
     try:
-        return mode_of(path)
+        return stat.S_IFMT(mode_of(path))
     except (OSError, ValueError) as error:
         Place(path).fail(f"cannot be read ({reason_of(error)})")
 
 
+def is_file(path: Path) -> bool:
+    """Whether `path` is an existing file; see `kind_of`."""
+    return kind_of(path) == stat.S_IFREG
+
+
+def is_folder(path: Path) -> bool:
+    """Whether `path` is an existing folder; see `kind_of`."""
+    return kind_of(path) == stat.S_IFDIR
+
+
+@contextmanager
+def opened(place: Place) -> Iterator[tuple[BinaryIO, bytes]]:
+    """Open a file to read it; yield it at its start, and its first bytes.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be read, is empty, or is a Git LFS pointer.
+    """
+    try:
+        with place.path.open("rb") as stream:
+            head = stream.read(SNIFFED_BYTES)
+            if not head:
+                place.fail("the file is empty, expected cameras")
+            refuse_pointer(place.path, head)
+            stream.seek(0)
+            yield stream, head
+    except (OSError, ValueError) as error:
+        place.fail(f"cannot be read ({reason_of(error)})")
+
+
 def read_json(path: Path) -> object:
-    """Return the content of a JSON file.
+    """Content of a JSON file.
 
     Parameters
     ----------
@@ -138,21 +162,14 @@ def read_json(path: Path) -> object:
         If the file cannot be read, is empty or is not JSON; with line and column.
     """
     place = Place(path)
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(SNIFFED_BYTES)
-            refuse_pointer(path, head)
-            if head[:1] not in b"{[\xef \t\r\n":  # so that a large splat file is not read
-                problem = foreign_kind(path, head) or (
-                    "expected JSON (cameras.json, transforms.json) "
-                    f"or a COLMAP model, got a file that starts with {head[:8]!r}"
-                )
-                place.fail(f"not a camera file: {problem}")
-            text = (head + stream.read()).decode("utf-8-sig")
-    except (OSError, ValueError) as error:
-        if isinstance(error, UnicodeDecodeError):
-            place.at(f"byte {error.start}").fail(f"not UTF-8 text ({error.reason})")
-        place.fail(f"cannot be read ({reason_of(error)})")
+    with opened(place) as (stream, head):
+        if head[:1] not in b"{[\xef \t\r\n":  # so that a large splat file is not read
+            problem = foreign_kind(path, head) or (
+                "expected JSON (cameras.json, transforms.json) "
+                f"or a COLMAP model, got a file that starts with {head[:8]!r}"
+            )
+            place.fail(f"not a camera file: {problem}")
+        text = stream.read()
     if not text.strip():
-        place.fail("the file is empty, expected cameras as JSON")
+        place.fail("the file is empty, expected cameras")
     return place.parsed(text)

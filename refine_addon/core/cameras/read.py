@@ -11,12 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..place import described
 from ..views import View, ViewSet
 from ..whole_file import expanded
 from .colmap import MODEL_FILES, SUFFIXES, find_colmap, read_colmap
 from .nerfstudio import read_transforms
-from .place import CameraPlace, exists, is_file, is_folder, read_json
+from .place import CameraPlace, is_file, is_folder, kind_of, read_json
 
 INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 """Keys that every camera of a ``cameras.json`` must have."""
@@ -53,7 +52,7 @@ def read_cameras(path: Path | str) -> ViewSet:
     if is_folder(path):
         return _read_folder(path)
     if not is_file(path):
-        problem = "is neither a file nor a folder" if exists(path) else "no such file or folder"
+        problem = "is neither a file nor a folder" if kind_of(path) else "no such file or folder"
         CameraPlace(path).fail(f"{problem}, expected cameras")
     if path.suffix in SUFFIXES and path.stem in MODEL_FILES:
         return read_colmap(path.parent, path.suffix)
@@ -61,7 +60,7 @@ def read_cameras(path: Path | str) -> ViewSet:
 
 
 def cameras_in(folder: Path) -> list[Path]:
-    """Return what of a folder holds cameras: JSON files, then the folder of a COLMAP model.
+    """What of a folder holds cameras: JSON files, then the folder of a COLMAP model.
 
     Parameters
     ----------
@@ -79,13 +78,12 @@ def cameras_in(folder: Path) -> list[Path]:
 
 def _read_folder(folder: Path) -> ViewSet:
     """Read the preferred cameras of a folder; the note names the others."""
-    found = cameras_in(folder)
+    found, colmap = cameras_in(folder), find_colmap(folder)
     if not found:
         CameraPlace(folder).fail(
             f"no cameras in this folder, expected {', '.join(JSON_NAMES)}, or a COLMAP model "
             "(cameras and images, both .bin or both .txt) in it, sparse/0 or sparse"
         )
-    colmap = find_colmap(folder)
     if colmap and found == [colmap[0]]:
         return read_colmap(*colmap)
     views = _read_json_cameras(found[0])
@@ -93,9 +91,7 @@ def _read_folder(folder: Path) -> ViewSet:
         f"COLMAP model in {each.relative_to(folder).as_posix()}" if is_folder(each) else each.name
         for each in found[1:]
     ]
-    if not others:
-        return views
-    unused = f"read {found[0].name}, not {', '.join(others)}"
+    unused = f"read {found[0].name}, not {', '.join(others)}" if others else ""
     return replace(views, note="; ".join(filter(None, (views.note, unused))))
 
 
@@ -105,15 +101,14 @@ def _read_json_cameras(path: Path) -> ViewSet:
     if isinstance(data, list):
         return read_inria(path, data)
     if not isinstance(data, dict) or "frames" not in data:
-        CameraPlace(path).fail(
-            "expected a list of cameras (cameras.json) or an object with 'frames' "
-            f"(transforms.json), got {described(data)}"
+        CameraPlace(path).expected(
+            "a list of cameras (cameras.json) or an object with 'frames' (transforms.json)", data
         )
     return read_transforms(path, data)
 
 
 def read_inria(path: Path, data: list[object]) -> ViewSet:
-    """Return the views of the ``cameras.json`` that the reference 3DGS implementation writes.
+    """Views of the ``cameras.json`` that the reference 3DGS implementation writes.
 
     ``rotation`` is camera to world; its columns are the camera's x (right), y (down) and z
     (forward). ``position`` is the camera's centre. Some forks add the principal point as ``cx`` and
@@ -138,7 +133,6 @@ def read_inria(path: Path, data: list[object]) -> ViewSet:
 
 
 def _inria_view(file: CameraPlace, index: int, item: object) -> View:
-    """Return the view of one camera."""
     place = file.at(f"camera {index}")
     camera = place.members(item)
     if "transform" in camera and "position" not in camera:
@@ -150,12 +144,8 @@ def _inria_view(file: CameraPlace, index: int, item: object) -> View:
     axes = at.rotation(at.matrix(camera["rotation"], (3,), 3))
     if np.linalg.det(axes) < 0:
         at.fail("expected a rotation, got a reflection (determinant -1)")
-    width, height = (place.at(repr(key)).side(camera[key]) for key in ("width", "height"))
-    fx, fy = (place.at(repr(key)).focal(camera[key]) for key in ("fx", "fy"))
-    cx, cy = (
-        place.at(repr(key)).number(camera.get(key, side / 2))
-        for key, side in (("cx", width), ("cy", height))
-    )
+    size = [place.at(repr(key)).side(camera[key]) for key in ("width", "height")]
+    focal = [place.at(repr(key)).focal(camera[key]) for key in ("fx", "fy")]
     center = np.array(place.at("'position'").numbers(camera["position"], 3))
     name = place.at("'img_name'").text(camera.get("img_name", str(index)))
-    return place.view(name, axes.T, center, (fx, fy), (cx, cy), (width, height))
+    return place.view(name, axes.T, center, focal, place.principal(camera, size), size)
