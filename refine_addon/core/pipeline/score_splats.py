@@ -12,7 +12,7 @@ from ..costs import Plan
 from ..execute import Progress, silent
 from ..pace import phases
 from ..quality.alignment import alignment
-from ..quality.psnr import psnr_after, quality_curve
+from ..quality.psnr import quality_curve
 from ..scores import Scores
 from ..scoring import closed_form, occlusion
 from ..splats import Splats
@@ -135,13 +135,8 @@ def with_quality(
         return scores
     curve = quality_curve(
         scores.ray_sample, scores.values, protected=protected, settled=scores.settled,
-        progress=progress, threads=threads,
+        between=scores.between, progress=progress, threads=threads,
     )  # fmt: skip
-    if curve is not None and scores.between is not None:
-        between = psnr_after(
-            scores.between, scores.values, curve.shares, protected=protected, threads=threads
-        )
-        curve = replace(curve, between=between)
     return replace(scores, quality=curve)
 
 

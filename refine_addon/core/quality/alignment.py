@@ -16,21 +16,19 @@ in a small part of its picture.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..affine import QUARTERS
-from ..execute import Progress, chunks, part, report, run_all, silent
+from ..execute import Progress, part, report, run_all, silent
 from ..splats import Splats
-from ..views import View, ViewSet
+from ..views import ViewSet
 from ..visibility import frustum, projection
 from ..visibility.cast import cast, pixels
-from ..visibility.projection import Gaussians
-from ..visibility.scene import Scene
 
 SAMPLE = 4096
 """About so many splats are a sample of all; each is enlarged to the area of those it stands for."""
@@ -91,11 +89,11 @@ class Alignment:
     far: tuple[str, ...] = ()
 
     def notes(self) -> list[str]:
-        """Return what the user should know, in sentences."""
+        """What the user should know, in sentences."""
         return [note for note in (self.turned(), self.distant()) if note]
 
     def turned(self) -> str:
-        """Return a sentence if the views are to be turned, else ""."""
+        """A sentence if the views are to be turned, else ""."""
         if not self.turn:
             return ""
         if self.known:
@@ -110,7 +108,7 @@ class Alignment:
         )
 
     def distant(self) -> str:
-        """Return a sentence if views see the splats from far away, else ""."""
+        """A sentence if views see the splats from far away, else ""."""
         if not self.far:
             return ""
         count = "1 camera sees" if len(self.far) == 1 else f"{len(self.far):,} cameras see"
@@ -119,23 +117,19 @@ class Alignment:
         )
 
     def facts(self) -> dict[str, Any]:
-        """Return it as plain JSON values."""
-        return {
-            "turn": self.turn,
-            "known": self.known,
-            "fineness": [round(value, 4) for value in self.fineness],
-            "far": list(self.far),
-        }
+        """Plain JSON values of it."""
+        rounded = [round(value, 4) for value in self.fineness]
+        return {**vars(self), "fineness": rounded, "far": list(self.far)}
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Alignment:
-        """Return the alignment that `facts` describe; of malformed ones, that nothing is known."""
+        """The alignment that `facts` describe; of malformed ones, that nothing is known."""
         try:
-            stored = facts or {}
+            stored = dict(facts or {})
             turn, known = int(stored.get("turn", 0)), bool(stored.get("known", False))
             fineness = tuple(float(value) for value in stored.get("fineness", ()))
             far = tuple(str(name) for name in stored.get("far", ()))
-        except (AttributeError, TypeError, ValueError):
+        except (TypeError, ValueError):
             return cls()
         whole = turn in QUARTERS and len(fineness) in {0, len(QUARTERS)} and (known or fineness)
         return cls(turn if whole else 0, known, fineness, far)
@@ -183,20 +177,19 @@ def alignment(
         one_way = np.linalg.norm(views.rotations[:, 2].mean(axis=0)) >= ONE_WAY
         if used is None or one_way or in_pictures >= WHOLE * count:
             return unturned
-        rows = _spread_rows(splats, SAMPLE)
-        fineness = _fineness(splats, rows, used.spread(VIEWS), progress, threads)
+        fineness = _fineness(splats, used.spread(VIEWS), progress, threads)
     best = list(QUARTERS)[int(np.argmax(fineness))]
     turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
     return replace(unturned, turn=turn, fineness=fineness)
 
 
-def _spread_rows(splats: Splats, count: int) -> NDArray[np.int64]:
-    """Return the rows of at least `count` splats, if there are as many, evenly spread."""
+def _spread_rows(splats, count):
+    """Rows of at least `count` splats, if there are as many, evenly spread."""
     return np.arange(0, len(splats), max(len(splats) // count, 1))
 
 
-def _in_picture(means: NDArray[np.float64], view: View) -> NDArray[np.float64]:
-    """Return where those of some points, (n, 3), that lie in a view are in its picture, (2, m).
+def _in_picture(means, view):
+    """Where those of some points, (n, 3), that lie in a view are in its picture, (2, m).
 
     In depths, from the middle of the lens.
     """
@@ -204,30 +197,21 @@ def _in_picture(means: NDArray[np.float64], view: View) -> NDArray[np.float64]:
         local = view.rotation @ (means - view.center).T  # (3, n)
         planes = frustum.clip_planes(view, float(np.finfo(np.float64).tiny))
         local = local[:, frustum.contains(view, local, planes)]
-        return np.asarray(local[:2] / local[2])
+        return local[:2] / local[2]
 
 
-def _is_far(points: NDArray[np.float64], view: View) -> bool:
-    """Tell whether all that a view sees, (2, m), lies in a small part of its picture."""
+def _is_far(points, view):
+    """Whether all that a view sees, (2, m), lies in a small part of its picture."""
     if points.shape[1] < FEW:
         return False
     ordered, tenth = np.sort(points, axis=1), points.shape[1] // 10
     widths = ordered[:, -1 - tenth] - ordered[:, tenth]  # (2,)
-    spans = widths * (view.fx / view.width, view.fy / view.height)
-    return bool(spans.max() < SMALL)
+    return (widths * (view.fx / view.width, view.fy / view.height)).max() < SMALL
 
 
-def _fineness(
-    splats: Splats,
-    rows: NDArray[np.int64],
-    views: ViewSet,
-    progress: Progress,
-    threads: int | None,
-) -> tuple[float, ...]:
-    """Return the fineness of the pictures of views, turned by each of `QUARTERS`.
-
-    Of the splats, `rows`, (n,), stand for all.
-    """
+def _fineness(splats, views, progress, threads):
+    """Fineness of the pictures of views, turned by each of `QUARTERS`."""
+    rows = _spread_rows(splats, SAMPLE)
     stand_for = len(splats) / len(rows)
     sample = splats.take(rows)
     larger = np.asarray(sample.log_scales, np.float64) + 0.5 * np.log(stand_for)
@@ -236,40 +220,20 @@ def _fineness(
         sample, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
     ordered = [view for view, _ in views.by_distance()]
-    count, rotations = len(ordered), list(QUARTERS.values())
 
-    def fineness_of_turned(piece: slice) -> float:
-        turn, number = divmod(piece.start, count)
-        columns_and_rows = pixels(ordered[number], number, RAYS / count)
-        view = ordered[number].turned(rotations[turn])
-        return _fineness_of(gaussians, scene, view, columns_and_rows, stand_for)
+    def of_turned(item):
+        rotation, (number, view) = item
+        with np.errstate(under="ignore"):
+            footprints = projection.project(gaussians, scene, view.turned(rotation))
+            rays = cast(footprints, *pixels(view, number, RAYS / len(ordered)))
+            square = np.zeros(len(gaussians))  # px^2
+            square[footprints.index] = footprints.sigmas[0] * footprints.sigmas[1] / stand_for
+            square /= FINE**2 * view.width * view.height
+            _, owner, weight = rays.contributions()
+            return float((weight / (1.0 + square[rays.hit[owner]])).sum()) / rays.count
 
     fineness = run_all(
-        fineness_of_turned, chunks(len(QUARTERS) * count, 1),
+        of_turned, itertools.product(QUARTERS.values(), enumerate(ordered)),
         progress=part(progress, 0.2, 1.0), what="checking", threads=threads,
     )  # fmt: skip
-    return tuple(np.reshape(fineness, (len(QUARTERS), count)).mean(axis=1).tolist())
-
-
-def _fineness_of(
-    gaussians: Gaussians,
-    scene: Scene,
-    view: View,
-    columns_and_rows: tuple[NDArray[np.int64], NDArray[np.int64]],
-    stand_for: float,
-) -> float:
-    """Return the fineness of one picture, through the pixels in (C,) columns and (R,) rows.
-
-    Each Gaussian stands for `stand_for` splats, and its footprint is as much larger.
-    """
-    with np.errstate(under="ignore"):
-        footprints = projection.project(gaussians, scene, view)
-        rays = cast(footprints, *columns_and_rows)
-        if not len(rays.ray):
-            return 0.0
-        square = np.zeros(len(gaussians))  # px^2
-        square[footprints.index] = footprints.sigmas[0] * footprints.sigmas[1] / stand_for
-        square /= FINE**2 * view.width * view.height
-        _, owner, weight = rays.contributions()
-        total = float((weight / (1.0 + square[rays.hit[owner]])).sum())
-    return total / rays.count
+    return tuple(np.reshape(fineness, (len(QUARTERS), -1)).mean(axis=1).tolist())

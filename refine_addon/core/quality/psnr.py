@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, part, run_all, silent
+from ..execute import Progress, part, run_all, silent
 from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import projection
@@ -21,16 +23,36 @@ from ..visibility.ray_sample import RaySample, cast_colored
 from ..visibility.rays import Rays
 from .curve import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
 
-Compare = Callable[[int, Rays], Sequence[float]]
-
 MIN_RAYS_WITH_HITS = 256
 """So many rays must hit a splat at least, or nothing is estimated."""
+
+
+def psnr_of(colors: NDArray[Any], truth: NDArray[Any], view: View) -> float:
+    """PSNR of a view, dB, given the colours of its rays with other and with all splats.
+
+    The logarithm of a mean over few rays is too low on average: by half the square of the mean's
+    relative error, to second order. This is corrected. The variance is that between neighbouring
+    rays, so that differences between parts of the picture do not count as chance.
+
+    Parameters
+    ----------
+    colors, truth : (3, P) floating
+    view : View
+    """
+    errors = np.mean((colors - truth) ** 2, axis=0, dtype=np.float64)
+    mean, count = float(np.mean(errors)), len(errors)
+    if mean <= 10.0 ** (-PSNR_CAP / 10.0):
+        return PSNR_CAP
+    unsampled = 1.0 - count / (view.width * view.height)  # with all pixels the mean is exact
+    variance = float(np.sum(np.diff(errors) ** 2)) / 2.0 / max(count - 1, 1)
+    relative = unsampled * variance / count / mean**2
+    return min(-10.0 * math.log10(mean) - 5.0 / math.log(10.0) * relative, PSNR_CAP)
 
 
 def psnr_kept(
     sample: RaySample, keep: NDArray[np.bool_], *, threads: int | None = None
 ) -> float | None:
-    """Return the estimated PSNR with only some splats kept, dB; None if too little is seen.
+    """Mean PSNR of all views with only some splats kept, dB; None if too little is seen.
 
     Parameters
     ----------
@@ -39,32 +61,11 @@ def psnr_kept(
     keep : (N,) bool
     threads : int, optional
     """
-    psnr = _mean_after(sample, keep.astype(np.int64), [1], threads)
-    return None if psnr is None else float(psnr[0])
-
-
-def psnr_after(
-    sample: RaySample,
-    values: NDArray[np.float32],
-    shares: Sequence[float] | NDArray[np.float64],
-    *,
-    protected: NDArray[np.bool_] | None = None,
-    threads: int | None = None,
-) -> NDArray[np.float64] | None:
-    """Return the mean PSNR of all views with some shares removed, (L,), dB; None if little is seen.
-
-    Parameters
-    ----------
-    sample : RaySample
-        Of all N splats.
-    values, protected
-        See `quality_curve`.
-    shares : (L,) float
-        Ascending.
-    threads : int, optional
-    """
-    counts = [math.floor(share * len(values)) for share in shares]
-    return _mean_after(sample, _places(values, protected), counts, threads)
+    if not _enough(sample):
+        return None
+    views = sample.seeing()
+    removing = _removing(sample, keep.astype(np.int64)[sample.splat_rows], [1])
+    return float(_mean(sample, _of_views(sample, removing, views, silent, threads), views)[0])
 
 
 def quality_curve(
@@ -73,10 +74,11 @@ def quality_curve(
     *,
     protected: NDArray[np.bool_] | None = None,
     settled: int | None = None,
+    between: RaySample | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Quality | None:
-    """Return the estimated PSNR at each of `quality.SHARES`; None if too little is seen.
+    """Estimated PSNR at each of `curve.SHARES`; None if too little is seen.
 
     Parameters
     ----------
@@ -89,6 +91,8 @@ def quality_curve(
     settled : int, optional
         How many splats are in their final order, see `Scores`: the curve ends there, and is None
         if that is before the first of its shares.
+    between : RaySample, optional
+        Of views between those of `sample`.
     progress : callable, optional
     threads : int, optional
 
@@ -104,22 +108,35 @@ def quality_curve(
         [count for share in shares if (count := math.floor(share * len(values))) <= last]
         for shares in (SHARES, ABSORBED_SHARES)
     )
-    if not removed:
+    if not removed or not _enough(sample):
         return None
-    place, views = _places(values, protected)[sample.splat_rows], sample.seeing()
-    of_views = _of_each_view(
-        sample, _removing(sample, place, removed), views, part(progress, 0.0, 0.5), threads
-    )
-    if of_views is None:
-        return None
+    order = np.argsort(values, kind="stable")
+    if protected is not None:
+        order = order[np.argsort(protected[order], kind="stable")]
+    place = np.empty(len(order), np.int64)  # of each splat in the order of removal
+    place[order] = np.arange(len(order))
+
+    def removing(rays_of: RaySample, progress: Progress) -> NDArray[np.float64]:
+        compare = _removing(rays_of, place[rays_of.splat_rows], removed)
+        return _of_views(rays_of, compare, rays_of.seeing(), progress, threads)
+
+    def gaining(number: int, rays: Rays) -> list[float]:
+        """By how much the PSNR is higher if kept splats stand in."""
+        view, colors = sample.views[number][0], sample.colors(number, rays)
+        truth, gains, place_of_hit = rays.colors(colors), [], place[sample.splat_rows[rays.hit]]
+        for count in absorbed:
+            keep = place_of_hit >= count  # (u,)
+            deleted = rays.keeping(keep).colors(colors)
+            stood_in = rays.colors_by_nearest_kept(colors, keep)
+            gains.append(psnr_of(stood_in, truth, view) - psnr_of(deleted, truth, view))
+        return gains
+
+    of_views, seeing = removing(sample, part(progress, 0.0, 0.5)), sample.seeing()
     validating = sample.validating()
-    gains = _of_each_view(
-        sample, _gaining(sample, place, absorbed), validating, part(progress, 0.5, 1.0), threads
-    )
-    assert gains is not None
-    psnr = np.minimum.accumulate(_mean(sample, of_views, views))
-    names = [sample.views[number][0].name for number in views]
-    return Quality(
+    gains = _of_views(sample, gaining, validating, part(progress, 0.5, 1.0), threads)
+    psnr = np.minimum.accumulate(_mean(sample, of_views, seeing))
+    names = [sample.views[number][0].name for number in seeing]
+    curve = Quality(
         np.array(SHARES[: len(removed)]),
         psnr,
         absorbed_from(psnr, _mean(sample, gains, validating), len(values)),
@@ -127,6 +144,10 @@ def quality_curve(
         dict(zip(names, np.minimum.accumulate(of_views, axis=1), strict=True)),
         sample.hits_of_ray(),
     )
+    if between is not None and _enough(between):
+        means = _mean(between, removing(between, silent), between.seeing())
+        curve = replace(curve, between=np.minimum.accumulate(means))
+    return curve
 
 
 def psnr_against(
@@ -137,7 +158,7 @@ def psnr_against(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> float | None:
-    """Return the estimated PSNR with other splats instead, dB; None if too little is seen.
+    """Estimated PSNR with other splats instead, dB; None if too little is seen.
 
     Parameters
     ----------
@@ -173,7 +194,7 @@ def mean_psnr(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> float | None:
-    """Return the mean PSNR, dB, of the pictures that other rays see; None if too little is seen.
+    """Mean PSNR, dB, of the pictures that other rays see; None if too little is seen.
 
     Parameters
     ----------
@@ -191,128 +212,49 @@ def mean_psnr(
         truth = rays.colors(sample.colors(number, rays))
         return [psnr_of(other.colors(colors), truth, sample.views[number][0])]
 
+    if not _enough(sample):
+        return None
     numbers = sample.validating()
-    psnr = _of_each_view(sample, compare, numbers, progress, threads)
-    return None if psnr is None else float(_mean(sample, psnr, numbers)[0])
+    return float(_mean(sample, _of_views(sample, compare, numbers, progress, threads), numbers)[0])
 
 
-def _mean_after(
-    sample: RaySample, places: NDArray[np.int64], counts: Sequence[int], threads: int | None
-) -> NDArray[np.float64] | None:
-    """Return the mean PSNR of all views after each of L removals, (L,), dB.
-
-    None if too little is seen. `places`, (N,), is that of each splat in the order of removal; see
-    `_removing`.
-    """
-    views = sample.seeing()
-    compare = _removing(sample, places[sample.splat_rows], counts)
-    psnr = _of_each_view(sample, compare, views, silent, threads)
-    return None if psnr is None else np.minimum.accumulate(_mean(sample, psnr, views))
+def _enough(sample):
+    """Whether enough rays of all views hit a splat."""
+    return sum(rays.hitting for rays in sample.rays if rays) >= MIN_RAYS_WITH_HITS
 
 
-def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]) -> Compare:
-    """Return a function that gives the PSNR of one view after each of L removals, dB.
+def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]):
+    """A function that gives the PSNR of one view after each of L removals, dB.
 
-    `place`, (M,), is that of each of the Gaussians in the order of removal: those whose place is
+    `place`, (M,), is that of each of the Gaussians in an order of removal: those whose place is
     below one of the ascending `counts` are removed.
     """
 
     def compare(number: int, rays: Rays) -> list[float]:
         view, colors = sample.views[number][0], sample.colors(number, rays)
-        truth, psnr = rays.colors(colors), []
-        left, place_of_hit = rays, place.take(rays.hit)
+        truth, psnr, place_of_hit = rays.colors(colors), [], place.take(rays.hit)
         for count in counts:
             # What is removed stays removed: the lists of hits grow shorter.
-            left = left.keeping(place_of_hit >= count)
-            psnr.append(psnr_of(left.colors(colors), truth, view))
+            rays = rays.keeping(place_of_hit >= count)
+            psnr.append(psnr_of(rays.colors(colors), truth, view))
         return psnr
 
     return compare
 
 
-def _gaining(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]) -> Compare:
-    """Return a function that gives by how much the PSNR is higher if kept splats stand in.
+def _of_views(sample, compare, numbers, progress, threads):
+    """Results of ``compare(number, rays)`` for each of v views, (v, L)."""
 
-    See `Rays.colors_by_nearest_kept`; parameters as `_removing`.
-    """
-
-    def compare(number: int, rays: Rays) -> list[float]:
-        view, colors = sample.views[number][0], sample.colors(number, rays)
-        truth, gains, place_of_hit = rays.colors(colors), [], place.take(rays.hit)
-        for count in counts:
-            keep = place_of_hit >= count  # (u,)
-            deleted = rays.keeping(keep).colors(colors)
-            stood_in = rays.colors_by_nearest_kept(colors, keep)
-            gains.append(psnr_of(stood_in, truth, view) - psnr_of(deleted, truth, view))
-        return gains
-
-    return compare
-
-
-def _of_each_view(
-    sample: RaySample,
-    compare: Compare,
-    numbers: Sequence[int],
-    progress: Progress,
-    threads: int | None,
-) -> NDArray[np.float64] | None:
-    """Return what `compare` returns for each of v views, (v, L).
-
-    None if too few rays of all views hit a splat.
-    """
-    if sample.hitting(range(len(sample.rays))) < MIN_RAYS_WITH_HITS:
-        return None
-
-    def compare_one(piece: slice) -> Sequence[float]:
-        number = numbers[piece.start]
-        rays = sample.rays[number]
-        assert rays is not None
+    def compare_one(number: int) -> Sequence[float]:
         with np.errstate(under="ignore"):
-            return compare(number, rays)
+            return compare(number, sample.rays[number])
 
-    values = run_all(
-        compare_one, chunks(len(numbers), 1), progress=progress, what="estimating", threads=threads
+    return np.array(
+        run_all(compare_one, numbers, progress=progress, what="estimating", threads=threads)
     )
-    return np.array(values)
 
 
-def _mean(
-    sample: RaySample, values: NDArray[np.float64], numbers: Sequence[int]
-) -> NDArray[np.float64]:
-    """Return the mean of values of some views, (v, L), weighted as the views are, (L,)."""
+def _mean(sample, values, numbers):
+    """Mean of values of some views, (v, L), weighted as the views are, (L,)."""
     weights = np.array([sample.views[number][1] for number in numbers])
-    return np.asarray(weights @ values / weights.sum())
-
-
-def _places(
-    values: NDArray[np.float32], protected: NDArray[np.bool_] | None = None
-) -> NDArray[np.int64]:
-    """Return the place of each of N splats in the order of removal, (N,); see `quality_curve`."""
-    order = np.argsort(values, kind="stable")
-    if protected is not None:
-        order = order[np.argsort(protected[order], kind="stable")]
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    return place
-
-
-def psnr_of(colors: NDArray[np.float64], truth: NDArray[np.float64], view: View) -> float:
-    """Return the PSNR of a view, dB, given the colours of its rays with other and all splats.
-
-    The logarithm of a mean over few rays is too low on average: by half the square of the mean's
-    relative error, to second order. This is corrected. The variance is that between neighbouring
-    rays, so that differences between parts of the picture do not count as chance.
-
-    Parameters
-    ----------
-    colors, truth : (3, P) float64
-    view : View
-    """
-    errors = np.mean((colors - truth) ** 2, axis=0)
-    mean, count = float(np.mean(errors)), len(errors)
-    if mean <= 10.0 ** (-PSNR_CAP / 10.0):
-        return PSNR_CAP
-    unsampled = 1.0 - count / (view.width * view.height)  # with all pixels the mean is exact
-    variance = float(np.sum(np.diff(errors) ** 2)) / 2.0 / max(count - 1, 1)
-    relative = unsampled * variance / count / mean**2
-    return min(-10.0 * math.log10(mean) - 5.0 / math.log(10.0) * relative, PSNR_CAP)
+    return weights @ values / weights.sum()

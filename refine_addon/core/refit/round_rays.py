@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .. import costs
 from ..costs import Plan
 from ..execute import Progress, chunks, part, return_freed, run
-from ..quality.curve import PSNR_CAP
+from ..quality.psnr import psnr_of
 from ..spherical_harmonics import single_colors
 from ..splats import Splats
 from ..views import View, ViewSet
@@ -62,7 +62,6 @@ _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
 _CHUNK = 1 << 14
 _EVERY = 2  # validation rays go through every second row of a round's rays
 _NOTHING = 1e-30  # hits of a ray; keeps a division finite
-_LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,11 +356,10 @@ class RoundRays:
             told = self._each(truth, windows, self._count, part(progress, 0.0, 0.5))
             self._validation = list(told)
         gaussians = self._gaussians(splats, part(progress, 0.5, 0.6))
-        work = _CastErrors(self.target(splats, gaussians), windows, self._validation)
-        errors = [*self._each(work, windows, len(splats), part(progress, 0.6, 1.0))]
+        work = _CastPsnr(self.target(splats, gaussians), windows, self._validation)
+        psnr = [*self._each(work, windows, len(splats), part(progress, 0.6, 1.0))]
         return_freed()
-        weights = [window.weight for window in windows]
-        return float(np.average(-10.0 * np.log10(errors), weights=weights))
+        return float(np.average(psnr, weights=[window.weight for window in windows]))
 
     def target(self, splats: Splats, gaussians: Gaussians) -> Target:
         """Return what rays are cast into: survivors, given also as Gaussians, the first of all."""
@@ -447,7 +445,7 @@ class CastTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class _CastErrors:
+class _CastPsnr:
     """Casts rays of a view into survivors, and compares colours; any process can."""
 
     target: Target
@@ -455,15 +453,14 @@ class _CastErrors:
     truths: Sequence[Truth]
 
     def __call__(self, number: int) -> float:
-        """Return the mean squared error of the colours that the rays of a view see."""
+        """PSNR of the colours that the rays of a view see, dB."""
         window, truth = self.windows[number], self.truths[number]
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
             rays, transmittance = cast_visible(footprints, truth.columns, truth.rows)
             colors = self.target.colors(rays.hit, window.view)
             seen = rays.composited(transmittance * rays.alpha, colors)
-        error = np.mean(np.square(truth.colors - seen), dtype=np.float64)
-        return float(max(error, _LEAST_ERROR))
+        return psnr_of(seen, truth.colors, window.part)
 
 
 @dataclass(frozen=True, eq=False)

@@ -149,10 +149,6 @@ class RaySample:
         every = [rays for rays in self.rays if rays is not None]
         return sum(len(rays.ray) for rays in every) / max(sum(rays.count for rays in every), 1)
 
-    def hitting(self, numbers: Sequence[int]) -> int:
-        """Return how many rays of some views hit a splat."""
-        return sum(rays.hitting for rays in (self.rays[number] for number in numbers) if rays)
-
 
 def validation_rays(
     splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
