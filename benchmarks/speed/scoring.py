@@ -21,7 +21,6 @@ from pathlib import Path
 import numpy as np
 
 from refine_addon.core import (
-    ClosedForm,
     Occlusion,
     Settings,
     Splats,
@@ -79,11 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     counts = [count for count in (100_000, 1_000_000, 3_000_000, 10_000_000) if count <= largest]
     for count in counts:
         splats = repeated(replace(room, sh_rest=room.sh_rest[:, :0]), count)
-        for label, reading in (("default", ClosedForm()), ("paper", ClosedForm.published("z"))):
-            settings = Settings("closed-form", closed_form=reading)
-            seconds = median_seconds(lambda s=splats, t=settings: score(s, views, t), runs)
-            each = seconds / count / 64 * 1e9
-            print(f"  {label:8} {count:>11,} splats  {seconds:7.3f} s  {each:6.2f} ns")
+        settings = Settings("closed-form")
+        seconds = median_seconds(lambda s=splats, t=settings: score(s, views, t), runs)
+        print(f"  {count:>11,} splats  {seconds:7.3f} s  {seconds / count / 64 * 1e9:6.2f} ns")
 
     print("\nclosed form, 1 M splats: seconds by number of views")
     splats = repeated(replace(room, sh_rest=room.sh_rest[:, :0]), 1_000_000)

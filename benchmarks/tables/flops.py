@@ -19,23 +19,23 @@ from typing import Any, ClassVar, get_args, get_type_hints
 import numpy as np
 
 from refine_addon.core.scoring import closed_form, occlusion
-from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.splats import ARRAYS, Splats
 from refine_addon.core.task import Settings
 from refine_addon.core.views import ViewSet
 
+from ..baselines.refine import refine
 from ..renderer import rasterizer
 
 READINGS = ("z", "distance", "default")
 ANALYTIC = {
-    "z: a row of four products and three sums": (7, 7, 7),
+    "z: a row of four products and three sums; published, three differences more": (8, 0, 7),
     "x', y': two more rows": (0, 0, 14),
     "abs(x'), abs(y'), their maximum less z, a comparison: the frustum": (0, 0, 5),
     "two comparisons, two products: what is inside, and what reaches inside": (0, 0, 4),
-    "d^2: z z, or three differences, products and sums": (1, 9, 1),
-    "+ eta, the division, weight and sum": (4, 4, 4),
+    "d^2: z z, or three differences and products, two sums": (1, 8, 1),
+    "+ eta, the division, weight and sum; published, weight / (d^2 + eta)": (3, 3, 4),
 }
-"""Term -> operations of a splat and a view, for both published readings and the default, in a view
+"""Term -> operations of a splat and a view, for both published readings and ours, in a view
 that sees a part of the splats around it; the few that reach into it from outside are left out."""
 
 PER_HIT = 34
@@ -127,14 +127,7 @@ class Counts:
 
 def measure(splats: Splats, views: ViewSet) -> Counts:
     """Count every method of the core, and the hits of rendering."""
-    settings = {
-        "refine-z": Settings("closed-form", views=0, closed_form=ClosedForm.published("z")),
-        "refine-distance": Settings(
-            "closed-form", views=0, closed_form=ClosedForm.published("distance")
-        ),
-    }
-    for name in get_args(get_type_hints(Settings)["method"]):
-        settings[name] = Settings(views=0, method=name)
+    names = ["refine-z", "refine-distance", *get_args(get_type_hints(Settings)["method"])]
     if len(splats) > MOST_SPLATS:
         drawn = np.random.default_rng(0).choice(len(splats), MOST_SPLATS, replace=False)
         sample = splats.take(np.sort(drawn))
@@ -142,9 +135,9 @@ def measure(splats: Splats, views: ViewSet) -> Counts:
         sample = splats
     few, many = (views.take(np.arange(n) % len(views)) for n in (16, 32))
     found, failed = [], {}
-    for name, each in settings.items():
+    for name in names:
         try:
-            less, more = (count(sample, v, each) / len(sample) for v in (few, many))
+            less, more = (count(sample, v, name) / len(sample) for v in (few, many))
         except (TypeError, ValueError, AttributeError, IndexError) as error:
             failed[name] = f"{type(error).__name__}: {error}"
             continue
@@ -156,16 +149,18 @@ def measure(splats: Splats, views: ViewSet) -> Counts:
     return Counts(found, failed, len(splats), len(views), hits)
 
 
-def count(splats: Splats, views: ViewSet, settings: Settings) -> int:
-    """Return how many operations the method takes, without what is said of the views besides."""
+def count(splats: Splats, views: ViewSet, method: str) -> int:
+    """Return how many operations a method takes, without what is said of the views besides."""
     arrays = {name: np.asarray(getattr(splats, name)).view(Counting) for name in ARRAYS}
     with _counted():
         Counting.total = 0
         with np.errstate(under="ignore"):
-            if settings.method == "occlusion":
-                occlusion.score(Splats(**arrays), views, settings.occlusion, threads=1)
+            if method == "occlusion":
+                occlusion.score(Splats(**arrays), views, threads=1)
+            elif method == "closed-form":
+                closed_form.score(Splats(**arrays), views, threads=1)
             else:
-                closed_form.score(Splats(**arrays), views, settings.closed_form, threads=1)
+                refine(Splats(**arrays), views, method.removeprefix("refine-"))
         return Counting.total
 
 

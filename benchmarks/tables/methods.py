@@ -19,12 +19,12 @@ from refine_addon import core
 from refine_addon.core import Settings
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.scores import Scores
-from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import ARRAYS, Splats
 from refine_addon.core.views import ViewSet
 
 from ..baselines import merging, rap, splat_transform
+from ..baselines.refine import refine
 from ..baselines.rendered import BASELINES, RENDERED, ROUNDS, removed_in_rounds
 from ..renderer.rasterizer import Statistics
 
@@ -169,15 +169,16 @@ def _external() -> list[Method]:
 def _published() -> list[Method]:
     """Return both published readings of the closed form."""
     readings = {"z": "the paper's formulas", "distance": "its authors' public code"}
-    return [
-        _scoring(
-            f"refine-{depth}",
-            LITERATURE,
-            f"REFINE's closed form, {text} (`ClosedForm.published({depth!r})`)",
-            Settings("closed-form", views=0, closed_form=ClosedForm.published(depth)),
-        )
-        for depth, text in readings.items()
-    ]
+    methods = []
+    for depth, text in readings.items():
+
+        def score(task: Task, statistics: Statistics | None, depth: str = depth) -> Scores:
+            del statistics
+            return as_scores(refine(task.splats, task.views, depth), len(task.views))
+
+        about = f"REFINE's closed form, {text} (`baselines/refine.py`)"
+        methods.append(Method(f"refine-{depth}", LITERATURE, about, score=score))
+    return methods
 
 
 CORE_ABOUT = {

@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from refine_addon.core import Settings, score
-from refine_addon.core.scoring.closed_form_settings import ClosedForm
+from refine_addon import core
+from refine_addon.core import Scores, Settings
 from refine_addon.core.scoring.occlusion import Occlusion
 
+from ..baselines.refine import refine
 from .evaluate import Evaluator
-from .methods import Task
+from .methods import Task, as_scores
+
+Score = Callable[[Task], Scores]
 
 
-def _occlusion(views: int = 0, **changes: float) -> Settings:
-    return Settings("occlusion", views=views, occlusion=Occlusion(**changes))
+def _by(settings: Settings) -> Score:
+    return lambda task: core.score(task.splats, task.views, settings)
+
+
+def _occlusion(views: int = 0, **changes: float) -> Score:
+    return _by(Settings("occlusion", views=views, occlusion=Occlusion(**changes)))
+
+
+def _published(depth: str, **changes: bool) -> Score:
+    return lambda task: as_scores(
+        refine(task.splats, task.views, depth, **changes), len(task.views)
+    )
 
 
 CHEAPER = {
@@ -32,11 +45,6 @@ CHEAPER = {
 }
 """Occlusion made cheaper: how much accuracy each way to save time costs."""
 
-_READINGS = {
-    "published, z": lambda **parts: ClosedForm.published("z", **parts),
-    "published, distance": lambda **parts: ClosedForm.published("distance", **parts),
-    "default": ClosedForm,
-}
 _PARTS = {
     "whole": {},
     "without visibility": {"visibility": False},
@@ -44,11 +52,11 @@ _PARTS = {
     "equal weights": {"equal_weights": True},
 }
 ABLATION = {
-    f"{reading}: {part}": Settings("closed-form", views=0, closed_form=make(**changes))
-    for reading, make in _READINGS.items()
+    f"published, {depth}: {part}": _published(depth, **changes)
+    for depth in ("z", "distance")
     for part, changes in _PARTS.items()
-}
-"""The closed form without its parts, as the paper takes it apart, in each of its readings."""
+} | {"default: whole": _by(Settings("closed-form", views=0))}
+"""The closed form as published, and without its parts as the paper takes it apart; and ours."""
 
 
 @dataclass(frozen=True)
@@ -70,13 +78,13 @@ class Line:
 
 
 def measure(
-    variants: Mapping[str, Settings], task: Task, evaluator: Evaluator, ratios: Sequence[float]
+    variants: Mapping[str, Score], task: Task, evaluator: Evaluator, ratios: Sequence[float]
 ) -> list[Line]:
-    """Score by each of the settings and compare what stays."""
+    """Score in each way and compare what stays."""
     lines = []
-    for name, settings in variants.items():
+    for name, score in variants.items():
         start = time.perf_counter()
-        scores = score(task.splats, task.views, settings)
+        scores = score(task)
         seconds = time.perf_counter() - start
         psnr = evaluator.psnr(task.splats, scores, ratios)
         lines.append(Line(name, seconds, psnr))

@@ -96,7 +96,7 @@ def _check_settings(options: argparse.Namespace) -> None:
     if scoring.refit.rounds is not None and options.survivors != "refit":
         raise RefineError(f"rounds is {scoring.refit.rounds}, expected only with --survivors refit")
     if options.command == "prune":
-        budget(options).refuse_meaningless(frustum=scoring.frustum)
+        budget(options)
 
 
 def open_blend() -> str:

@@ -22,7 +22,6 @@ from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, Scor
 from .pipeline import prune, score
 from .refit.refit import Refit, Refitted, refit, refit_rounds
 from .scores import Scores
-from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .solid import Solid
@@ -47,7 +46,6 @@ __all__ = [
     "CleanRequest",
     "Cleaned",
     "Cleaning",
-    "ClosedForm",
     "ConvertRequest",
     "Level",
     "Levels",

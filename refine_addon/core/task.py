@@ -13,7 +13,6 @@ from .execute import Cancelled
 from .merging.absorb import Absorbed
 from .refit.refit import Refit
 from .scores import Scores
-from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .selection import Budget, RowBytes
 from .splats import Splats, among_all
@@ -37,16 +36,14 @@ class Settings:
         as hidden, and is the fastest.
     views : int
         Use at most this many views, spread evenly; 0 uses all.
-    closed_form : ClosedForm
     occlusion : Occlusion
-        Settings of these methods.
+        Settings of this method.
     refit : Refit
         Settings of refitting.
     """
 
     method: Literal["occlusion", "closed-form"] = "occlusion"
     views: int = 64
-    closed_form: ClosedForm = field(default_factory=ClosedForm)
     occlusion: Occlusion = field(default_factory=Occlusion)
     refit: Refit = field(default_factory=Refit)
 
@@ -56,11 +53,6 @@ class Settings:
             raise RefineError(f"method is {self.method!r}, expected one of {', '.join(METHODS)}")
         if self.views < 0:
             raise RefineError(f"views is {self.views}, expected 0 (all) or more")
-
-    @property
-    def frustum(self) -> bool:
-        """Whether `Scores.seen` counts only views in whose frustum a splat lies; see `Scores`."""
-        return self.method != "closed-form" or self.closed_form.frustum
 
     @property
     def estimates(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 
@@ -279,8 +280,9 @@ def test_a_budget_that_means_nothing_to_the_scores_is_refused(
     settings, core = bpy.context.scene.refine, addon.core
     settings.views, settings.survivors = 4, survivors
     checked = addon.mesh.layout.check(room)
-    asked = core.Settings(method, 4, core.ClosedForm(frustum=False))
+    asked = core.Settings(method, 4)
     scores = core.score(addon.objects.splat_object.gather(checked), room_views, asked)
+    scores = replace(scores, frustum=False)
     addon.mesh.scores.store(checked, scores, addon.mesh.scores.Provenance(asked))
     settings.budget = kind
     addon.ui.plans.refresh(bpy.context)

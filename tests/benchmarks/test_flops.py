@@ -11,9 +11,7 @@ pytest.importorskip("numba")
 
 from benchmarks.tables import flops
 from benchmarks.tables.flops import ANALYTIC, READINGS, Counting
-from refine_addon.core import Settings
 from refine_addon.core.scoring import closed_form
-from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View, ViewSet
 
@@ -48,14 +46,10 @@ def test_what_is_no_arithmetic_counts_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reading", "settings"),
-    [
-        ("default", ClosedForm()),
-        ("z", ClosedForm.published("z")),
-        ("distance", ClosedForm.published("distance")),
-    ],
+    ("reading", "method"),
+    [("default", "closed-form"), ("z", "refine-z"), ("distance", "refine-distance")],
 )
-def test_the_table_is_what_the_closed_form_does(reading: str, settings: ClosedForm) -> None:
+def test_the_table_is_what_the_closed_form_does(reading: str, method: str) -> None:
     """32 views less 16, over 16 views and the splats; a fifth is of the boxes of runs."""
     rng = np.random.default_rng(0)
     count = 3000
@@ -74,17 +68,16 @@ def test_the_table_is_what_the_closed_form_does(reading: str, settings: ClosedFo
         )
     )
     expected = sum(term[READINGS.index(reading)] for term in ANALYTIC.values())
-    options = Settings("closed-form", views=0, closed_form=settings)
 
-    few = flops.count(splats, views.take(range(16)), options)
-    many = flops.count(splats, views, options)
+    few = flops.count(splats, views.take(range(16)), method)
+    many = flops.count(splats, views, method)
 
     assert (many - few) / 16 / count == pytest.approx(expected, abs=0.3)
     assert closed_form.np is np
 
 
 def test_the_table_s_terms_are_whole_numbers_of_all_readings() -> None:
-    """12 for z, 20 for the distance, 35 for the default."""
+    """12 for z, 11 for the distance, 35 for ours."""
     totals = [math.fsum(term[reading] for term in ANALYTIC.values()) for reading in range(3)]
 
-    assert totals == [12, 20, 35]
+    assert totals == [12, 11, 35]

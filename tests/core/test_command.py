@@ -326,7 +326,7 @@ def test_the_report_of_a_prune_is_complete_and_plain(folder):
     for name in ("input", "output"):
         size = (folder / entry["files"][name]).stat().st_size
         assert size == entry["files"][f"{name}_bytes"]
-    assert entry["settings"]["closed_form"]["depth"] == "z"
+    assert entry["settings"]["method"] == "closed-form"
     assert math.isclose(1.0, sum(entry["weights"]["lambda"].values()))
     assert {"read_s", "score_s", "select_s", "write_s", "total_s"} == set(entry["timings"])
     assert 0 < entry["timings"]["total_s"] <= report["seconds"]

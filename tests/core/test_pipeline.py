@@ -15,7 +15,6 @@ import pytest
 from refine_addon.core import (
     Budget,
     Cancelled,
-    ClosedForm,
     Occlusion,
     PruneRequest,
     RefineError,
@@ -32,8 +31,8 @@ from refine_addon.core import (
     select,
 )
 from refine_addon.core.pipeline import absorb_splats, decide
-from refine_addon.core.scoring.adaptive import Statistics, lambdas
-from refine_addon.core.scoring.closed_form_block import LUMA
+from refine_addon.core.scoring import closed_form
+from refine_addon.core.scoring.closed_form import LUMA, lambdas
 from refine_addon.core.selection import rank
 from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
@@ -229,11 +228,9 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
     low, middle_one, high = np.sort(splats.log_scales.astype(np.float64), axis=1).T
     luma = (0.28209479177387814 * splats.sh_dc.astype(np.float64) + 0.5).clip(0, 1) @ LUMA
     factors = lambdas(
-        Statistics(
-            float(np.mean(np.minimum(np.exp(high - low), 1e6))),
-            float(np.var(luma)),
-            float(np.mean(4 * alpha * (1 - alpha))),
-        )
+        float(np.mean(np.minimum(np.exp(high - low), 1e6))),
+        float(np.var(luma)),
+        float(np.mean(4 * alpha * (1 - alpha))),
     )
     values = np.zeros(len(means))
     for share, content in zip(factors, (np.exp(middle_one + high), luma**2, alpha**2), strict=True):
@@ -254,11 +251,10 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
 def test_closed_form_of_floats_keeps_the_splats_that_doubles_keep(file, views):
     """At every tenth: against the same numbers as doubles, and against the formula in doubles."""
     splats = file.splats()
-    for form in (ClosedForm(), ClosedForm("distance"), ClosedForm.published("z")):
-        settings = Settings("closed-form", closed_form=form)
-        scores = score(splats, views, settings)
+    for form in ({}, {"depth": "distance"}, {"depth": "distance", "frustum": False}):
+        scores = closed_form.score(splats, views, **form)
 
-        assert agreement(scores, score(wide(splats), views, settings)) == [1.0] * 9
+        assert agreement(scores, closed_form.score(wide(splats), views, **form)) == [1.0] * 9
 
     assert agreement(score(splats, views, FAST), in_doubles(splats, views)) == [1.0] * 9
 
@@ -478,14 +474,6 @@ def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small
     result = prune(splats, views, Budget(threshold=median), FAST, survivors="absorb")
 
     assert np.count_nonzero(result.keep) == pytest.approx(len(splats) / 2, abs=1)
-
-
-def test_without_the_frustum_test_no_number_of_views_is_counted(small, views):
-    """Every view would count as seeing every splat."""
-    published = Settings("closed-form", closed_form=ClosedForm.published("z"))
-
-    with pytest.raises(RefineError, match="min_seen would remove none"):
-        prune(read_ply(small).splats(), views, Budget(min_seen=3), published)
 
 
 @pytest.mark.slow

@@ -12,7 +12,6 @@ import pytest
 from refine_addon.core import (
     Budget,
     Cancelled,
-    ClosedForm,
     RefineError,
     Scores,
     Settings,
@@ -423,15 +422,6 @@ def test_every_method_reaches_a_psnr(method, goal):
     assert result.report["estimated_psnr"] == pytest.approx(goal, abs=0.6)
     assert result.report["budget"] == {"psnr": goal}
     assert not result.keep.all()
-
-
-def test_published_scores_reach_it_too():
-    """They see every splat from every view, yet the estimate is that of the pictures."""
-    settings = Settings("closed-form", closed_form=ClosedForm.published("distance"))
-
-    result = prune(cloud(), ring(), Budget(psnr=30.0), settings)
-
-    assert result.report["estimated_psnr"] == pytest.approx(30.0, abs=0.6)
 
 
 @pytest.mark.slow

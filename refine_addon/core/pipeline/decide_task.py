@@ -363,8 +363,6 @@ def _scores_of(
             curve = with_quality(known[0], protected=task.protected, threads=threads)
             known = curve, known[1]
         return known[0], known
-    # `select` checks this too, but only after the work.
-    task.budget.refuse_meaningless(frustum=task.settings.frustum)
     scores = score(
         splats,
         views,

@@ -92,9 +92,7 @@ def score(
                 settled=settled, progress=scoring, threads=threads,
             )  # fmt: skip
         else:
-            scores = closed_form.score(
-                splats, used, settings.closed_form, progress=scoring, threads=threads
-            )
+            scores = closed_form.score(splats, used, progress=scoring, threads=threads)
         if quality and scores.ray_sample is None:
             rays = validation_rays(splats, used, progress=casting, threads=threads)
             scores = replace(scores, ray_sample=rays)

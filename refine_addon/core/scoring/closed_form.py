@@ -13,43 +13,101 @@ frustum. And the more is removed, the more a splat counts relative to those arou
     D'_i  = D_i / m_i^(w_i / 2),    w_i = D_i / (D_i + .05)
 
 with D in units of its mean, and m_i its mean over the splats in the same cell of a coarse grid.
+
+Splats are read once, in chunks, and may lie in files: 49 bytes of each are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Any
+import math
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import radix
 from ..errors import RefineError
-from ..execute import Progress, chunks, default_threads, part, run_all, silent
+from ..execute import Progress, chunks, run_all, silent, stages
 from ..rendering import NEAR_RELATIVE
 from ..scores import Scores
-from ..splats import Splats, refuse_undrawable
+from ..splats import Splats, base_color, drawable, opacity, refuse_undrawable
 from ..views import ViewSet
+from ..visibility.frustum import Frustums
 from ..visibility.scene import principal_axes, size_of
-from . import adaptive
-from .closed_form_block import CELLS, HIGHEST, ROWS, Frame, NeighbourhoodSums, RowBlock
-from .closed_form_settings import DEFAULTS, ETA_RELATIVE, ClosedForm
+from .nearness import near_order
 
-Each = Callable[..., Iterable[Any]]
+LUMA = (0.299, 0.587, 0.114)
+"""Factors of red, green and blue in the luma (Rec. 601)."""
 
-SHARES = {"read": 0.2, "count": 0.0, "sum_views": 0.75, "add": 0.0, "compare": 0.0}
-"""How much of the time each step takes, for progress; the other steps are too short to tell."""
+CALIBRATION = (10.73, 56.06, 100.67)
+"""Means of the three statistics over the calibration scenes of REFINE's authors."""
 
-WHAT = {"read": "reading", "count": "reading"}
-"""What progress is told of a step; of the others "scoring"."""
+RATIO_LIMIT = 1e6
+"""Axis ratios above this count as this, so that one flat disk does not make the mean infinite."""
+
+ETA_RELATIVE = 0.005
+"""Eta over the squared size of the scene: the paper's .05 at a viewing distance of 3 m."""
+
+UNSEEN = 1e-6
+"""A splat that no view sees has H = this / (squared distance to the views + eta): such splats are
+ordered by distance, and nearly always below all that are seen."""
+
+REACH = 2.0
+"""Standard deviations along its longest axis that a splat reaches into an image from outside."""
+
+LOCAL_HALF = 0.05
+"""Score, in units of the mean, at which w is 1/2; see the top of this file."""
+
+CELLS = 64
+"""Cells of the neighbourhoods along each axis."""
+
+ROWS = 1 << 18
+"""Splats whose order and whose sums over cells are computed together; the last bits of scores
+depend on it."""
+
+_CHUNK = 4096
+_RUN = 1000
+"""Splats processed together: so few that their projections into 64 views stay in the L2 cache, and
+not a multiple of the page size, at which loads and stores alias."""
+
+_VIEW_BLOCK = 64
+_SMALLEST_AREA = -300.0  # natural logarithm
+_SMALLEST_SQUARE = 1e-300
+_NOISE = 1e-12  # a smaller statistic counts as 0: rounding leaves about this much of a zero
+
+
+class Rows(Protocol):
+    """Splats in memory, or read when a slice is taken."""
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+
+    def take(self, piece: slice, /) -> Splats:
+        """Return some of them; an empty slice has the dtypes of all."""
+
+
+class _Columns(NamedTuple):
+    """What the formula needs of N splats."""
+
+    good: NDArray[np.bool_]  # which can be drawn
+    means: NDArray[np.floating[Any]]  # (N, 3)
+    alpha: NDArray[np.float64]
+    area: NDArray[np.float64]  # product of the two largest scales
+    reach: NDArray[np.float64]  # how far outside an image it still counts, world units
+    luma: NDArray[np.float32]  # 0..1, to 6e-8
+
+    def three_g(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
+        """G of a slice for geometry, colour and opacity, (n,) each."""
+        luma, alpha = self.luma[piece].astype(np.float64), self.alpha[piece]
+        return self.area[piece], luma * luma, alpha * alpha
 
 
 def score(
-    splats: Splats,
+    splats: Rows,
     views: ViewSet,
-    settings: ClosedForm = DEFAULTS,
     *,
+    depth: Literal["z", "distance"] = "z",
+    frustum: bool = True,
+    local: bool = True,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
@@ -57,14 +115,20 @@ def score(
 
     Parameters
     ----------
-    splats : Splats
-        In the frame and unit of the views.
+    splats : Splats or Rows
+        N splats in the frame and unit of the views.
     views : ViewSet
         All of them are used.
-    settings : ClosedForm
+    depth : {"z", "distance"}
+        Depth along the view's axis, or distance to its centre.
+    frustum : bool
+        Whether only views that a splat lies in, or reaches into, count for it.
+    local : bool
+        Whether a splat counts relative to those around it.
     progress : callable, optional
         See `refine_addon.core.execute.Progress`.
     threads : int, optional
+        The scores are the same bits for any number.
 
     Returns
     -------
@@ -78,194 +142,349 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
-    total, middle = len(splats), views.middle()
-    pieces = [*chunks(total, ROWS)]
-    threads = default_threads() if threads is None else threads
-    inner = max(threads // max(len(pieces), 1), 1)  # threads of a block
-    blocks = [
-        RowBlock(splats.take(piece), views, settings, middle, threads=inner) for piece in pieces
-    ]
-    done = 0.0
-
-    def each(step: str, *arguments: Any) -> list[Any]:
-        nonlocal done
-        progress_of_step = part(progress, done, done + SHARES[step])
-        done += SHARES[step]
-        if len(blocks) == 1:
-            blocks[0].progress = progress_of_step
-        return run_all(
-            lambda piece: blocks[piece.start].step(step, *arguments), chunks(len(blocks), 1),
-            progress=progress_of_step, what=WHAT.get(step, "scoring"), threads=threads,
-        )  # fmt: skip
-
-    scene = steps(each, total, views, settings)
-    values, seen = (
-        np.concatenate([getattr(block, name) for block in blocks]) for name in ("values", "seen")
-    )
-    return Scores(
-        values=values,
-        seen=seen,
-        views_used=len(views),
-        undrawable=scene.undrawable,
-        facts=scene.facts,
-        method="closed-form",
-        frustum=settings.frustum,
-    )
-
-
-@dataclass(frozen=True)
-class SceneFacts:
-    """What the steps tell of all splats together.
-
-    Attributes
-    ----------
-    undrawable : int
-        How many cannot be drawn.
-    size : float
-        Of the scene, see `scene.Scene`.
-    facts : dict of str to Any
-        See `Scores`.
-    """
-
-    undrawable: int
-    size: float
-    facts: dict[str, Any]
-
-
-def steps(
-    each: Each,
-    total: int,
-    views: ViewSet,
-    settings: ClosedForm,
-    *,
-    remember: Callable[[str, Callable[[], Any]], Any] = lambda _name, make: make(),
-) -> SceneFacts:
-    """Score splats block by block; each `RowBlock` has its scores afterwards.
-
-    Parameters
-    ----------
-    each : callable
-        ``each(step, *arguments)`` does a step with every block of rows, and returns what came of
-        it in the order of the blocks. Results are put together in that order, so they are the
-        same bits wherever and whenever blocks are computed.
-    total : int
-        How many splats there are.
-    views, settings
-        See `score`.
-    remember : callable, optional
-        ``remember(name, make)`` returns what `make` returns, or returned in an earlier run: blocks
-        drop the arrays that the frame is computed from.
-
-    Raises
-    ------
-    RefineError
-        See `score`.
-    """
+    total = len(splats)
     if not total:
         raise RefineError("there are no splats to score")
-    tallies, moments, highest = _joined(each("read"))
+    reading, summing, completing, comparing = stages(progress, 0.2, 0.67, 0.08, 0.05)
+    origin, spread = views.middle()
+    columns, squared, tallies, moments = _read(splats, origin, spread, reading, threads)
     good = int(tallies[:, 0].sum())
     refuse_undrawable(good, total)
-    axes, eta, near, size = remember(
-        "frame", lambda: _frame(each, good, moments, highest, settings)
+    # A median, so that a few far splats hardly change it.
+    used = squared if good == total else squared[columns.good]
+    size = size_of(float(np.median(used, overwrite_input=True)))
+    del squared, used
+    eta, near = ETA_RELATIVE * size * size, NEAR_RELATIVE * size
+    counted = _Views(views, origin, near, eta, by_distance=depth == "distance", frustum=frustum)
+    visibility, seen = _sum_views(columns, counted, summing, threads)
+    axes = principal_axes(moments) / size
+    cells = np.zeros(total if local else 0, np.int32)
+
+    def complete(piece: slice) -> list[float]:
+        points = np.empty((3, piece.stop - piece.start))
+        np.subtract(columns.means[piece].T, origin[:, None], out=points)
+        alone = visibility[piece]
+        with np.errstate(under="ignore"):
+            if not alone.all():
+                away = np.einsum("in,in->n", points, points) + spread + eta
+                alone[:] = np.where(alone == 0.0, UNSEEN / away, alone)
+            alone *= columns.alpha[piece]
+            alone *= columns.good[piece]
+            sums = [float(np.sum(alone * g)) for g in columns.three_g(piece)]
+            if local:
+                cells[piece] = _cells(axes @ points)
+        seen[piece] *= columns.good[piece]
+        return [*sums, float(np.sum(seen[piece]))]
+
+    sums = np.array(
+        run_all(
+            complete, chunks(total, _CHUNK), progress=completing, what="scoring", threads=threads
+        )
     )
-    sums = np.concatenate([*each("sum_views", Frame(axes, float(eta), float(near)))])
-    if settings.frustum and not sums[:, 3].any():
+    if frustum and not sums[:, 3].any():
         raise RefineError(
             f"no camera sees the splats: none of {total} lies in the frustum of any of "
             f"{len(views)} views; check that cameras and splats share their frame and unit"
         )
     statistics = _statistics(tallies)
-    lambdas = _lambdas(statistics, settings)
+    weights = lambdas(**statistics)
     means = np.sum(sums[:, :3], axis=0) / total  # of H G, for each of the three G
-    factors = np.divide(lambdas, means, out=np.zeros(3), where=means > 0.0)
-    of_neighbourhoods = _powers(each("add", factors), local=settings.local)
-    for _ in each("compare", *of_neighbourhoods):
-        pass
-    facts = {
-        "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
-        "statistics": vars(statistics).copy(),
-    }
-    return SceneFacts(total - good, float(size), facts)
+    factors = np.divide(weights, means, out=np.zeros(3), where=means > 0.0)
+    values = np.empty(total, np.float32)
+
+    def add(piece: slice) -> None:
+        with np.errstate(under="ignore"):
+            terms = zip(factors, columns.three_g(piece), strict=True)
+            whole = sum(factor * (visibility[piece] * g) for factor, g in terms)
+            _store(values, whole, columns.good, piece)
+
+    run_all(add, chunks(total, 4 * _CHUNK), progress=comparing, what="scoring", threads=threads)
+    if local:
+        _compare(values, cells, columns.good, threads)
+    return Scores(
+        values, seen, len(views), total - good,
+        {
+            "lambda": dict(zip(("geometry", "color", "opacity"), weights, strict=True)),
+            "statistics": statistics,
+        },
+        method="closed-form", frustum=frustum,
+    )  # fmt: skip
 
 
-def _joined(
-    read: Iterable[tuple[Any, ...]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Return what `RowBlock.read` tells of all blocks together.
+def lambdas(
+    anisotropy: float, luma_variance: float, translucency: float
+) -> tuple[float, float, float]:
+    """Lambda of geometry, colour and opacity: each in [0, 1], their sum 1 (REFINE, Eq. 17-20).
 
-    The tallies of all chunks, (chunks, 5), the sum of their moments, (4, 3), and how often each
-    value of the highest digit occurs, (1, 65536).
+    ``ln(F_gem) / 10.73``, ``100 F_col / 56.06`` and ``100 F_opa / 100.67``, divided by their sum,
+    with the constants of the authors' code. If all three are 0, all lambdas are equal.
+
+    Parameters
+    ----------
+    anisotropy : float
+        F_gem, mean of longest over shortest axis, 1 or more.
+    luma_variance : float
+        F_col, variance of the luma, which lies in 0..1.
+    translucency : float
+        F_opa times 4, mean of 4 alpha (1 - alpha), in 0..1.
+
+    Examples
+    --------
+    >>> [round(value, 3) for value in lambdas(10.73, 0.05, 0.5)]
+    [0.274, 0.111, 0.615]
     """
-    tallies, moments, *highest = zip(*read, strict=True)
-    digits = radix.added(map(radix.Sparse, *highest))
-    return np.concatenate(tallies), np.sum(np.concatenate(moments), axis=0), digits
+    raw = (math.log(anisotropy), 100.0 * luma_variance, 100.0 * translucency)
+    terms = [value / usual for value, usual in zip(raw, CALIBRATION, strict=True)]
+    terms = [term if term > _NOISE else 0.0 for term in terms]
+    total = sum(terms)
+    return (
+        (terms[0] / total, terms[1] / total, terms[2] / total) if total else (1 / 3, 1 / 3, 1 / 3)
+    )
 
 
-def _lambdas(statistics: adaptive.Statistics, settings: ClosedForm) -> tuple[float, float, float]:
-    """Return lambda of geometry, colour and opacity."""
-    if settings.equal_weights:
-        return (1 / 3, 1 / 3, 1 / 3)
-    return adaptive.lambdas(statistics, offset=settings.anisotropy_offset or 0.0)
+def _read(
+    splats: Rows,
+    origin: NDArray[np.float64],
+    spread: float,
+    progress: Progress,
+    threads: int | None,
+) -> tuple[_Columns, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Columns, squared distances to the views, tallies of chunks, and sums for `principal_axes`."""
+    count = len(splats)
+    kind = splats.take(slice(0, 0)).means.dtype.newbyteorder("=")
+    alphas, area, reach = np.empty((3, count))
+    lumas = np.empty(count, np.float32)
+    columns = _Columns(
+        np.empty(count, np.bool_), np.empty((count, 3), kind), alphas, area, reach, lumas
+    )
+    squared = np.empty(count)
+
+    def read(piece: slice) -> tuple[tuple[float, ...], NDArray[np.float64]]:
+        chunk = splats.take(piece).by_columns()
+        good = columns.good[piece] = drawable(chunk)  # (n,)
+
+        def clean(values: NDArray[Any], instead: float = 0.0) -> NDArray[Any]:
+            keep = good.reshape(-1, *[1] * (values.ndim - 1))
+            return values if good.all() else np.where(keep, values, values.dtype.type(instead))
+
+        means = columns.means[piece] = clean(chunk.means)
+        offset = means - origin  # (n, 3)
+        # Values that underflow to 0 are negligible in the sums.
+        with np.errstate(under="ignore"):
+            squared[piece] = np.einsum("ij,ij->i", offset, offset) + spread
+            alpha = columns.alpha[piece] = opacity(clean(chunk.opacity_logits, -np.inf))
+            red, green, blue = base_color(clean(chunk.sh_dc)).T
+            columns.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+            logs = clean(chunk.log_scales).astype(np.float64)
+            if chunk.model == "2dgs":  # how long they are is told by the axes that they have
+                logs[:, 2] = logs[:, :2].min(axis=1)
+            columns.area[piece], ratio, longest = _axes(logs)
+            columns.reach[piece] = REACH * longest
+            alpha, luma = alpha[good], columns.luma[piece][good].astype(np.float64)
+            mean = luma.sum() / max(len(luma), 1)
+            squares = np.sum(np.square(luma - mean))
+            translucency = np.sum(4.0 * alpha * (1.0 - alpha))
+            # Nearer than this, the products underflow anyway.
+            weighted = offset / np.maximum(squared[piece], _SMALLEST_SQUARE)[:, None]
+            weighted[~good] = 0.0
+            moments = np.vstack([weighted.T @ offset, weighted.sum(axis=0)])
+        return (len(luma), ratio[good].sum(), translucency, mean, squares), moments
+
+    results = run_all(
+        read, chunks(count, 4 * _CHUNK), progress=progress, what="reading", threads=threads
+    )
+    tallies, moments = zip(*results, strict=True)
+    return columns, squared, np.array(tallies), np.sum(moments, axis=0)
 
 
-def _frame(
-    each: Each,
-    good: int,
-    moments: NDArray[np.float64],
-    highest: NDArray[np.int64],
-    settings: ClosedForm,
-) -> tuple[NDArray[np.float64], float, float, float]:
-    """Return what `Frame` takes, and the scene's size, of which eta and near plane are multiples.
-
-    The size is a median over splats, so a few far splats hardly change it. Of the splats `good` can
-    be drawn; for `moments`, (4, 3), and `highest` see `_joined`.
-    """
-
-    def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
-        return highest if shift == HIGHEST else radix.added(each("count", prefixes, shift))
-
-    size = size_of(radix.median(count, np.dtype(np.float64), good))
-    axes = principal_axes(moments) / size  # (3, 3)
-    eta = ETA_RELATIVE * size * size if settings.eta is None else settings.eta
-    return axes, eta, NEAR_RELATIVE * size, size
+def _axes(logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Product of the two largest scales, longest over shortest, and longest, (n,) each."""
+    a, b, c = logs.T  # (n,) each
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    largest, smallest = np.maximum(high, c), np.minimum(low, c)
+    middle = np.maximum(low, np.minimum(high, c))
+    ratio = np.minimum(largest - np.maximum(smallest, -1e300), np.log(RATIO_LIMIT))
+    area = np.maximum(largest + middle, _SMALLEST_AREA)
+    return np.exp(area), np.exp(ratio), np.exp(largest)
 
 
-def _powers(
-    neighbourhoods: Iterable[NeighbourhoodSums | None], *, local: bool
-) -> tuple[NDArray[np.float64] | None, float]:
-    """Return the powers of `RowBlock.compare`, and the mean score of all."""
-    if not local:
-        for _ in neighbourhoods:
-            pass
-        return None, 0.0
-    powers, count, end = np.zeros(CELLS**3), np.zeros(CELLS**3, np.int64), 0
-    for of_block in neighbourhoods:
-        assert of_block is not None
-        cells, sums, counts = of_block
-        powers[cells] += sums
-        count[cells] += counts
-        end = max(end, int(cells[-1]) + 1)
-    # Cut behind the last occupied cell: more zeros would change the pairs of NumPy's pairwise sum.
-    powers, count = powers[:end], count[:end]
-    overall = float(powers.sum() / count.sum())
-    # Sums, means and logarithms in turn, in place.
-    powers /= np.maximum(count, 1)
-    powers /= overall
-    np.maximum(powers, np.finfo(np.float32).tiny, out=powers)
-    np.log(powers, out=powers)
-    powers *= -0.5
-    return powers, overall
-
-
-def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
-    """Return the statistics of a scene; for `tallies`, (chunks, 5), see `RowBlock.read`."""
+def _statistics(tallies: NDArray[np.float64]) -> dict[str, float]:
+    """The arguments of `lambdas`, from the tallies of chunks."""
     count, ratios, translucency, luma, squares = tallies.T  # (chunks,) each
     total = count.sum()
     # Variance within the chunks plus variance of their means: sums of squares do not cancel.
     around = luma - luma @ count / total
-    return adaptive.Statistics(
-        anisotropy=float(ratios.sum() / total),
-        luma_variance=float((squares.sum() + around * around @ count) / total),
-        translucency=float(translucency.sum() / total),
+    return {
+        "anisotropy": float(ratios.sum() / total),
+        "luma_variance": float((squares.sum() + around * around @ count) / total),
+        "translucency": float(translucency.sum() / total),
+    }
+
+
+def _sum_views(
+    columns: _Columns, counted: _Views, progress: Progress, threads: int | None
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """H without its factor alpha, which takes the place of `reach`; views that each lies in."""
+    total = len(columns.good)
+    seen, order = np.empty(total, np.int32), np.arange(total, dtype=np.int32)
+
+    def sort(rows: slice) -> None:
+        order[rows] = rows.start + near_order(columns.means[rows])
+
+    def sum_views(piece: slice) -> None:
+        rows = order[piece]
+        points = np.ones((4, len(rows)))  # x, y, z, 1
+        near = np.take(columns.means, rows, axis=0)
+        np.subtract(near.T, counted.origin[:, None], out=points[:3])
+        columns.reach[rows], seen[rows] = counted.sums(points, columns.reach[rows])
+
+    if counted.frustum:  # else every view counts for all, wherever they lie
+        run_all(sort, chunks(total, ROWS), threads=threads)
+    run_all(
+        sum_views, chunks(total, 8 * _CHUNK), progress=progress, what="scoring", threads=threads
     )
+    return columns.reach, seen
+
+
+class _Views:
+    """Views that sum what splats are worth to them."""
+
+    def __init__(
+        self,
+        views: ViewSet,
+        origin: NDArray[np.float64],
+        near: float,
+        eta: float,
+        *,
+        by_distance: bool,
+        frustum: bool,
+    ) -> None:
+        self.origin, self.weights, self.eta = origin, views.weights, eta
+        self.by_distance, self.frustum = by_distance, frustum
+        self.frustums = Frustums(views, origin, near)
+
+    def sums(
+        self, points: NDArray[np.float64], reach: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """H without alpha, and the number of views that each lies in, of n splats, (n,) each.
+
+        `points` is (4, n) around the origin, `reach` (n,). Splats of a run lie near each other, so
+        most views see none of them, and many see all.
+        """
+        starts = np.arange(0, len(reach), _RUN)
+        low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
+        visibility, seen = np.empty(len(reach)), np.empty(len(reach), np.int32)
+        with np.errstate(under="ignore"):
+            if self.frustum:
+                reaches = np.maximum.reduceat(reach, starts)
+                touching, whole = self.frustums.classify(low, high, reaches)
+            else:
+                touching = whole = np.ones((len(self.weights), len(starts)), np.bool_)
+            # Views of which a run is partly outside come first, then those that see all of it.
+            views = np.argsort(whole * 1 - touching * 2, axis=0, kind="stable")  # (V, runs)
+            counts = np.count_nonzero(touching, axis=0).tolist()
+            partly = np.count_nonzero(touching & ~whole, axis=0).tolist()
+            for run, start in enumerate(starts.tolist()):
+                here = slice(start, start + _RUN)
+                visibility[here], seen[here] = self._of_run(
+                    points[:, here], reach[here], views[: counts[run], run], partly[run]
+                )
+        return visibility, seen
+
+    def _of_run(
+        self,
+        points: NDArray[np.float64],
+        reach: NDArray[np.float64],
+        views: NDArray[np.int64],
+        partly: int,
+    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """The same of a run that some views see, (v,); the first `partly` of them not all of it."""
+        total = np.zeros(len(reach))
+        seen = np.full(len(reach), len(views) - partly, np.int32)
+        for start in range(0, len(views), _VIEW_BLOCK):
+            some = views[start : start + _VIEW_BLOCK]
+            count = min(max(partly - start, 0), len(some))
+            depth, beyond, between = self.frustums.project(points, some, count)
+            if count:
+                inside = beyond <= 0.0  # (c, n)
+                inside &= between
+                # A byte can count the at most 64 views of a block.
+                seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
+                # Few pairs reach inside from outside: what follows is computed for these alone.
+                limit = reach * self.frustums.beyond_per_unit[some[:count]]  # (c, n)
+                index = np.flatnonzero((between > inside) & (beyond < limit))
+                view, splat = np.divmod(index, len(reach))
+                away = beyond.ravel()[index]
+                share = 1.0 - away / limit.ravel()[index]
+                # The depth at which the image is wide enough for the centre.
+                across = np.square(depth.ravel()[index] + away)
+            squared = self._squared(points, depth, some)
+            if count and self.by_distance:
+                across = squared[view, splat]
+            squared += self.eta
+            counted = np.divide(1.0, squared, out=squared)
+            if count:
+                counted[:count] *= inside
+            summed = np.einsum("v,vn->n", self.weights[some], counted)
+            if count:
+                share /= across + self.eta
+                summed += np.bincount(splat, self.weights[some[view]] * share, len(reach))
+            total += summed
+        return total, seen
+
+    def _squared(
+        self, points: NDArray[np.float64], depth: NDArray[np.float64], views: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """d^2, (V, n); `depth` is overwritten by it."""
+        if not self.by_distance:
+            return np.multiply(depth, depth, out=depth)
+        depth[:] = 0.0
+        for axis in range(3):
+            step = points[axis] - self.frustums.centers[views, axis, None]
+            depth += np.multiply(step, step, out=step)
+        return depth
+
+
+def _cells(place: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Neighbourhoods of places in scene sizes, (3, n); `place` is overwritten."""
+    # All of space is mapped into a ball, so cells grow with the distance.
+    place *= CELLS / 2 / (1.0 + np.sqrt(np.einsum("in,in->n", place, place)))
+    x, y, z = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
+    return np.asarray((x * CELLS + y) * CELLS + z)
+
+
+def _compare(
+    values: NDArray[np.float32],
+    cells: NDArray[np.int32],
+    good: NDArray[np.bool_],
+    threads: int | None,
+) -> None:
+    """Divide each score by a power of the mean score around it."""
+    end = int(cells.max()) + 1
+    powers, count = np.zeros(end), np.zeros(end, np.int64)
+    for rows in chunks(len(values), ROWS):
+        sums = np.bincount(cells[rows], values[rows])
+        powers[: len(sums)] += sums
+        count[: len(sums)] += np.bincount(cells[rows][good[rows]], minlength=len(sums))
+    overall = float(powers.sum() / count.sum())
+    powers /= np.maximum(count, 1)
+    powers /= overall
+    powers = -0.5 * np.log(np.maximum(powers, np.finfo(np.float32).tiny))
+
+    def compare(piece: slice) -> None:
+        plain = values[piece].astype(np.float64)
+        weight = plain / (plain + LOCAL_HALF * overall)
+        with np.errstate(under="ignore"):
+            _store(values, plain * np.exp(weight * powers[cells[piece]]), good, piece)
+
+    run_all(compare, chunks(len(values), 4 * _CHUNK), threads=threads)
+
+
+def _store(
+    into: NDArray[np.float32], values: NDArray[np.float64], good: NDArray[np.bool_], piece: slice
+) -> None:
+    """Set the scores of some splats, where underflow is ignored; undrawable ones score 0."""
+    stored = values.astype(np.float32)
+    # A drawable splat must not tie with undrawable ones by underflow.
+    np.maximum(stored, np.finfo(np.float32).tiny, out=stored, where=good[piece])
+    into[piece] = stored

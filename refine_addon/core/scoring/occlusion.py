@@ -21,6 +21,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,6 @@ from ..visibility.measuring import SECONDS, Measured, Measuring, Sampling
 from ..visibility.projection import Gaussians
 from ..visibility.ray_sample import RaySample
 from . import closed_form, coverage
-from .closed_form_settings import ClosedForm
 from .removal_rounds import RemovalRounds
 
 LEAST = 0.1
@@ -50,8 +50,8 @@ EXPONENT = 0.25
 BETWEEN_RAYS = 0.375
 """How many rays they have together, as a part of `VALIDATION_RAYS`."""
 
-PRIOR = ClosedForm("distance", frustum=False, local=False)
-"""Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
+PRIOR: dict[str, Any] = {"depth": "distance", "frustum": False, "local": False}
+"""The closed form of the floor: without frustum test, as splats that no view shows need one too."""
 
 
 @dataclass(frozen=True)
@@ -429,7 +429,7 @@ class MemoryScoring(OcclusionScoring):
         )
         refuse_undrawable(int(np.count_nonzero(good)), len(good))
         measuring = Measuring(scene, views, settings, threads)
-        prior = closed_form.score(splats, views, PRIOR, progress=scoring, threads=threads).values
+        prior = closed_form.score(splats, views, **PRIOR, progress=scoring, threads=threads).values
         rays = RaySample(measuring.views, gaussians, splats, few_views=few_views)
         super().__init__(gaussians, measuring, settings.rounds, prior, ~good, rays)
         if settings.rounds > 1:

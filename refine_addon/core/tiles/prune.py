@@ -36,7 +36,7 @@ from ..report import (
     remark,
 )
 from ..scores import Scores
-from ..scoring.closed_form_block import ROWS
+from ..scoring.closed_form import ROWS
 from ..selection import Budget, refuse_none_left
 from ..survivor_choice import Became
 from ..urls import Url
@@ -229,7 +229,6 @@ class TilesRequest(Request[TileScene, TileDecision]):
             )
         if budget.psnr is not None and not settings.estimates:
             raise RefineError(f"over tiles {settings.method} estimates no PSNR: choose occlusion")
-        budget.refuse_meaningless(frustum=settings.frustum)
 
     def costs(self, scene: TileScene) -> list[Plan]:
         """Return what the steps are expected to cost; see `Request.costs`."""
@@ -313,7 +312,7 @@ class TilesRequest(Request[TileScene, TileDecision]):
         """
         settings, absorb = self.prune.settings, self.prune.absorb
         used = self.prune.views.spread(settings.views)
-        closed_form = ClosedFormContext(scene.folder, used, settings.closed_form, used.middle())
+        closed_form = ClosedFormContext(scene.folder, used, {}, used.middle())
         if absorb:
             measured = measured_once(closed_form, scene.units, settings, runners)
             return measured.scores, measured

@@ -19,7 +19,7 @@ from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..formats.registry import read_splats
 from ..rendering import MODELS, Model
-from ..scoring.closed_form_block import ROWS
+from ..scoring.closed_form import ROWS
 from ..splats import Splats, joined, with_model
 from ..urls import Url
 from . import storage
