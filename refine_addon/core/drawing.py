@@ -22,8 +22,7 @@ from .visibility import projection
 from .visibility.cast import hits
 from .visibility.projection import Footprints
 from .visibility.ray_sample import colors_from
-from .visibility.ray_sums import in_front
-from .visibility.rays import LOG_OPAQUE
+from .visibility.rays import LOG_OPAQUE, in_front
 from .visibility.scene import Scene
 
 _PIXELS = 1 << 15  # drawn at a time, about, which limits temporary memory

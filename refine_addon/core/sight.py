@@ -18,7 +18,7 @@ from .views import View, ViewSet
 from .visibility import projection
 from .visibility.cast import hits
 from .visibility.projection import Footprints, Gaussians
-from .visibility.ray_sums import in_front
+from .visibility.rays import in_front
 from .visibility.scene import Scene
 
 LIGHT_LEFT = 0.1

@@ -36,7 +36,7 @@ from refine_addon.core.scoring.closed_form import LUMA, lambdas
 from refine_addon.core.selection import rank
 from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
-from refine_addon.core.visibility import froxels, lattices, points, projection, ray_sums
+from refine_addon.core.visibility import froxels, lattices, points, projection, rays
 from refine_addon.core.visibility.measuring import Measured
 from refine_addon.core.visibility.scene import principal_axes
 from tests.strategies import plain_header, ply_of, splat_names
@@ -281,7 +281,7 @@ def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     some = views.take(range(0, len(views), every))
     settings = Settings("occlusion", occlusion=Occlusion(rounds=rounds))
     scores = score(file.splats(), some, settings)
-    for module in (projection, lattices, points, froxels, ray_sums):
+    for module in (projection, lattices, points, froxels, rays):
         monkeypatch.setattr(module, "np", Doubles())
     monkeypatch.setattr(projection, "_by_depth", lambda depth: np.argsort(depth, kind="stable"))
     gaussians, frame, _ = projection.prepare(wide(file.splats()), some)

@@ -25,8 +25,7 @@ from ..views import View
 from ..visibility import projection
 from ..visibility.cast import aimed, cast, depth_complexity, pixels
 from ..visibility.projection import Footprints, Gaussians
-from ..visibility.ray_sums import in_front
-from ..visibility.rays import Rays
+from ..visibility.rays import Rays, in_front
 from ..visibility.scene import Scene
 
 RAYS = 2500

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,7 @@ square (the R2 sequence, Roberts 2018)."""
 
 
 def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the columns and rows of a view through which about `count` rays go, spread evenly.
+    """Columns and rows of a view through which about `count` rays go, spread evenly.
 
     Parameters
     ----------
@@ -61,13 +60,13 @@ def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], 
 
 
 def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
-    """Return `count` of `size` pixels, evenly spread and ascending; `start` shifts them, 0 to 1."""
+    """`count` of `size` pixels, evenly spread and ascending; `start` shifts them, 0 to 1."""
     places = (np.arange(count) + start) * (size / count)
-    return np.asarray(np.floor(places), np.int64)
+    return np.floor(places).astype(np.int64)
 
 
 def depth_complexity(footprints: Footprints, view: View) -> float:
-    """Return about how many footprints a ray of a view hits on average, at most all of them."""
+    """About how many footprints a ray of a view hits on average, at most all of them."""
     size = float(view.width * view.height)
     area = _squared_radius(footprints.alphas)  # (n,), px^2
     area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
@@ -75,12 +74,9 @@ def depth_complexity(footprints: Footprints, view: View) -> float:
 
 
 def aimed(
-    view: View,
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    targets: NDArray[np.float32],
+    view: View, columns: NDArray[np.int64], rows: NDArray[np.int64], targets: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """Return which pixel each ray goes through so that rays pass through targets, (2, P).
+    """Pixel that each ray goes through so that rays pass through targets, (2, P).
 
     The columns and rows divide the image into cells of one ray each. A ray goes through the first
     of the targets that lie in its cell, or where its column and row cross if none does.
@@ -109,7 +105,7 @@ def aimed(
     )
     ray, first = np.unique(down * len(columns) + across, return_index=True)
     aims[:, ray] = pixel[:, first]
-    return np.asarray(aims, np.int64)
+    return aims
 
 
 def cast(
@@ -118,7 +114,7 @@ def cast(
     rows: NDArray[np.int64],
     aims: NDArray[np.int64] | None = None,
 ) -> Rays:
-    """Return the rays through some pixels with all that they hit.
+    """Rays through some pixels with all that they hit.
 
     A ray hits a footprint where its alpha there is at least `ALPHA_CUT`. Discs are hit where the
     ray meets their plane: see `projection.Footprints.discs`.
@@ -132,45 +128,51 @@ def cast(
     aims : (2, P) int64, optional
         See `aimed`.
     """
-    found = hits(footprints, columns, rows, _PAIRS, aims=aims)
-    return _front_to_back(footprints, (columns, rows, aims), found)
+    return _front_to_back(
+        footprints, columns, rows, aims, hits(footprints, columns, rows, _PAIRS, aims=aims)
+    )
 
 
 def cast_visible(
     footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]
 ) -> VisibleRays:
-    """Return what `Rays.visible` does of `cast`, and do not follow rays on behind opaque hits.
+    """The same as `Rays.visible` of `cast`, without following rays on behind opaque hits.
 
     Footprints come front to back, some at a time: it is known of each ray how much is left of it.
     """
     log_left = np.zeros(len(columns) * len(rows))
 
-    def found() -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
+    def found():
         for piece in hits(footprints, columns, rows, _PAIRS, wanted):
             yield piece
             log_left[:] += np.bincount(piece[1], np.log1p(-piece[2]), len(log_left))
 
-    def wanted(_footprint: NDArray[np.int64], ray: NDArray[np.int32]) -> NDArray[np.bool_]:
-        return np.asarray((log_left > LOG_OPAQUE - _MARGIN).take(ray))
+    def wanted(_footprint, ray):
+        return (log_left > LOG_OPAQUE - _MARGIN).take(ray)
 
-    return _front_to_back(footprints, (columns, rows, None), found()).visible()
+    return _front_to_back(footprints, columns, rows, None, found()).visible()
 
 
-def _front_to_back(
-    footprints: Footprints,
-    through: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64] | None],
-    found: Iterable[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]],
-) -> Rays:
-    """Return rays with their hits, as `hits` yields them; for what rays go through see `cast`."""
-    pieces = [_compact(np.empty(0), np.empty(0), np.empty(0))]
-    pieces += [_compact(*piece) for piece in found]
+def _front_to_back(footprints, columns, rows, aims, found):
+    """Rays with their hits, as `hits` yields them; for what they go through see `cast`."""
+    # The smallest types hold them. A view has fewer than 2^16 rays: NumPy sorts numbers of 16 bits
+    # by radix, in linear time.
+    types = np.int32, np.uint16, np.float32
+    pieces = [[np.empty(0, kind) for kind in types]]
+    pieces += [[*map(np.ndarray.astype, piece, types)] for piece in found]
     footprint, ray, alpha = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
     order = np.argsort(ray, kind="stable")  # footprints are front to back, and so stay hits
-    hit, owner = _members(footprints.index, footprint.take(order))
-    alpha, (columns, rows, aims) = alpha.take(order), through
+    used = np.zeros(len(footprints.index), np.bool_)
+    used[footprint] = True
+    members = np.flatnonzero(used)
+    members = members[np.argsort(footprints.index[members])]  # (u,)
+    place = np.empty(len(used), np.int32)  # of each footprint among those that are hit
+    place[members] = np.arange(len(members))
+    alpha = alpha.take(order)
     return Rays(
-        columns, rows, ray.take(order).astype(np.int32), owner, alpha, np.log1p(-alpha), hit, aims
-    )
+        columns, rows, ray.take(order).astype(np.int32), place.take(footprint.take(order)), alpha,
+        np.log1p(-alpha), footprints.index[members], aims,
+    )  # fmt: skip
 
 
 def hits(
@@ -213,10 +215,14 @@ def hits(
         _bounding_boxes(footprints, squared_radius, axis, places)
         for axis, places in enumerate((columns, rows))
     )
-    if aims is not None:
-        across, down = _with_cell_before(across), _with_cell_before(down)
+    if aims is not None:  # the cell before may reach into the box
+        across, down = (
+            (np.maximum(first - 1, 0), count + (first > 0)) for first, count in (across, down)
+        )
     boxed = np.flatnonzero(across[1] * down[1] > 0)  # (r,)
-    for start, end in _slices((across[1] * down[1])[boxed], limit):
+    ends = np.cumsum((across[1] * down[1])[boxed])
+    cuts = np.searchsorted(ends, np.arange(0, int(ends[-1:].sum()), limit)).tolist()
+    for start, end in pairwise([*cuts, len(boxed)]):
         checkpoint()
         owner, column, row = _boxed_pixels(boxed[start:end], across, down)
         pixel = row * np.int32(len(columns)) + column
@@ -236,31 +242,8 @@ def hits(
         yield owner, pixel[inside], np.minimum(alpha, np.float32(ALPHA_MAX))
 
 
-def _compact(
-    owner: NDArray[Any], ray: NDArray[Any], alpha: NDArray[Any]
-) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]]:
-    """Return hits in the smallest types that hold them.
-
-    A view has fewer than 2^16 rays: NumPy sorts numbers of 16 bits by radix, in linear time.
-    """
-    return owner.astype(np.int32), ray.astype(np.uint16), alpha.astype(np.float32)
-
-
-def _slices(sizes: NDArray[np.int64], limit: int) -> list[tuple[int, int]]:
-    """Return slices of consecutive groups, (r,) sizes, with about `limit` members each."""
-    ends = np.cumsum(sizes, dtype=np.int64)
-    if not len(ends):
-        return []
-    cuts = np.searchsorted(ends, np.arange(0, ends[-1], limit)).tolist()
-    return [*pairwise([*cuts, len(sizes)])]
-
-
-def _boxed_pixels(
-    chosen: NDArray[np.int64],
-    across: tuple[NDArray[np.int64], NDArray[np.int64]],
-    down: tuple[NDArray[np.int64], NDArray[np.int64]],
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-    """Return all p pairs of some of n footprints, (b,), and the pixels in their bounding boxes.
+def _boxed_pixels(chosen, across, down):
+    """All p pairs of some of n footprints, (b,), and the pixels in their bounding boxes.
 
     For the boxes of all n see `_bounding_boxes`. Of each pair these are the footprint, and which of
     the columns and rows the pixel lies in, (p,) each.
@@ -276,30 +259,8 @@ def _boxed_pixels(
     return chosen.take(box), column, row
 
 
-def _members(
-    index: NDArray[np.int64], footprint: NDArray[np.int32]
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Return the u Gaussians that are hit, ascending, and for each hit its place among them.
-
-    `index`, (n,), is the Gaussian of each footprint, each once, `footprint`, (h,), that of each
-    hit.
-    """
-    used = np.zeros(len(index), np.bool_)
-    used[footprint] = True
-    members = np.flatnonzero(used)
-    members = members[np.argsort(index[members])]
-    place = np.empty(len(index), np.int32)
-    place[members] = np.arange(len(members))
-    return index[members], place.take(footprint)
-
-
-def _bounding_boxes(
-    footprints: Footprints,
-    squared_radius: NDArray[np.float32],
-    axis: int,
-    places: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first of some columns or rows in each footprint's bounding box, and how many."""
+def _bounding_boxes(footprints, squared_radius, axis, places):
+    """The first of some columns or rows in each footprint's bounding box, and how many."""
     center = footprints.centers[axis] - np.float32(0.5)
     if footprints.discs is None:
         half = np.sqrt(squared_radius * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
@@ -310,18 +271,8 @@ def _bounding_boxes(
     return first, end - first
 
 
-def _with_cell_before(
-    box: tuple[NDArray[np.int64], NDArray[np.int64]],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return boxes, see `_bounding_boxes`, with the cell before: it may reach into the box."""
-    first = np.maximum(box[0] - 1, 0)
-    return first, box[0] + box[1] - first
-
-
-def _disc_extent(
-    discs: NDArray[np.float32], squared_radius: NDArray[np.float32], axis: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return from where to where discs reach from their centres along an axis, (n,) each, px.
+def _disc_extent(discs, squared_radius, axis):
+    """From where to where discs reach from their centres along an axis, (n,) each, px.
 
     With C, g and the squared radius r^2 of `projection.Footprints.discs`, the edge
     ``d' C^-1 d = r^2 (1 + g d)^2`` is an ellipse about ``r^2 C g / s``, ``s = 1 - r^2 g' C g``, and
@@ -337,28 +288,22 @@ def _disc_extent(
     shift = along[0] * axes[0][axis] + along[1] * axes[1][axis]  # (C g) along the axis
     half = np.sqrt(share * (axes[0][axis] ** 2 + axes[1][axis] ** 2 + share * shift**2))
     least = np.sqrt(squared_radius * np.float32(DISC_LOW_PASS))
-    ends = share * shift - half, share * shift + half
-    low = np.where(bounded, np.minimum(ends[0], -least), np.float32(-_NO_END))
-    high = np.where(bounded, np.maximum(ends[1], least), np.float32(_NO_END))
-    return low, high
+    low, high = np.minimum(share * shift - half, -least), np.maximum(share * shift + half, least)
+    end = np.float32(_NO_END)
+    return np.where(bounded, low, -end), np.where(bounded, high, end)
 
 
-def _before(places: NDArray[np.int64], edges: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return how many of some ascending pixels lie before each edge, (n,)."""
+def _before(places, edges):
+    """How many of some ascending pixels lie before each edge, (n,)."""
     size = int(places[-1]) + 1
     if size > _MAX_TABLE:
-        return np.asarray(np.searchsorted(places.astype(np.float64), edges.astype(np.float64)))
+        return np.searchsorted(places.astype(np.float64), edges.astype(np.float64))
     table = np.searchsorted(places, np.arange(size + 1))  # four times as fast as searching each
-    return np.asarray(table.take(edges.clip(0.0, size).astype(np.int64)))
+    return table.take(edges.clip(0.0, size).astype(np.int64))
 
 
-def _squared_distances(
-    footprints: Footprints,
-    owner: NDArray[np.int64],
-    column: NDArray[np.integer[Any]],
-    row: NDArray[np.integer[Any]],
-) -> NDArray[np.float32]:
-    """Return the squared Mahalanobis distance of pixels to footprints, (p,).
+def _squared_distances(footprints, owner, column, row):
+    """Squared Mahalanobis distance of pixels to footprints, (p,).
 
     `owner`, (p,), is the row of the footprint; the centre of a pixel is at + 0.5. Of discs it is
     that of where the ray meets them, at most that of their low-pass; see `projection`.
@@ -375,10 +320,8 @@ def _squared_distances(
     return squared
 
 
-def _on_discs(
-    discs: NDArray[np.float32], across: NDArray[np.float32], down: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Return what `_squared_distances` does of discs, (7, p), at a step from their centres."""
+def _on_discs(discs, across, down):
+    """The same on discs, (7, p), at a step from their centres."""
     depth = 1.0 + discs[4] * across + discs[5] * down  # of the centre over that of the hit
     first, second = (discs[k] * across + discs[k + 1] * down for k in (0, 2))
     ahead = depth > BEHIND
@@ -387,10 +330,10 @@ def _on_discs(
     on_plane = ahead & (squared <= low_pass)
     squared = np.where(on_plane, squared, low_pass)
     squared[on_plane & (depth > discs[6])] = np.inf  # nearer than the near plane
-    return np.asarray(squared, np.float32)
+    return squared.astype(np.float32)
 
 
-def _squared_radius(alphas: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the squared Mahalanobis distance at which alpha falls to `ALPHA_CUT`, (n,)."""
+def _squared_radius(alphas):
+    """Squared Mahalanobis distance at which alpha falls to `ALPHA_CUT`, (n,)."""
     ratio = alphas * np.float32(1.0 / ALPHA_CUT)
-    return np.asarray(np.float32(2.0) * np.log(np.maximum(ratio, np.float32(1.0))))
+    return np.float32(2.0) * np.log(np.maximum(ratio, np.float32(1.0)))

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..execute import checkpoint
 from ..rendering import ALPHA_CUT, ALPHA_MAX
-from .points import Points
+from .points import Points, runs
 from .projection import Footprints
-from .ray_sums import behind, in_front, paired
+from .rays import behind, in_front, paired
 
 GAMMA_SHAPE = 2.3
 """Shape of the gamma distribution of the thickness in front of a point. The larger it is, the
@@ -35,70 +35,57 @@ cannot be seen. Thicknesses of cells are means, so hidden points are not left ou
 rays are."""
 
 
-def traits(
-    footprints: Footprints,
-    mass: NDArray[np.float32],
-    colors: NDArray[np.float32],
-    area: float,
-) -> NDArray[np.float32]:
-    """Return what points take from their splats, in one table: one look-up is faster than six.
+def integrals(
+    footprints: Footprints, colors: NDArray[np.float32], points: Points
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Integrals over the image of ``alpha T`` and of ``alpha^2 T^2 |c - B|^2``, (n,) each, px^2.
+
+    Of each the integral of alpha or alpha^2 over the whole footprint is exact, times the mean over
+    its points in the image, weighted alike. S is the product of the two sigmas, A the opacity, and
+    q the squared Mahalanobis distance. The footprint ends where alpha falls to `ALPHA_CUT`::
+
+        integral of A exp(-q / 2) = 2 pi S (A - cut)
+        integral of A^2 exp(-q)   =   pi S (A^2 - cut^2)
 
     Parameters
     ----------
     footprints : Footprints
-    mass : (n,) float32
     colors : (n, 3) float32
-    area : float
-        Of a cell, px^2.
-
-    Returns
-    -------
-    (n, 6) float32
-        Red, green, blue; the mass over the cell's area; the largest share of a cell that the splat
-        covers, which is its opacity; `evenness`.
+    points : Points
+        Over the footprints.
     """
-    table = np.empty((len(mass), 6), np.float32)
-    table[:, :3] = colors
-    table[:, 3] = mass / np.float32(area)
-    np.minimum(footprints.alphas, np.float32(ALPHA_MAX), out=table[:, 4])
-    table[:, 5] = evenness(footprints, area)
-    return table
-
-
-def composite(
-    shares: NDArray[np.float32], traits: NDArray[np.float32], counts: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the transmittance in front of points and their squared contrast, (m,) each.
-
-    Parameters
-    ----------
-    shares : (m,) float32
-        Of the splat's mass.
-    traits : (m, 6) float32
-        Of each point's splat, see `traits`.
-    counts : (C,) int64
-        How many points each column has.
-    """
-    covered = shares * traits[:, 3]
-    np.minimum(covered, traits[:, 4], out=covered)
-    thick = thickness(covered)
-    sums = in_front(paired(thick, thick * traits[:, 5]), counts)
-    front, even = sums.real.astype(np.float32), sums.imag.astype(np.float32)
-    return transmittance(front, even), squared_contrast(front, covered, traits[:, :3], counts)
-
-
-def thickness(covered: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the optical thickness of points, ``-log(1 - a)``, (m,).
-
-    Parameters
-    ----------
-    covered : (m,) float32
-        a, the share of its cell that each point covers: its mass over the cell's area, at most the
-        splat's opacity.
-    """
-    left = np.subtract(np.float32(1.0), covered)
-    np.log(left, out=left)
-    return np.asarray(np.negative(left, out=left))
+    alphas, count = footprints.alphas, len(footprints.alphas)
+    area = np.float32(2.0 * math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
+    excess = alphas - np.float32(ALPHA_CUT)
+    mass = area * excess
+    mass_squared = np.float32(0.5) * area * excess * (alphas + np.float32(ALPHA_CUT))
+    # What points take from their splats, in one table: one look-up is faster than six.
+    traits = np.empty((count, 6), np.float32)
+    traits[:, :3] = colors
+    traits[:, 3] = mass / np.float32(points.area)
+    np.minimum(alphas, np.float32(ALPHA_MAX), out=traits[:, 4])
+    traits[:, 5] = evenness(footprints, points.area)
+    visible, errors = np.empty((2, len(points.owners)))  # (m,) each
+    for cells, members in runs(points.counts):
+        shares, counts = points.shares[members], points.counts[cells]
+        of_points = traits.take(points.owners[members], axis=0)
+        covered = shares * of_points[:, 3]  # of the cell; at most the splat's opacity
+        np.minimum(covered, of_points[:, 4], out=covered)
+        thick = -np.log(np.float32(1.0) - covered)
+        sums = in_front(paired(thick, thick * of_points[:, 5]), counts)
+        front, even = sums.real.astype(np.float32), sums.imag.astype(np.float32)
+        weight = transmittance(front, even)
+        weight *= shares
+        visible[members] = weight
+        weight *= weight
+        errors[members] = weight * _squared_contrast(front, covered, of_points[:, :3], counts)
+    checkpoint()
+    owners = points.owners.astype(np.int64)
+    error = np.bincount(owners, errors, count).astype(float)
+    # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
+    # footprint that lies in the image.
+    error *= points.share_inside / np.maximum(points.squares, 1e-30)
+    return mass * np.bincount(owners, visible, count), mass_squared * error
 
 
 def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
@@ -131,26 +118,13 @@ def transmittance(front: NDArray[np.float32], even: NDArray[np.float32]) -> NDAr
     return np.asarray(np.exp(-even) * (np.float32(1.0) + gaps / shape) ** -shape)
 
 
-def squared_contrast(
-    front: NDArray[np.float32],
-    covered: NDArray[np.float32],
-    colors: NDArray[np.float32],
-    counts: NDArray[np.int64],
-) -> NDArray[np.float32]:
-    """Return the squared contrast of each point, (m,).
+def _squared_contrast(front, covered, colors, counts):
+    """Squared contrast of each point, (m,), given the thickness in front and the share it covers.
 
     Point j adds ``T_j a_j c_j`` to the picture; T_j is the transmittance in front of it and a_j the
     share of the cell that it covers. The colour behind point k, over black, is
     ``B_k = (sum over j > k of T_j a_j c_j) / T_{k+1}``. The contrast ``c_k - B_k`` is squared and
-    summed over the channels.
-
-    Parameters
-    ----------
-    front, covered : (m,) float32
-        Optical thickness in front of each point, and a.
-    colors : (m, 3) float32
-    counts : (C,) int64
-        How many points each column has.
+    summed over the channels. `counts`, (C,), is how many points each column has.
     """
     weight = np.exp(-np.minimum(front, np.float32(_MAX_THICKNESS)))  # T_k
     left = np.maximum(weight * (np.float32(1.0) - covered), np.float32(_LEAST_LEFT))  # T_{k+1}
@@ -165,41 +139,3 @@ def squared_contrast(
         contrast *= contrast
         squared += contrast
     return squared
-
-
-def means_over_footprints(
-    points: Points, visible: NDArray[np.float64], errors: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the means over each footprint of T and of ``T^2 |c - B|^2``, both (n,).
-
-    The first is weighted by alpha, the second by alpha^2; both are 0 outside the image.
-
-    Parameters
-    ----------
-    points : Points
-    visible, errors : (m,) float64
-        Of each point: its share times T, and the square of that times ``|c - B|^2``.
-    """
-    checkpoint()
-    count = len(points.share_inside)
-    owners = points.owners.astype(np.int64)
-    total = np.asarray(np.bincount(owners, errors, count), np.float64)
-    # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
-    # footprint that lies in the image.
-    total *= points.share_inside / np.maximum(points.squares, 1e-30)
-    return np.asarray(np.bincount(owners, visible, count), np.float64), total
-
-
-def masses(footprints: Footprints) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the integrals of alpha and of alpha^2 over each footprint, (n,) each, px^2.
-
-    S is the product of the two sigmas, A the opacity, and q the squared Mahalanobis distance. The
-    footprint ends where alpha falls to `ALPHA_CUT`::
-
-        integral of A exp(-q / 2) = 2 pi S (A - cut)
-        integral of A^2 exp(-q)   =   pi S (A^2 - cut^2)
-    """
-    alphas = footprints.alphas
-    area = np.float32(2.0 * math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
-    excess = alphas - np.float32(ALPHA_CUT)
-    return area * excess, np.float32(0.5) * area * excess * (alphas + np.float32(ALPHA_CUT))

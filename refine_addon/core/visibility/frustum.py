@@ -11,14 +11,13 @@ Multiplied by z, with the principal point measured from the centre of the image,
 
 from __future__ import annotations
 
-import math
 import threading
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, run_all, silent
+from ..execute import Progress, chunks, run, silent
 from ..views import View, ViewSet
 
 _STACK = 16
@@ -54,7 +53,7 @@ class Side(NamedTuple):
 
 
 def image_sides(view: View) -> tuple[Side, Side]:
-    """Return the image of a view across and down."""
+    """The image of a view across and down."""
     return (
         Side(view.fx, view.cx - view.width / 2, view.width / 2),
         Side(view.fy, view.cy - view.height / 2, view.height / 2),
@@ -62,12 +61,12 @@ def image_sides(view: View) -> tuple[Side, Side]:
 
 
 def clip_planes(view: View, near: float) -> tuple[float, float]:
-    """Return near and far plane, world units; `near` is for views that have none of their own."""
+    """Near and far plane, world units; `near` is for views that have none of their own."""
     return (view.near if view.near > 0.0 else near), view.far
 
 
 def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> NDArray[np.bool_]:
-    """Return which points lie in a view, (n,).
+    """Which points lie in a view, (n,).
 
     Parameters
     ----------
@@ -120,7 +119,7 @@ class Frustums:
     def classify(
         self, low: NDArray[np.float64], high: NDArray[np.float64], reach: NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which views may see a part of some boxes, and which surely see all of them.
+        """Which views may see a part of some boxes, and which surely see all of them.
 
         Parameters
         ----------
@@ -158,7 +157,7 @@ class Frustums:
     def project(
         self, points: NDArray[np.float64], views: NDArray[np.int64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return how deep points lie in views, and where in the first of them.
+        """How deep points lie in views, and where in the first of them.
 
         Parameters
         ----------
@@ -186,7 +185,10 @@ class Frustums:
         rows = stack.reshape(-1, 4)
         rows[: len(views)] = self._rows[2, views]
         rows[len(views) : end] = self._rows[:2, views[:count]].reshape(-1, 4)
-        product = self._memory((*stack.shape[:2], points.shape[1]))
+        size = stack.shape[0] * _STACK * points.shape[1]
+        if getattr(self._buffers, "memory", np.empty(0)).size < size:
+            self._buffers.memory = np.empty(size)
+        product = self._buffers.memory[:size].reshape(*stack.shape[:2], -1)
         np.matmul(stack, points, out=product)
         flat = product.reshape(-1, points.shape[1])
         depth, across = flat[: len(views)], flat[len(views) : end]
@@ -198,19 +200,11 @@ class Frustums:
             between &= depth[:count] <= self._far[views[:count]]
         return depth, beyond, between
 
-    def _memory(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return this thread's buffer in a shape; its content is arbitrary."""
-        size = math.prod(shape)
-        held: NDArray[np.float64] | None = getattr(self._buffers, "memory", None)
-        if held is None or held.size < size:
-            held = self._buffers.memory = np.empty(size)
-        return held[:size].reshape(shape)
-
 
 def census(
     points: NDArray[np.floating[Any]], views: ViewSet, *, progress: Progress = silent
 ) -> NDArray[np.int64]:
-    """Return how many of N points lie in each of V views, (V,); those not finite lie in none.
+    """How many of N points lie in each of V views, (V,); those not finite lie in none.
 
     Parameters
     ----------
@@ -228,24 +222,22 @@ def census(
     """
     origin = views.middle()[0]
     frustums = Frustums(views, origin, float(np.finfo(np.float64).tiny))
-    counts = np.zeros((-(-len(points) // _POINTS), len(views)), np.int64)
     numbers = np.arange(len(views))
 
-    def count_in_views(piece: slice) -> None:
-        local = np.ones((4, min(piece.stop, len(points)) - piece.start))
+    def count_in_views(piece: slice) -> NDArray[np.int64]:
+        local = np.ones((4, piece.stop - piece.start))
         with np.errstate(invalid="ignore", over="ignore", under="ignore"):
             local[:3] = (points[piece] - origin).T
             local[:, ~np.isfinite(local).all(axis=0)] = np.nan
             _, beyond, between = frustums.project(local, numbers, len(numbers))
-            inside = between & (beyond <= 0.0)
-        counts[piece.start // _POINTS] = np.count_nonzero(inside, axis=1)
+            return np.count_nonzero(between & (beyond <= 0.0), axis=1)
 
-    run_all(count_in_views, chunks(len(points), _POINTS), progress=progress, what="counting")
-    return np.asarray(counts.sum(axis=0))
+    counts = run(count_in_views, chunks(len(points), _POINTS), progress=progress, what="counting")
+    return sum(counts, np.zeros(len(views), np.int64))
 
 
-def _rows(views: ViewSet, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows, (3, V, 4), whose products with ``(p, 1)`` are x', y' and z of every view.
+def _rows(views, centers):
+    """Rows, (3, V, 4), whose products with ``(p, 1)`` are x', y' and z of every view.
 
     x' and y' contain the principal point and the half image size, so a point p lies in the image
     where ``|x'| <= z`` and ``|y'| <= z``.

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,6 @@ from . import froxels, projection
 from .points import cell_size, scatter
 from .projection import Footprints, Gaussians
 from .ray_sample import RaySample, cast_view
-from .rays import Rays
 from .scene import Scene
 
 VIEW_GROUPS = 8
@@ -80,12 +80,12 @@ class Measured:
 
     @classmethod
     def zero(cls, count: int) -> Measured:
-        """Return sums of no views."""
+        """Sums of no views."""
         return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
 
     @classmethod
     def sum(cls, parts: Iterable[Measured]) -> Measured:
-        """Return the sums of all parts, one at least."""
+        """Sums of all parts, one at least."""
         total: Measured | None = None
         for other in parts:
             total = total or cls.zero(len(other.seen))
@@ -94,7 +94,7 @@ class Measured:
         return total
 
     def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
-        """Return the sums of `count` splats: these ones at `index`, 0 for all others."""
+        """Sums of `count` splats: these ones at `index`, 0 for all others."""
         every = Measured.zero(count)
         every.contribution[index] = self.contribution
         every.error[index] = self.error
@@ -102,7 +102,7 @@ class Measured:
         return every
 
     def take(self, rows: NDArray[np.int64]) -> Measured:
-        """Return the sums of some Gaussians."""
+        """Sums of some Gaussians."""
         return Measured(self.contribution[rows], self.error[rows], self.seen[rows])
 
     def add(self, other: Measured) -> None:
@@ -163,40 +163,28 @@ class Measuring:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        views: ViewSet,
-        sampling: Sampling,
-        threads: int | None,
+        self, scene: Scene, views: ViewSet, sampling: Sampling, threads: int | None
     ) -> None:
         self.scene, self.sampling, self.threads = scene, sampling, threads
         self.views = views.by_distance()
-        total = len(self.views)
-        count = min(VIEW_GROUPS, total)
-        self.groups = [list(range(k, total, count)) for k in range(count)]
-
-    @property
-    def count(self) -> int:
-        """Number of groups."""
-        return len(self.groups)
+        self.count = min(VIEW_GROUPS, len(self.views))
+        self.groups = [list(range(k, len(self.views), self.count)) for k in range(self.count)]
 
     def groups_of_part(self, turn: int, parts: int) -> range:
-        """Return every `parts`-th group, the first at `turn`; see `occlusion.measure_part`."""
+        """Every `parts`-th group, the first at `turn`; see `occlusion.measure_part`."""
         parts = min(parts, self.count)
         return range(turn % parts, self.count, parts)
 
     def weight_share(self, groups: Sequence[int]) -> float:
-        """Return the sum of the weights of some groups over that of all views."""
-        weights = [weight for _, weight in self.views]
-        chosen = (weights[number] for k in groups for number in self.groups[k])
-        return math.fsum(chosen) / math.fsum(weights)
+        """Sum of the weights of some groups over that of all views."""
+        chosen = (self.views[number][1] for k in groups for number in self.groups[k])
+        return math.fsum(chosen) / math.fsum(weight for _, weight in self.views)
 
     def measure(
         self, gaussians: Gaussians, groups: Sequence[int], progress: Progress
     ) -> Mapping[int, Measured]:
-        """Return the sums over some groups of views; see `measure_groups`."""
-        no_sample = np.empty(0, np.int64)
-        return self.measure_groups(gaussians, groups, no_sample, progress)[0]
+        """Sums over some groups of views; see `measure_groups`."""
+        return self.measure_groups(gaussians, groups, np.empty(0, np.int64), progress)[0]
 
     def measure_groups(
         self,
@@ -206,7 +194,7 @@ class Measuring:
         progress: Progress,
         ray_samples: Sequence[RaySample] = (),
     ) -> tuple[Mapping[int, Measured], dict[int, NDArray[np.float64]]]:
-        """Return the sums over each group of views, and the errors of a sample in each view.
+        """Sums over each group of views, and the errors of a sample in each view.
 
         Parameters
         ----------
@@ -224,76 +212,39 @@ class Measuring:
         dict of int to Measured, dict of int to (views, m) float64
             Of each of these groups.
         """
-        numbers = [number for k in groups for number in self.groups[k]]
-        wanted = [
-            WantedRays(rays.scoring, {number for number in numbers if rays.wants(number)})
-            for rays in ray_samples
-        ]
-        measurements = run(
-            _MeasureAndCast(gaussians, self.scene, self.views, self.sampling, numbers, wanted),
-            range(len(numbers)), cost=SECONDS * len(gaussians) * len(numbers),
+        chosen = [(k, number) for k in groups for number in self.groups[k]]
+        lacking = {n: [rays for rays in ray_samples if rays.wants(n)] for _, n in chosen}
+        measured = run(
+            partial(_measure_and_cast, gaussians, self.scene, self.views, self.sampling),
+            [(number, [rays.scoring for rays in lacking[number]]) for _, number in chosen],
+            cost=SECONDS * len(gaussians) * len(chosen),
             progress=progress, what="scoring", threads=self.threads,
         )  # fmt: skip
-        sums: dict[int, Measured] = {}
-        errors: dict[int, NDArray[np.float64]] = {}
-        for k in groups:
-            total = sums[k] = Measured.zero(len(gaussians))
-            errors_of_views = []
-            for number in self.groups[k]:
-                measurement, cast = next(measurements)
-                before = total.error[sample]  # (m,)
-                total.add_view(measurement, self.views[number][1], self.threads)
-                errors_of_views.append(total.error[sample] - before)
-                for ray_sample, rays in zip(ray_samples, cast, strict=True):
-                    if rays is not None:
-                        ray_sample.rays[number] = rays
-            errors[k] = np.array(errors_of_views)
-        for _ in measurements:
-            pass  # lets it end
-        return sums, errors
+        sums = {k: Measured.zero(len(gaussians)) for k in groups}
+        errors: dict[int, list[NDArray[np.float64]]] = {k: [] for k in groups}
+        for (measurement, cast), (k, number) in zip(measured, chosen, strict=True):
+            before = sums[k].error[sample]  # (m,)
+            sums[k].add_view(measurement, self.views[number][1], self.threads)
+            errors[k].append(sums[k].error[sample] - before)
+            for ray_sample, rays in zip(lacking[number], cast, strict=True):
+                ray_sample.rays[number] = rays
+        return sums, {k: np.array(of_views) for k, of_views in errors.items()}
 
 
-class WantedRays(NamedTuple):
-    """The numbers of the views whose rays a sample lacks, and whether they are scoring rays."""
-
-    scoring: bool
-    numbers: set[int]
-
-
-@dataclass(frozen=True, eq=False)
-class _MeasureAndCast:
-    """Measures some views and casts their rays; picklable, so that any process can run it.
-
-    `wanted` says of several samples of rays whether they are scoring rays, and the numbers of the
-    views whose rays are wanted.
-    """
-
-    gaussians: Gaussians
-    scene: Scene
-    views: list[tuple[View, float]]  # all of them
-    sampling: Sampling
-    numbers: list[int]  # of the views to measure
-    wanted: list[WantedRays]
-
-    def __call__(self, index: int) -> tuple[ViewMeasurement, list[Rays | None]]:
-        """Return what a view sees of the splats, and its rays."""
-        number = self.numbers[index]
-        footprints, measurement = measure_view(
-            self.gaussians, self.scene, self.views[number][0], self.sampling
-        )
-        with np.errstate(under="ignore"):
-            return measurement, [
-                cast_view(self.views, number, footprints, scoring=scoring)
-                if number in numbers
-                else None
-                for scoring, numbers in self.wanted
-            ]
+def _measure_and_cast(gaussians, scene, views, sampling, number_and_kinds):
+    """What a view sees of the splats, and its scoring or validation rays; any process can."""
+    number, kinds = number_and_kinds
+    footprints, measurement = measure_view(gaussians, scene, views[number][0], sampling)
+    with np.errstate(under="ignore"):
+        return measurement, [
+            cast_view(views, number, footprints, scoring=scoring) for scoring in kinds
+        ]
 
 
 def measure_view(
     gaussians: Gaussians, scene: Scene, view: View, sampling: Sampling
 ) -> tuple[Footprints, ViewMeasurement]:
-    """Return the footprints in a view, and what it sees of them."""
+    """Footprints in a view, and what it sees of them."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
     colors = gaussians.colors[footprints.index]  # (n, 3)
@@ -301,36 +252,13 @@ def measure_view(
 
 
 def measure_footprints(
-    footprints: Footprints,
-    colors: NDArray[np.float32],
-    view: View,
-    sampling: Sampling,
+    footprints: Footprints, colors: NDArray[np.float32], view: View, sampling: Sampling
 ) -> ViewMeasurement:
-    """Return what a view sees of n footprints.
-
-    Parameters
-    ----------
-    footprints : Footprints
-    colors : (n, 3) float32
-    view : View
-    sampling : Sampling
-    """
+    """What a view sees of n footprints in their colours, (n, 3)."""
     rows, inside = footprints.index, footprints.inside
     if not len(rows):
         return ViewMeasurement(rows, inside, np.empty(0), np.empty(0))
     with np.errstate(under="ignore"):
         side = cell_size(footprints, view, sampling.cell, sampling.density)
         points = scatter(footprints, view, side, sampling.density)
-        mass, mass_squared = froxels.masses(footprints)  # (n,) each
-        traits = froxels.traits(footprints, mass, colors, points.area)  # (n, 6)
-        visible, errors = np.empty((2, len(points.owners)))  # (m,) each
-        for cells, members in points.pieces():
-            shares = points.shares[members]
-            of_points = traits.take(points.owners[members], axis=0)
-            weight, squared_contrast = froxels.composite(shares, of_points, points.counts[cells])
-            weight *= shares
-            visible[members] = weight
-            weight *= weight
-            errors[members] = weight * squared_contrast
-        visible, errors = froxels.means_over_footprints(points, visible, errors)
-        return ViewMeasurement(rows, inside, mass * visible, mass_squared * errors)
+        return ViewMeasurement(rows, inside, *froxels.integrals(footprints, colors, points))

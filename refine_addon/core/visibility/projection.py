@@ -47,7 +47,6 @@ _SLACK = 1e-4  # of a coordinate; far more than rounding moves a mean by
 _BEYOND = 0.15  # of the image's size; farther outside, the projection is linearised at this edge
 _THINNEST_DISC = 1e-3  # px; seen from the edge a disc is a line, which covers no pixel's centre
 _EDGE_ON = 1e-6  # cosine; a plane seen from the edge has no depths
-_Axes = tuple["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[np.float32]"]
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -381,7 +380,7 @@ def footprints_and_depths(
                 centers, axes, kept = _ellipses(local, shape, view)
                 if gaussians.model == "antialiased":
                     alphas *= kept
-            footprints = Footprints(index, centers, *axes, inside, alphas, discs)
+            footprints = Footprints(index, centers, *axes, inside=inside, alphas=alphas, discs=discs)
             depths_of_piece = local[2]
             if gaussians.model == "antialiased":  # some are now too faint to be drawn
                 drawn = np.flatnonzero(alphas > ALPHA_CUT)
@@ -424,17 +423,17 @@ def _joined(
 def in_camera(
     gaussians: Gaussians, scene: Scene, view: View
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return centres, (3, M), and covariances, (6, M), in camera coordinates, scene sizes."""
+    """Centres, (3, M), and covariances, (6, M), in camera coordinates, scene sizes."""
     turned = _product(_rotation6(view.rotation @ scene.axes.T), gaussians.covariances)
     return _local(gaussians.means, scene, view), turned
 
 
 def depths(gaussians: Gaussians, scene: Scene, view: View) -> NDArray[np.float32]:
-    """Return how far Gaussians lie along the axis of a view, (M,), scene sizes."""
-    return np.asarray(_local(gaussians.means, scene, view)[2])
+    """How far Gaussians lie along the axis of a view, (M,), scene sizes."""
+    return _local(gaussians.means, scene, view)[2]
 
 
-def _computable(scene: Scene, view: View) -> bool:
+def _computable(scene, view):
     """Whether float32 can hold this view's coordinates; if not, the view counts as empty."""
     away = float(np.abs(view.center - scene.origin).max())
     lens = (view.fx, view.fy, abs(view.cx), abs(view.cy), view.width, view.height)
@@ -443,21 +442,21 @@ def _computable(scene: Scene, view: View) -> bool:
 
 
 def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
-    """Return near and far plane in scene sizes."""
+    """Near and far plane in scene sizes."""
     near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
     return min(max(near / scene.size, _NEAREST), _NO_END), min(far / scene.size, _NO_END)
 
 
-def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
-    """Return camera coordinates of centres, (3, M), scene sizes."""
+def _local(means, scene, view):
+    """Camera coordinates of centres, (3, M), scene sizes."""
     shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
     local = _product((view.rotation @ scene.axes.T).astype(np.float32), means)
     local -= shift[:, None]
     return local
 
 
-def _product(matrix: NDArray[np.float32], columns: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a matrix times columns, (n, n) and (n, M).
+def _product(matrix, columns):
+    """A matrix times columns, (n, n) and (n, M).
 
     Each is summed in the same order. BLAS rounds by where a column stands and how many there are,
     so a splat would be seen otherwise among the few of a tile than among all.
@@ -468,20 +467,14 @@ def _product(matrix: NDArray[np.float32], columns: NDArray[np.float32]) -> NDArr
     return result
 
 
-def _touches(
-    local: NDArray[np.float32],
-    largest: NDArray[np.float32],
-    views: tuple[View, View],
-    planes: tuple[float, float],
-    low_pass: float,
-) -> NDArray[np.bool_]:
-    """Return which footprints may reach into the image, (M,); on the safe side.
+def _touches(local, largest, views, planes, low_pass):
+    """Which footprints may reach into the image, (M,); on the safe side.
 
     It is `frustum.contains` with the image widened by how far each footprint reaches. Of `views`,
     the first is drawn, and the second is the part of it that counts; see `footprints_and_depths`.
     """
     x, y, z = local
-    touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
+    touching = (z >= planes[0]) & (z <= planes[1])
     drawn, sides = map(frustum.image_sides, views)
     for coordinate, whole, side in zip((x, y), drawn, sides, strict=True):
         margin = _margin(whole) * largest  # (M,), px times depth
@@ -523,16 +516,15 @@ def boxes_touch(
     return touching
 
 
-def _margin(side: frustum.Side) -> float:
-    """Return how far a footprint reaches, px times depth, for a longest standard deviation of 1."""
+def _margin(side):
+    """How far a footprint reaches, px times depth, for a longest standard deviation of 1."""
     # A footprint is longest where its ray is most oblique; beyond `_BEYOND` it grows no further.
     slope = (abs(side.offset) + (1.0 + 2.0 * _BEYOND) * side.half) / side.focal
     return CUT_SIGMAS * side.focal * float(np.hypot(1.0, slope))
 
 
-def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the (6, 6) matrix from the 6 numbers of S to those of ``R S R'``, R a rotation."""
-    r = rotation
+def _rotation6(r):
+    """The (6, 6) matrix from the 6 numbers of S to those of ``R S R'``, R a rotation."""
     return np.array(
         [
             [r[a, i] * r[b, j] + (r[a, j] * r[b, i] if i != j else 0.0) for i, j in _PAIRS]
@@ -542,49 +534,24 @@ def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
     )
 
 
-def _ellipses(
-    local: NDArray[np.float32], shape: NDArray[np.float32], view: View
-) -> tuple[NDArray[np.float32], _Axes, NDArray[np.float32]]:
-    """Return the footprints of Gaussians, and how much of their opacity antialiasing keeps."""
+def _ellipses(local, shape, view):
+    """Footprints of Gaussians: centres, axes, and how much of their opacity antialiasing keeps.
+
+    For a centre far outside the image, J is computed at the edge that `_BEYOND` sets, because J
+    grows without bound.
+    """
     x, y, z = local
     across, down = x / z, y / z
     centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
-    variances, directions = _principal(*_image_covariance((across, down, z), shape, view))
+    across, down = _near_image(across, down, view)
+    variances, direction = _principal(across, down, z, shape, view)
     sigmas = np.sqrt(variances + LOW_PASS)
     kept = np.sqrt(variances[0] * variances[1]) / (sigmas[0] * sigmas[1])
-    return centers, _half_axes(sigmas, directions), kept
+    return centers, _half_axes(sigmas, direction), kept
 
 
-def _image_covariance(
-    ray: tuple[NDArray[np.float32], ...], shape: NDArray[np.float32], view: View
-) -> tuple[NDArray[np.float32], ...]:
-    """Return xx, xy, yy, (n,) each, of ``J S J'`` in pixels, without the low-pass.
-
-    J is the Jacobian of the projection at ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and
-    ``(0, fy / z, -fy y / z^2)``. `ray` has ``x / z``, ``y / z`` and z of the centres, (n,) each.
-    For a centre far outside the image, J is computed at the edge that `_BEYOND` sets, because J
-    grows without bound. `shape` is S: xx, xy, xz, yy, yz, zz, (6, n).
-    """
-    return _projected((*_near_image(ray[0], ray[1], view), ray[2]), shape, view)
-
-
-def _projected(
-    ray: tuple[NDArray[np.float32], ...], shape: NDArray[np.float32], view: View
-) -> tuple[NDArray[np.float32], ...]:
-    """Return what `_image_covariance` does, with J at ``x / z`` and ``y / z`` as they are."""
-    across, down, z = ray
-    fx, fy = view.fx / z, view.fy / z
-    xx = fx * fx * (shape[0] + across * (across * shape[5] - 2 * shape[2]))
-    yy = fy * fy * (shape[3] + down * (down * shape[5] - 2 * shape[4]))
-    xy = fx * fy * (shape[1] + across * (down * shape[5] - shape[4]) - down * shape[2])
-    factor = np.minimum(1.0, _LARGEST_VARIANCE / np.maximum(xx + yy, 1.0))
-    return xx * factor, xy * factor, yy * factor
-
-
-def _near_image(
-    across: NDArray[Any], down: NDArray[Any], view: View
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return ``x / z`` and ``y / z`` of centres, (n,) each, no farther out than `_BEYOND` says."""
+def _near_image(across, down, view):
+    """``x / z`` and ``y / z`` of centres, (n,) each, no farther out than `_BEYOND` says."""
     beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
     return (
         across.clip(-view.cx / view.fx - beyond[0], (view.width - view.cx) / view.fx + beyond[0]),
@@ -595,10 +562,10 @@ def _near_image(
 def jacobian(
     gaussians: Gaussians, scene: Scene, view: View
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return J W of Gaussians in a view: how column and row change with the mean, (M, 3) each.
+    """J W of Gaussians in a view: how column and row change with the mean, (M, 3) each.
 
-    In pixels for a step of one scene size along each axis of the scene's frame; see
-    `_image_covariance` for J.
+    In pixels for a step of one scene size along each axis of the scene's frame; see `_principal`
+    for J.
     """
     x, y, z = _local(gaussians.means, scene, view).astype(np.float64)
     across, down = _near_image(x / z, y / z, view)
@@ -609,38 +576,45 @@ def jacobian(
     )
 
 
-def _principal(
-    xx: NDArray[np.float32], xy: NDArray[np.float32], yy: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Return the eigenvalues of C, (2, n), the larger first, and the direction of the major axis.
+def _principal(across, down, z, shape, view):
+    """Eigenvalues of C, (2, n), the larger first, and the direction of the major axis, (2, n).
+
+    C is ``J S J'`` in pixels, without the low-pass. J is the Jacobian of the projection at
+    ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and ``(0, fy / z, -fy y / z^2)``; across and
+    down are ``x / z`` and ``y / z``, (n,) each. `shape` is S: xx, xy, xz, yy, yz, zz, (6, n).
 
     With ``m = (xx + yy) / 2`` and ``r = hypot((xx - yy) / 2, xy)`` the eigenvalues of C are m + r
     and m - r; the latter is computed as ``det C / (m + r)``, which loses no digits by cancellation.
-    For the direction see `_major_direction`.
+    With h the half difference, ``(h + r, xy)`` and ``(xy, r - h)`` both point along the major axis.
+    The one without cancellation is used, and made to point right; (1, 0) for a circle.
     """
+    fx, fy = view.fx / z, view.fy / z
+    xx = fx * fx * (shape[0] + across * (across * shape[5] - 2 * shape[2]))
+    yy = fy * fy * (shape[3] + down * (down * shape[5] - 2 * shape[4]))
+    xy = fx * fy * (shape[1] + across * (down * shape[5] - shape[4]) - down * shape[2])
+    factor = np.minimum(1.0, _LARGEST_VARIANCE / np.maximum(xx + yy, 1.0))
+    xx, xy, yy = xx * factor, xy * factor, yy * factor
     mean, half = (xx + yy) / 2, (xx - yy) / 2
     root = np.sqrt(half * half + xy * xy)
     first = np.maximum(mean + root, 0.0)
     second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(mean + root, 1e-30)
-    return np.stack([first, second]), _major_direction(half, xy, root)
+    wide = half >= 0.0
+    c, s = np.where(wide, half + root, np.abs(xy)), np.where(wide, xy, root - half)
+    s = np.where(wide | (xy >= 0.0), s, -s)
+    length = np.hypot(c, s)
+    c = np.where(length > 0.0, c / np.maximum(length, 1e-30), 1.0)
+    s = np.where(length > 0.0, s / np.maximum(length, 1e-30), 0.0)
+    return np.stack([first, second]), np.stack([c, s])
 
 
-def _half_axes(
-    sigmas: NDArray[np.float32], direction: tuple[NDArray[np.float32], NDArray[np.float32]]
-) -> _Axes:
-    """Return the half axes of these lengths, and the lengths, (2, n) each, the longer first."""
+def _half_axes(sigmas, direction):
+    """Half axes of these lengths, and the lengths, (2, n) each, the longer first."""
     c, s = direction
-    return sigmas[0] * np.stack([c, s]), sigmas[1] * np.stack([-s, c]), sigmas
+    return sigmas[0] * direction, sigmas[1] * np.stack([-s, c]), sigmas
 
 
-def _discs(
-    local: NDArray[np.float32],
-    shape: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    view: View,
-    near: float,
-) -> tuple[NDArray[np.float32], _Axes, NDArray[np.float32]]:
-    """Return the footprints of discs: centres, axes, and what rays hit.
+def _discs(local, shape, normals, view, near):
+    """Footprints of discs: centres, axes, and what rays hit.
 
     The ray through a pixel hits the plane of a disc at ``(u, v)``, in units of its two scales, and
     its alpha there is ``o exp(-(u^2 + v^2) / 2)``, at least ``o exp(-|d|^2 / (2 DISC_LOW_PASS))``,
@@ -653,7 +627,7 @@ def _discs(
     x, y, z = local
     across, down = x / z, y / z
     centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
-    variances, direction = _principal(*_projected((across, down, z), shape, view))
+    variances, direction = _principal(across, down, z, shape, view)
     sigmas = np.sqrt(np.maximum(variances, _THINNEST_DISC**2))
     c, s = direction
     facing = normals[0] * across + normals[1] * down + normals[2]
@@ -670,7 +644,7 @@ def _discs(
 
 
 def disc_axes(variances: NDArray[FloatT]) -> NDArray[FloatT]:
-    """Return the half axes, (2, n), of ellipses that cover as much as discs with their low-pass.
+    """Half axes, (2, n), of ellipses that cover as much as discs with their low-pass.
 
     The larger of two Gaussians of variance l along both axes, the low-pass, and of a and b, has the
     integral ``2 pi l`` where ``a < l``, ``2 pi sqrt(a b)`` where ``b > l``, and else, with t the
@@ -694,28 +668,11 @@ def disc_axes(variances: NDArray[FloatT]) -> NDArray[FloatT]:
     covered += low * (2.0 * np.pi - 4.0 * angle)
     whole = np.where(variances[1] >= low, np.sqrt(first * thin), covered / (2.0 * np.pi))
     major = np.sqrt(first)
-    return np.asarray(np.stack([major, np.minimum(whole / major, major)]), variances.dtype)
+    return np.stack([major, np.minimum(whole / major, major)]).astype(variances.dtype)
 
 
-def _major_direction(
-    half: NDArray[np.float32], xy: NDArray[np.float32], root: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the unit vector along the major axis, (n,) across and down; (1, 0) for a circle.
-
-    ``(half + root, xy)`` and ``(xy, root - half)`` both point along it, with half = (xx - yy) / 2
-    and root as in `_half_axes`. The one without cancellation is used, and made to point right.
-    """
-    wide = half >= 0.0
-    c, s = np.where(wide, half + root, np.abs(xy)), np.where(wide, xy, root - half)
-    s = np.where(wide | (xy >= 0.0), s, -s)
-    length = np.hypot(c, s)
-    c = np.where(length > 0.0, c / np.maximum(length, 1e-30), 1.0)
-    s = np.where(length > 0.0, s / np.maximum(length, 1e-30), 0.0)
-    return c, s
-
-
-def _by_depth(depth: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the order of positive float32 numbers, (n,), nearest first.
+def _by_depth(depth):
+    """Order of positive float32 numbers, (n,), nearest first.
 
     The bits of positive floats, read as integers, sort as the floats do; NumPy sorts 16 bits at a
     time by radix, in linear time.
@@ -723,5 +680,4 @@ def _by_depth(depth: NDArray[np.float32]) -> NDArray[np.int64]:
     bits = np.ascontiguousarray(depth).view(np.uint32)
     order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
     high = (bits >> 16).astype(np.uint16)
-    second = np.argsort(high[order], kind="stable")
-    return np.asarray(order[second])
+    return order[np.argsort(high[order], kind="stable")]

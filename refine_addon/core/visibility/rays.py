@@ -6,6 +6,10 @@ ray are composited front to back, as a renderer composites a pixel::
     C = sum over hits of  T alpha c,    T = product over the hits in front of  1 - alpha
 
 So the colours of these pixels are known with all splats and with any choice of them, exactly.
+
+Values of all rays lie one after the other, those of each front to back. Running sums run over all
+of them at once and restart at each ray, which costs no loop over rays; likewise down the columns of
+points in the cells of an image (`froxels`).
 """
 
 from __future__ import annotations
@@ -18,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import checkpoint
-from .ray_sums import behind, in_front, paired
 
 LOG_OPAQUE = -9.3
 """Logarithm of the transmittance below which nothing is seen, 1e-4."""
@@ -78,58 +81,43 @@ class Rays:
         """How many rays there are."""
         return len(self.columns) * len(self.rows)
 
-    def pixels_of(
-        self, ray: NDArray[np.integer[Any]]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return column and row of the pixels that some rays, (n,), go through, (n,) each."""
-        if self.aims is not None:
-            return self.aims[0].take(ray), self.aims[1].take(ray)
-        return self.columns.take(ray % len(self.columns)), self.rows.take(ray // len(self.columns))
-
     @property
     def hitting(self) -> int:
         """How many of the rays hit a splat."""
         return len(self._first_hits())
 
+    def pixels_of(
+        self, ray: NDArray[np.integer[Any]]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Column and row of the pixels that some rays, (n,), go through, (n,) each."""
+        if self.aims is not None:
+            return self.aims[0].take(ray), self.aims[1].take(ray)
+        return self.columns.take(ray % len(self.columns)), self.rows.take(ray // len(self.columns))
+
     def keeping(self, keep: NDArray[np.bool_]) -> Rays:
-        """Return the rays with their hits on some of the splats alone.
+        """The rays with their hits on some of the splats alone.
 
         Parameters
         ----------
         keep : (u,) bool
             Which of `hit` stay.
         """
-        kept = np.flatnonzero(keep.take(self.owner))
-        return replace(
-            self,
-            ray=self.ray.take(kept),
-            owner=self.owner.take(kept),
-            alpha=self.alpha.take(kept),
-            log_passed=self.log_passed.take(kept),
-        )
+        return self._with_hits(np.flatnonzero(keep.take(self.owner)))
 
     def visible(self) -> VisibleRays:
-        """Return the rays with the hits that are not hidden alone: they see the same."""
-        log_front = in_front(self.log_passed.astype(np.float64), self.counts())
-        kept = np.flatnonzero(log_front > LOG_OPAQUE)
+        """The rays with the hits that are not hidden alone: they see the same."""
+        kept, log_front = self._seen()
         owner = self.owner.take(kept)
         used = np.zeros(len(self.hit), np.bool_)
         used[owner] = True
         place = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        seen = replace(
-            self,
-            ray=self.ray.take(kept),
-            owner=place.take(owner),
-            alpha=self.alpha.take(kept),
-            log_passed=self.log_passed.take(kept),
-            hit=self.hit[used],
-        )
-        return VisibleRays(seen, np.exp(log_front.take(kept).astype(np.float32)))
+        seen = replace(self._with_hits(kept), owner=place.take(owner), hit=self.hit[used])
+        return VisibleRays(seen, np.exp(log_front))
 
     def composited(
         self, weight: NDArray[np.float32], colors: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Return the colour of each ray over black, (3, P), 0..1; see `colors`.
+        """Colour of each ray over black, (3, P), 0..1; see `colors`.
 
         Parameters
         ----------
@@ -145,7 +133,7 @@ class Rays:
         return result.clip(0.0, 1.0)
 
     def contributions(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-        """Return what the rays see: the r hits that are not hidden.
+        """What the rays see: the r hits that are not hidden.
 
         Returns
         -------
@@ -154,13 +142,11 @@ class Rays:
         weight : (r,) float32
             Transmittance times alpha: the share of the pixel that the splat makes up.
         """
-        log_front = in_front(self.log_passed.astype(np.float64), self.counts())
-        seen = np.flatnonzero(log_front > LOG_OPAQUE)
-        weight = self.alpha.take(seen) * np.exp(log_front.take(seen).astype(np.float32))
-        return self.ray.take(seen), self.owner.take(seen), weight
+        seen, log_front = self._seen()
+        return self.ray.take(seen), self.owner.take(seen), self.alpha.take(seen) * np.exp(log_front)
 
     def colors(self, colors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the colour of each ray over black, (3, P), 0..1.
+        """Colour of each ray over black, (3, P), 0..1.
 
         Parameters
         ----------
@@ -176,7 +162,7 @@ class Rays:
     def removal_errors(
         self, colors: NDArray[np.float32]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return how much all rays together would change without each splat, (u,) each.
+        """How much all rays together would change without each splat, (u,) each.
 
         Parameters
         ----------
@@ -203,17 +189,16 @@ class Rays:
                 self.alpha[piece], self.log_passed[piece], colors.take(owner[piece], axis=1),
                 np.diff(ends[first : last + 1]),
             )  # fmt: skip
-        sums = (np.bincount(owner, each, len(self.hit)) for each in (error, weight))
-        errors, contributions = (np.asarray(each, np.float64) for each in sums)
-        return errors, contributions
+        errors, weights = (np.bincount(owner, each, len(self.hit)) for each in (error, weight))
+        return errors.astype(float), weights.astype(float)
 
     def colors_by_nearest_kept(
         self, colors: NDArray[np.float64], keep: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        """Return the colour of each ray, (3, P), 0..1, if kept splats stand in for removed ones.
+        """Colour of each ray, (3, P), 0..1, if kept splats stand in for removed ones.
 
         A removed splat is as opaque as it was, in the colour of the nearest kept hit of the ray, or
-        black where there is none.
+        black where there is none. Nearest in the number of hits between; of two, the one in front.
 
         Parameters
         ----------
@@ -221,16 +206,6 @@ class Rays:
             Of the splats that are hit.
         keep : (u,) bool
             Which of them are kept.
-        """
-        black = colors.shape[1]  # the column behind all splats
-        owner = self._nearest_kept(keep, black)
-        return replace(self, owner=owner).colors(np.append(colors, np.zeros((3, 1)), axis=1))
-
-    def _nearest_kept(self, keep: NDArray[np.bool_], none_kept: int) -> NDArray[np.int32]:
-        """Return for each hit the owner of its ray's nearest kept hit, (h,), or `none_kept`.
-
-        Nearest in the number of hits between; of two, the one in front. A kept hit is its own.
-        `keep` is of the (u,) splats that are hit.
         """
         kept, here = keep.take(self.owner), np.arange(len(self.owner))
         none = len(here)  # farther than any hit
@@ -244,27 +219,33 @@ class Rays:
         nearest = np.where(steps_front < steps_back, before, after)
         alone = np.minimum(steps_front, steps_back) == none
         owner = self.owner.take(np.where(alone, here, nearest))
-        owner[alone] = none_kept
-        return owner
+        owner[alone] = colors.shape[1]  # the column of black
+        return replace(self, owner=owner).colors(np.append(colors, np.zeros((3, 1)), axis=1))
 
-    def _first_hits(self) -> NDArray[np.int64]:
-        """Return the place of the first hit of each ray that has any."""
+    def counts(self) -> NDArray[np.int64]:
+        """How many hits each ray has, of those that hit a splat."""
+        return np.diff(np.append(self._first_hits(), len(self.ray)))
+
+    def _first_hits(self):
+        """Place of the first hit of each ray that has any."""
         new = np.ones(len(self.ray), np.bool_)
         np.not_equal(self.ray[1:], self.ray[:-1], out=new[1:])
         return np.flatnonzero(new)
 
-    def counts(self) -> NDArray[np.int64]:
-        """Return how many hits each ray has, of those that hit a splat."""
-        return np.diff(np.append(self._first_hits(), len(self.ray)))
+    def _seen(self):
+        """The hits that are not hidden, and the logarithm of the transmittance in front of them."""
+        log_front = in_front(self.log_passed.astype(np.float64), self.counts())
+        seen = np.flatnonzero(log_front > LOG_OPAQUE)
+        return seen, log_front.take(seen).astype(np.float32)
+
+    def _with_hits(self, kept):
+        """The rays with some of their hits."""
+        names = ("ray", "owner", "alpha", "log_passed")
+        return replace(self, **{name: getattr(self, name).take(kept) for name in names})
 
 
-def _removal_errors(
-    alpha: NDArray[np.float32],
-    log_passed: NDArray[np.float32],
-    colors: NDArray[np.float32],
-    counts: NDArray[np.int64],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return for each hit of some rays how much its ray would change without it.
+def _removal_errors(alpha, log_passed, colors, counts):
+    """How much a ray would change without each of its hits; some rays.
 
     For `alpha` and `log_passed`, (h,), see `Rays`; colours are (3, h), and `counts`, (n,), is how
     many hits each ray has, at least one. Errors and contributions, (h,) each, are those of
@@ -286,3 +267,50 @@ def _removal_errors(
         change *= change
         error += change
     return error, weight
+
+
+def paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[Any]:
+    """Two real arrays as the real and imaginary parts of one complex array, (m,).
+
+    A running sum over the pair is two running sums in the time of one.
+    """
+    pair = np.empty(first.shape, np.complex128)
+    pair.real, pair.imag = first, second
+    return pair
+
+
+def in_front(values: NDArray[Any], counts: NDArray[np.int64]) -> NDArray[Any]:
+    """For each value the sum of those in front of it in its column, (m,).
+
+    Parameters
+    ----------
+    values : (m,) float64 or complex128
+    counts : (C,) int64
+        How many values each column has, at least one.
+
+    Examples
+    --------
+    >>> in_front(np.array([1.0, 2.0, 4.0, 8.0]), np.array([3, 1])).tolist()
+    [0.0, 1.0, 3.0, 0.0]
+    """
+    sums = np.cumsum(values)
+    sums -= values
+    sums -= np.repeat(sums.take(np.cumsum(counts) - counts), counts)
+    return sums
+
+
+def behind(values: NDArray[Any], counts: NDArray[np.int64]) -> NDArray[Any]:
+    """For each value the sum of those behind it in its column, (m,).
+
+    Parameters
+    ----------
+    values, counts
+        See `in_front`.
+
+    Examples
+    --------
+    >>> behind(np.array([1.0, 2.0, 4.0, 8.0]), np.array([3, 1])).tolist()
+    [6.0, 4.0, 0.0, 0.0]
+    """
+    sums = np.cumsum(values)
+    return np.repeat(sums.take(np.cumsum(counts) - 1), counts) - sums
