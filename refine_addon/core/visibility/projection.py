@@ -375,12 +375,14 @@ def footprints_and_depths(
             discs = None
             if chunk.normals is not None:
                 normals = _product(turned, np.take(chunk.normals, rows, axis=1))
-                centers, axes, discs = _discs(local, shape, normals, view, planes[0])
+                centers, (major, minor, sigmas), discs = _discs(
+                    local, shape, normals, view, planes[0]
+                )
             else:
-                centers, axes, kept = _ellipses(local, shape, view)
+                centers, (major, minor, sigmas), kept = _ellipses(local, shape, view)
                 if gaussians.model == "antialiased":
                     alphas *= kept
-            footprints = Footprints(index, centers, *axes, inside=inside, alphas=alphas, discs=discs)
+            footprints = Footprints(index, centers, major, minor, sigmas, inside, alphas, discs)
             depths_of_piece = local[2]
             if gaussians.model == "antialiased":  # some are now too faint to be drawn
                 drawn = np.flatnonzero(alphas > ALPHA_CUT)
