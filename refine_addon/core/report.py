@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from .formats.ply import SplatFile
 from .formats.registry import Packed
-from .merging.absorb import Counts
 from .quality.cost import expected_seconds
 from .quality.curve import FEWEST, expected, in_words, out_of_reach, parted
 from .scores import Scores
@@ -204,7 +203,7 @@ def conclude(
     scores: Scores,
     keep: NDArray[np.bool_],
     psnr: float | None,
-    absorbed: Counts | None,
+    absorbed: Any,
     why: str,
 ) -> None:
     """Add to a report what it says about the quality of the pictures and about absorbing.
@@ -217,8 +216,8 @@ def conclude(
     keep : (N,) bool
     psnr : float or None
         The estimate for the result, dB.
-    absorbed : Counts or None
-        What survivors absorbed, if they did.
+    absorbed : merging.merge.Merged or tiles.absorbing.Survivors or None
+        What was merged, if anything was.
     why : str
         See `remark`.
     """
@@ -240,8 +239,14 @@ def conclude(
     if why:
         facts["notes"].append(why)
     if absorbed is not None:
-        facts["absorbed"] = absorbed.facts()
-        facts["notes"].append(absorbed.note())
+        changed = int(np.count_nonzero(absorbed.changed))
+        facts["absorbed"] = {
+            "changed": changed, "merged": absorbed.merged, "deleted": absorbed.deleted
+        }  # fmt: skip
+        facts["notes"].append(
+            f"{changed:,} survivors absorbed {absorbed.merged:,} splats; "
+            f"{absorbed.deleted:,} were deleted"
+        )
 
 
 def little_seen(seen: NDArray[np.int32]) -> str:

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from .affine import transformed
 from .formats.ply_columns import ChangedColumns, Columns
-from .merging.absorb import Absorbed
+from .merging.merge import Merged
 
 
 def survivor_columns(
     stored: Columns | NDArray[Any],
-    absorbed: Absorbed | None,
+    absorbed: Merged | None,
     matrix: NDArray[Any] | None = None,
 ) -> Mapping[str, NDArray[Any]]:
     """Return stored columns with the values of changed survivors put in.
@@ -27,7 +27,7 @@ def survivor_columns(
     ----------
     stored : mapping of str to (N,), or structured array
         All properties of the splats before absorbing, such as `SplatFile.rows`; not changed.
-    absorbed : Absorbed or None
+    absorbed : Merged or None
         Of these splats; None where survivors stay what they are: no column changes.
     matrix : (4, 4) floating, optional
         From the frame of the survivors to that of the columns; by default they are the same.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .errors import RefineError
 from .execute import Cancelled
-from .merging.absorb import Absorbed
+from .merging.merge import Merged
 from .refit.refit import Refit
 from .scores import Scores
 from .scoring.occlusion import Occlusion
@@ -219,7 +219,7 @@ class Result:
         The scores that decided which splats stay; of those that stay they may tell less, see
         `Scores.settled`. With `absorbed`: the scores that decided how many survive, or else which
         tenth was deleted first.
-    absorbed : Absorbed or None
+    absorbed : Merged or None
         The survivors as they became; None if all are what they were.
     report : dict
         Counts, settings, facts about the scores, timings and versions, ready for JSON.
@@ -231,7 +231,7 @@ class Result:
     keep: NDArray[np.bool_]
     scores: Scores
     report: dict[str, Any]
-    absorbed: Absorbed | None = None
+    absorbed: Merged | None = None
     stopped: Cancelled | KeyboardInterrupt | None = None
 
     def __repr__(self) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import RefineError
-from ..core.merging.absorb import Absorbed
+from ..core.merging.merge import Merged
 from ..core.quality.curve import Quality
 from ..core.scores import Scores
 from ..core.selection import Budget, rank
@@ -400,7 +400,7 @@ def _joined_masks(parts: list[Any], counts: list[int]) -> NDArray[np.bool_]:
     ])  # fmt: skip
 
 
-def _part(absorbed: Absorbed, rows: slice) -> Absorbed:
+def _part(absorbed: Merged, rows: slice) -> Merged:
     """Return the survivors of one object."""
     first = int(np.count_nonzero(absorbed.keep[: rows.start]))
     keep = absorbed.keep[rows]

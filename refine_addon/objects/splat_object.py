@@ -24,7 +24,7 @@ from ..core.execute import chunks, run_all
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
 from ..core.levels.lod import Level
-from ..core.merging.absorb import Absorbed
+from ..core.merging.merge import Merged
 from ..core.moves import Move
 from ..core.selection import Budget
 from ..core.splats import Splats
@@ -232,14 +232,14 @@ def frame_of(checked: SplatObject) -> Frame:
     return Frame(mesh_layout.sh_degree(checked.mesh), np.linalg.inv(matrix))
 
 
-def changed(frame: Frame, keep: NDArray[np.bool_], absorbed: Absorbed | None) -> Change:
+def changed(frame: Frame, keep: NDArray[np.bool_], absorbed: Merged | None) -> Change:
     """Return what is to become of an object's splats; touches nothing of Blender's.
 
     Parameters
     ----------
     frame : Frame
     keep : (N,) bool
-    absorbed : Absorbed or None
+    absorbed : Merged or None
         What the survivors became, in the world.
     """
     if absorbed is None:

@@ -21,7 +21,7 @@ from refine_addon.core import (
     read_ply,
     score,
 )
-from refine_addon.core.merging.absorb import Absorbed
+from refine_addon.core.merging.merge import Merged
 from refine_addon.core.pipeline import absorb_splats, decide, decide_task
 from refine_addon.core.pipeline.refit_splats import Made, unchanged_note
 from refine_addon.core.quality.curve import AS_GOOD, expected
@@ -96,7 +96,7 @@ def test_where_absorbing_gains_hardly_anything_rows_stay(splats, views, monkeypa
 def test_the_note_does_not_call_less_more(splats, reached, words):
     """Absorbing can reach less than deletion, in a shot that sees a fifth of the splats."""
     every = np.ones(len(splats), np.bool_)
-    tried = Made(Absorbed(splats, every, every, 0, 0), reached)
+    tried = Made(Merged(splats, every, every, 0, 0), reached)
 
     assert unchanged_note(59.0, tried).endswith(words)
 
@@ -206,7 +206,7 @@ def test_absorbing_that_misses_a_psnr_loses_to_deletion(splats, reached, kept, a
     """For 30 dB deletion leaves 25 splats at 30.1: fewer at 26.6 dB are not what was asked for."""
     keep = np.arange(len(splats)) < 25
     some = splats.take(np.arange(kept))
-    made = Made(Absorbed(some, keep, np.zeros(kept, np.bool_), 0, 0), reached)
+    made = Made(Merged(some, keep, np.zeros(kept, np.bool_), 0, 0), reached)
 
     as_good = decide_task._as_good(Task(Budget(psnr=30.0)), keep, 30.1, made)
 

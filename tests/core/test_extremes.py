@@ -9,7 +9,7 @@ import pytest
 
 from refine_addon.core import CHOICES, Budget, ViewSet, prune
 
-from .test_absorb import around, cloud
+from .test_merging import around, cloud
 
 COUNT = 120
 

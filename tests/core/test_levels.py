@@ -30,7 +30,7 @@ from refine_addon.core import (
 from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.levels import distance
 from refine_addon.core.levels.distance import OriginalPictures
-from refine_addon.core.merging import absorb as absorbing
+from refine_addon.core.merging import merge as merging
 from refine_addon.core.pipeline import absorb_splats
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.splats import ARRAYS
@@ -133,17 +133,19 @@ def joined_in_double(splats):
 def test_what_absorbed_before_is_not_thinned_by_a_tenth_again(monkeypatch):
     """Of 576, 57 are deleted before any merge; of the 288 left, none are, since 288 went already.
 
-    Patience goes by what has gone of the 519: 1 - 288/519, then 1 - 144/519.
+    The merge penalty goes by what has gone of the 519: 1 - 288/519, then 1 - 144/519.
     """
-    given, shares, whole, plain = [], [], absorbing.absorb, absorbing.patience
+    given, shares, whole, plain = [], [], merging.merge, merging.merge_penalty
     monkeypatch.setattr(
-        absorb_splats.absorbing,
-        "absorb",
+        absorb_splats,
+        "merge",
         lambda *rest, **named: (
             given.append(len(rest[0]) - named["deleted"].sum()) or whole(*rest, **named)
         ),
     )
-    monkeypatch.setattr(absorbing, "patience", lambda share: shares.append(share) or plain(share))
+    monkeypatch.setattr(
+        merging, "merge_penalty", lambda share: shares.append(share) or plain(share)
+    )
 
     lod(colourful(), cameras(), Levels((0.5, 0.25)))
 

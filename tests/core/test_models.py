@@ -15,8 +15,7 @@ from refine_addon.core.levels.files import LevelsRequest, lod_file
 from refine_addon.core.levels.lod import Levels
 from refine_addon.core.merging import field as merge_field
 from refine_addon.core.merging import pairs as merging
-from refine_addon.core.merging.absorb import absorb
-from refine_addon.core.merging.field import ViewSums
+from refine_addon.core.merging.merge import merge
 from refine_addon.core.operation.arranged import convert_files
 from refine_addon.core.operation.files import file_to_file
 from refine_addon.core.operation.requests import ConvertRequest, ScoreRequest
@@ -233,7 +232,7 @@ def test_two_small_splats_merge_into_one_of_their_mass(model):
     splats = with_model(splats, model)
     views = ViewSet((VIEW,))
 
-    merged = absorb(splats, views, seen_whole, 1).splats
+    merged = merge(splats, views, seen_whole(splats), seen_whole, 1).splats
 
     assert merged.model == model
     before, after = (
@@ -242,9 +241,9 @@ def test_two_small_splats_merge_into_one_of_their_mass(model):
     assert after == pytest.approx(before, rel=0.12)
 
 
-def seen_whole(left, _sums, _progress):
-    """Return what absorbing asks of views: all splats contribute alike."""
-    return ViewSums(np.full(len(left), 10.0), np.full(len(left), 1.0))
+def seen_whole(left, _sums=None, _progress=None):
+    """Return the sums that merging asks for: all splats contribute alike."""
+    return np.outer([10.0, 1.0], np.ones(len(left)))
 
 
 def test_splats_of_different_models_are_no_scene():
@@ -310,7 +309,8 @@ def test_of_discs_one_behind_the_other_comes_one_that_faces_the_camera():
         sh_dc=np.ones((2, 3)),
     )
 
-    merged = absorb(with_model(discs, "2dgs"), ViewSet((VIEW,)), seen_whole, 1).splats
+    discs = with_model(discs, "2dgs")
+    merged = merge(discs, ViewSet((VIEW,)), seen_whole(discs), seen_whole, 1).splats
 
     assert abs(rotation_matrices(merged.quaternions)[0, 2, 2]) > 0.99
     np.testing.assert_allclose(np.sort(np.exp(merged.log_scales[0, :2])), [0.01, 0.02], rtol=0.02)

@@ -12,7 +12,7 @@ from refine_addon.core import Splats, read_ply, survivor_columns
 from refine_addon.core.affine import transformed
 from refine_addon.core.formats import ply_write
 from refine_addon.core.formats.ply_columns import values_by_name
-from refine_addon.core.merging.absorb import Absorbed
+from refine_addon.core.merging.merge import Merged
 from refine_addon.core.splats import ARRAYS
 from tests.strategies import plain_ply
 
@@ -37,7 +37,7 @@ def absorbed_of(splats, keep, changed, factor=2.0):
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
         getattr(kept, name)[changed] *= factor
     gone = len(keep) - int(keep.sum())
-    return Absorbed(kept, keep, changed, 0, gone)
+    return Merged(kept, keep, changed, 0, gone)
 
 
 KEEP = np.array([True, True, False, True, True])

@@ -21,7 +21,7 @@ from .. import costs
 from ..costs import Plan
 from ..errors import RefineError
 from ..execute import Progress, silent
-from ..merging.absorb import Absorbed
+from ..merging.merge import Merged
 from ..pace import phases
 from ..pipeline import decide, planned, score, scoring_plans
 from ..quality.curve import PSNR_CAP
@@ -146,7 +146,7 @@ class Level:
         From how far away it will do.
     scores : Scores
         What the views saw of all splats, the same for all levels.
-    absorbed : Absorbed or None
+    absorbed : Merged or None
         What all splats became by absorbing and refitting.
     remark : str
         Why the PSNR that was asked for is out of reach; "" if it is not.
@@ -162,7 +162,7 @@ class Level:
     psnr: float | None
     reach: Reach
     scores: Scores
-    absorbed: Absorbed | None = None
+    absorbed: Merged | None = None
     remark: str = ""
     made: dict[str, Any] = field(default_factory=dict)
 
@@ -320,7 +320,7 @@ class _Made(NamedTuple):
     keep: NDArray[np.bool_]
     splats: Splats
     result: Result
-    absorbed: Absorbed | None
+    absorbed: Merged | None
 
 
 def _deleting(
@@ -359,7 +359,7 @@ def _absorbing(
         )
 
 
-def _both(first: Absorbed, second: Absorbed) -> Absorbed:
+def _both(first: Merged, second: Merged) -> Merged:
     """Return what two steps make of the splats of the first, one after the other."""
     keep = first.keep.copy()
     keep[first.keep] = second.keep

@@ -45,7 +45,7 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Return near neighbours of every point, most of them the nearest.
+    """Near neighbours of every point, most of them the nearest.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def nearest(
 def _candidates(
     points: NDArray[np.float64], window: int, progress: Progress, threads: int | None
 ) -> Callable[[slice], NDArray[np.int32]]:
-    """Return a function that gives the candidates of a slice of n points, (n, C) indices.
+    """Callable: the candidates of a slice of n points, (n, C) indices.
 
     A candidate may appear more than once, and a point is among its own.
     """
@@ -98,25 +98,20 @@ def _candidates(
         return lambda piece: np.broadcast_to(everyone, (piece.stop - piece.start, total))
     turns = rotation_matrices(CURVES)
 
-    def along(piece: slice) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        curve = piece.start
+    def along(curve: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         order = spatial_order(points @ turns[curve].T + SHIFTS[curve]).astype(np.int32)
         place = np.empty(total, np.int32)
         place[order] = np.arange(total, dtype=np.int32)
         # At either end of a curve the window lies to one side.
         return order, np.clip(place - window, 0, total - 1 - 2 * window)
 
-    curves = run_all(
-        along, chunks(len(CURVES), 1), progress=progress, what="finding neighbours", threads=threads
-    )
+    what = "finding neighbours"
+    curves = run_all(along, range(len(CURVES)), progress=progress, what=what, threads=threads)
 
     def around(piece: slice) -> NDArray[np.int32]:
         steps = np.arange(2 * window + 1, dtype=np.int32)
-        windows = (
-            order.take(first[piece, None] + steps)  # (n, 2 window + 1)
-            for order, first in curves
-        )
-        return np.concatenate(list(windows), axis=1)
+        windows = [order.take(first[piece, None] + steps) for order, first in curves]
+        return np.concatenate(windows, axis=1)
 
     return around
 
@@ -124,7 +119,7 @@ def _candidates(
 def _nearest_of(
     points: NDArray[np.float64], piece: slice, candidates: NDArray[np.int32], count: int
 ) -> NDArray[np.int32]:
-    """Return the `count` nearest of the candidates of n points, (n, count)."""
+    """The `count` nearest of the candidates of n points, (n, count)."""
     squared = np.zeros(candidates.shape)  # (n, C)
     with np.errstate(under="ignore"):
         for axis in range(3):

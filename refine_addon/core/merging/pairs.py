@@ -1,4 +1,7 @@
-"""The cost of merging two splats, as an error of the pictures, and the merged splat.
+"""Where two splats become one: what it costs the pictures, and the merged splat, colours included.
+
+`price` and `costs` are the cost of a pair, `merge` is the merged splat, `blend` its harmonics, and
+`as_splats` what a file stores of it.
 
 Splat i changes the picture by its footprint ``f_i = alpha_i exp(-q_i / 2)`` times the contrast
 ``s_i = c_i - B`` between its colour and the colour behind it. The views measure two sums over all
@@ -28,16 +31,18 @@ standard deviation of the viewing directions to either side of their mean (`cost
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..affine import quaternion
+from ..execute import Progress, chunks, run_all
 from ..rendering import ALPHA_MAX, LOW_PASS, Model
-from ..splats import LOG_ZERO, rotation_matrices
+from ..splats import LOG_ZERO
 from ..visibility.projection import disc_axes
-from .field import Array, Field, Footprint, Index, across, footprint, normalized
+from .field import Array, Field, Footprint, Index, across, footprint, normalized, packed
 
 Real = NDArray[np.floating[Any]]
 
@@ -46,11 +51,9 @@ FLATTEST = 1e-14
 
 ASIDE = 0.1
 """Least standard deviation of viewing directions that discs are made for, about radians: other
-views than those given look from aside, too. Results hardly depend on it between .03 and .3."""
+views than those given look from aside, too. Results hardly depend on it between 0.03 and 0.3."""
 
-CHANNELS = 3
-"""Red, green and blue."""
-
+_CHUNK = 1 << 14  # splats at a time: some MB of temporary memory a thread
 _CANCELLED = 1e-6  # a mean of two unit vectors with a smaller squared length counts as 0
 _TINY = 1e-280  # replaces 0 as a divisor
 # Bytes of a number -> what replaces 0 as a divisor, and the least determinant over xx yy: rounding
@@ -65,7 +68,7 @@ class Pairs(NamedTuple):
     Attributes
     ----------
     cost : (M,) float64
-        Squared error of the pictures that the merge causes, in the unit of `ViewSums`.
+        Squared error of the pictures that the merge causes, in the unit of `Field.error`.
     position, color : (M,) float64
         Share of the first splat in the mean and covariance, and in the colour.
     opacity, growth : (M,) float64
@@ -84,7 +87,7 @@ class Pairs(NamedTuple):
 
 
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
-    """Return costs and results of merges, by the equations at the top of this file.
+    """Costs and results of merges, by the equations at the top of this file.
 
     Parameters
     ----------
@@ -98,10 +101,10 @@ def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pair
 
 
 def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Real:
-    """Return the costs of merges, (M,): the mean over two viewing directions.
+    """Costs of merges, (M,) float32: the mean over two viewing directions.
 
-    They are float32, and computed in float32 from the steps between means on; those of discs are
-    computed in float64, since discs have a thickness of 0. `price` tells what a merge makes.
+    They are computed in float32 from the steps between means on; those of discs in float64, since
+    discs have a thickness of 0. `price` tells what a merge makes.
 
     Parameters
     ----------
@@ -149,7 +152,7 @@ class _Ends(NamedTuple):
     apart: Real
 
     def take(self, rows: Index) -> _Ends:
-        """Return the ends of some pairs."""
+        """Ends of some pairs."""
         one, two = (
             _Side(*(values.take(rows, axis=-1) for values in side)) for side in (self.one, self.two)
         )
@@ -157,7 +160,7 @@ class _Ends(NamedTuple):
 
 
 def _gather(splats: Field, first: Index, second: Index, kind: type[np.floating[Any]]) -> _Ends:
-    """Return the ends of pairs as `kind`, float32 or float64."""
+    """Ends of pairs as `kind`, float32 or float64."""
 
     def both(values: Array) -> list[Real]:
         return [
@@ -173,11 +176,10 @@ def _gather(splats: Field, first: Index, second: Index, kind: type[np.floating[A
     unit = 1.0 / np.maximum(spread, _TINY)  # (M,), over the squared unit of length
     step = (splats.means.take(second, axis=0) - splats.means.take(first, axis=0)).T * np.sqrt(unit)
     color, rest = color.astype(kind, copy=False), rest.astype(kind, copy=False)
+    amounts = zip(*map(both, (splats.opacity, splats.contribution, splats.error)), strict=True)
     one, two = (
-        _Side(np.multiply(shape, unit, dtype=kind, casting="same_kind", order="C"), *amounts)
-        for shape, *amounts in zip(
-            shapes, both(splats.opacity), both(splats.contribution), both(splats.error), strict=True
-        )
+        _Side(np.multiply(shape, unit, dtype=kind, casting="same_kind", order="C"), *of_side)
+        for shape, of_side in zip(shapes, amounts, strict=True)
     )
     directions, deviations, colors = map(both, (splats.direction, splats.deviation, splats.color))
     direction = color * directions[0] + rest * directions[1]  # (3, M)
@@ -186,152 +188,119 @@ def _gather(splats: Field, first: Index, second: Index, kind: type[np.floating[A
     direction[:, lost] = directions[0][:, lost]
     apart = colors[0] - colors[1]
     return _Ends(
-        splats.model,
-        one,
-        two,
-        color,
-        rest,
-        step.astype(kind, order="C"),
-        _unit(direction),
+        splats.model, one, two, color, rest, step.astype(kind, order="C"), _unit(direction),
         _mean_deviation(deviations[0], deviations[1], color),
-        (blur * unit).astype(kind, copy=False),
-        _dot(apart, apart),
-    )
-
-
-def _price(ends: _Ends, tilt: float) -> Pairs:
-    """Return costs and results of merges, viewed from one direction.
-
-    Masses and inner products here are divided by 2 pi, a factor that cancels; they are named by the
-    signals i, j and m of the equations. All arrays are (M,).
-    """
-    plane, color, rest = _in_plane(ends, tilt), ends.color, ends.rest
-    one, two, merged = plane[:3]
-    ii, jj, mm = one.squared(), two.squared(), merged.squared()
-    s_i, s_j, both = _contrasts(ends, ends.one.contribution / one.mass * ii,
-                                ends.two.contribution / two.mass * jj)  # fmt: skip
-    pp, qq, pq = _products(plane, color, rest, (ii, jj, mm))
-    cost = s_i * pp + 2.0 * both * pq + s_j * qq
-    # The contrast of the merged splat is l_i s_i + l_j s_j.
-    mixed = color * color * s_i + 2.0 * color * rest * both + rest * rest * s_j
-    tau = (ends.one.contribution + ends.two.contribution) / (one.mass + two.mass)
-    return Pairs(
-        tau * np.maximum(cost, 0.0), plane.position, color, merged.mass / merged.base, plane.growth,
-        tau * np.maximum(mixed, 0.0) * mm,
+        (blur * unit).astype(kind, copy=False), _dot(apart, apart),
     )  # fmt: skip
 
 
-def _products(
-    plane: _Plane, color: Real, rest: Real, squares: tuple[Real, Real, Real]
-) -> tuple[Real, Real, Real]:
-    """Return ``<p, p>``, ``<q, q>`` and ``<p, q>``, (M,) each.
+def _price(ends: _Ends, tilt: float) -> Pairs:
+    """Costs and results of merges, viewed from one direction.
 
-    `color` and `rest` are l_i and l_j, `squares` the inner products of i, j and m with themselves.
+    Masses and inner products here are divided by 2 pi, a factor that cancels; inner products are
+    named by the signals i, j and m of the equations. All arrays are (M,).
     """
-    ii, jj, mm = squares
+    color, rest, blur = ends.color, ends.rest, ends.blur
+    direction = _unit(ends.direction + tilt * ends.deviation) if tilt else ends.direction
+    plane = across(direction.T)
+    x, y = (_dot(ends.step, axis) for axis in plane)
+    step = (x * x, x * y, y * y)
+    one, two = (
+        _signal(side.covariances, side.opacity, plane, blur, ends.model)
+        for side in (ends.one, ends.two)
+    )
+    mixed: Any
+    position, other = _shares(one.mass, two.mass)
+    ij = _inner(one, two, step, 1.0)
+    # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
+    mass = one.mass + two.mass - np.minimum(ij, np.minimum(one.mass, two.mass))
+    if ends.model == "2dgs":
+        whole = _mixture(ends.one.covariances, ends.two.covariances, ends.step, position)
+        viewed = (np.asarray(each.T, np.float64, order="C") for each in ends[6:8])
+        disc = footprint(flat_as_viewed(whole.T, *viewed), plane, np.zeros(len(blur)))
+        area = base = _area(_disc_as_drawn(disc, blur))
+        growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
+        mixed = _disc_as_drawn((disc[0] * growth, disc[1] * growth, disc[2] * growth), blur)
+        area = base = _area(mixed)
+    else:
+        rest_of_one, between = 1.0 - position, position * other
+        mixed = tuple(
+            position * a + rest_of_one * b + between * c
+            for a, b, c in zip(one.footprint, two.footprint, step, strict=True)
+        )
+        area = _area(mixed)
+        base = _base(mixed, area, blur, ends.model)
+        growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
+        mixed = tuple(each * growth for each in mixed)
+        area, base = area * growth, base * growth
+    merged = _Signal(mixed, area, mass)
+    ii, jj, mm = (each.mass * each.mass / (2.0 * each.area) for each in (one, two, merged))
     # The merged centre lies between the two, away from each by the other's share of the step.
-    im = plane.one.times(plane.merged, plane.step, plane.other * plane.other)
-    jm = plane.two.times(plane.merged, plane.step, plane.position * plane.position)
-    pq = plane.overlap - rest * im - color * jm
+    im = _inner(one, merged, step, other * other)
+    jm = _inner(two, merged, step, position * position)
+    pp = ii - 2.0 * color * im + color * color * mm
+    qq = jj - 2.0 * rest * jm + rest * rest * mm
+    pq = ij - rest * im - color * jm
     pq += color * rest * mm
-    return ii - 2.0 * color * im + color * color * mm, jj - 2.0 * rest * jm + rest * rest * mm, pq
+    s_i, s_j = (
+        _squared_contrast(side.error, side.contribution / signal.mass * squared)
+        for side, signal, squared in ((ends.one, one, ii), (ends.two, two, jj))
+    )
+    # By Cauchy-Schwarz |s_i.s_j| is at most this; measured errors and colours can contradict it.
+    limit = np.sqrt(s_i * s_j)
+    s_ij = np.clip(0.5 * (s_i + s_j - ends.apart), -limit, limit)
+    cost = s_i * pp + 2.0 * s_ij * pq + s_j * qq
+    # The contrast of the merged splat is l_i s_i + l_j s_j.
+    contrast = color * color * s_i + 2.0 * color * rest * s_ij + rest * rest * s_j
+    tau = (ends.one.contribution + ends.two.contribution) / (one.mass + two.mass)
+    return Pairs(
+        tau * np.maximum(cost, 0.0), position, color, mass / base, growth,
+        tau * np.maximum(contrast, 0.0) * mm,
+    )  # fmt: skip
 
 
 class _Signal(NamedTuple):
     """M splats in the plane viewed: f in the equations, but for their places."""
 
     footprint: Footprint
-    area: Array
-    base: Array
-    mass: Array
-
-    def squared(self) -> Array:
-        """Return ``<f, f>``, (M,)."""
-        return self.mass * self.mass / (2.0 * self.area)
-
-    def times(self, other: _Signal, step: Footprint, factor: Real | float) -> Real:
-        """Return ``<f, g>``, (M,), given xx, xy, yy of the step between the two, times a factor."""
-        product = _product(self.footprint, other.footprint, step, factor)
-        return self.mass * other.mass * product
+    area: Real
+    mass: Real
 
 
-class _Plane(NamedTuple):
-    """M pairs and their merged splats in the plane viewed; arrays are (M,)."""
-
-    one: _Signal
-    two: _Signal
-    merged: _Signal
-    step: Footprint
-    position: Real
-    other: Real
-    growth: Real
-    overlap: Real
-
-
-def _in_plane(ends: _Ends, tilt: float) -> _Plane:
-    """Return pairs and their merged splats in the plane viewed; `tilt`: see `price`."""
-    plane = across((_unit(ends.direction + tilt * ends.deviation) if tilt else ends.direction).T)
-    x, y = (_dot(ends.step, axis) for axis in plane)
-    step, blur = (x * x, x * y, y * y), ends.blur
-    one, two = (_signal(side, plane, blur, ends.model) for side in (ends.one, ends.two))
-    position, other = _shares(one.mass, two.mass)
-    overlap = one.times(two, step, 1.0)
-    discs = ends.model == "2dgs"
-    if discs:
-        sharp = footprint(_mixed_disc(ends, position), plane, np.zeros(len(blur)))
-        mixed = _disc_as_drawn(sharp, blur)
-    else:
-        between = position * other
-        xx, xy, yy = step
-        mixed = _mixed(
-            one.footprint, two.footprint, position, (between * xx, between * xy, between * yy)
-        )
-    # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
-    mass = one.mass + two.mass - np.minimum(overlap, np.minimum(one.mass, two.mass))
-    area = _area(mixed)
-    base = _base(mixed, area, blur, ends.model)
-    growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
-    grown = sharp if discs else mixed
-    mixed = (grown[0] * growth, grown[1] * growth, grown[2] * growth)
-    if discs:
-        mixed = _disc_as_drawn(mixed, blur)
-        area = base = _area(mixed)
-    else:
-        area, base = area * growth, base * growth
-    return _Plane(
-        one, two, _Signal(mixed, area, base, mass), step, position, other, growth, overlap
-    )
-
-
-def _signal(side: _Side, plane: tuple[Real, Real], blur: Real, model: Model) -> _Signal:
-    """Return splats in a plane, spanned by unit vectors, with a low-pass of variance `blur`."""
+def _signal(
+    covariances: Real, opacity: Real, plane: tuple[Real, Real], blur: Real, model: Model
+) -> _Signal:
+    """Splats in a plane, spanned by unit vectors, with a low-pass of variance `blur`."""
     if model == "2dgs":
-        sharp = footprint(side.covariances.T, plane, np.zeros(len(blur)))
-        ellipse = _disc_as_drawn(sharp, blur)
+        ellipse = _disc_as_drawn(footprint(covariances.T, plane, np.zeros(len(blur))), blur)
     else:
-        ellipse = footprint(side.covariances.T, plane, blur)
+        ellipse = footprint(covariances.T, plane, blur)
     area = _area(ellipse)
-    base = _base(ellipse, area, blur, model)
-    return _Signal(ellipse, area, base, side.opacity * base)
+    return _Signal(ellipse, area, opacity * _base(ellipse, area, blur, model))
 
 
-def _mixed_disc(ends: _Ends, share: Array) -> Array:
-    """Return the covariances of mixtures of discs, (M, 6); `share`, (M,), is that of the first."""
-    whole = _mixture(ends.one.covariances.T, ends.two.covariances.T, ends.step.T, share)
-    viewed = (np.ascontiguousarray(each.T, np.float64) for each in (ends.direction, ends.deviation))
-    return flat_as_viewed(whole, *viewed)
+def _inner(one: _Signal, other: _Signal, step: Footprint, factor: Real | float) -> Real:
+    """Inner products ``<f, g>``, (M,), given xx, xy, yy of the step between, times a factor.
+
+    That of two normal densities is one at the step, whose covariance is the sum of the two.
+    """
+    xx, xy, yy = (a + b for a, b in zip(one.footprint, other.footprint, strict=True))
+    determinant = _determinant((xx, xy, yy))
+    square = (yy * step[0] - 2.0 * xy * step[1] + xx * step[2]) * factor / determinant
+    density = np.exp(-0.5 * np.clip(square, 0.0, _FARTHEST)) / np.sqrt(determinant)
+    return np.asarray(one.mass * other.mass * density)
 
 
-def _base(footprint: Footprint, area: Real, blur: Real, model: Model) -> Real:
-    """Return the area that opacity is meant for, (M,): see `_Signal`; `area` has the low-pass."""
+def _base(ellipse: Footprint, area: Real, blur: Real, model: Model) -> Real:
+    """Area that opacity is meant for, (M,): of antialiased splats it is without the low-pass."""
     if model != "antialiased":
         return area
-    (xx, xy, yy), (tiny, _) = footprint, _least(area)
+    (xx, xy, yy), (tiny, _) = ellipse, _least(area)
     return _area((np.maximum(xx - blur, tiny), xy, np.maximum(yy - blur, tiny)))
 
 
 def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
-    """Return ellipses that cover as much as discs with their low-pass, along the same axes.
+    """Ellipses that cover as much as discs with their low-pass, along the same axes.
 
     `sharp` is without the low-pass, whose variance in `blur` is that of other splats; see
     `disc_axes`.
@@ -347,22 +316,17 @@ def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
     return middle + stretch * half, stretch * xy, middle - stretch * half
 
 
-def _contrasts(ends: _Ends, one: Array, two: Array) -> tuple[Array, Array, Array]:
-    """Return ``|s_i|^2``, ``|s_j|^2`` and ``s_i.s_j``, (M,) each, as the measured errors imply.
-
-    `one` and `two`, (M,), are what the errors would be for a contrast of 1.
-    """
-    s_i, s_j = _squared_contrast(ends.one.error, one), _squared_contrast(ends.two.error, two)
-    both = 0.5 * (s_i + s_j - ends.apart)
-    # By Cauchy-Schwarz |s_i.s_j| is at most this; measured errors and colours can contradict it.
-    limit = np.sqrt(s_i * s_j)
-    return s_i, s_j, np.clip(both, -limit, limit)
-
-
 def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
-    """Return the merged splats; each has the mean and covariance of the mixture of its pair.
+    """Merged splats; each has the mean and covariance of the mixture of its pair.
 
     ``mu = w mu_i + w' mu_j`` and ``C = w C_i + w' C_j + w w' d d'``, w + w' = 1, d = mu_j - mu_i.
+
+    Parameters
+    ----------
+    splats, first, second
+        See `price`.
+    pairs : Pairs
+        What `price` returns of them.
     """
     one, two = splats.take(first), splats.take(second)
     position, color = pairs.position[:, None], pairs.color[:, None]
@@ -371,7 +335,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     lost = ~direction.any(axis=1)
     direction[lost] = one.direction[lost]
     deviation = _mean_deviation(one.deviation.T, two.deviation.T, pairs.color).T
-    covariances = _mixture(one.covariances, two.covariances, step, pairs.position)
+    covariances = _mixture(one.covariances.T, two.covariances.T, step.T, pairs.position).T
     if one.model == "2dgs":
         covariances = flat_as_viewed(covariances, direction, deviation)
     return Field(
@@ -384,24 +348,125 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
         deviation,
         color * one.color + (1.0 - color) * two.color,
         pairs.color * one.blur + (1.0 - pairs.color) * two.blur,
-        one.model,
+        model=one.model,
     )
 
 
-def _mixture(one: Array, two: Array, step: Array, share: Array) -> Array:
-    """Return the covariances of mixtures of pairs, (M, 6), given theirs.
+def groups(merges: Sequence[tuple[Index, Index, Array]], count: int) -> tuple[Index, Array]:
+    """The splat that each of some went into, or is, and its share of the colour of that one.
 
-    `step`, (M, 3), is from the mean of the first to that of the second, whose share in the mixture
-    is `share`, (M,).
+    Parameters
+    ----------
+    merges : list of (into, gone, share)
+        Of each round, see `graph.MergeGraph`.
+    count : int
+        Of the splats, N.
+
+    Returns
+    -------
+    owner, share : (N,) int64, (N,) float64
     """
-    position = share[:, None]
+    owner, share = np.arange(count), np.ones(count)
+    # From the last round to the first: what a round merges into may go into another in a later one.
+    for into, gone, kept_share in reversed(merges):
+        owner[gone] = owner[into]
+        share[gone] = share[into] * (1.0 - kept_share)
+        share[into] *= kept_share
+    return owner, share
+
+
+def blend(
+    values: NDArray[Any],
+    members: Index,
+    share: Array,
+    merged: NDArray[Any],
+    into: Index,
+    progress: Progress,
+    threads: int | None,
+) -> None:
+    """Write the harmonics of merged splats: means of those of all that went into one, by shares.
+
+    Rounded to float32, whatever type they have, so that tiles and files give the same.
+
+    Parameters
+    ----------
+    values : (N, n, 3) floating
+        Harmonics of the splats before.
+    members : (m,) int64
+        Rows of those that went into one, group by group.
+    share : (m,) float64
+        Of each in the colour of the merged splat, see `groups`.
+    merged : (K, n, 3) floating
+        Harmonics of the kept splats; changed.
+    into : (m,) int64
+        Row of the merged splat of each.
+    progress, threads
+    """
+    starts, largest = np.flatnonzero(np.diff(into, prepend=-1)), np.finfo(np.float32).max
+
+    def fill(harmonic: int) -> None:  # one at a time, to save memory
+        with np.errstate(under="ignore"):
+            weighted = values[members, harmonic] * share[:, None]  # (m, 3)
+            means = np.add.reduceat(weighted, starts).clip(-largest, largest)
+            merged[into[starts], harmonic] = means.astype(np.float32)
+
+    harmonics = values.shape[1] if len(starts) else 0
+    run_all(fill, range(harmonics), progress=progress, what="merging", threads=threads)
+
+
+def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[Array, Array, Array]:
+    """Log scales, (M, 3), quaternions, (M, 4), and logits of the opacity, (M,), of merged splats.
+
+    Discs are those of their two longest axes, with the mass that they had; the third scale is 0.
+    """
+    count = len(merged.opacity)
+    stored = np.empty((count, 3)), np.empty((count, 4)), np.empty(count)
+
+    def fill(piece: slice) -> None:
+        some = merged.take(np.arange(piece.start, piece.stop))
+        with np.errstate(under="ignore"):
+            logs, vectors = axes(some.covariances)
+            opacity = some.opacity
+            if merged.model == "2dgs":
+                vectors = vectors[:, :, [1, 2, 0]]
+                logs = np.stack([logs[:, 1], logs[:, 2], np.full(len(logs), LOG_ZERO)], axis=1)
+                sides = vectors[:, :, :2] * np.exp(logs[:, None, :2])
+                thin = packed(sides @ np.swapaxes(sides, 1, 2))
+                plane, none = across(some.direction), np.zeros(len(logs))
+                before, after = (
+                    _area(_disc_as_drawn(footprint(each, plane, none), some.blur))
+                    for each in (some.covariances, thin)
+                )
+                opacity = np.minimum(opacity * before / after, ALPHA_MAX)
+            stored[0][piece], stored[1][piece] = logs, quaternion(vectors)
+            stored[2][piece] = np.log(opacity) - np.log1p(-opacity)
+
+    run_all(fill, chunks(count, _CHUNK), progress=progress, what="merging", threads=threads)
+    return stored
+
+
+def axes(covariances: Array) -> tuple[Array, Array]:
+    """Log scales, (M, 3), ascending, and axes as columns, (M, 3, 3), of covariances, (M, 6)."""
+    full = _full(covariances)
+    total = np.maximum(np.trace(full, axis1=1, axis2=2), _TINY)
+    values, vectors = np.linalg.eigh(full / total[:, None, None])
+    logs = 0.5 * (np.log(np.maximum(values, FLATTEST)) + np.log(total)[:, None])
+    vectors[np.linalg.det(vectors) < 0.0] *= -1.0
+    return logs, vectors
+
+
+def _mixture(one: Real, two: Real, step: Real, share: Real) -> Array:
+    """Covariances of mixtures of pairs, (6, M), given theirs; `share`, (M,), is that of the first.
+
+    `step`, (3, M), is from the mean of the first to that of the second.
+    """
     rows, columns = np.triu_indices(3)
-    between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
-    return np.asarray(position * one + (1.0 - position) * two + between, np.float64)
+    between = step[rows] * step[columns] * (share * (1.0 - share))  # (6, M)
+    return np.asarray(share * one + (1.0 - share) * two + between, np.float64)
 
 
 def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Array:
-    """Return covariances, (M, 6), of discs that look like given ones from where they are viewed.
+    """Covariances, (M, 6), of discs that look like given ones from where they are viewed.
 
     A disc with the normal n that a covariance C is projected to along a, ``E C E'`` with
     ``E = I - a n' / (n' a)``, looks like C along a, however thick C is. With M the mean of
@@ -413,7 +478,7 @@ def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Ar
     ----------
     covariances : (M, 6) float64
     direction, deviation : (M, 3) float64
-        See `field.Viewing`; `ASIDE` is the least standard deviation.
+        See `field.Field`; `ASIDE` is the least standard deviation.
     """
     beside = deviation - np.einsum("ij,ij->i", deviation, direction)[:, None] * direction
     size = np.maximum(np.sqrt(np.einsum("ij,ij->i", beside, beside)), ASIDE)
@@ -427,20 +492,17 @@ def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Ar
         + ASIDE**power * np.eye(3)
         for power in (-1, 1)
     )
-    rows, columns = np.triu_indices(3)
-    left = flat((scaled @ _full(covariances) @ scaled)[:, rows, columns])
-    seen: Array = (back @ _full(left) @ back)[:, rows, columns]
-    return seen
+    return packed(back @ _full(flat(packed(scaled @ _full(covariances) @ scaled))) @ back)
 
 
 def _full(covariances: Array) -> Array:
-    """Return symmetric matrices, (M, 3, 3), of their upper halves, (M, 6)."""
+    """Symmetric matrices, (M, 3, 3), of their upper halves, (M, 6)."""
     full: Array = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     return full
 
 
 def flat(covariances: Array) -> Array:
-    """Return covariances, (M, 6), without what they have along their shortest axis.
+    """Covariances, (M, 6), without what they have along their shortest axis.
 
     That axis n is the eigenvector of the least eigenvalue, which is
     ``t / 3 + 2 p cos((acos(det(B / p) / 2) + 2 pi) / 3)`` with t the trace, ``B = C - t / 3 I`` and
@@ -450,7 +512,9 @@ def flat(covariances: Array) -> Array:
     full = _full(covariances) / total[:, None, None]
     centered = full - np.eye(3) / 3.0
     p = np.sqrt(np.maximum(np.einsum("nij,nij->n", centered, centered) / 6.0, FLATTEST))
-    angle = np.arccos(np.clip(_triple(centered) / (2.0 * p**3), -1.0, 1.0)) / 3.0
+    first, second, third = np.moveaxis(centered, 1, 0)
+    determinant = np.einsum("ni,ni->n", first, np.cross(second, third))
+    angle = np.arccos(np.clip(determinant / (2.0 * p**3), -1.0, 1.0)) / 3.0
     least = 1.0 / 3.0 + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
     normal = _null(full - least[:, None, None] * np.eye(3))
     along = np.einsum("nij,nj->ni", full, normal)
@@ -458,20 +522,11 @@ def flat(covariances: Array) -> Array:
     outer = normal[:, :, None] * along[:, None, :]
     left = full - outer - np.swapaxes(outer, 1, 2)
     left += own[:, None, None] * normal[:, :, None] * normal[:, None, :]
-    rows, columns = np.triu_indices(3)
-    result: Array = left[:, rows, columns] * total[:, None]
-    return result
-
-
-def _triple(matrices: Array) -> Array:
-    """Return the determinants of matrices, (M, 3, 3)."""
-    first, second, third = np.moveaxis(matrices, 1, 0)
-    determinant: Array = np.einsum("ni,ni->n", first, np.cross(second, third))
-    return determinant
+    return packed(left) * total[:, None]
 
 
 def _null(matrices: Array) -> Array:
-    """Return unit vectors, (M, 3), that symmetric matrices of rank 2 or less map to 0."""
+    """Unit vectors, (M, 3), that symmetric matrices of rank 2 or less map to 0."""
     rows = np.moveaxis(matrices, 1, 0)  # (3, M, 3)
     crossed = np.stack([np.cross(rows[k], rows[(k + 1) % 3]) for k in range(3)], axis=1)
     best = np.argmax(np.einsum("nki,nki->nk", crossed, crossed), axis=1)
@@ -484,48 +539,8 @@ def _null(matrices: Array) -> Array:
     return normalized(np.where(lost[:, None], beside, normal))
 
 
-def axes(covariances: Array) -> tuple[Array, Array]:
-    """Return log scales, (M, 3), and quaternions, (M, 4), of covariances, (M, 6)."""
-    full = _full(covariances)
-    total = np.maximum(np.trace(full, axis1=1, axis2=2), _TINY)
-    values, vectors = np.linalg.eigh(full / total[:, None, None])
-    logs = 0.5 * (np.log(np.maximum(values, FLATTEST)) + np.log(total)[:, None])
-    vectors[np.linalg.det(vectors) < 0.0] *= -1.0
-    return logs, quaternion(vectors)
-
-
-def flattened(merged: Field, logs: Array, quaternions: Array) -> tuple[Array, Array, Array]:
-    """Return merged splats as discs of their two longest axes, with the mass that they had.
-
-    Parameters
-    ----------
-    merged : Field
-    logs, quaternions : (M, 3), (M, 4) float64
-        See `axes`: the shortest axis comes first.
-
-    Returns
-    -------
-    logs, quaternions, opacity : (M, 3), (M, 4), (M,) float64
-        The shortest axis comes last, and is 0.
-    """
-    flat = np.stack([logs[:, 1], logs[:, 2], np.full(len(logs), LOG_ZERO)], axis=1)
-    x, y, z, w = quaternions[:, 1], quaternions[:, 2], quaternions[:, 3], quaternions[:, 0]
-    # A third of a turn about (1, 1, 1) takes the first axis to the second, and so on.
-    turned = 0.5 * np.stack([w - x - y - z, w + x + y - z, w + y + z - x, w + z + x - y], axis=1)
-    vectors = rotation_matrices(turned)[:, :, :2] * np.exp(flat[:, None, :2])
-    rows, columns = np.triu_indices(3)
-    covariances = (vectors @ np.swapaxes(vectors, 1, 2))[:, rows, columns]
-    plane = across(merged.direction)
-    none = np.zeros(len(flat))
-    thick, thin = (
-        _area(_disc_as_drawn(footprint(each, plane, none), merged.blur))
-        for each in (merged.covariances, covariances)
-    )
-    return flat, turned, np.minimum(merged.opacity * thick / thin, ALPHA_MAX)
-
-
 def _dot(one: Real, other: Real) -> Real:
-    """Return the inner products of vectors, (M,), given (3, M) each.
+    """Inner products of vectors, (M,), given (3, M) each.
 
     Written out, so that rounding does not depend on where they lie in memory.
     """
@@ -533,53 +548,40 @@ def _dot(one: Real, other: Real) -> Real:
 
 
 def _unit(vectors: Real) -> Real:
-    """Return vectors, (3, M), with length 1; zero vectors stay 0."""
+    """Vectors, (3, M), with length 1; zero vectors stay 0."""
     length = np.sqrt(_dot(vectors, vectors))
     length[length == 0.0] = 1.0
     return np.asarray(vectors / length)
 
 
 def _shares(one: Real, two: Real) -> tuple[Real, Real]:
-    """Return the shares of two positive amounts in their sum, (M,) each."""
+    """Shares of two positive amounts in their sum, (M,) each."""
     total = one + two
     return one / total, two / total
 
 
 def _squared_contrast(error: Real, whole: Real) -> Real:
-    """Return the squared contrast that a measured error implies, (M,).
+    """Squared contrast that a measured error implies, (M,); `whole` is the error for |s| = 1.
 
-    Colours are in 0..1, so it is at most 1 for each channel. `whole` is the error for |s| = 1.
+    Colours are in 0..1, so it is at most 1 for each of three channels.
     """
-    return np.asarray(np.minimum(error, CHANNELS * whole) / np.maximum(whole, _least(whole)[0]))
+    return np.asarray(np.minimum(error, 3 * whole) / np.maximum(whole, _least(whole)[0]))
 
 
 def _mean_deviation(one: Real, two: Real, share: Real) -> Real:
-    """Return the mean of deviations, (3, M), whose signs are arbitrary, so they are made alike."""
+    """Mean of deviations, (3, M), whose signs are arbitrary, so they are made alike."""
     rest = 1.0 - share
     np.negative(rest, where=_dot(one, two) < 0.0, out=rest)
     return np.asarray(share * one + rest * two)
 
 
-def _mixed(one: Footprint, two: Footprint, share: Array, between: Footprint) -> Footprint:
-    """Return the covariance of a mixture of two distributions; `share`, (M,), is that of the first.
-
-    `between` is the covariance of the two centres, weighted by their shares.
-    """
-    rest = 1.0 - share
-    return (
-        share * one[0] + rest * two[0] + between[0],
-        share * one[1] + rest * two[1] + between[1],
-        share * one[2] + rest * two[2] + between[2],
-    )
-
-
 def _least(values: Real) -> tuple[float, float]:
-    """Return what replaces 0 as a divisor, and the least determinant over xx yy: see `_LEAST`."""
+    """What replaces 0 as a divisor, and the least determinant over xx yy: see `_LEAST`."""
     return _LEAST[values.dtype.itemsize]
 
 
 def _determinant(footprint: Footprint) -> Real:
-    """Return the determinant, (M,), kept above 0 where rounding would leave 0 or less."""
+    """Determinant, (M,), kept above 0 where rounding would leave 0 or less."""
     xx, xy, yy = footprint
     tiny, thinnest = _least(xx)
     squared = xx * yy
@@ -587,17 +589,5 @@ def _determinant(footprint: Footprint) -> Real:
 
 
 def _area(footprint: Footprint) -> Real:
-    """Return the area of the ellipse of one standard deviation, divided by pi, (M,)."""
+    """Area of the ellipse of one standard deviation, divided by pi, (M,)."""
     return np.asarray(np.sqrt(_determinant(footprint)))
-
-
-def _product(one: Footprint, other: Footprint, step: Footprint, factor: Real | float) -> Real:
-    """Return 2 pi times the integral of the product of two normal densities, (M,).
-
-    The integral is a normal density at the step between their centres, whose products are `step`
-    times `factor`; its covariance is the sum of the two.
-    """
-    xx, xy, yy = one[0] + other[0], one[1] + other[1], one[2] + other[2]
-    determinant = _determinant((xx, xy, yy))
-    square = (yy * step[0] - 2.0 * xy * step[1] + xx * step[2]) * factor / determinant
-    return np.asarray(np.exp(-0.5 * np.clip(square, 0.0, _FARTHEST)) / np.sqrt(determinant))

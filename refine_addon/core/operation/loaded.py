@@ -13,7 +13,7 @@ from ..formats.format import Format
 from ..formats.ply import SplatFile
 from ..formats.ply_columns import Columns
 from ..formats.registry import Packed
-from ..merging.absorb import Absorbed
+from ..merging.merge import Merged
 from ..selection import Budget, RowBytes
 from ..splats import Splats
 from ..survivors import survivor_columns
@@ -114,6 +114,6 @@ class Loaded:
             return self
         return replace(self, sizes=replace(sizes, row=sizes.changed))
 
-    def columns(self, absorbed: Absorbed | None) -> Mapping[str, NDArray[Any]]:
+    def columns(self, absorbed: Merged | None) -> Mapping[str, NDArray[Any]]:
         """Return the stored properties with what survivors became; none if they did not change."""
         return survivor_columns(self.stored, absorbed, np.linalg.inv(self.matrix))

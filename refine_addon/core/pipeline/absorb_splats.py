@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from .. import costs
 from ..costs import Plan
 from ..execute import Progress, part, silent
-from ..merging import absorb as absorbing
-from ..merging.absorb import Absorbed
-from ..merging.field import ViewSums
+from ..merging.merge import Merged, copied, merge, stage_counts
 from ..pace import phases
 from ..quality.curve import left_to_lose
 from ..quality.psnr import psnr_against
@@ -130,7 +128,7 @@ def _to_count(task: Task, left: int) -> list[Plan]:
 def _stages(count: int, left: int, images: costs.Images) -> Plan:
     """Return the costs of the stages of absorbing; the first tenth is deleted before."""
     begin = max(count - math.floor(FIRST * count), left)
-    return costs.joined(costs.absorbing(begin, absorbing.stages(begin, left), images))
+    return costs.joined(costs.absorbing(begin, stage_counts(begin, left), images))
 
 
 def _absorb_to_count(
@@ -171,10 +169,10 @@ def _absorb_to_count(
     return replace(made, psnr=estimated(made.refitted.splats, last))
 
 
-def _deleted(splats: Splats, keep: NDArray[np.bool_]) -> Absorbed:
+def _deleted(splats: Splats, keep: NDArray[np.bool_]) -> Merged:
     """Return what plain deletion leaves, as absorbing returns it."""
-    left = absorbing.in_float64(splats.take(keep))
-    return absorbing.Absorbed(left, keep, np.zeros(len(left), np.bool_), 0, len(keep) - len(left))
+    left = copied(splats, np.flatnonzero(keep))
+    return Merged(left, keep, np.zeros(len(left), np.bool_), 0, len(keep) - len(left))
 
 
 def _absorb_to_psnr(
@@ -257,7 +255,7 @@ def absorb_removed(
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
-) -> Absorbed:
+) -> Merged:
     """Reduce splats to `count` survivors that absorb the others.
 
     Parameters
@@ -269,14 +267,14 @@ def absorb_removed(
     known : tuple of Scores and Measured, optional
         The results of `occlusion.score_once` for these splats and views, if known.
     began : int, optional
-        How many splats there were before these absorbed others. What is deleted first, and how
-        patient merging is, go by the share of them that has gone.
+        How many splats there were before these absorbed others. What is deleted first, and what
+        merging costs, go by the share of them that has gone.
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
 
     Returns
     -------
-    Absorbed
+    Merged
 
     Raises
     ------
@@ -298,25 +296,22 @@ def absorb_removed(
     # Undrawable splats have the lowest scores, so these go first.
     rest = select(scores, Budget(keep=total - first), protected=protected)
     # The deleted splats hid almost nothing, so the first stage need not measure again.
-    at_first = [ViewSums(measured.contribution[rest], measured.error[rest])]
+    sums = np.array([measured.contribution, measured.error])
     del known, scores, measured
     turns = itertools.count()
 
-    def measure(now: Splats, expected: ViewSums | None, stage_progress: Progress) -> ViewSums:
-        if expected is None:
-            return at_first.pop()
+    def measure(
+        now: Splats, expected: NDArray[np.float64], stage_progress: Progress
+    ) -> NDArray[np.float64]:
         measured, share = occlusion.measure_part(
             now, used, settings.occlusion, next(turns), PARTS,
             progress=stage_progress, threads=threads,
         )  # fmt: skip
-        return ViewSums(
-            measured.contribution + (1.0 - share) * expected.contribution,
-            measured.error + (1.0 - share) * expected.error,
-        )
+        return np.array([measured.contribution, measured.error]) + (1.0 - share) * expected
 
     with np.errstate(under="ignore"):  # as in `score_splats.score`
-        return absorbing.absorb(
-            splats, used, measure, count,
+        return merge(
+            splats, used, sums, measure, count,
             began=began - deleted, deleted=~rest, protected=protected,
             progress=absorbing_progress, threads=threads,
         )  # fmt: skip

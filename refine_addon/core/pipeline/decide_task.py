@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .. import selection
 from ..costs import Cost, Plan, joined
 from ..execute import Progress, report, silent
-from ..merging.absorb import Absorbed
+from ..merging.merge import Merged
 from ..pace import phases
 from ..quality.cost import expected_seconds
 from ..quality.curve import AS_GOOD, PLAIN, deletion_will_do, in_words, needed
@@ -258,7 +258,7 @@ def _facts(
     keep: NDArray[np.bool_],
     psnr: float | None,
     clock: Clock,
-    absorbed: Absorbed | None = None,
+    absorbed: Merged | None = None,
 ) -> dict[str, Any]:
     """Return the report, but for what survivors may become."""
     facts = make_report(scores, keep, task.budget, task.settings, clock)

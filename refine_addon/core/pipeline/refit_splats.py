@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ..execute import Cancelled, Progress, return_freed
-from ..merging.absorb import Absorbed
+from ..merging.merge import Merged
 from ..pace import named
 from ..quality.curve import in_words
 from ..refit.refit import Refitted, refit_rounds
@@ -25,7 +25,7 @@ class Made:
 
     Attributes
     ----------
-    absorbed : Absorbed
+    absorbed : Merged
         Before refitting: by absorbing, or by deletion where that is better to begin with.
     psnr : float or None
         The estimated PSNR of what they became in the end, dB; None if too little is seen.
@@ -43,7 +43,7 @@ class Made:
         What ended refitting before it was done; see `Result.stopped`.
     """
 
-    absorbed: Absorbed
+    absorbed: Merged
     psnr: float | None = None
     psnr_between: float | None = None
     refitted: Refitted | None = None
@@ -62,7 +62,7 @@ class Made:
         return {**self.before, self.became: self.psnr}
 
     @property
-    def survivors(self) -> Absorbed:
+    def survivors(self) -> Merged:
         """The survivors as they became in the end."""
         if self.refitted is None:
             return self.absorbed

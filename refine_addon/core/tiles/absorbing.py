@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..costs import Images
 from ..costs import absorbing as plan_stages
-from ..merging.absorb import Counts, patience, stages
+from ..merging.merge import merge_penalty, stage_counts
 from ..pipeline.absorb_splats import FIRST, PARTS
 from ..selection import Budget, select
 from ..task import Settings
@@ -46,7 +46,7 @@ REGION = 1 << 20
 """Splats of a region at most; absorbing takes about 900 bytes of each."""
 
 ALONE = 0.6
-"""Least share that a stage of several regions leaves where one is enough; see `absorb.ALONE`. Half
+"""Least share that a stage of several regions leaves where one is enough; see `merge.ALONE`. Half
 goes in two stages: four regions in one stage lost .5 dB."""
 
 _SAMPLE = 1 << 14  # splats that decide along which axis a box is divided
@@ -55,8 +55,8 @@ _ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32
 
 
 @dataclass(frozen=True, eq=False)
-class Survivors(Counts):
-    """What is left of N splats: K of them; for the counts see `absorb.Absorbed`.
+class Survivors:
+    """What is left of N splats: K of them; for the counts see `merge.Merged`.
 
     Attributes
     ----------
@@ -113,8 +113,8 @@ def absorb(tiles: MeasuredTiles, goal: int, settings: Settings, runner: Runner) 
     left = _Left(tiles.units, rows, tiles.measured.take(rows))
     if len(rows) <= REGION:
         return _at_once(tiles.context, left, AbsorbAtOnce(goal, total, settings), runner)
-    factor = patience(1.0 - goal / len(rows))
-    counts = stages(len(rows), goal, ALONE)
+    factor = merge_penalty(1.0 - goal / len(rows))
+    counts = stage_counts(len(rows), goal, ALONE)
     images = Images.of(tiles.context.views)
     runners = runner.phases(*plan_stages(len(rows), counts, images))
     for number, count in enumerate(counts):

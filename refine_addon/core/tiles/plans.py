@@ -6,7 +6,7 @@ import math
 
 from .. import costs
 from ..costs import Cost, Images, Plan
-from ..merging.absorb import ALONE, stages
+from ..merging.merge import ALONE, stage_counts
 from ..pipeline.absorb_splats import FIRST
 from ..refit.refit import Refit
 from ..refit.round_rays import limits
@@ -55,7 +55,7 @@ def making(count: int, left: int, images: Images, refit: Refit | None) -> list[P
     """
     begin = max(count - math.floor(FIRST * count), left)
     alone = absorbing.ALONE if begin > absorbing.REGION else ALONE
-    after = stages(begin, left, alone)
+    after = stage_counts(begin, left, alone)
     absorbed = costs.joined(costs.absorbing(begin, after, images))
     refitted: Plan = []
     if refit is not None:

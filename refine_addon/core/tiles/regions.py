@@ -5,15 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..merging.absorb import mergeable, reduced
-from ..merging.field import Field, MeasuredField, ViewSums, measured_field
+from ..merging.field import Field, MeasuredField, measured_field
 from ..merging.graph import MergeGraph
+from ..merging.merge import mergeable, reduced
 from ..operation.run import Runtime
 from ..pipeline.absorb_splats import absorb_removed
 from ..rendering import MODELS
@@ -63,14 +62,14 @@ class StageContext:
     """What all steps of a stage need.
 
     The folder is that of the stage. It has for each region ``rows``, those of its splats among the
-    rows of all sources, ascending, and ``sums``, what the views see of them: see `ViewSums`.
+    rows of all sources, ascending, and ``sums``, what the views see of them: see `Field`.
     """
 
     folder: Folder
     views: ViewSet
     scene: Scene
     sources: Sequence[Source]  # what the stage before left
-    factor: float = 1.0  # on the cost of merging, priced by regions: see `absorb.patience`
+    factor: float = 1.0  # on the cost of merging, priced by regions: see `merge.merge_penalty`
 
     def gathered(
         self, rows: NDArray[np.int64]
@@ -115,7 +114,7 @@ class SaveMeans:
 
 @dataclass(frozen=True)
 class GatherRegion:
-    """Gets a region ready to merge, but for the allowance."""
+    """Gets a region ready to merge, but for the bias."""
 
     index: int
 
@@ -131,7 +130,7 @@ class GatherRegion:
         splats = unpacked(table)
         places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
         measured = measured_field(
-            splats, places, context.views, context.scene, ViewSums(*sums),
+            splats, places, context.views, context.scene, sums,
             progress=runtime.progress, threads=runtime.threads,
         )  # fmt: skip
         arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
@@ -159,7 +158,7 @@ class PriceRegion:
         field = _field(*(arrays[name] for name in _FIELD))
         measured = MeasuredField(field, arrays["mass"], arrays["seen_by"])
         graph = MergeGraph(
-            measured.with_allowance(self.whole), context.scene, context.factor,
+            measured.with_bias(self.whole), context.scene, context.factor,
             threads=runtime.threads,
         )  # fmt: skip
         graph.connect(runtime.progress)
@@ -193,27 +192,23 @@ class AbsorbRegion:
     def _absorbed(self, context: StageContext, runtime: Runtime) -> NDArray[np.int64]:
         folder = context.folder
         arrays = folder.load(self.index, (*_GATHERED, "sums"))
-        graph = partial(self._graph, context, runtime.threads)
+        graph = self._graph(context, runtime.threads)
         protected = np.zeros(len(arrays["gathered"]), np.bool_)
         with np.errstate(under="ignore"):
-            left, keep, taken, _, expected, _ = reduced(
-                unpacked(arrays["gathered"]), ViewSums(*arrays["sums"]), arrays["mergeable"], graph,
-                self.count, protected=protected, progress=runtime.progress,
+            left, keep, members, expected = reduced(
+                unpacked(arrays["gathered"]), arrays["gathered_members"],
+                np.asarray(arrays["sums"], np.float64), arrays["mergeable"], graph, self.count,
+                protected=protected, progress=runtime.progress,
             )  # fmt: skip
-        # A survivor now also stands for all that the splats it absorbed stood for.
-        stays = taken >= 0
-        members = np.bincount(taken[stays], arrays["gathered_members"][stays], len(left))
         survivors = {"splats": packed(left), "origin": arrays["gathered_origin"][keep]}
-        survivors["members"] = members.astype(np.int64)
-        survivors["expected"] = np.array([expected.contribution, expected.error])
-        folder.save(self.index, survivors)
+        folder.save(self.index, survivors | {"members": members, "expected": expected})
         return np.array(len(left))
 
     def _graph(self, context: StageContext, threads: int | None) -> MergeGraph:
         """Return the graph that `PriceRegion` saved."""
         priced = context.folder.load(self.index, (*_FIELD, *_PRICED)).values()
         *field, contribution, error, first, second, cost = priced
-        return MergeGraph.connected_by(
+        return MergeGraph(
             replace(_field(*field), contribution=contribution, error=error),
             context.scene, context.factor, (first, second, cost), threads=threads,
         )  # fmt: skip
