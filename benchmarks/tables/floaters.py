@@ -29,21 +29,30 @@ from numpy.typing import NDArray
 
 from refine_addon.core.cleaning.clean import Cleaning, clean
 from refine_addon.core.cleaning.clusters import touching
-from refine_addon.core.cleaning.search import (
+from refine_addon.core.cleaning.judge import (
     AGREE,
+    AT_SURFACE,
     FAINT,
     FEW,
+    GIANT_NEEDED,
+    GLARING,
     HAZE_HELD,
     ISOLATED_SUPPORT,
+    NEEDED,
+    NEEDLE_NEEDED,
+    POWER,
     SUPPORT,
-    Search,
-    _Suspects,
+    WIDE,
+    judge,
 )
+from refine_addon.core.cleaning.search import Found, Search, is_slender
+from refine_addon.core.cleaning.support import share
 from refine_addon.core.execute import silent
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.splats import SH_C0, Splats, joined, opacity
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
+from refine_addon.core.visibility.projection import Gaussians
 from refine_addon.core.visibility.ray_sample import validation_rays
 
 from .evaluate import Evaluator, read_scene
@@ -328,56 +337,64 @@ def _sure(folder: Path, recipe: str, seed: int) -> str:
     )
 
 
-class _Asked(Search):
-    """A search that keeps why splats stay."""
-
-    def _floats(self, suspects: _Suspects) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        shows, faint = super()._floats(suspects)
-        large = suspects.giant | suspects.needle
-        seen, past, support = self.evidence.views, self.evidence.past, self.evidence.support()
-        passed = np.where(large, np.maximum(past, seen * (1.0 - support)), past)
-        most = np.where(large | suspects.doubted, SUPPORT, ISOLATED_SUPPORT)
-        change, needed = self._change(suspects.giant), self._needed(suspects, passed, support)
-        hazy = (self.gaussians.alphas < FAINT) & ~suspects.giant
-        rows = np.flatnonzero(suspects.mask & hazy)
-        near, touch = touching(self.gaussians, rows)
-        in_haze = np.zeros(len(seen))
-        in_haze[rows] = np.count_nonzero(touch & (self.gaussians.alphas < FAINT)[near], axis=1)
-        told = {
-            "not drawn": ~self.shown,
-            "no suspect": ~suspects.mask,
-            "no ray": seen == 0.0,
-            "near": support >= most,
-            "few agree": ~large & (past < AGREE * seen),
-            "one view": (past < FEW) & ~(suspects.giant & (passed >= FEW)),
-            "small change": change < needed,
-            "haze": change < needed * HAZE_HELD**in_haze,
-            "held": np.ones(len(seen), np.bool_),
-        }
-        self.why, left = {}, ~shows
-        for name, true in told.items():
-            self.why[name] = left & true
-            left = left & ~true
-        return shows, faint
+def _kept(gaussians: Gaussians, found: Found) -> dict[str, NDArray[np.bool_]]:
+    """Return why Gaussians stay, (M,) each: the first reason in this order; see `judge`."""
+    shows, _, _ = judge(gaussians, found)
+    evidence, giant, large = found.evidence, found.giant, found.large
+    seen, past = evidence.views, evidence.past
+    support = share(evidence.near, evidence.near + evidence.behind)
+    passed = np.where(large, np.maximum(past, seen * (1.0 - support)), past)
+    most = np.where(large | found.doubted, SUPPORT, ISOLATED_SUPPORT)
+    contrast = evidence.contrast / np.where(evidence.behind > 0.0, evidence.behind, 1.0)
+    wide = np.where(giant, np.maximum(found.width, WIDE) / WIDE, 1.0)
+    change = np.minimum(gaussians.alphas * contrast, GLARING) * wide
+    factors = [GIANT_NEEDED * AT_SURFACE**support, NEEDLE_NEEDED]
+    needed = NEEDED * np.select([giant, found.needle], factors, 1.0) / (1.0 + passed) ** POWER
+    hazy = gaussians.alphas < FAINT
+    rows = np.flatnonzero(found.suspects & hazy & ~giant)
+    near, touch = touching(gaussians, rows, silent, None)
+    in_haze = np.zeros(len(seen))
+    in_haze[rows] = np.count_nonzero(touch & hazy[near], axis=1)
+    told = {
+        "not drawn": ~found.shown,
+        "no suspect": ~found.suspects,
+        "no ray": seen == 0.0,
+        "near": support >= most,
+        "few agree": ~large & (past < AGREE * seen),
+        "one view": (past < FEW) & ~(giant & (passed >= FEW)),
+        "small change": change < needed,
+        "haze": change < needed * HAZE_HELD**in_haze,
+        "held": np.ones(len(seen), np.bool_),
+    }
+    why, left = {}, ~shows
+    for name, true in told.items():
+        why[name] = left & true
+        left = left & ~true
+    return why
 
 
 def _why(folder: Path, recipe: str, seed: int) -> str:
     """Say of each kind of floaters how many are found, and why the others stay, per cent."""
     scene = read_scene(folder)
     dirty, kinds, names = dirtied(folder, scene.splats, scene.train, recipe, seed)
-    gaussians, size, _ = projection.prepare(dirty, scene.train)
-    used = scene.train.spread(Cleaning().views)
-    search = _Asked(gaussians, size, dirty, (used, ()), None)
-    search.reasons(silent)
+    gaussians, frame, _ = projection.prepare(dirty, scene.train)
+    views = [view for view, _ in scene.train.spread(Cleaning().views).by_distance()]
+    slender = is_slender(dirty.log_scales[gaussians.index])
+    found = Search(gaussians, frame, views, None).find(slender, silent)
+    place = np.full(len(dirty), -1)
+    place[gaussians.index] = np.arange(len(gaussians))
     rows = np.arange(len(kinds)) + len(scene.splats)
-    why = {name: search.of_all(mask)[rows] for name, mask in search.why.items()}
+    why = {
+        name: mask[place[rows]] & (place[rows] >= 0)
+        for name, mask in _kept(gaussians, found).items()
+    }
     why["not drawn"] |= ~np.isin(rows, gaussians.index)
-    found = ~np.any(list(why.values()), axis=0)
+    goes = ~np.any(list(why.values()), axis=0)
     cells = []
     for kind, name in enumerate(names):
         of_kind = kinds == kind
         rest = ", ".join(f"{text} {mask[of_kind].mean():.1%}" for text, mask in why.items())
-        cells.append(f"{name} ({of_kind.sum()}): found {found[of_kind].mean():.1%}, {rest}")
+        cells.append(f"{name} ({of_kind.sum()}): found {goes[of_kind].mean():.1%}, {rest}")
     return f"{folder.name}, {recipe}: {'; '.join(cells)}"
 
 

@@ -97,19 +97,17 @@ def test_fog_holds_no_cluster_together():
 
 def seen_as(monkeypatch, near, behind, contrast, views, past):
     """Let the views have seen that of every suspect, whatever they see."""
-    suspected = search.Search._suspects
+    searching = search.Search.find
 
-    def find(self, progress):
-        suspects = suspected(self, progress)
-        self.seen[-1] = views
-        for name, value in (
-            ("near", near), ("behind", behind), ("contrast", contrast * behind),
-            ("views", views), ("past", past),
-        ):  # fmt: skip
-            getattr(self.evidence, name)[-1] = value
-        return suspects
+    def find(self, *how):
+        found = searching(self, *how)
+        found.views[-1] = views
+        seen = (near, behind, contrast * behind, views, past)
+        for values, value in zip(found.evidence, seen, strict=True):
+            values[-1] = value
+        return found
 
-    monkeypatch.setattr(search.Search, "_suspects", find)
+    monkeypatch.setattr(search.Search, "find", find)
     # The splat put in last is the last Gaussian, too.
     monkeypatch.setattr(
         projection, "spatial_order", lambda place, _ties=None, **_: np.arange(len(place))
@@ -191,16 +189,16 @@ def test_a_clump_goes_as_one_unless_a_group_of_views_denies_it(monkeypatch, deni
     The six views are in four groups by turns: two views each in the first two, one in the others.
     """
     seen_as(monkeypatch, 0.051, 0.949, 0.8, 6, 6)
-    suspected = search.Search._suspects
+    searching = search.Search.find
     looked = []
 
-    def find(self, progress):
-        suspects = suspected(self, progress)
-        looked.append(self.past_by[:, -1].tolist())
-        self.past_by[list(denied)] = 0.0
-        return suspects
+    def find(self, *how):
+        found = searching(self, *how)
+        looked.append(found.by_part[1, :, -1].tolist())
+        found.by_part[1, list(denied)] = 0.0
+        return found
 
-    monkeypatch.setattr(search.Search, "_suspects", find)
+    monkeypatch.setattr(search.Search, "find", find)
     places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (10, 3))
     inmost_last = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1))
 
@@ -252,10 +250,10 @@ def hits(keys, alphas, *, absent=()):
     alpha = np.array(alphas)
     present = np.array([place not in absent for place in range(len(alpha))], float)
     transmittance = np.cumprod(np.append(1.0, 1.0 - alpha * present))[:-1]
-    every, width = np.arange(len(alpha)), np.zeros(len(alpha), np.float32)
-    return support.Hits(
-        every, width, every, alpha, transmittance, transmittance * alpha * present,
-        0.0 * alpha, np.array(keys), np.full(len(alpha), 0.05),
+    every = np.arange(len(alpha))
+    return support.Light(
+        every, every, alpha, transmittance, transmittance * alpha * present,
+        np.array(keys), np.full(len(alpha), 0.05),
     )  # fmt: skip
 
 
@@ -286,10 +284,11 @@ def test_a_view_sees_past_what_little_light_stops_near(alphas, near, views, past
     .1 and .9 of the rest: .1 / .91. .2 and .9: .2 / .92. Of .05 and .04 only .088 stops at all, and
     from .1 on a view sees what is there.
     """
-    evidence, suspects = support.Evidence.zero(3), np.array([True, False, False])
+    suspects = np.array([True, False, False])
     colors = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [0.3, 0.6, 0.9]], np.float32)
 
-    evidence.add(hits([0.1, 0.12, 0.5], alphas, absent=(0,)), suspects, colors)
+    light = hits([0.1, 0.12, 0.5], alphas, absent=(0,))
+    evidence = support.Evidence(*support.evidence_of(light, suspects, colors))
 
     behind = (1.0 - near) * alphas[2]
     assert evidence.near[0] == pytest.approx(0.5 * near)

@@ -7,27 +7,33 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from refine_addon.core.cleaning.clumps import VIEW_PARTS, Looks, judge
-from refine_addon.core.cleaning.search import Search
+from refine_addon.core.cleaning import judge
+from refine_addon.core.cleaning.clusters import small_clusters
+from refine_addon.core.cleaning.search import VIEW_PARTS, Found
+from refine_addon.core.cleaning.support import Evidence
 from refine_addon.core.execute import silent
 from refine_addon.core.visibility import projection
 
 from .test_cleaning import SIDE, cameras, joined, made, wall
 from .test_cleaning_reasons import clump
 
-NEEDED = (2.0, 1.5)
-"""Evidence against a clump: .1 of a pixel's change by 9^1.5 is 2.7, by 6^1.5 1.47."""
 
+def judged(count, past=8.0, near=0.0, past_by=2.0, parted=(), denied=()):
+    """Return whether each splat of a chain goes; each group has two views.
 
-def judged(count, past=8.0, near=0.0, past_by=2.0):
-    """Return whether each splat of a chain goes; each group has two views."""
-    ones = np.ones(count)
-    groups = np.full((VIEW_PARTS, count), 2.0, np.float32)
-    by = groups.copy()
-    by[1] = past_by
-    looks = Looks(near * ones, (1.0 - near) * ones, past * ones, 0.1 * ones, groups, by)
-    chain = np.arange(count - 1)
-    return judge(looks, 0.5 * ones, (chain, chain + 1), NEEDED)
+    A clump needs 125 x 4/255 of evidence, 1.96: .1 of a pixel's change by 9^1.5 is 2.7, by 6^1.5
+    1.47. The chain is parted before some splats, and one group sees past none of those denied.
+    """
+    ones, no = np.ones(count), np.zeros(count, np.bool_)
+    by_part = np.full((2, VIEW_PARTS, count), 2.0, np.float32)
+    by_part[1, 1] = past_by
+    by_part[1, 3, list(denied)] = 0.0
+    evidence = Evidence(near * ones, (1.0 - near) * ones, 0.0 * ones, 8.0 * ones, past * ones)
+    found = Found(~no, no, no, no, ~no, 8.0 * ones, 0.0 * ones, evidence, by_part)
+    chain = np.arange(count)
+    near, touch = np.minimum(chain + 1, count - 1)[:, None], ~np.isin(chain + 1, parted)[:, None]
+    gaussians = SimpleNamespace(alphas=0.5 * ones)
+    return judge._clumps(gaussians, found, 0.1 * ones, chain, near, touch)
 
 
 def test_ten_splats_that_touch_go_together():
@@ -53,16 +59,7 @@ def test_every_group_of_views_has_to_agree(past_by, goes):
 
 def test_clumps_apart_are_judged_apart():
     """Ten splats that no group denies go; ten beside them that one denies do not."""
-    ones = np.ones(20)
-    groups = np.full((VIEW_PARTS, 20), 2.0, np.float32)
-    by = groups.copy()
-    by[3, 10:] = 0.0
-    chain = np.delete(np.arange(19), 9)
-
-    goes = judge(
-        Looks(0.0 * ones, ones, 8.0 * ones, 0.1 * ones, groups, by),
-        0.5 * ones, (chain, chain + 1), NEEDED,
-    )  # fmt: skip
+    goes = judged(20, parted=(10,), denied=range(10, 20))
 
     np.testing.assert_array_equal(goes, np.arange(20) < 10)
 
@@ -72,8 +69,7 @@ def test_faint_splats_do_not_make_a_clump_one_with_the_wall():
     depth = np.arange(2.3, 4.01, 0.1)
     haze = made(np.stack([0 * depth, 0 * depth, depth], axis=1), 0.06, 0.2, 0.1)
     gaussians, _, _ = projection.prepare(joined(wall(), haze, clump()), cameras())
-    one = SimpleNamespace(gaussians=gaussians, threads=1)
 
-    small = Search._clusters(one, np.ones(len(gaussians), np.bool_), silent)
+    small = small_clusters(gaussians, np.ones(len(gaussians), np.bool_), silent, 1)
 
     np.testing.assert_array_equal(small, gaussians.index >= SIDE**2 + len(depth))

@@ -15,7 +15,7 @@ Principal points are measured from the image's upper left corner, and pixel cent
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import ChainMap, Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..views import ORTHONORMAL, View, ViewSet
+from ..views import ORTHONORMAL, ViewSet
 from .image_size import image_size
 from .lenses import FISHEYE624, MODELS_BY_NAME, PANORAMAS, Model, counted, lens_note
 from .place import CameraPlace, is_file, is_folder, read_json
@@ -80,25 +80,19 @@ def read_transforms(path: Path, data: object) -> ViewSet:
     for index, item in enumerate(frames):
         at = place.at(f"frame {index}")
         frame = at.members(item, ("transform_matrix",))
-        views.append(_view(at, str(index), [frame, shared], world, remarks))
-        lenses.update(_lens(at, shared | frame))
+        values = ChainMap(frame, shared)  # a frame's own keys override those of the whole file
+        views.append(_view(at, values, str(index), world, remarks))
+        lenses.update(_lens(at, values))
     notes += [f"{text} of {counted(count, 'frame')}" for text, count in remarks.items()]
     return ViewSet(tuple(views), "; ".join(filter(None, (lens_note(lenses, "frame"), *notes))))
 
 
-def _view(
-    place: CameraPlace,
-    name: str,
-    sources: list[dict[str, Any]],
-    world: World,
-    remarks: Counter[str],
-) -> View:
-    """View of a frame by its own keys and, where these lack one, those of the whole file."""
-    values = sources[1] | sources[0]
-    name = place.at("'file_path'").text(sources[0].get("file_path", name))
+def _view(place, values, name, world, remarks):
+    """View of a frame; notes what is done to its pose."""
+    name = place.at("'file_path'").text(values.maps[0].get("file_path", name))
     axes, center = _pose(place.at("'transform_matrix'"), values["transform_matrix"], remarks)
     size = _size(place, values, name)
-    focal = [_focal(place, sources, *along) for along in zip("xy", size, strict=True)]
+    focal = [_focal(place, values.maps, *along) for along in zip("xy", size, strict=True)]
     if not any(focal):
         place.fail("missing 'fl_x', expected fl_x, fl_y, camera_angle_x or camera_angle_y")
     both = [focal[0] or focal[1], focal[1] or focal[0]]
@@ -107,9 +101,7 @@ def _view(
     return place.view(name, (rotation @ axes).T, center, both, place.principal(values, size), size)
 
 
-def _pose(
-    place: CameraPlace, value: object, remarks: Counter[str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _pose(place, value, remarks):
     """The camera's axes (x right, y down, z forward) as columns, and its centre.
 
     A uniform scale only moves points along rays through the centre, which does not change the
@@ -145,7 +137,7 @@ def _size(place: CameraPlace, values: Mapping[str, Any], name: str) -> list[int]
     return [place.at("'file_path'").side(side) for side in size]
 
 
-def _focal(place: CameraPlace, sources: list[dict[str, Any]], axis: str, side: int) -> float:
+def _focal(place, sources, axis, side):
     """Focal length along an axis by the first key that exists, or 0."""
     for keys in sources:
         if f"fl_{axis}" in keys:

@@ -4,29 +4,28 @@
    clusters that touch nothing else, giants and needles (`search.Search`).
 2. All suspects are taken away, and it is measured what the views see at the place of each: how much
    of the light that reaches it stops near it, and how much goes on to a surface behind. So floaters
-   are no support for each other, and a surface supports all that belongs to it. What has lost its
-   support by that is suspect, too, and both steps are done again.
+   are no support for each other, and a surface supports all that belongs to it. A splat that has
+   lost its support by that is suspect, too, and both steps are done again.
 
-Only the second step decides. A splat with nothing behind it, such as one of a sky, stays.
+Only the second step decides (`judge`). A splat with nothing behind it, such as one of a sky, stays.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, part, silent
-from ..splats import Splats, among_all, refuse_undrawable
+from ..splats import Splats, refuse_undrawable
 from ..views import ViewSet
 from ..visibility import projection
 from ..volumes import refuse_all
-from .search import Search
-
-Sums = TypeVar("Sums")
+from .judge import FAINT, judge
+from .search import Search, is_slender
 
 REASONS = {
     "front": "in front of surfaces",
@@ -41,6 +40,9 @@ REASONS = {
 
 DEFAULT_REASONS = ("front", "isolated", "giant", "needle")
 """All but what no picture shows, and what no view can judge."""
+
+NEAR = 0.3
+"""Haze is at most so far from a camera, scene sizes."""
 
 
 @dataclass(frozen=True)
@@ -105,22 +107,11 @@ class Cleaned:
     settings: Cleaning
 
     def counts(self) -> dict[str, int]:
-        """Return how many splats go for each reason that is switched on."""
+        """Number of splats that go for each reason that is switched on."""
         return {name: int(np.count_nonzero(self.by_reason[name])) for name in self.settings.reasons}
 
-    def for_all(self, rest: NDArray[np.bool_]) -> Cleaned:
-        """Return this of what was left of N splats, (N,) bool, for them all: the others go too."""
-        return replace(
-            self,
-            keep=among_all(self.keep, rest),
-            by_reason={name: among_all(mask, rest) for name, mask in self.by_reason.items()},
-            past=among_all(self.past, rest),
-            seen=among_all(self.seen, rest),
-            sure=among_all(self.sure, rest),
-        )
-
     def surety(self) -> dict[str, float | None]:
-        """Return the mean of `sure` for each of `REASONS`; None where no view tells."""
+        """Mean of `sure` for each of `REASONS`; None where no view tells."""
         return {
             name: float(self.sure[mask].mean(dtype=np.float64))
             if name != "outside" and mask.any()
@@ -129,13 +120,13 @@ class Cleaned:
         }
 
     def facts(self) -> dict[str, Any]:
-        """Return what a report says of it."""
+        """What a report says of it."""
         surety = self.surety()
         sure = {name: surety[name] for name in self.settings.reasons}
         return {**self.counts(), "sure": sure, "words": self.in_words()}
 
     def in_words(self) -> str:
-        """Return what goes, why, and how sure that is, such as "2,114 in front of surfaces (96 %)".
+        """What goes, why, and how sure that is, such as "2,114 in front of surfaces (96 %)".
 
         The percentage is the mean of `sure`.
         """
@@ -149,10 +140,9 @@ class Cleaned:
         return ", ".join(words) or "nothing to clean away"
 
     def notes(self) -> list[str]:
-        """Return what else the user should know, in sentences."""
-        if not self.undrawable:
-            return []
-        return [f"{self.undrawable} splats cannot be drawn: no view shows them, and they stay"]
+        """What else the user should know, in sentences."""
+        note = f"{self.undrawable} splats cannot be drawn: no view shows them, and they stay"
+        return [note] if self.undrawable else []
 
 
 def clean(
@@ -189,33 +179,69 @@ def clean(
     Cancelled
         If `progress` answers ``False``.
     """
-    if forced_out is not None and forced_out.any():
-        rest = ~forced_out if protected is None else ~forced_out | protected
-        refuse_all(~rest)
-        cleaned = clean(
-            splats.take(rest), views, settings,
-            protected=None if protected is None else protected[rest],
-            progress=progress, threads=threads,
-        )  # fmt: skip
-        return cleaned.for_all(rest)
+    rest = np.ones(len(splats), np.bool_) if forced_out is None else ~forced_out
+    if protected is not None:
+        rest |= protected
+    refuse_all(~rest)
+    left = splats if rest.all() else splats.take(rest)
     with np.errstate(under="ignore"):
         gaussians, scene, good = projection.prepare(
-            splats, views, progress=part(progress, 0.0, 0.05), threads=threads
+            left, views, progress=part(progress, 0.0, 0.05), threads=threads
         )
-        if len(splats):
-            refuse_undrawable(int(np.count_nonzero(good)), len(good))
-        used = views.spread(settings.views)
-        names = {id(view) for view in used}
-        unused = tuple(view for view in views if id(view) not in names)
-        search = Search(gaussians, scene, splats, (used, unused), threads)
-        reasons = search.reasons(part(progress, 0.05, 1.0))
-    may_go = np.ones(len(splats), np.bool_) if protected is None else ~protected
-    by_reason = {name: search.of_all(mask) & may_go for name, mask in reasons.items()}
-    keep = ~np.any([by_reason[name] for name in settings.reasons], axis=0)
-    if len(splats) and not keep.any():
-        raise RefineError(f"cleaning would remove all {len(splats)} splats; nothing was removed")
+        if len(left):
+            refuse_undrawable(int(np.count_nonzero(good)), len(left))
+        deciding = [view for view, _ in views.spread(settings.views).by_distance()]
+        slender = is_slender(left.log_scales[gaussians.index])
+        search = Search(gaussians, scene, deciding, threads)
+        found = search.find(slender, part(progress, 0.05, 1.0))
+        shows, faint, sure = judge(gaussians, found, threads)
+        faint &= found.doubted & ~found.large
+        centers = scene.positions(np.array([view.center for view in deciding]))
+        haze = faint & (gaussians.alphas < FAINT) & _near_any(centers, gaussians.means, faint)
+        unused = [view for view in views if view not in deciding]
+        masks = {
+            "front": shows & found.doubted & ~found.large,
+            "isolated": shows & ~found.doubted & ~found.large,
+            "giant": shows & found.giant,
+            "needle": shows & found.needle,
+            "transparent": faint & ~haze,
+            "haze": haze,
+            "outside": _outside(gaussians, scene, found.shown, unused),
+        }
+    rows = np.flatnonzero(rest)[gaussians.index]
+
+    def of_all(values: NDArray[Any]) -> NDArray[Any]:
+        """Values of M Gaussians, (M,), for all splats, (N,); 0 for the others."""
+        whole = np.zeros(len(splats), values.dtype)
+        whole[rows] = values
+        return whole
+
+    may_go = True if protected is None else ~protected
+    by_reason = {name: of_all(mask) & may_go for name, mask in masks.items()}
+    keep = rest & ~np.any([by_reason[name] for name in settings.reasons], axis=0)
+    if len(left) and not keep.any():
+        raise RefineError(f"cleaning would remove all {len(left)} splats; nothing was removed")
+    past, seen = (of_all(x.astype(np.int32)) for x in (found.evidence.past, found.views))
     return Cleaned(
-        keep, by_reason, search.of_all(search.evidence.past.astype(np.int32)),
-        search.of_all(search.seen.astype(np.int32)), search.of_all(search.sure.astype(np.float32)),
-        int(np.count_nonzero(~good)), len(views), len(search.views), settings,
+        keep, by_reason, past, seen, of_all(sure.astype(np.float32)),
+        int(np.count_nonzero(~good)), len(views), len(deciding), settings,
     )  # fmt: skip
+
+
+def _near_any(centers, means, chosen):
+    """Gaussians among those chosen, (M,) bool, that are near a centre, (M,) bool."""
+    rows = np.flatnonzero(chosen)
+    near = np.zeros(len(rows), np.bool_)
+    for center in centers:
+        step = means[:, rows].T.astype(np.float64) - center
+        near |= np.einsum("ij,ij->i", step, step) < NEAR * NEAR
+    return np.bincount(rows[near], minlength=len(chosen)) > 0
+
+
+def _outside(gaussians, scene, shown, unused):
+    """Gaussians that reach into the picture of no view, used or not, (M,)."""
+    rows = np.flatnonzero(~shown)
+    for view in unused:
+        if len(rows):
+            rows = np.delete(rows, projection.project(gaussians.take(rows), scene, view).index)
+    return np.bincount(rows, minlength=len(shown)) > 0

@@ -5,9 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, silent
+from ..execute import Progress, part
 from ..merging.neighbours import nearest
 from ..visibility.projection import Gaussians
+
+SMALL = 100
+"""A cluster of fewer splats is suspect."""
+
+SOLID = (0.1, 0.3)
+"""Splats of lower opacity do not hold clusters together: by each of these, since faint ones between
+a dense cluster and a bush make one of the two."""
 
 NEIGHBOURS = 8
 """How many near neighbours of a splat are tested for whether they touch it."""
@@ -20,31 +27,29 @@ APART = 0.01
 middle."""
 
 
-def cluster_sizes(
-    gaussians: Gaussians, *, progress: Progress = silent, threads: int | None = None
-) -> NDArray[np.int64]:
-    """Return how many splats there are in the cluster of each, (M,).
+def small_clusters(
+    gaussians: Gaussians, solid: NDArray[np.bool_], progress: Progress, threads: int | None
+) -> NDArray[np.bool_]:
+    """Gaussians of a small cluster, (M,) bool, of those that are solid, (M,) bool.
 
     Two are in one cluster if they touch, or if a chain of others that touch leads from one to the
     other.
     """
-    points = gaussians.means.T.astype(np.float64)  # (M, 3)
-    near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)
-    one = np.repeat(np.arange(len(points)), near.shape[1])
-    other = near.ravel().astype(np.int64)
-    touch = _touch(gaussians, points, one, other)
-    labels = connected(len(points), one[touch], other[touch])
-    return np.bincount(labels, minlength=len(points))[labels]
+    small = np.zeros(len(solid), np.bool_)
+    for number, least in enumerate(SOLID):
+        rows = np.flatnonzero(solid & (gaussians.alphas >= least))
+        half = part(progress, number / len(SOLID), (number + 1) / len(SOLID))
+        near, touch = touching(gaussians.take(rows), np.arange(len(rows)), half, threads)
+        one, other = np.nonzero(touch)
+        labels = connected(len(rows), one, near[one, other])
+        small[rows[np.bincount(labels, minlength=len(rows))[labels] < SMALL]] = True
+    return small
 
 
 def touching(
-    gaussians: Gaussians,
-    rows: NDArray[np.int64],
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
+    gaussians: Gaussians, rows: NDArray[np.int64], progress: Progress, threads: int | None
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return near neighbours of some splats, and which of them each touches, (r, k) each.
+    """Near neighbours of some splats, and which of them each touches, (r, k) each.
 
     Parameters
     ----------
@@ -54,35 +59,22 @@ def touching(
     """
     points = gaussians.means.T.astype(np.float64)  # (M, 3)
     near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)[rows].astype(np.int64)
-    touch = _touch(gaussians, points, np.repeat(rows, near.shape[1]), near.ravel())
-    return near, touch.reshape(near.shape)
-
-
-def _touch(
-    gaussians: Gaussians,
-    points: NDArray[np.float64],
-    one: NDArray[np.int64],
-    other: NDArray[np.int64],
-) -> NDArray[np.bool_]:
-    """Return which pairs of splats touch, (E,); points are their means, (M, 3)."""
+    one, other = np.repeat(rows, near.shape[1]), near.ravel()
     step = points[other] - points[one]
     length = np.sqrt(np.einsum("ij,ij->i", step, step))
     unit = (step / np.maximum(length, np.finfo(np.float64).tiny)[:, None]).T
-    reach = sum(_deviation(gaussians.covariances[:, rows], unit) for rows in (one, other)) * REACH
-    reach += APART * (1.0 + np.sqrt(np.einsum("ij,ij->i", points, points)))[one]
-    return np.asarray(length <= reach)
-
-
-def _deviation(covariances: NDArray[np.float32], unit: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the standard deviation of splats along directions, (n,), of (6, n) and (3, n)."""
     x, y, z = unit
-    xx, xy, xz, yy, yz, zz = covariances.astype(np.float64)
-    squared = xx * x * x + yy * y * y + zz * z * z + 2.0 * (xy * x * y + xz * x * z + yz * y * z)
-    return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+    reach = np.zeros(len(one))
+    for ends in (one, other):  # by their standard deviations along the step
+        xx, xy, xz, yy, yz, zz = gaussians.covariances[:, ends].astype(np.float64)
+        mixed = xy * x * y + xz * x * z + yz * y * z
+        reach += np.sqrt(np.maximum(xx * x * x + yy * y * y + zz * z * z + 2.0 * mixed, 0.0))
+    away = APART * (1.0 + np.sqrt(np.einsum("ij,ij->i", points, points)))[one]
+    return near, (length <= reach * REACH + away).reshape(near.shape)
 
 
 def connected(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the lowest number in the connected part of a graph that each node is in, (count,).
+    """Lowest number in the connected part of a graph that each node is in, (count,).
 
     Parameters
     ----------
@@ -105,10 +97,7 @@ def connected(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> N
             # The root of a part that touches a lower one, and the node itself, move there.
             np.minimum.at(labels, before[ends[lower]], low[lower])
             np.minimum.at(labels, ends[lower], low[lower])
-        while True:
-            jumped = labels[labels]
-            if np.array_equal(jumped, labels):
-                break
+        while not np.array_equal(jumped := labels[labels], labels):
             labels = jumped
         if np.array_equal(labels, before):
             return labels

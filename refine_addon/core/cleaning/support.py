@@ -15,8 +15,7 @@ beyond, cameras a scene size apart see one move against the other.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from ..views import View
 from ..visibility import projection
 from ..visibility.cast import aimed, cast, depth_complexity, pixels
 from ..visibility.projection import Footprints, Gaussians
-from ..visibility.rays import Rays, in_front
+from ..visibility.rays import in_front
 from ..visibility.scene import Scene
 
 RAYS = 2500
@@ -62,20 +61,52 @@ _FRACTION = 0.999  # how much of the numbers from one ray to the next the places
 _TINY = 1e-30  # replaces 0 as a divisor
 
 
-class Around(NamedTuple):
-    """What lies around r hits on their rays, as places among all hits.
+class Light(NamedTuple):
+    """What becomes of the light on the rays of one view: the h hits that it reaches, near to far.
 
-    Those from `first` up to `last` are near them, those from `last` up to `end` lie behind.
+    Attributes
+    ----------
+    hit : (u,) int64
+        The Gaussians that any ray hits.
+    owner : (h,) int32
+        Which of them each hit is on.
+    alpha, transmittance, weight : (h,) float64
+        Alpha there, the share of the light that reaches it, and the share that it takes: their
+        product, or 0 where the Gaussian counts as absent.
+    key : (h,) float64
+        See `Hits`.
+    window : (h,) float64
+        Hits on the same ray are near if their keys differ by at most this.
     """
 
-    first: NDArray[np.int64]
-    last: NDArray[np.int64]
-    end: NDArray[np.int64]
+    hit: NDArray[np.int64]
+    owner: NDArray[np.int32]
+    alpha: NDArray[np.float64]
+    transmittance: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    key: NDArray[np.float64]
+    window: NDArray[np.float64]
+
+    def around(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
+        """First, last and end for each of some hits, (r,) each, as places among all.
+
+        Hits from first up to last are near it on its ray, those from last up to end behind it.
+        """
+        key, window, ray = self.key[rows], self.window[rows], np.floor(self.key[rows])
+        end = ray + (1.0 + _FRACTION) / 2.0
+        return (
+            np.searchsorted(self.key, np.maximum(key - window, ray)),
+            np.searchsorted(self.key, np.minimum(key + window, end), side="right"),
+            np.searchsorted(self.key, end),
+        )
+
+    def sums(self, rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum of values, (r,), of some hits for each of `hit`, (u,)."""
+        return np.asarray(np.bincount(self.owner[rows], values, len(self.hit)), np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """The h hits of the rays of one view on u Gaussians: ray by ray, near to far.
+class Hits(NamedTuple):
+    """What the rays of one view hit that may show once suspects are absent: h hits, near to far.
 
     Attributes
     ----------
@@ -85,57 +116,9 @@ class Hits:
         The longer standard deviation of their footprints, as a share of the image's longer side.
     owner : (h,) int32
         Which of them each hit is on.
-    alpha, transmittance, weight : (h,) float64
-        Alpha there, the share of the light that reaches it, and the share that it takes: their
-        product, or 0 where the Gaussian counts as absent.
-    ray : (h,) float64
-        The number of the ray.
-    key : (h,) float64
-        Ray plus place on it, 0 to 1; ascending.
-    window : (h,) float64
-        Hits on the same ray are near if their keys differ by at most this.
-    """
-
-    hit: NDArray[np.int64]
-    width: NDArray[np.float32]
-    owner: NDArray[np.int32]
-    alpha: NDArray[np.float64]
-    transmittance: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    ray: NDArray[np.float64]
-    key: NDArray[np.float64]
-    window: NDArray[np.float64]
-
-    def around(self, rows: NDArray[np.int64]) -> Around:
-        """Return what lies around some hits on their rays."""
-        key, window, ray = self.key[rows], self.window[rows], self.ray[rows]
-        end = ray + (1.0 + _FRACTION) / 2.0
-        return Around(
-            np.searchsorted(self.key, np.maximum(key - window, ray)),
-            np.searchsorted(self.key, np.minimum(key + window, end), side="right"),
-            np.searchsorted(self.key, end),
-        )
-
-    def sums(self, rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each of `hit` the sum of values, (r,), of some hits, (u,)."""
-        return np.asarray(np.bincount(self.owner[rows], values, len(self.hit)), np.float64)
-
-
-@dataclass(frozen=True, eq=False)
-class ViewHits:
-    """What the rays of one view hit that may show once suspects are absent: h hits, near to far.
-
-    Attributes
-    ----------
-    hit : (u,) int64
-        The Gaussians that any ray hits.
-    width : (u,) float32
-        See `Hits`.
-    owner : (h,) int32
-        Which of them each hit is on.
     alpha : (h,) float32
     key : (h,) float64
-        See `Hits`.
+        The ray's number plus the place on it, 0 to 1; ascending.
     scale : float
         How much of a key is one unit of nearness, 1 / scene size.
     """
@@ -147,22 +130,38 @@ class ViewHits:
     key: NDArray[np.float64]
     scale: float
 
-    def without(self, absent: NDArray[np.bool_]) -> Hits:
-        """Return the hits that light reaches if some Gaussians, (M,) bool, take none."""
+    def without(self, absent: NDArray[np.bool_]) -> Light:
+        """The light if some Gaussians, (M,) bool, take none."""
         ray = np.floor(self.key)
         present = (~absent[self.hit]).take(self.owner).astype(np.float64)
         alpha = self.alpha.astype(np.float64)
-        _, counts = np.unique(ray, return_counts=True)
-        log_front = in_front(np.log1p(-alpha) * present, counts)
+        log_front = in_front(np.log1p(-alpha) * present, np.unique(ray, return_counts=True)[1])
         reached = np.flatnonzero(log_front > math.log(REACHED))  # (h,)
-        ray, key, alpha = ray[reached], self.key[reached], alpha[reached]
-        transmittance = np.exp(log_front[reached])
-        nearness = (ray + _FRACTION - key) / self.scale
-        return Hits(
-            self.hit, self.width, self.owner[reached], alpha, transmittance,
-            transmittance * alpha * present[reached], ray, key,
-            self.scale * np.maximum(WINDOW * nearness, PARALLAX),
-        )  # fmt: skip
+        key, alpha, transmittance = self.key[reached], alpha[reached], np.exp(log_front[reached])
+        nearness = (ray[reached] + _FRACTION - key) / self.scale
+        window = self.scale * np.maximum(WINDOW * nearness, PARALLAX)
+        weight = transmittance * alpha * present[reached]
+        return Light(self.hit, self.owner[reached], alpha, transmittance, weight, key, window)
+
+
+class Evidence(NamedTuple):
+    """What views see of M Gaussians with all suspects absent; 0 but for the suspects.
+
+    Attributes
+    ----------
+    near, behind : (M,) float64
+        Light that stops near their places, and behind them, times their alpha.
+    contrast : (M,) float64
+        The latter times the difference of colour between suspect and what lies behind.
+    views, past : (M,) float64
+        How many views see what lies at and behind it, and how many of them see past it.
+    """
+
+    near: NDArray[np.float64]
+    behind: NDArray[np.float64]
+    contrast: NDArray[np.float64]
+    views: NDArray[np.float64]
+    past: NDArray[np.float64]
 
 
 def hits_of_view(
@@ -172,8 +171,8 @@ def hits_of_view(
     numbered: tuple[View, int],
     absent: NDArray[np.bool_],
     targets: NDArray[np.bool_] | None = None,
-) -> ViewHits | None:
-    """Return what the rays of one view hit; None if nothing.
+) -> Hits | None:
+    """What the rays of one view hit; None if nothing.
 
     Parameters
     ----------
@@ -204,20 +203,17 @@ def hits_of_view(
     place = np.empty(len(gaussians), np.int64)
     place[footprints.index] = np.arange(len(footprints.index))
     footprints = footprints.take(place[rays.hit])  # of the u that are hit
-    depth = _depths(gaussians.take(rays.hit), footprints, scene, view, rays, reached)
-    nearness = 1.0 / depth
+    nearness = 1.0 / _depths(gaussians.take(rays.hit), footprints, scene, view, rays, reached)
     scale = _FRACTION / float(nearness.max())
     key = rays.ray[reached] + np.maximum(_FRACTION - scale * nearness, 0.0)
     order = np.argsort(key, kind="stable")
     reached = reached[order]
     width = footprints.sigmas[0] / np.float32(max(view.width, view.height))
-    return ViewHits(rays.hit, width, rays.owner[reached], rays.alpha[reached], key[order], scale)
+    return Hits(rays.hit, width, rays.owner[reached], rays.alpha[reached], key[order], scale)
 
 
-def _centers(
-    footprints: Footprints, targets: NDArray[np.bool_], number: int, area: float
-) -> NDArray[np.float32]:
-    """Return the centres of those targets that rays spread evenly would miss, (2, t), pixels.
+def _centers(footprints, targets, number, area):
+    """Centres of those targets that rays spread evenly would miss, (2, t), pixels.
 
     They are smaller than an area, px^2, and in another order in each view.
     """
@@ -227,15 +223,8 @@ def _centers(
     return footprints.centers[:, rows[np.argsort(turn)]]
 
 
-def _depths(
-    gaussians: Gaussians,
-    footprints: Footprints,
-    scene: Scene,
-    view: View,
-    rays: Rays,
-    reached: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """Return how deep rays hit splats, scene sizes, (h,): where the splats are densest on them.
+def _depths(gaussians, footprints, scene, view, rays, reached):
+    """Depths at which rays hit splats, scene sizes, (h,): where the splats are densest on them.
 
     Given the place in the image, the mean depth of a Gaussian is that of its centre plus
     ``c' C^-1 d``, with C its covariance in the image, c that of image and depth, and d the step
@@ -265,152 +254,60 @@ def _depths(
         slope = slope.clip(-longest, longest)  # no splat is deeper than long
         along = step[0] * unit[0][owner] + step[1] * unit[1][owner]  # (h,), in sigmas
         depth = depth + slope[owner] * along
-    return np.asarray(np.maximum(depth, _NEAREST * z[owner]), np.float64)
+    return np.maximum(depth, _NEAREST * z[owner])
 
 
-def own_support(
-    hits: Hits, wanted: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the light that each of `hit` takes, and that times its support by others, (u,) each.
+def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Light that each of `Light.hit` takes, and that times its support by others, (2, u).
 
     Others support it as they would if it were gone: then ``1 / (1 - alpha)`` times as much light
-    reaches what lies behind it. Both are 0 of those that are not wanted, (u,) bool.
+    reaches what lies behind it. Both are 0 of those that are not wanted, (M,) bool.
     """
-    rows = np.flatnonzero(wanted.take(hits.owner) & (hits.weight > 0.0))
-    before = _running(hits.weight)
-    around = hits.around(rows)
-    more = 1.0 / (1.0 - hits.alpha[rows])
-    near = before[rows] - before[around.first]
-    near += (before[around.last] - before[rows + 1]) * more
-    behind = (before[around.end] - before[around.last]) * more
+    rows = np.flatnonzero(wanted[light.hit].take(light.owner) & (light.weight > 0.0))
+    before = _running(light.weight)
+    first, last, end = light.around(rows)
+    more = 1.0 / (1.0 - light.alpha[rows])
+    near = before[rows] - before[first]
+    near += (before[last] - before[rows + 1]) * more
+    behind = (before[end] - before[last]) * more
     support = near / np.maximum(near + behind, _TINY)
-    support = np.where(behind > NOTHING * hits.transmittance[rows], support, 1.0)
-    weight = hits.weight[rows]
-    return hits.sums(rows, weight), hits.sums(rows, weight * support)
+    support = np.where(behind > NOTHING * light.transmittance[rows], support, 1.0)
+    weight = light.weight[rows]
+    return np.stack([light.sums(rows, weight), light.sums(rows, weight * support)])
 
 
-@dataclass(frozen=True, eq=False)
-class _Sums:
-    """Sums over views for M Gaussians; each attribute is an array, (M,) float64."""
-
-    @classmethod
-    def zero(cls, count: int) -> Self:
-        """Return the sums of no views, for `count` Gaussians."""
-        return cls(*np.zeros((len(fields(cls)), count)))
-
-    def merge(self, other: Self) -> None:
-        """Add the sums of other views."""
-        for item in fields(self):
-            getattr(self, item.name)[:] += getattr(other, item.name)
-
-
-@dataclass(frozen=True, eq=False)
-class Support(_Sums):
-    """What views see of M Gaussians, all of them present.
-
-    Attributes
-    ----------
-    weight, supported : (M,) float64
-        The light that each takes, and that times its support by others.
-    views : (M,) float64
-        In how many views the centre lies.
-    width : (M,) float64
-        The largest of `Hits.width`, not a sum.
-    """
-
-    weight: NDArray[np.float64]
-    supported: NDArray[np.float64]
-    views: NDArray[np.float64]
-    width: NDArray[np.float64]
-
-    def add(self, hits: Hits, wanted: NDArray[np.bool_]) -> None:
-        """Add light and support, in one view, of the Gaussians that are wanted, (M,) bool."""
-        weight, supported = own_support(hits, wanted[hits.hit])
-        self.weight[hits.hit] += weight
-        self.supported[hits.hit] += supported
-        self.width[hits.hit] = np.maximum(self.width[hits.hit], hits.width)
-
-    def merge(self, other: Self) -> None:
-        """Add what other views see."""
-        width = np.maximum(self.width, other.width)
-        super().merge(other)
-        self.width[:] = width
-
-    def shares(self) -> NDArray[np.float64]:
-        """Return the share of its light that others support, (M,); 1 where no view sees it."""
-        lit = self.weight > 0.0
-        return np.where(lit, self.supported / np.where(lit, self.weight, 1.0), 1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence(_Sums):
-    """What views see of M Gaussians with all suspects gone; 0 but for the suspects.
-
-    Attributes
-    ----------
-    near, behind : (M,) float64
-        Light that stops near their places, and behind them, times their alpha.
-    contrast : (M,) float64
-        The latter times the difference of colour between suspect and what lies behind.
-    views, past : (M,) float64
-        How many views see what lies at and behind it, and how many of them see past it.
-    """
-
-    near: NDArray[np.float64]
-    behind: NDArray[np.float64]
-    contrast: NDArray[np.float64]
-    views: NDArray[np.float64]
-    past: NDArray[np.float64]
-
-    def support(self) -> NDArray[np.float64]:
-        """Return the share of the light that stops near each, (M,); 1 where no view sees it."""
-        total = self.near + self.behind
-        return np.where(total > 0.0, self.near / np.where(total > 0.0, total, 1.0), 1.0)
-
-    def add(self, hits: Hits, suspects: NDArray[np.bool_], colors: NDArray[np.float32]) -> None:
-        """Add what one view sees.
-
-        The hits are those with the suspects, (M,) bool, absent; colours are (M, 3).
-        """
-        rows = np.flatnonzero(suspects[hits.hit].take(hits.owner))
-        around = hits.around(rows)
-        before = _running(hits.weight)
-        near = before[around.last] - before[around.first]
-        behind = before[around.end] - before[around.last]
-        alpha = hits.alpha[rows]
-        mass, stops, passes = (
-            hits.sums(rows, alpha * values) for values in (np.ones_like(near), near, behind)
-        )
-        contrast = _contrast(hits, rows, around, behind, colors)
-        self.near[hits.hit] += stops
-        self.behind[hits.hit] += passes
-        self.contrast[hits.hit] += hits.sums(rows, alpha * behind * contrast)
-        sees = (stops + passes > SEEN * mass) & (mass > 0.0)
-        self.views[hits.hit[sees]] += 1.0
-        self.past[hits.hit[sees & (stops < PAST * (stops + passes))]] += 1.0
-
-
-def _contrast(
-    hits: Hits,
-    rows: NDArray[np.int64],
-    around: Around,
-    behind: NDArray[np.float64],
-    colors: NDArray[np.float32],
+def evidence_of(
+    light: Light, suspects: NDArray[np.bool_], colors: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Return how much some hits differ in colour from what lies behind them, (r,).
+    """`Evidence` that one view gives of `Light.hit`, (5, u).
 
-    It is the root mean square of the channels. `around` is theirs, and `behind`, (r,), the light
-    that stops behind them.
+    The suspects, (M,) bool, are absent; colours are (M, 3).
     """
+    rows = np.flatnonzero(suspects[light.hit].take(light.owner))
+    before = _running(light.weight)
+    first, last, end = light.around(rows)
+    near, behind = before[last] - before[first], before[end] - before[last]
     squared = np.zeros(len(rows))
-    for channel in colors[hits.hit].T.astype(np.float64):
-        of_hits = channel.take(hits.owner)
-        before = _running(hits.weight * of_hits)
-        color = (before[around.end] - before[around.last]) / np.maximum(behind, _TINY)
-        squared += (of_hits[rows] - color) ** 2
-    return np.where(behind > NOTHING, np.sqrt(squared / 3.0), 0.0)
+    for channel in colors[light.hit].T.astype(np.float64):
+        own = channel.take(light.owner)
+        before = _running(light.weight * own)
+        squared += (own[rows] - (before[end] - before[last]) / np.maximum(behind, _TINY)) ** 2
+    contrast = np.where(behind > NOTHING, np.sqrt(squared / 3.0), 0.0)  # root mean square
+    alpha = light.alpha[rows]
+    mass, stops, passes, differs = (
+        light.sums(rows, values)
+        for values in (alpha, alpha * near, alpha * behind, alpha * behind * contrast)
+    )
+    sees = (stops + passes > SEEN * mass) & (mass > 0.0)
+    past = sees & (stops < PAST * (stops + passes))
+    return np.stack([stops, passes, differs, sees, past])
+
+
+def share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share that a part is of a whole, (M,) each; 1 where there is nothing."""
+    return np.divide(part, whole, out=np.ones_like(whole), where=whole > 0.0)
 
 
 def _running(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sum of the values before each place, and of all, (h + 1,)."""
+    """Sum of the values before each place, and of all, (h + 1,)."""
     return np.append(0.0, np.cumsum(values))
