@@ -13,7 +13,7 @@ from ..core.formats.registry import SUFFIXES, format_named, without_suffix
 from ..core.levels.files import check_goal, is_streamed, level_paths
 from ..core.urls import Url, refuse_url
 from . import zones
-from .options import DEFAULT_LEVELS, arrangement, budget, cleaning, levels, settings, survivors
+from .options import DEFAULT_LEVELS, arrangement, budget, cleaning, levels, settings
 from .report import is_report
 from .zones import ROLES
 
@@ -219,9 +219,6 @@ def _check_together(parser: argparse.ArgumentParser, options: argparse.Namespace
         if getattr(options, name, None):
             option = "-o" if name == "output" else f"--{name.replace('_', '-')}"
             parser.error(f"{option} does not go with --together")
-    changes = survivors(options) in ("absorb", "refit")
-    if options.psnr is not None and (changes or options.method == "closed-form"):
-        parser.error("with --together, --psnr goes with --method occlusion and unchanged survivors")
     if options.workers is not None and options.scheduler:
         parser.error("expected --workers or --scheduler, and not both")
     if options.workers is not None and options.workers < 1:

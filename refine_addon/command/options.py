@@ -171,8 +171,8 @@ def _add_prune(commands: Any) -> None:
         "by what the cameras see of it, far better when much is removed (--method then only "
         "matters with --threshold and --min-seen); refit: they absorb and are then fitted to what "
         "all splats look like, some dB better still, in several times the time; auto, the "
-        "default: absorb, but unchanged where that is as good, and with --method, --threshold, "
-        "--min-seen or --together",
+        "default: absorb, but unchanged where that is as good, and with --method, --threshold or "
+        "--min-seen",
     )
     _add_rounds(prune)
     becoming.add_argument(

@@ -11,8 +11,8 @@ from ..core import PruneRequest, ViewSet, picture_files, prune_file, prune_tiles
 from ..core.formats.registry import without_suffix
 from ..core.picture_files import PictureFiles
 from ..core.quality.curve import UNSEEN, in_views, in_words
+from ..core.tiles.cluster import Cluster, cluster
 from ..core.tiles.storage import located
-from ..core.tiles.workers import Workers
 from . import zones
 from .options import budget, cleaning, settings, survivors
 from .run import Run
@@ -82,12 +82,10 @@ def _prune_together(run: Run, label: str, views: ViewSet) -> dict[str, Any]:
     return done
 
 
-def _workers(options: argparse.Namespace) -> contextlib.AbstractContextManager[Workers | None]:
+def _workers(options: argparse.Namespace) -> contextlib.AbstractContextManager[Cluster | None]:
     """Return who works on tiles; None for this process alone."""
     if options.workers is None and not options.scheduler:
         return contextlib.nullcontext()
-    from ..core.tiles.cluster import cluster
-
     return cluster(options.workers, options.scheduler)
 
 

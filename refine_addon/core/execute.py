@@ -74,6 +74,8 @@ _HEAPS = -8  # M_ARENA_MAX of glibc's malloc.h
 _HELD = 30_000_000  # bytes; above 32 MB, freeing a block does not raise glibc's threshold
 _INTERVAL = 0.1  # seconds between two reports while a piece of work takes long
 _ALIGNED = 64  # bytes, of arrays in a file
+_SENT = 1 << 24  # bytes of work that is sent to a cluster; arrays in files travel as names
+_AHEAD = 4  # pieces of work for each thread whose results may wait for those before them
 _PACKAGE, _FOLDER = __name__.rpartition(".core.")[0], Path(__file__).resolve().parents[1]
 
 _BEGIN = """
@@ -205,6 +207,23 @@ def checked_by(check: Callable[[], None]) -> Iterator[None]:
         _own.check = before
 
 
+@contextmanager
+def on(cluster: Any) -> Iterator[None]:
+    """Have `run` in this thread, within the block, give what is worth processes to a cluster.
+
+    Parameters
+    ----------
+    cluster : tiles.cluster.Cluster or None
+        None leaves it to this machine. Work that holds large arrays is not sent.
+    """
+    before = getattr(_own, "cluster", None)
+    _own.cluster = cluster
+    try:
+        yield
+    finally:
+        _own.cluster = before
+
+
 def default_threads() -> int:
     """How many threads to use: the cores that this process may run on, at most 8."""
     if hasattr(os, "sched_getaffinity"):
@@ -298,6 +317,10 @@ def run(
     # page-faulted. No effect on other systems.
     np.empty(_HELD, np.uint8)
     todo, done = list(items), 0
+    cluster = getattr(_own, "cluster", None)
+    if cost and cluster is not None and len(packed := pickle.dumps(work)) <= _SENT:
+        yield from cluster.run(packed, todo, progress, what)
+        return
     threads = min(default_threads() if threads is None else threads, max(len(todo), 1))
     if threads > 1 and cost and cost >= _least(threads) and _possible():
         try:
@@ -356,11 +379,13 @@ def _side_by_side(
             return work(item)
 
     with ThreadPoolExecutor(threads) as pool:
-        futures = deque(pool.submit(checked, item) for item in items)
+        left, futures = deque(items), deque[Any]()
         try:
             for index in range(len(items)):
                 if index % step == 0:
                     report(progress, index / len(items), what)
+                while left and len(futures) < _AHEAD * threads:
+                    futures.append(pool.submit(checked, left.popleft()))
                 future = futures.popleft()  # and forget the result once it is used
                 while not future.done() and not wait([future], _INTERVAL).done:
                     report(progress, index / len(items), what)

@@ -1,8 +1,11 @@
-"""Arrays in files: indexing reads them, so scenes larger than memory are scored by the same code.
+"""Arrays in files: indexing reads them, so scenes larger than memory are pruned by the same code.
 
 Each access maps the file, copies what is asked for and lets the map go: pages that stay mapped
 count as memory of the process. Pickled, an array is its file's name, type and shape, so processes
 that see the file share it.
+
+The files lie in the folder of a job. It also keeps what its finished stages returned (`once`), so
+that the same job goes on from there after a kill.
 """
 
 from __future__ import annotations
@@ -10,16 +13,20 @@ from __future__ import annotations
 import contextlib
 import errno
 import math
+import os
+import pickle
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError, reason_of
+
+Result = TypeVar("Result")
 
 
 class Interrupted(RefineError):
@@ -112,6 +119,55 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
         name: Mapped(folder / name, dtype, (rows, *further))
         for name, (dtype, rows, further) in kinds.items()
     }
+
+
+def once(job: Path | None, stage: str, make: Callable[[], Result]) -> Result:
+    """Result of a stage of a job: that of an earlier run, or what `make` returns, which is kept.
+
+    Parameters
+    ----------
+    job : Path or None
+        Without one `make` is called.
+    stage : str
+    make : callable
+
+    Raises
+    ------
+    Interrupted
+        If the disk is full or fails.
+    """
+    if job is None:
+        return make()
+    done, result = noted(job, stage)
+    return result if done else note(job, stage, make())
+
+
+def note(job: Path, stage: str, result: Result) -> Result:
+    """Keep the result of a stage, whole or not at all, and return it; see `once`."""
+    path = job / f"{stage}.done"
+    temporary = path.with_name(f"{secrets.token_hex(8)}.tmp")
+    try:
+        with writing(path):
+            with temporary.open("xb") as stream:
+                pickle.dump(result, stream, protocol=5)
+            temporary.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+    return result
+
+
+def noted(job: Path, stage: str) -> tuple[bool, Any]:
+    """Whether a stage is done, and its result; one whose files are damaged is not done."""
+    path = job / f"{stage}.done"
+    if not path.exists():
+        return False, None
+    with reading(path), path.open("rb") as stream:
+        # Unpickling runs what it reads: nothing that another user has written.
+        if not hasattr(os, "getuid") or os.fstat(stream.fileno()).st_uid == os.getuid():
+            with contextlib.suppress(Interrupted, EOFError, ValueError, pickle.PickleError):
+                return True, pickle.load(stream)
+    return False, None
 
 
 @contextlib.contextmanager

@@ -83,11 +83,6 @@ def test_a_tile_that_is_missing_stops_all(folder, capsys):
         ([*CLOSED, "-o", "out.ply"], "-o does not go with --together"),
         ([*CLOSED, "--output-dir", "out", "--clean"], "--clean does not go with --together"),
         (
-            [*CLOSED, "--output-dir", "out", "--psnr", "40"],
-            "--psnr goes with --method occlusion",
-        ),
-        (["--output-dir", "out", "--psnr", "40", "--absorb"], "unchanged survivors"),
-        (
             [*CLOSED, "--output-dir", "out", "--protect", "sphere:0,0,0,1"],
             "--protect does not go with --together",
         ),

@@ -33,8 +33,8 @@ what is now hidden or no longer hidden by others.
 STAGE = 0.5
 """Share of its splats that each of very many stages leaves; fewer stages leave more.
 
-At least a half: tiles count a splat whose cheapest operation is a merge as half a splat, and would
-run out of splats to remove beyond that (`_staying` in `tiles/absorbing.py`).
+At least a half: regions count a splat whose cheapest operation is a merge as half a splat, and
+would run out of splats to remove beyond that.
 """
 
 FINER = 0.8

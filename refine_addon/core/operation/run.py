@@ -10,7 +10,6 @@ A request says what is to be done, a source where the splats are, a sink where t
 | `lod_file` | `FileSource` | `LevelsRequest` | a `LevelSink` | `core/levels/files.py` |
 | `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/operation.py` |
 | `score_object` | `ObjectSource` | `ScoreRequest` | `FileSink` | `objects/operation.py` |
-| `prune_tiles` | `TileScene` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Many files as one scene, larger than memory: one ranking and one budget over all of them.
 
-`prune` is the way through. `units` cuts the files into runs of rows, `folder` keeps what stands
-between the steps, and `workers` does the steps in this process or `cluster` on a Dask cluster. A
-step is a class with `run`: of the closed form in `closed_form`, of what views see in `gaussians`
-and `seeing`, of absorbing in `regions`, of the selection in `selecting`, and of the tiles in
-`writing`.
+`prune` is the way through. `source` copies the files' columns into files of the job (`job`), where
+they are one array each (`core.mapped`): so everything else is the code that prunes a single file.
+Only what would need all splats in memory at once is done region by region, in `regions`.
+`cluster` has work done by Dask, `writing` writes all tiles or none, `storage` opens URLs.
 """

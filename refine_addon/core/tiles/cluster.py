@@ -1,8 +1,7 @@
-"""Who does the steps of a job: workers of a Dask cluster, on this machine or on others.
+"""Work done on the workers of a Dask cluster, on this machine or on others.
 
-Only steps and their results travel: sums, counts and names. Workers read the tiles and read and
-write the folder of the job, which all of them must see under the same path. Dask does the steps of
-a lost worker again elsewhere, and a step that is done twice writes the same bytes.
+Arrays in files travel as names, so workers must see the folder of the job under the same path. Dask
+does the work of a lost worker again elsewhere.
 """
 
 from __future__ import annotations
@@ -19,25 +18,25 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import Any
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..execute import report
-from ..operation.run import Runtime
-from .folder import Folder, Interrupted
-from .units import Tile, header_of
-from .workers import Batch, Context, Result
+from ..execute import Progress, report, run_all
+from ..mapped import Interrupted
+from .source import Tile, bytes_of
+from .writing import waiting_in
 
 _AHEAD = 3
-"""Groups of steps a thread of a worker that are handed out ahead: so many wait here at most."""
+"""Groups of items a thread of a worker that are handed out ahead: so many wait here at most."""
 
-_TOGETHER = 16  # most steps in a group: each group takes scheduler and coordinator about 15 ms
+_TOGETHER = 16  # most items in a group: each group takes scheduler and coordinator about 15 ms
 
 _TURNS = 4
-"""Groups a thread at least, where there are as many steps, so that all end at about one time."""
+"""Groups a thread at least, where there are as many items, so that all end at about one time."""
 
-_PATIENCE = 0.2  # seconds between two looks whether to go on
+_INTERVAL = 0.2  # seconds between two looks whether to go on
 
 _ALONE = 60.0  # seconds without any worker after which a job ends
 
@@ -104,7 +103,7 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
 
 
 def _uninterrupted(make: Callable[[], Any]) -> Any:
-    """Return what `make` returns, which is called on a thread, where no Ctrl-C arrives.
+    """What `make` returns, called on a thread, where no Ctrl-C arrives.
 
     A cluster that is interrupted while it starts cannot close what it has started. So it starts,
     is closed, and only then is the interrupt raised.
@@ -130,7 +129,7 @@ def _block_ctrl_c() -> None:
 
 
 class Cluster:
-    """Does steps on the workers of a Dask cluster.
+    """The workers of a Dask cluster; see `execute.on`.
 
     Parameters
     ----------
@@ -140,7 +139,7 @@ class Cluster:
     def __init__(self, client: Any) -> None:
         self._client = client
 
-    def check(self, folder: Folder, tiles: Sequence[Tile]) -> None:
+    def check(self, job: Path, tiles: Sequence[Tile]) -> None:
         """Ask every worker whether it sees the files of a job.
 
         Raises
@@ -150,22 +149,10 @@ class Cluster:
         Interrupted
             If all workers were lost.
         """
-        answers = self._answers(folder, tiles)
-        for worker, answer in answers.items():
-            wrong = answer
-            if isinstance(answer, BaseException):
-                wrong = f"it cannot run refine {VERSION}: {answer}"
-            if wrong:
-                raise RefineError(
-                    f"worker {worker}: {wrong}; workers need the same files under the same paths"
-                )
-
-    def _answers(self, folder: Folder, tiles: Sequence[Tile]) -> dict[str, Any]:
-        """Return what each worker answers to `_answer`, but for those that were lost meanwhile."""
         for _ in range(_TRIES):
             try:
                 self._client.wait_for_workers(1, timeout=_CONNECT)
-                answers = self._client.run(_answer, VERSION, folder, tiles, on_error="return")
+                answers = self._client.run(_answer, VERSION, job, tiles, on_error="return")
             except TimeoutError as error:
                 raise RefineError("the scheduler has no workers") from error
             except Exception as error:
@@ -173,14 +160,24 @@ class Cluster:
             there = {
                 worker: answer
                 for worker, answer in answers.items()
-                if not isinstance(answer, OSError)
+                if not isinstance(answer, OSError)  # lost meanwhile
             }
+            for worker, answer in there.items():
+                if isinstance(answer, BaseException):
+                    answer = f"it cannot run refine {VERSION}: {answer}"
+                if answer:
+                    raise RefineError(
+                        f"worker {worker}: {answer}; workers need the same files under the same "
+                        "paths"
+                    )
             if there:
-                return there
+                return
         raise Interrupted("the workers were lost again and again")
 
-    def run(self, batch: Batch[Context, Result]) -> Iterator[Result]:
-        """Do steps; see `Workers.run`.
+    def run(
+        self, packed: bytes, items: Sequence[Any], progress: Progress, what: str
+    ) -> Iterator[Any]:
+        """Do pickled work with each item; yield the results in order.
 
         Raises
         ------
@@ -190,73 +187,65 @@ class Cluster:
         from distributed import CancelledError, KilledWorker
         from distributed.comm import CommClosedError
 
-        # Once: the arrays of all views take Dask some milliseconds.
-        packed = pickle.dumps(batch.context)
-        steps, threads = batch.steps, max(sum(self._client.nthreads().values()), 1)
-        size = max(1, min(_TOGETHER, len(steps) // (_TURNS * threads)))
-        groups = [steps[start : start + size] for start in range(0, len(steps), size)]
-        shares = iter(batch.shares())
+        threads = max(sum(self._client.nthreads().values()), 1)
+        size = max(1, min(_TOGETHER, len(items) // (_TURNS * threads)))
+        left = deque(items[start : start + size] for start in range(0, len(items), size))
         waiting: deque[Any] = deque()
-        left, done = deque(groups), 0.0
+        done = 0
         try:
-            for _ in groups:
+            while left or waiting:
                 while left and len(waiting) < _AHEAD * threads:
-                    waiting.append(self._submit(packed, left.popleft()))
-                results = self._result(waiting[0], batch, done)
-                waiting.popleft()
-                for result in results:
-                    done += next(shares)
+                    key = f"refine-{uuid.uuid4().hex}"
+                    waiting.append(self._client.submit(_run, packed, left.popleft(), key=key))
+                self._wait(waiting[0], functools.partial(report, progress, done / len(items), what))
+                for result in waiting.popleft().result():
                     yield result
+                    done += 1
         except (KilledWorker, CancelledError, CommClosedError) as error:
             raise Interrupted(f"workers were lost ({error})") from error
         finally:
             self._client.cancel([*waiting])
 
-    def _submit(self, packed: bytes, group: Sequence[Any]) -> Any:
-        key = f"{type(group[0]).__name__}-{uuid.uuid4().hex}"
-        return self._client.submit(_run, packed, [*group], key=key)
-
-    def _result(self, future: Any, batch: Batch[Any, Any], done: float) -> Any:
-        """Return the result of a future, and ask meanwhile whether to go on."""
+    def _wait(self, future: Any, look: Callable[[], None]) -> None:
+        """Wait for a future, and look meanwhile whether to go on."""
         ended, seen = threading.Event(), time.monotonic()
         future.add_done_callback(lambda _: ended.set())
-        report(batch.progress, done, batch.what)
-        while not ended.wait(_PATIENCE):
-            report(batch.progress, done, batch.what)
+        look()
+        while not ended.wait(_INTERVAL):
+            look()
             alone = time.monotonic() - seen
             if alone > _ALONE / 10.0 and self._client.nthreads():
                 seen = time.monotonic()
             elif alone > _ALONE:
                 raise Interrupted("all workers were lost")
-        return future.result()
 
 
-def _run(packed: bytes, group: Sequence[Any]) -> list[Any]:
-    """Do steps one after the other, in a worker."""
-    context = _unpacked(packed)
-    return [step.run(context, Runtime(threads=1)) for step in group]
+def _run(packed: bytes, items: Sequence[Any]) -> list[Any]:
+    """Do work with some items, in a worker."""
+    return run_all(_unpacked(packed), items, threads=1)
 
 
 @functools.lru_cache(maxsize=2)
-def _unpacked(packed: bytes) -> object:
-    return pickle.loads(packed)
+def _unpacked(packed: bytes) -> Callable[[Any], Any]:
+    work: Callable[[Any], Any] = pickle.loads(packed)
+    return work
 
 
-async def _answer(version: str, folder: Folder, tiles: Sequence[Tile]) -> str:
-    """Say what is wrong with this worker; "" if nothing is."""
+async def _answer(version: str, job: Path, tiles: Sequence[Tile]) -> str:
+    """What is wrong with this worker, in a sentence; "" if nothing is."""
     if version != VERSION:
         return f"it has refine {VERSION}, this is {version}"
     # Not on the worker's own thread: requests for many tiles would make it look dead.
-    return await asyncio.to_thread(_missing, folder, tiles)
+    return await asyncio.to_thread(_missing, job, tiles)
 
 
-def _missing(folder: Folder, tiles: Sequence[Tile]) -> str:
-    """Return what this process cannot see of a job's files, in a sentence; "" if all is there."""
-    if not folder.noted("begun")[0]:
-        return f"{folder.path} is not there"
+def _missing(job: Path, tiles: Sequence[Tile]) -> str:
+    """What this process cannot see of a job's files, in a sentence; "" if all is there."""
+    if not waiting_in(job).exists():
+        return f"{job} is not there"
     for tile in tiles:
         with contextlib.suppress(RefineError, OSError):
-            header_of(tile)
+            [*bytes_of(tile, 0, tile.header)]
             continue
         return f"{tile.path} is not there, or another file"
     return ""

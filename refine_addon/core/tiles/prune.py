@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
+import shutil
 import tempfile
-import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,49 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...version import VERSION
-from ..costs import Cost, Images, Plan, joined
-from ..errors import RefineError
-from ..execute import Cancelled, Progress, silent
-from ..formats.format import Format
-from ..formats.ply_header import with_count
+from ..errors import RefineError, reason_of
+from ..execute import Cancelled, Progress, chunks, on, run, seconds, silent, stages
+from ..mapped import Interrupted, note, noted, once, write
 from ..operation.requests import PruneRequest
-from ..operation.run import Request, Runtime, Written, run
-from ..quality.curve import needed
-from ..quality.psnr import psnr_kept
-from ..refit.refit import Gains, Refit
-from ..report import (
-    MEASURES,
-    conclude,
-    conclude_between,
-    expected_psnr,
-    files_facts,
-    make_report,
-    remark,
-)
-from ..scores import Scores
-from ..scoring.closed_form import ROWS
-from ..selection import Budget, refuse_none_left
-from ..survivor_choice import Became
+from ..pipeline import decide
+from ..report import Clock, files_facts
+from ..splats import Splats, on_disk
+from ..task import Result, Task
 from ..urls import Url
-from . import absorbing
-from .absorbing import Survivors
-from .closed_form import ClosedFormContext, by_closed_form
-from .folder import Folder, Interrupted
-from .plans import making as plan_making
-from .plans import scoring as plan_scoring
-from .refitting import refit_survivors
-from .scoring import MeasuredTiles, by_occlusion, measured_once
-from .selecting import ChooseByScore, removals, rule_of
+from .cluster import Cluster
+from .source import ROWS, Tile, copied, tiles_at
 from .storage import located, new_folder
-from .units import Tile, Unit, header_of, pieces_of, tiles_at, units_of
-from .workers import InProcess, Runner, Workers
-from .writing import Outputs, WriteTile
+from .writing import Kept, Outputs, WriteTile, header_of, waiting_in
 
-UNCHANGED = (
-    "survivors stay unchanged: over tiles they absorb or are refitted where that is asked for by "
-    "name, which takes longer, and room on the disk"
-)
-"""A note of the report, where the files of one scene would have absorbed by default."""
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 
 def prune_tiles(
@@ -68,15 +42,14 @@ def prune_tiles(
     *,
     progress: Progress = silent,
     threads: int | None = None,
-    workers: Workers | None = None,
+    workers: Cluster | None = None,
 ) -> dict[str, Any]:
     """Prune files of splats as one scene, by one budget over all of them; none is held in memory.
 
     The same splats stay as if all files were one, in the order in which they are given: of equal
-    scores, those of the first file go first. All files are written, or none. What stands between
-    the steps lies in a folder beside the outputs until the job is done: 50 bytes a splat for the
-    closed form, 400 for occlusion. If the process is interrupted or killed, the same call later
-    goes on from there.
+    scores, those of the first file go first. All files are written, or none. The columns of all
+    splats and what is made of them lie in a folder beside the outputs until the job is done. If the
+    process is interrupted or killed, the same call later goes on behind the last finished stage.
 
     Parameters
     ----------
@@ -87,12 +60,13 @@ def prune_tiles(
         URL, the folder of the job is in the current directory, files are copied to the URL under
         other names, and renamed at the end.
     request : PruneRequest
-        What is asked. Up to `absorbing.REGION` splats, survivors that change are those of one file;
-        more are absorbed and refitted region by region.
-    progress, threads
-        See `operation.run.run`.
-    workers : Workers, optional
-        Who does the steps; by default this process. See `cluster`.
+        What is asked. Up to `regions.REGION` splats, kept splats that change are those of one file;
+        more are merged and refitted region by region.
+    progress : callable, optional
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int, optional
+    workers : Cluster, optional
+        Who does what is worth processes; by default this machine. See `cluster`.
 
     Returns
     -------
@@ -102,391 +76,213 @@ def prune_tiles(
     Raises
     ------
     RefineError, Cancelled
-        See `pipeline.prune` and `units.tiles_at`; also if the request is none that works over
-        tiles, or two files have one name. Then nothing is written, and nothing kept.
+        See `prune` and `source.tiles_at`; also if two files have one name. Then nothing is written,
+        and nothing kept.
     Interrupted
         If a disk is full, a storage or all workers fail, or a file appears in the place of an
         output. What is done is kept for the same call.
+
+    Notes
+    -----
+    Memory: about 150 bytes a splat, and the hits of scoring rays, see `occlusion.score`. A worker
+    needs for each view at work about 160 bytes for each splat that it shows. On the disk: what the
+    tiles take, and 60 bytes a splat besides.
     """
-    absorbs_in_memory, by_default = request.absorb, request.survivors == "auto"
-    if by_default:  # over tiles absorbing takes far longer, and room on the disk
-        request = replace(request, survivors="unchanged")
-    asked = TilesRequest(request)
-    tiles = tiles_at(sources, request.model)
+    if request.zones or request.cleaning or request.pictures:
+        raise RefineError(
+            "volumes, cleaning and pictures need all splats in memory: not over tiles"
+        )
+    clock, tiles = Clock(), tiles_at(sources, request.model)
     output = None if folder is None or request.dry_run else located(folder)
     with contextlib.ExitStack() as held:
+        outputs = None
         if output is None:
-            place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-")))
+            job = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-"))) / "job"
         else:
             near = Path.cwd() if isinstance(output, Url) else output.absolute()
-            place = near / f".refine-{_digest(tiles, asked)}"
-        scene = TileScene(Folder(place), tiles, workers or InProcess(threads))
-        sink = TileSink(scene, output, overwrite=request.overwrite)
-        told = run(scene, asked, sink, progress=progress, threads=threads).report
-    if by_default:
-        told["survivors"]["asked"] = "auto"
-        if absorbs_in_memory:
-            told["notes"].append(UNCHANGED)
-    return told
+            job = near / f".refine-{_digest(tiles, request)}"
+            held.enter_context(new_folder(output))
+            outputs = Outputs(job, tiles, output, request.overwrite)
+        held.enter_context(_opened(job, outputs))
+        held.enter_context(on(workers))
+        if workers is not None:
+            _check(workers, job, tiles)
+        count, size = sum(tile.splats for tile in tiles), sum(tile.size for tile in tiles)
+        views = len(request.views.spread(request.settings.views))
+        reading, deciding, writing = stages(
+            progress, seconds("read", count), seconds("measure", count, views),
+            seconds("write", count),
+        )  # fmt: skip
+        kept, counts, facts = once(
+            job, "kept", lambda: _decided(job, tiles, request, clock, (reading, deciding), threads)
+        )
+        sizes = _written(job, tiles, kept, counts, outputs, writing, threads)
+        if outputs is not None:
+            outputs.publish()
+        clock.lap("write_s")
+    clock.stop()
+    target = None if outputs is None else str(output)
+    facts["files"] = files_facts(f"{len(tiles)} tiles", target, size, sum(sizes))
+    written = int(counts[:, 0].sum()) if outputs else None
+    facts["splats"] |= {"written": written, "left_out": 0}
+    names = ("input", "output", "before", "kept", "unseen", "input_bytes", "output_bytes")
+    targets = [str(each) for each in outputs.targets] if outputs else [None] * len(tiles)
+    facts["tiles"] = [
+        dict(zip(names, (t.path, to, t.splats, kept, unseen, t.size, after), strict=True))
+        for t, to, (kept, unseen), after in zip(tiles, targets, counts.tolist(), sizes, strict=True)
+    ]
+    facts["timings"] = clock.timings
+    return facts
 
 
-@dataclass(frozen=True, eq=False)
-class TileScene:
-    """Tiles as one scene: a source whose splats stay on the disk.
+def _check(workers: Cluster, job: Path, tiles: Sequence[Tile]) -> None:
+    """Raise `RefineError` if a worker does not see all files; `Interrupted` if much is done."""
+    goes_on = noted(job, "begun")[0]
+    note(job, "begun", None)
+    try:
+        workers.check(job, tiles)
+    except RefineError as error:
+        raise (Interrupted(str(error)) if goes_on else error) from error
 
-    Attributes
-    ----------
-    folder : Folder
-        Of the job.
-    tiles : list of Tile
-    workers : Workers
-        Who does the steps.
+
+def _decided(
+    job: Path,
+    tiles: Sequence[Tile],
+    request: PruneRequest,
+    clock: Clock,
+    progress: tuple[Progress, Progress],
+    threads: int | None,
+) -> tuple[Kept, NDArray[np.int64], dict[str, Any]]:
+    """What stays; of each tile how many stay and how many are unseen, (tiles, 2); the report."""
+    splats = once(job, "splats", lambda: copied(tiles, job / "splats", progress[0], threads))
+    clock.lap("read_s")
+    lengths = np.array([tile.dtype.itemsize for tile in tiles])
+    counts = np.array([tile.splats for tile in tiles])
+    each = np.unique(lengths[counts > 0])
+    task = Task(
+        request.budget, request.settings, splats, request.views,
+        survivors=request.survivors,
+        row_bytes=int(each[0]) if len(each) == 1 else np.repeat(lengths, counts),
+        fixed_bytes=sum(tile.fixed_bytes for tile in tiles),
+    )  # fmt: skip
+    result = decide(task, clock=clock, progress=progress[1], threads=threads)
+    if result.stopped is not None:
+        raise result.stopped
+    ends = np.cumsum(counts)
+    masks = (result.keep, result.scores.seen == 0)
+    before = [np.append(0, np.cumsum(mask))[[*(ends - counts), *ends]] for mask in masks]
+    told = np.stack([sums[len(tiles) :] - sums[: len(tiles)] for sums in before], axis=1)
+    result.report["splats"].pop("unseen_removed", None)
+    return _stored(job, result), told, result.report
+
+
+def _stored(job: Path, result: Result) -> Kept:
+    """What stays, in files of the job."""
+    rows, became = np.empty(0, np.int64), None
+    if result.absorbed is not None:
+        changed = np.flatnonzero(result.absorbed.changed)
+        rows, made = np.flatnonzero(result.keep)[changed], result.absorbed.splats
+        pieces: Iterator[Splats] = (
+            made.take(changed[piece]) for piece in chunks(len(changed), ROWS)
+        )
+        became = on_disk(job / "became", pieces) if len(changed) else None
+    arrays = write(job / "keep", [{"keep": result.keep, "changed": rows}])
+    return Kept(**arrays, became=became)
+
+
+def _written(
+    job: Path,
+    tiles: Sequence[Tile],
+    kept: Kept,
+    counts: NDArray[np.int64],
+    outputs: Outputs | None,
+    progress: Progress,
+    threads: int | None,
+) -> list[int]:
+    """Bytes of each tile, which is written where it waits, unless it is in its place."""
+    if outputs is None:
+        return [
+            tile.size - tile.header + len(header_of(tile, count))
+            - (tile.splats - count) * tile.dtype.itemsize
+            for tile, count in zip(tiles, counts[:, 0].tolist(), strict=True)
+        ]  # fmt: skip
+    sizes = outputs.in_place()
+    numbers = [number for number in range(len(tiles)) if number not in sizes]
+    work = WriteTile(job, tiles, kept, outputs.urls)
+    cost = seconds("write", sum(tiles[number].splats for number in numbers))
+    written = run(work, numbers, progress=progress, what="writing", threads=threads, cost=cost)
+    sizes |= dict(zip(numbers, written, strict=True))
+    return [sizes[number] for number in range(len(tiles))]
+
+
+@contextlib.contextmanager
+def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
+    """Make the folder of a job, and keep others from it; it stays if the job can go on.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be made, or another process works on the job.
     """
-
-    folder: Folder
-    tiles: list[Tile]
-    workers: Workers
-
-    @functools.cached_property
-    def units(self) -> list[Unit]:
-        """The tiles, cut into units."""
-        return units_of(self.tiles)
-
-    @property
-    def total(self) -> int:
-        """How many splats there are."""
-        return sum(map(len, self.units))
-
-    @property
-    def bytes(self) -> int:
-        """Of all files."""
-        return sum(tile.size for tile in self.tiles)
-
-    def read(self, _form: Format | None) -> TileScene:
-        """Raise `RefineError` if a worker does not see all files, `Interrupted` if much is done."""
-        goes_on, _ = self.folder.noted("begun")
-        self.folder.note("begun", None)
-        try:
-            self.workers.check(self.folder, self.tiles)
-        except RefineError as error:
-            if goes_on:
-                raise Interrupted(str(error)) from error
-            raise
-        return self
-
-
-@dataclass(frozen=True, eq=False)
-class TileDecision:
-    """Which splats stay of each tile; which these are, the units say in the folder of the job.
-
-    Attributes
-    ----------
-    counts : (tiles, 2) int64
-        Of each tile, how many splats stay, and how many lie in no view.
-    changed : bool
-        Whether survivors may have changed.
-    report : dict
-    """
-
-    counts: NDArray[np.int64]
-    changed: bool
-    report: dict[str, Any]
-
-
-@dataclass(frozen=True, eq=False)
-class _Made:
-    """What survivors became: see `pipeline.refit_splats.Made`."""
-
-    absorbed: Survivors  # by absorbing alone
-    survivors: Survivors  # in the end
-    refitted: Gains | None = None
-    seconds: float = 0.0
-    psnr: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class TilesRequest(Request[TileScene, TileDecision]):
-    """What is asked of a prune over tiles.
-
-    Attributes
-    ----------
-    prune : PruneRequest
-    """
-
-    prune: PruneRequest
-
-    def __post_init__(self) -> None:
-        """Refuse what needs all splats at once."""
-        budget, settings = self.prune.budget, self.prune.settings
-        if self.prune.zones or self.prune.cleaning or self.prune.pictures:
-            raise RefineError(
-                "volumes, cleaning and pictures need all splats in memory: not over tiles"
-            )
-        if self.prune.absorb and (budget.threshold is not None or budget.psnr is not None):
-            what = "a threshold" if budget.psnr is None else "a PSNR"
-            raise RefineError(
-                f"{what} needs all splats in memory to absorb: over tiles choose another budget"
-            )
-        if budget.psnr is not None and not settings.estimates:
-            raise RefineError(f"over tiles {settings.method} estimates no PSNR: choose occlusion")
-
-    def costs(self, scene: TileScene) -> list[Plan]:
-        """Return what the steps are expected to cost; see `Request.costs`."""
-        writing = Cost("rewriting" if self.prune.absorb else "writing", scene.bytes)
-        return [joined(self._plans(scene)), [writing], []]
-
-    def _plans(self, scene: TileScene) -> list[Plan]:
-        """Return what getting ready, scoring, saving scores, and making survivors may cost."""
-        asked, count = self.prune, scene.total
-        images = Images.of(asked.views.spread(asked.settings.views))
-        removed = removals(asked.budget, scene.tiles)
-        known = removed is not None and not removed.by_bytes
-        settled = needed(removed.amount, count) if removed is not None and known else None
-        plans = plan_scoring(count, images, asked.settings, settled, once=asked.absorb)
-        if not asked.absorb:
-            return [*plans, []]
-        left = count - removed.amount if removed is not None and known else count // 2
-        made = plan_making(count, left, images, _refit(asked))
-        return [*plans, joined(made)]
-
-    def decide(self, scene: TileScene, runtime: Runtime) -> TileDecision:
-        """Score the tiles and decide what stays.
-
-        Raises
-        ------
-        RefineError, Cancelled, Interrupted
-            See `prune_tiles`.
-        """
-        asked, runner = self.prune, Runner(scene.workers, runtime.progress)
-        *scoring, making = runner.phases(*self._plans(scene))
-        scores, measured = self._score(scene, scoring)
-        notes = (*scores.notes, asked.views.note) if asked.views.note else scores.notes
-        scores = replace(scores, notes=notes, views_given=len(asked.views))
-        runtime.clock.lap("score_s")
-        silently = Runner(scene.workers)
-        counts = _select(scene, asked.budget, scores, silently)
-        runtime.clock.lap("select_s")
-        made = None
-        if measured is not None:
-            made = self._made(measured, int(counts[:, 0].sum()), making)
-            settled = absorbing.settle(made.survivors, scene.units, scene.folder, silently)
-            counts = _counted(scene, settled)
-            runtime.clock.lap("absorb_s")
-        changed = made is not None and bool(made.survivors.regions)
-        psnr = made.psnr if made else None
-        keep = np.empty(0, np.bool_)
-        if scores.ray_sample is not None:
-            load = scene.folder.load
-            keep = np.concatenate([load(unit.index, ["keep"])["keep"] for unit in scene.units])
-            psnr = psnr if changed else psnr_kept(scores.ray_sample, keep)
-        facts = make_report(scores, keep, asked.budget, asked.settings, runtime.clock)
-        kept, unseen = counts.sum(axis=0).tolist()
-        size, removed = scene.bytes, scene.total - kept
-        why = remark(asked.budget, removed, scene.total, psnr, size)
-        conclude(facts, scores, keep, psnr, made.absorbed if made else None, why)
-        conclude_between(facts, None)
-        facts["survivors"]["asked"] = asked.survivors
-        if made is not None:
-            if made.refitted is not None:
-                told: dict[Became, float | None] = {
-                    "absorb": made.refitted.psnr_before,
-                    "refit": psnr,
-                }
-                share = removed / scene.total
-                facts["survivors"] |= expected_psnr(scores, share, told)
-                facts["survivors"]["became"] = "refit"
-                facts["refitted"] = {"began": "absorb", **made.refitted.facts(made.seconds)}
-                facts["notes"].append(made.refitted.note(made.seconds))
-            if asked.settings.method == "closed-form":
-                facts["notes"].append(MEASURES)
-        facts["splats"] |= {"before": scene.total, "kept": kept, "removed": removed}
-        facts["splats"] |= {"unseen": unseen, "left_out": 0, "protected": 0, "forced": 0}
-        return TileDecision(counts, changed, facts)
-
-    def _score(
-        self, scene: TileScene, runners: Sequence[Runner]
-    ) -> tuple[Scores, MeasuredTiles | None]:
-        """Score all splats; to absorb, also return what the views see of them.
-
-        Of the runners one gets tiles ready, one scores and one saves the scores.
-        """
-        settings, absorb = self.prune.settings, self.prune.absorb
-        used = self.prune.views.spread(settings.views)
-        closed_form = ClosedFormContext(scene.folder, used, {}, used.middle())
-        if absorb:
-            measured = measured_once(closed_form, scene.units, settings, runners)
-            return measured.scores, measured
-        if settings.method == "closed-form":
-            return by_closed_form(closed_form, scene.units, runners[1])[0], None
-        removed = removals(self.prune.budget, scene.tiles)
-        settled = None
-        if removed is not None and not removed.by_bytes:
-            settled = needed(removed.amount, scene.total)
-        return by_occlusion(closed_form, scene.units, settings, settled, runners), None
-
-    def _made(self, measured: MeasuredTiles, kept: int, runner: Runner) -> _Made:
-        """Return what so many survivors become."""
-        settings, refit = self.prune.settings, _refit(self.prune)
-        count, images = len(measured.measured.seen), Images.of(measured.context.views)
-        plans = plan_making(count, kept, images, refit)
-        absorbing_runner, refitting, estimating = runner.phases(*plans)
-        absorbed = absorbing.absorb(measured, kept, settings, absorbing_runner)
-        made = _Made(absorbed, absorbed)
-        if refit is not None and kept < count:
-            start = time.perf_counter()
-            done = refit_survivors(measured, absorbed, refit, refitting)
-            if done is not None:
-                made = _Made(absorbed, done.survivors, done, time.perf_counter() - start)
-        if not made.survivors.regions:
-            return made
-        _, psnr = absorbing.estimated(measured, made.survivors.regions, estimating)
-        return replace(made, psnr=psnr)
-
-
-def _refit(request: PruneRequest) -> Refit | None:
-    """Return how survivors are refitted; None if they are not."""
-    return request.settings.refit if request.survivors == "refit" else None
-
-
-def _select(scene: TileScene, budget: Budget, scores: Scores, runner: Runner) -> NDArray[np.int64]:
-    """Decide by scores which splats stay; return how many, see `TileDecision.counts`."""
-    rule = rule_of(budget, scores, scene.tiles, scene.units, scene.folder, runner)
-    steps = [ChooseByScore(unit, rule) for unit in scene.units]
-    counts = _counted(scene, runner.run(scene.folder, steps, "selecting"))
-    refuse_none_left(budget, scene.total, int(counts[:, 0].sum()))
-    return counts
-
-
-def _counted(scene: TileScene, each: Iterable[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Add up what each unit tells of its parts; see `selecting.save_kept`."""
-    numbers = {tile: number for number, tile in enumerate(scene.tiles)}
-    rows = [numbers[part.tile] for unit in scene.units for part in unit.parts]
-    counts = np.zeros((len(scene.tiles), 2), np.int64)
-    np.add.at(counts, rows, np.concatenate([*each]))
-    return counts
-
-
-class TileSink:
-    """A folder in which each tile gets a file of what stays of it: all of them or none.
-
-    Parameters
-    ----------
-    scene : TileScene
-    folder : Path or Url or None
-        Made if it is not there. None writes nothing.
-    overwrite : bool
-        Whether files may be replaced.
-    """
-
-    timing = "write_s"
-    form = None
-    """Tiles are plain PLY."""
-
-    def __init__(self, scene: TileScene, folder: Path | Url | None, *, overwrite: bool) -> None:
-        self._scene, self._folder, self._overwrite = scene, folder, overwrite
-        self._outputs: Outputs | None = None
-
-    @contextlib.contextmanager
-    def opened(self) -> Iterator[None]:
-        """Refuse what cannot be written, and open the folder of the job.
-
-        It is removed when the block ends, unless the job can go on.
-
-        Raises
-        ------
-        RefineError
-            See `Outputs.of` and `Folder.opened`.
-        """
-        scene, folder = self._scene, self._folder
-        with contextlib.ExitStack() as held:
-            if folder is not None:
-                held.enter_context(new_folder(folder))
-                self._outputs = Outputs.of(
-                    scene.folder, scene.tiles, folder, overwrite=self._overwrite
-                )
-            held.enter_context(scene.folder.opened())
+    try:
+        waiting_in(job).mkdir(parents=True, exist_ok=True)
+        lock = (job / "lock").open("wb")
+    except OSError as error:
+        raise RefineError(f"{job}: cannot be made ({reason_of(error)})") from error
+    stays = True
+    try:
+        with lock:
+            _lock(job, lock)
+            for left in (*job.glob("gaussians-*"), *job.glob("*.tmp")):
+                shutil.rmtree(left, ignore_errors=True)  # of a run that was killed
+            stays = False
             try:
                 yield
             except Interrupted as error:
-                if self._outputs is None:
-                    raise
-                raise Interrupted(
-                    f"{error}; the same command goes on where this one was"
-                ) from error
-            except (RefineError, Cancelled):
-                scene.folder.remove()
-                if self._outputs:
-                    self._outputs.discard()
+                stays = outputs is not None
+                if stays:
+                    raise Interrupted(
+                        f"{error}; the same command goes on where this one was"
+                    ) from error
                 raise
-            scene.folder.remove()
-
-    def write(self, scene: TileScene, decision: TileDecision, runtime: Runtime) -> Written:
-        """Write each tile where it waits, unless it is in its place; then rename all of them."""
-        outputs, kept = self._outputs, decision.counts[:, 0].tolist()
-        if outputs is None:
-            sizes = [_size(tile, count) for tile, count in zip(scene.tiles, kept, strict=True)]
-        else:
-            runner = Runner(scene.workers, runtime.progress)
-            sizes = _write(scene, decision, outputs, runner)
-            outputs.publish()
-        target = None if outputs is None else str(self._folder)
-        before = scene.bytes
-        return Written(
-            files=files_facts(f"{len(scene.tiles)} tiles", target, before, sum(sizes)),
-            splats={"written": None if outputs is None else sum(kept)},
-            facts={"tiles": _facts(scene.tiles, outputs, sizes, decision.counts)},
-        )
+            except (RefineError, Cancelled):
+                if outputs:
+                    outputs.discard()
+                raise
+            except BaseException:
+                stays = True
+                raise
+    finally:
+        if not stays:  # after the lock is closed: Windows removes no open file
+            _remove(job)
 
 
-def _write(scene: TileScene, decision: TileDecision, outputs: Outputs, runner: Runner) -> list[int]:
-    """Write each tile that is not in its place; return the bytes of all."""
-    sizes, pieces = outputs.in_place(), pieces_of(scene.tiles, scene.units)
-    steps = [
-        WriteTile(number, tile, pieces[number], kept, decision.changed, url)
-        for number, (tile, (kept, _), url) in enumerate(
-            zip(scene.tiles, decision.counts.tolist(), outputs.urls, strict=True)
-        )
-        if number not in sizes
-    ]
-    written = runner.run(scene.folder, steps, "writing", [step.tile.size for step in steps])
-    sizes |= {step.number: size for step, size in zip(steps, written, strict=True)}
-    return [sizes[number] for number in range(len(scene.tiles))]
+def _lock(job: Path, lock: Any) -> None:
+    """Lock the folder of a job, or raise `RefineError`."""
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise RefineError(f"{job}: another run is at work on the same job") from error
+    except OSError:
+        pass  # this file system has no locks
 
 
-def _size(tile: Tile, kept: int) -> int:
-    """Return the bytes of a tile of which so many splats stay."""
-    header = header_of(tile)
-    shorter = len(header) - len(with_count(header, kept))
-    return tile.fixed_bytes - shorter + kept * tile.row_bytes
+def _remove(job: Path) -> None:
+    """Remove a folder and all that is in it; Ctrl-C meanwhile comes too late."""
+    try:
+        shutil.rmtree(job, ignore_errors=True)
+    except KeyboardInterrupt:
+        shutil.rmtree(job, ignore_errors=True)
 
 
-def _facts(
-    tiles: Sequence[Tile], outputs: Outputs | None, sizes: Sequence[int], counts: NDArray[np.int64]
-) -> list[dict[str, Any]]:
-    """Return what the report says of each tile."""
-    targets = [str(target) for target in outputs.targets] if outputs else [None] * len(tiles)
-    return [
-        {
-            "input": tile.path,
-            "output": target,
-            "before": tile.splats,
-            "kept": kept,
-            "unseen": unseen,
-            "input_bytes": tile.size,
-            "output_bytes": size,
-        }
-        for tile, target, size, (kept, unseen) in zip(
-            tiles, targets, sizes, counts.tolist(), strict=True
-        )
-    ]
-
-
-def _digest(tiles: Sequence[Tile], request: TilesRequest) -> str:
-    """Return a name for a job: that of the same job again, and of no other."""
-    digest, asked = hashlib.blake2b(digest_size=8), request.prune
-    for fact in (VERSION, ROWS, [*tiles], asked.budget, asked.settings, asked.survivors):
+def _digest(tiles: Sequence[Tile], request: PruneRequest) -> str:
+    """Name of a job: that of the same job again, and of no other."""
+    digest = hashlib.blake2b(digest_size=8)
+    for fact in (VERSION, [*tiles], request.budget, request.settings, request.survivors):
         digest.update(repr(fact).encode("utf-8", "surrogateescape"))
-    for view in asked.views.spread(asked.settings.views):
+    for view in request.views.spread(request.settings.views):
         for field in fields(view):
             value = getattr(view, field.name)
             is_array = isinstance(value, np.ndarray)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import secrets
+import stat
 from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import whole_file
-from ..errors import RefineError
+from ..errors import RefineError, reason_of
+from ..mapped import Interrupted
 from ..urls import Url, is_url
 from ..whole_file import expanded
-from .folder import Interrupted
 
 _FLEETING = ("url", "access")
 """Parts of the names of facts about a file that change though it does not: where a server sends
@@ -30,12 +31,12 @@ _NO_SUCH = "there is no such file"
 
 
 def located(path: Path | str) -> Path | Url:
-    """Return a URL, or a path with ``~`` replaced; raise `RefineError` if there is no such user."""
+    """URL, or path with ``~`` replaced; raises `RefineError` if there is no such user."""
     return Url(path) if is_url(path) else expanded(path)
 
 
 def identity(path: Path | Url) -> str:
-    """Return a name of a file that is the same however the file is named."""
+    """Name of a file that is the same however the file is named."""
     if isinstance(path, Url):
         with _opened(path, "cannot be looked for") as (system, inner):
             name: str = system.unstrip_protocol(inner)
@@ -46,7 +47,7 @@ def identity(path: Path | Url) -> str:
 
 
 def file_key(path: Path | Url) -> Hashable:
-    """Return what is the same for all names of a file that exists, hard links included."""
+    """What all names of a file that exists have in common, hard links included."""
     name = identity(path)
     if not name.startswith(_LOCAL):
         return name
@@ -56,11 +57,14 @@ def file_key(path: Path | Url) -> Hashable:
 
 
 def state(path: Path | Url) -> tuple[int, int | str]:
-    """Return the bytes of a file and what changes with its content: a time in ns, or facts."""
+    """Bytes of a file, and what changes with its content: a time in ns, or facts."""
     if not isinstance(path, Url):
         with _explained(path, "cannot be read"):
             status = path.stat()
-            return status.st_size, status.st_mtime_ns
+        if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for a writer
+            kind = "folder" if stat.S_ISDIR(status.st_mode) else "device"
+            raise RefineError(f"{path}: is a {kind}, expected a PLY file")
+        return status.st_size, status.st_mtime_ns
     with _opened(path, "cannot be read") as (system, inner):
         facts = system.info(inner)
         if facts.get("type") == "directory":
@@ -75,13 +79,16 @@ def state(path: Path | Url) -> tuple[int, int | str]:
         return int(facts["size"]), repr(sorted(lasting.items()))
 
 
-def beginning(url: Url, size: int, whole: int) -> bytes:
-    """Return the first `size` bytes of a file of `whole` bytes, or all.
+def beginning(path: Path | Url, size: int, whole: int) -> bytes:
+    """First `size` bytes of a file of `whole` bytes, or all.
 
-    A file that can only be read from its beginning is refused: `array` would be sent all of it.
+    A URL that can only be read from its beginning is refused: `array` would be sent all of it.
     """
+    if not isinstance(path, Url):
+        with _explained(path, "cannot be read"), path.open("rb") as stream:
+            return stream.read(size)
     with (
-        _opened(url, "cannot be read") as (system, inner),
+        _opened(path, "cannot be read") as (system, inner),
         system.open(inner, "rb", cache_type="none") as stream,
     ):
         start: bytes = stream.read(size)
@@ -91,17 +98,7 @@ def beginning(url: Url, size: int, whole: int) -> bytes:
 
 
 def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
-    """Read an array, and nothing else of the file; it is shorter where the file ends.
-
-    Parameters
-    ----------
-    path : Path or Url
-    dtype : dtype
-    count : int
-        How many elements.
-    begin : int
-        Bytes before the first.
-    """
+    """Elements from byte `begin` on, and nothing else of the file; fewer where the file ends."""
     if not isinstance(path, Url):
         with _explained(path, "cannot be read"):
             return np.fromfile(path, dtype, count, offset=begin)
@@ -170,7 +167,7 @@ def publish(made: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
 
 
 def size_of(path: Path | Url) -> int | None:
-    """Return the bytes of a file; None if there is none."""
+    """Bytes of a file; None if there is none."""
     if not isinstance(path, Url):
         return path.stat().st_size if path.is_file() else None
     with _opened(path, "cannot be looked for") as (system, inner):
@@ -193,7 +190,7 @@ def _opened(url: Url, problem: str) -> Iterator[tuple[Any, str]]:
 
 
 def _split(url: Url) -> tuple[Any, str]:
-    """Return the file system of a URL, and the path there."""
+    """File system of a URL, and the path there."""
     try:
         from fsspec.core import url_to_fs
     except ImportError as error:
@@ -212,10 +209,6 @@ def _explained(path: Path | Url, problem: str) -> Iterator[None]:
     except (RefineError, MemoryError):
         raise
     except Exception as error:  # each storage has errors of its own
-        missing = isinstance(error, FileNotFoundError)
-        said = getattr(error, "strerror", None) or (_NO_SUCH if missing else str(error))
-        raise (
-            Interrupted
-            if isinstance(path, Url)
-            else RefineError(f"{path}: {problem} ({said or type(error).__name__})")
-        ) from error
+        missing = isinstance(error, FileNotFoundError) and not error.strerror
+        kind = Interrupted if isinstance(path, Url) else RefineError
+        raise kind(f"{path}: {problem} ({_NO_SUCH if missing else reason_of(error)})") from error

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import secrets
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,131 +14,170 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..formats.ply_columns import ChangedColumns, splats_from_columns
+from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
 from ..formats.ply_header import with_count, with_model
 from ..formats.ply_write import write_rows
-from ..operation.run import Runtime
+from ..mapped import Interrupted, Mapped, note, noted, writing
+from ..splats import Splats
 from ..urls import Url
 from ..whole_file import refuse_one_file
 from . import storage
-from .folder import Folder, Interrupted
-from .units import Piece, Tile, bytes_of, header_of, rows_of, unpacked
+from .source import ROWS, Tile, bytes_of, rows_of
 
 RENAMED = "renamed"
-"""Name of the note of all tiles, made before the first is renamed: bytes and times, (tiles, 2)."""
+"""Stage in which tiles are renamed; noted before the first: their bytes and times."""
+
+
+def waiting_in(job: Path) -> Path:
+    """Where finished tiles of a job wait until all of them are finished."""
+    return job / "tiles"
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What stays of N splats, in files of the job.
+
+    Attributes
+    ----------
+    keep : (N,) bool
+    changed : (M,) int64
+        Rows of the splats that stay and are not what they were, ascending.
+    became : Splats or None
+        What these are now.
+    """
+
+    keep: Mapped
+    changed: Mapped
+    became: Splats | None
+
+    def columns(self, rows: NDArray[Any], begin: int) -> Mapping[str, NDArray[Any]]:
+        """Columns of rows of a tile with their changes; `begin` splats are before them."""
+        if self.became is None:
+            return {}
+        first, end = (bisect_left(self.changed, row) for row in (begin, begin + len(rows)))
+        splats, changed = self.became.take(slice(first, end)), self.changed[first:end] - begin
+        degree = splats_from_columns(rows[:1]).sh_rest.shape[1]
+        return ChangedColumns(rows, changed, replace(splats, sh_rest=splats.sh_rest[:, :degree]))
 
 
 @dataclass(frozen=True)
 class WriteTile:
-    """Writes what stays of a tile into the folder of the job."""
+    """Writes what stays of a tile into the folder of the job; any process can.
 
-    number: int
-    tile: Tile
-    pieces: list[Piece]  # all of its rows, in their order
-    kept: int  # how many of its splats stay
-    changed: bool  # whether some of them absorbed others
-    url: Url | None  # where to copy the file
+    Attributes
+    ----------
+    job : Path
+    tiles : sequence of Tile
+    kept : Kept
+    urls : sequence of Url or None
+        Where to copy each file.
+    """
 
-    def run(self, folder: Folder, _runtime: Runtime) -> int:
-        """Write the file, unless it is there; return its bytes."""
-        waiting_file, name = folder.tiles / self.tile.name, f"{self.number:06d}.written"
-        done, size = folder.noted(name)
-        if not (done and waiting_file.exists()):
-            size = self._write(folder, waiting_file)
-            folder.note(name, np.array(size))
-        if self.url is not None:
-            storage.upload(waiting_file, self.url)
-        return int(size)
+    job: Path
+    tiles: Sequence[Tile]
+    kept: Kept
+    urls: Sequence[Url | None]
 
-    def _write(self, folder: Folder, waiting_file: Path) -> int:
-        tile = self.tile
-        with folder.writing(waiting_file) as stream:
-            header = with_count(header_of(tile), self.kept)
-            stream.write(with_model(header, tile.model) if tile.model_can_change else header)
+    def __call__(self, number: int) -> int:
+        """Write the file of a tile, unless an earlier run has; return its bytes."""
+        waiting, url = waiting_in(self.job) / self.tiles[number].name, self.urls[number]
+        if not waiting.exists():
+            unfinished = waiting_in(self.job) / f"{number:06d}-{secrets.token_hex(8)}.tmp"
+            try:
+                with writing(waiting):
+                    self._write(number, unfinished)
+                    unfinished.replace(waiting)
+            finally:
+                unfinished.unlink(missing_ok=True)
+        if url is not None:
+            storage.upload(waiting, url)
+        return waiting.stat().st_size
+
+    def _write(self, number: int, path: Path) -> None:
+        tile, begin = self.tiles[number], sum(tile.splats for tile in self.tiles[:number])
+        header = header_of(tile, int(np.count_nonzero(self.kept.keep[begin : begin + tile.splats])))
+        with path.open("wb") as stream:
+            stream.write(header)
             for beside in bytes_of(tile, tile.header, tile.begin):
                 stream.write(beside.data)
-            for piece in self.pieces:
-                keep, rows = folder.map(piece.unit, "keep")[piece.place], rows_of(piece.part)
-                columns = self._columns(folder, rows, piece) if self.changed else {}
-                write_rows(stream, rows, keep, columns)
+            for start in range(0, tile.splats, ROWS):
+                rows = rows_of(tile, start, min(start + ROWS, tile.splats))
+                first = begin + start
+                columns = self.kept.columns(rows, first)
+                write_rows(stream, rows, self.kept.keep[first : first + len(rows)], columns)
             for beside in bytes_of(tile, tile.end, tile.size):
                 stream.write(beside.data)
-            return stream.tell()
 
-    def _columns(self, folder: Folder, rows: NDArray[Any], piece: Piece) -> ChangedColumns:
-        """Return the columns of rows, with what those became that absorbed others."""
-        changed = folder.map(piece.unit, "changed")
-        here = slice(*np.searchsorted(changed, (piece.place.start, piece.place.stop)).tolist())
-        splats = unpacked(folder.map(piece.unit, "became")[here])
-        degree = splats_from_columns(rows[:1]).sh_rest.shape[1]
-        splats = replace(splats, sh_rest=splats.sh_rest[:, :degree])
-        return ChangedColumns(rows, changed[here] - piece.place.start, splats)
+
+def header_of(tile: Tile, kept: int) -> bytes:
+    """Header of a tile of which so many splats stay."""
+    header = with_count(b"".join(map(bytes, bytes_of(tile, 0, tile.header))), kept)
+    return with_model(header, tile.model) if THIRD_SCALE in (tile.dtype.names or ()) else header
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """Where the tiles of a job go."""
+    """Where the tiles of a job go.
 
-    job: Folder
-    targets: Sequence[Path | Url]  # the names that all tiles get in the end
-    waiting: Sequence[Path | Url]  # where each waits, in the same storage, until all are written
-    overwrite: bool  # whether files may be replaced
+    Parameters
+    ----------
+    job : Path
+    tiles : sequence of Tile
+    folder : Path or Url
+        In which each gets a file of its own name; it is there.
+    overwrite : bool
+        Whether files may be replaced.
 
-    @classmethod
-    def of(
-        cls, job: Folder, tiles: Sequence[Tile], folder: Path | Url, *, overwrite: bool
-    ) -> Outputs:
-        """Return where tiles go that end in a folder, which is there.
+    Raises
+    ------
+    RefineError
+        If two tiles have one name, or a file could not be made, or may not be replaced.
+    """
 
-        Raises
-        ------
-        RefineError
-            If two tiles have one name, or a file could not be made, or may not be replaced.
-        """
-        targets = {folder / tile.name: tile for tile in tiles}
-        if len(targets) < len(tiles):
-            name = next(tile.name for tile in tiles if targets[folder / tile.name] is not tile)
-            raise RefineError(f"{targets[folder / name].path}: another tile is called {name} too")
-        waiting: list[Path | Url] = [
-            folder / f"{job.path.name}-{number:06d}"
-            if isinstance(folder, Url)
-            else job.tiles / tile.name
-            for number, tile in enumerate(tiles)
-        ]
-        refuse_one_file(target for target in targets if isinstance(target, Path))
-        outputs = cls(job, [*targets], waiting, overwrite)
-        read = {storage.identity(tile.place) for tile in tiles}
-        for target in targets:
+    job: Path
+    tiles: Sequence[Tile]
+    folder: Path | Url
+    overwrite: bool
+
+    def __post_init__(self) -> None:
+        first: dict[str, Tile] = {}
+        for tile in self.tiles:
+            if first.setdefault(tile.name, tile) is not tile:
+                raise RefineError(f"{tile.path}: another tile is called {tile.name} too")
+        refuse_one_file(target for target in self.targets if isinstance(target, Path))
+        read = {storage.identity(tile.place) for tile in self.tiles}
+        for target in self.targets:
             if storage.identity(target) in read:
                 raise RefineError(
                     f"{target}: is read until all tiles are written; write to another folder"
                 )
-        outputs.refuse_existing()
-        return outputs
+        self._refuse_existing(self.in_place())
+
+    @property
+    def targets(self) -> list[Path | Url]:
+        """The names that tiles get in the end."""
+        return [self.folder / tile.name for tile in self.tiles]
+
+    @property
+    def waiting(self) -> list[Path | Url]:
+        """Where tiles wait, in the same storage, until all are written."""
+        if isinstance(self.folder, Url):
+            name = self.job.name
+            return [self.folder / f"{name}-{number:06d}" for number in range(len(self.tiles))]
+        return [waiting_in(self.job) / tile.name for tile in self.tiles]
 
     @property
     def urls(self) -> list[Url | None]:
         """Where to copy each tile; None on a disk, where it is written at once."""
-        return [None if isinstance(place, Path) else place for place in self.waiting]
+        return [place if isinstance(place, Url) else None for place in self.waiting]
 
     def in_place(self) -> dict[int, int]:
-        """Return the bytes of the tiles, by number, that an interrupted run renamed already."""
-        noted, states = self.job.noted(RENAMED)
-        if not noted:
-            return {}
+        """Bytes of the tiles, by number, that an interrupted run has renamed."""
         return {
             number: size
-            for number, (size, changed) in enumerate(states.tolist())
+            for number, (size, changed) in enumerate(noted(self.job, RENAMED)[1] or ())
             if self._is_renamed(number, size, changed)
         }
-
-    def refuse_existing(self) -> None:
-        """Raise `RefineError` if a tile that is not in its place could not get there."""
-        there = self.in_place()
-        for number, target in enumerate(self.targets):
-            if number not in there:
-                storage.refuse_existing(target, overwrite=self.overwrite)
-                _refuse_other_disk(target)
 
     def publish(self) -> None:
         """Rename all tiles that are not in their places yet.
@@ -147,20 +188,17 @@ class Outputs:
             If one cannot be renamed, or another file is in its place; if that is so from the
             beginning, none is renamed.
         """
-        there = self.in_place()
+        there, before = self.in_place(), noted(self.job, RENAMED)[1]
         try:
-            self.refuse_existing()
-            _, noted = self.job.noted(RENAMED)
+            self._refuse_existing(there)
             states = [
-                noted[number] if number in there else _state(waiting)
+                before[number] if number in there else _state(waiting)
                 for number, waiting in enumerate(self.waiting)
             ]
-            self.job.note(RENAMED, np.array(states, np.int64))
-            for number, (waiting, target) in enumerate(
-                zip(self.waiting, self.targets, strict=True)
-            ):
+            note(self.job, RENAMED, states)
+            for number, pair in enumerate(zip(self.waiting, self.targets, strict=True)):
                 if number not in there:
-                    storage.publish(waiting, target, overwrite=self.overwrite)
+                    storage.publish(*pair, overwrite=self.overwrite)
         except RefineError as error:
             raise Interrupted(str(error)) from error
 
@@ -170,28 +208,32 @@ class Outputs:
             if url is not None:
                 storage.discard(url)
 
+    def _refuse_existing(self, there: Mapping[int, int]) -> None:
+        """Raise `RefineError` if a tile that is not in its place could not get there."""
+        for number, target in enumerate(self.targets):
+            if number in there:
+                continue
+            storage.refuse_existing(target, overwrite=self.overwrite)
+            if isinstance(target, Path):  # a link to another disk: nothing is renamed there
+                behind = Path(os.path.realpath(target)).parent
+                if behind.stat().st_dev != target.parent.stat().st_dev:
+                    raise RefineError(
+                        f"{target}: is a link to another disk, {behind}; remove the link"
+                    )
+
     def _is_renamed(self, number: int, size: int, changed: int) -> bool:
-        """Return whether a tile is in its place, given its bytes and the time of its last change.
+        """Whether a tile is in its place, given its bytes and the time of its last change.
 
         Storages behind URLs give a file another time when they rename it.
         """
-        target = self.targets[number]
+        target, waiting = self.targets[number], self.waiting[number]
         if isinstance(target, Path):
             return target.is_file() and _state(target) == (size, changed)
-        waiting = self.waiting[number]
         return storage.size_of(waiting) is None and storage.size_of(target) == size
 
 
-def _refuse_other_disk(target: Path | Url) -> None:
-    """Raise `RefineError` if a target is a link to another disk: nothing is renamed there."""
-    if isinstance(target, Path):
-        behind = Path(os.path.realpath(target)).parent
-        if behind.stat().st_dev != target.parent.stat().st_dev:
-            raise RefineError(f"{target}: is a link to another disk, {behind}; remove the link")
-
-
 def _state(path: Path | Url) -> tuple[int, int]:
-    """Return the bytes of a file, and on a disk the time of its last change, ns."""
+    """Bytes of a file, and on a disk the time of its last change, ns."""
     if isinstance(path, Path):
         status = path.stat()
         return status.st_size, status.st_mtime_ns

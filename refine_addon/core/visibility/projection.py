@@ -96,8 +96,9 @@ class Gaussians:
         if self.boxes is None:
             yield 0, self
             return
+        size = self.means.shape[2]
         for number in np.flatnonzero(boxes_touch(self.boxes, scene, view, window)).tolist():
-            rows = slice(number * CHUNK, (number + 1) * CHUNK)
+            rows = slice(number * size, (number + 1) * size)
             largest = self.largest[rows]
             # What is not projected stays in its file.
             arrays: dict[str, Any] = {

@@ -88,7 +88,7 @@ class RaySample:
     ) -> None:
         self.views, self.splats, self.scoring, self.share = views, splats, scoring, 1.0
         self._step = max(math.ceil(len(views) / VALIDATION_VIEWS), 1) if few_views else 1
-        self.splat_rows = self.stored_rows = gaussians.index
+        self.splat_rows = self.stored_rows = np.asarray(gaussians.index)
         self.rays: list[Rays | None] = [None] * len(views)
 
     def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:

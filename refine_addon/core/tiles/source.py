@@ -1,0 +1,195 @@
+"""Tiles: what is known of them, and their rows as splats."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Hashable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RefineError
+from ..execute import Progress, run
+from ..formats.ply import splat_header, stated_model
+from ..formats.ply_body import check_counts, has_lists
+from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
+from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
+from ..rendering import Model
+from ..splats import Splats, joined, on_disk, with_model
+from ..urls import Url
+from . import storage
+
+ROWS = 1 << 16
+"""Rows of a tile that are read together, 15 MB at degree 3."""
+
+_HEADER = 1 << 16  # bytes that are read of a tile for its header, which hardly ever has more
+_PIECE = 1 << 24  # bytes beside the rows that are copied at a time
+
+
+class Tile(NamedTuple):
+    """A file of splats, as it was when the job began."""
+
+    path: str  # absolute, or a URL
+    splats: int  # how many it holds
+    dtype: np.dtype[Any]  # of a row
+    model: Model  # how they are drawn
+    header: int  # bytes of the header
+    begin: int  # bytes before the first row
+    size: int  # bytes of the file
+    changed: int | str  # see `storage.state`
+
+    @property
+    def place(self) -> Path | Url:
+        """Where it is."""
+        return storage.located(self.path)
+
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.place.name
+
+    @property
+    def end(self) -> int:
+        """Bytes up to the end of the last row."""
+        return self.begin + self.splats * self.dtype.itemsize
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Bytes of everything but the rows."""
+        return self.size - self.end + self.begin
+
+
+def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
+    """Look at the files of a scene.
+
+    Parameters
+    ----------
+    paths : sequence of path-like
+    model : {"default", "antialiased", "2dgs"}, optional
+        How their splats are drawn, where they do not say or are wrong.
+
+    Raises
+    ------
+    RefineError
+        See `tile_at`; also if a file is given twice, since its splats would count twice, if they
+        are of different models, or none has a splat.
+    """
+    tiles: list[Tile] = []
+    given: dict[Hashable, Tile] = {}
+    for path in paths:
+        tile = tile_at(path, model)
+        first = given.setdefault(storage.file_key(tile.place), tile)
+        if first is not tile:
+            also = "" if first.path == tile.path else f", also as {first.path}"
+            raise RefineError(f"{tile.path}: is given twice{also}")
+        tiles.append(tile)
+        if tile.model != tiles[0].model:
+            raise RefineError(
+                f"{tile.path}: its splats are {tile.model}, those of {tiles[0].path} "
+                f"{tiles[0].model}; expected one model in all tiles"
+            )
+    if not any(tile.splats for tile in tiles):
+        raise RefineError(f"none of {len(tiles)} tiles has a splat: there is nothing to prune")
+    return tiles
+
+
+def tile_at(path: Path | str, model: Model | None = None) -> Tile:
+    """Look at a file of splats; only its header is read.
+
+    Parameters
+    ----------
+    path : path-like
+        Or a URL.
+    model
+        See `tiles_at`.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be read, is no plain binary PLY, is truncated or holds no splats.
+    """
+    place = storage.located(path)
+    size, changed = storage.state(place)
+    if place.name in ("", ".", ".."):
+        raise RefineError(f"{place}: names no file")
+    head = storage.beginning(place, _HEADER, size)
+    if b"end_header" not in head:
+        head = storage.beginning(place, HEADER_LIMIT, size)
+    header, vertex = splat_header(place, io.BytesIO(head))
+    if header.order == TEXT:
+        raise RefineError(
+            f"{place}: is {format_of(header.raw)}, expected a plain binary PLY as a tile, which "
+            "'refine convert IN OUT.ply' makes of other formats"
+        )
+    before = [*zip(header.elements[:vertex], header.counts, strict=False)]
+    if any(has_lists(element) for element, _ in before):
+        raise RefineError(f"{place}: has lists before the splats, expected none in a tile")
+    check_counts(header, size - len(header.raw))
+    begin = sum(count * element.dtype(header.order).itemsize for element, count in before)
+    dtype, stated = header.elements[vertex].dtype(header.order), None
+    stated = stated_model(header.raw, dtype) or "default"
+    if model not in (None, stated) and THIRD_SCALE not in (dtype.names or ()):
+        raise RefineError(f"{place}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}")
+    return Tile(
+        str(place if isinstance(place, Url) else place.absolute()), header.counts[vertex], dtype,
+        model or stated, len(header.raw), len(header.raw) + begin, size, changed,
+    )  # fmt: skip
+
+
+def rows_of(tile: Tile, start: int, stop: int) -> NDArray[Any]:
+    """Rows of a tile, read rather than mapped: what is mapped stays in memory.
+
+    Raises
+    ------
+    RefineError
+        If the tile cannot be read, or is another file than it was.
+    """
+    return _read(tile, tile.dtype, stop - start, tile.begin + start * tile.dtype.itemsize)
+
+
+def bytes_of(tile: Tile, start: int, stop: int) -> Iterator[NDArray[np.uint8]]:
+    """Bytes of a tile, some at a time; see `rows_of` for errors."""
+    for begin in range(start, stop, _PIECE):
+        yield _read(tile, np.dtype(np.uint8), min(_PIECE, stop - begin), begin)
+
+
+def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
+    """Array from a tile; see `storage.array`."""
+    sent = storage.array(tile.place, dtype, count, begin)
+    if storage.state(tile.place) != (tile.size, tile.changed):
+        raise RefineError(f"{tile.path}: was changed while it was worked on; nothing was written")
+    if len(sent) != count:
+        raise RefineError(
+            f"{tile.path}: {sent.nbytes} bytes were sent, expected the {count * dtype.itemsize} "
+            f"from {begin} on"
+        )
+    return sent
+
+
+def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
+    """All splats of some tiles, one of which has one, in files of a new folder.
+
+    They have the types and the degree that hold the numbers of all tiles: coefficients that a tile
+    lacks are 0.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `rows_of` and `splats.on_disk`.
+    """
+    empty = {tile.dtype: np.empty(0, tile.dtype) for tile in tiles if tile.splats}
+    kinds = [splats_from_columns(rows) for rows in empty.values()]
+    kinds = kinds if len(kinds) > 1 else []
+    pieces = [
+        (tile, start, min(start + ROWS, tile.splats))
+        for tile in tiles
+        for start in range(0, tile.splats, ROWS)
+    ]
+
+    def read(piece: tuple[Tile, int, int]) -> Splats:
+        splats = joined([*kinds, splats_from_columns(rows_of(*piece))])
+        return with_model(splats, piece[0].model)
+
+    return on_disk(folder, run(read, pieces, progress=progress, what="reading", threads=threads))
