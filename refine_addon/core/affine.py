@@ -32,31 +32,31 @@ _CHUNK = 1 << 16  # splats whose covariances are computed together, which limits
 
 
 def scales_of(matrix: NDArray[Any]) -> NDArray[np.float64]:
-    """Return by how much a (4, 4) or (3, 3) matrix scales along its three axes, largest first."""
+    """By how much a (4, 4) or (3, 3) matrix scales along its three axes, largest first."""
     linear = np.asarray(matrix, np.float64)[:3, :3]
     return np.asarray(np.linalg.svd(linear, compute_uv=False))
 
 
 def is_uniform(matrix: NDArray[Any]) -> bool:
-    """Return whether a (4, 4) or (3, 3) matrix scales all directions alike; it may mirror."""
+    """Whether a (4, 4) or (3, 3) matrix scales all directions alike; it may mirror."""
     scales = scales_of(matrix)
     return bool(scales[0] - scales[2] <= _UNIFORM * scales[0])
 
 
 def is_flat(matrix: NDArray[Any]) -> bool:
-    """Return whether a (4, 4) or (3, 3) matrix maps space to a plane, a line or a point."""
+    """Whether a (4, 4) or (3, 3) matrix maps space to a plane, a line or a point."""
     scales = scales_of(matrix)
     return not scales[2] > _FLAT * scales[0]
 
 
 def moved(means: NDArray[Any], matrix: NDArray[Any]) -> NDArray[np.float64]:
-    """Return places, (N, 3), where an affine (4, 4) matrix moves them."""
+    """Places, (N, 3), where an affine (4, 4) matrix moves them."""
     with np.errstate(invalid="ignore", over="ignore"):  # of what is not finite
         return np.asarray(means @ matrix[:3, :3].T.astype(np.float64) + matrix[:3, 3])
 
 
 def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True) -> Splats:
-    """Return the splats transformed by an affine matrix.
+    """Splats transformed by an affine matrix.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
 
 
 def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
-    """Return the splats transformed by any affine matrix that can be inverted, harmonics as well.
+    """Splats transformed by any affine matrix that can be inverted, harmonics as well.
 
     As `transformed`, but where the matrix scales directions differently, harmonics become the
     nearest to what is seen (`spherical_harmonics.stretched`); the rest is exact.
@@ -154,15 +154,15 @@ def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
         )
 
 
-def _rotated(quaternions: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the product of a rotation and each of `quaternions`, (N, 4); lengths stay."""
+def _rotated(quaternions, rotation):
+    """Product of a rotation and each of `quaternions`, (N, 4); lengths stay."""
     w, x, y, z = quaternion(rotation)
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.asarray(np.asarray(quaternions, np.float64) @ left.T)
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit quaternion w x y z of rotation matrices, (..., 3, 3) -> (..., 4).
+    """Unit quaternion w x y z of rotation matrices, (..., 3, 3) -> (..., 4).
 
     It is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack 2000).
     This needs no case distinction and is as accurate for half a turn as for other angles.
@@ -183,8 +183,8 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(q[..., :1] < 0.0, -q, q)
 
 
-def _stretched(splats: Splats, means: NDArray[Any], linear: NDArray[np.float64]) -> Splats:
-    """Return splats with these means and the covariances ``M S M'``, M being `linear`."""
+def _stretched(splats, means, linear):
+    """Splats with these means and the covariances ``M S M'``, M being `linear`."""
     logs, quaternions = np.empty((len(splats), 3)), np.empty((len(splats), 4))
     for piece in chunks(len(splats), _CHUNK):
         stored = np.asarray(splats.log_scales[piece], np.float64)

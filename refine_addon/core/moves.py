@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,7 +64,7 @@ class Move:
 
 
 def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
-    """Return the maps that explain how points moved, those that did not move first.
+    """Maps that explain how points moved, those that did not move first.
 
     A map is fitted to all points, and where it does not fit, to a few that are drawn at random, of
     which the map is taken that most points agree with (RANSAC, Fischler and Bolles 1981); then the
@@ -98,10 +97,8 @@ def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
     return moves
 
 
-def _best(
-    before: NDArray[np.float64], after: NDArray[np.float64], random: np.random.Generator
-) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_]]:
-    """Return the map that most points agree with, (4, 4), None where hardly any, and which do."""
+def _best(before, after, random):
+    """Map that most points agree with, (4, 4), None where hardly any, and which do."""
     whole = _refined(before, after, np.arange(len(before)))
     if whole is not None and (fits := _fits(whole, before, after)).all():
         return whole, fits
@@ -128,7 +125,7 @@ def _best(
     return best, _fits(best, before, after)
 
 
-def _draws(count: int, random: np.random.Generator) -> Iterator[NDArray[np.int64]]:
+def _draws(count, random):
     """Yield a few points at a time, from smaller and smaller runs of all."""
     for number in range(_TRIES):
         size = max(min(count, 2 * _DRAWN), int(count * _BLOCKS[number % len(_BLOCKS)]))
@@ -136,15 +133,13 @@ def _draws(count: int, random: np.random.Generator) -> Iterator[NDArray[np.int64
         yield start + random.choice(size, min(size, _DRAWN), replace=False)
 
 
-def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """Return at most so many of some rows, evenly spread."""
+def _spread(rows, most):
+    """At most so many of some rows, evenly spread."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]
 
 
-def _refined(
-    before: NDArray[np.float64], after: NDArray[np.float64], agree: NDArray[np.int64]
-) -> NDArray[np.float64] | None:
-    """Return the map of points that agree, (4, 4); a translation where that explains them."""
+def _refined(before, after, agree):
+    """Map of points that agree, (4, 4); a translation where that explains them."""
     if len(agree) < LEAST:
         return None
     rows = _spread(agree, _FITTED)
@@ -156,14 +151,8 @@ def _refined(
     return _fitted(before, after)
 
 
-def _fits(
-    matrix: NDArray[np.float64],
-    before: NDArray[np.float64],
-    after: NDArray[np.float64],
-    *,
-    slack: float = 1.0,
-) -> NDArray[np.bool_]:
-    """Return which points a map takes to where they are but for rounding, (N,)."""
+def _fits(matrix, before, after, *, slack=1.0):
+    """Which points a map takes to where they are but for rounding, (N,)."""
     fits = np.empty(len(before), np.bool_)
     turn, shift = np.abs(matrix[:3, :3]).T, np.abs(matrix[:3, 3])
     for part in chunks(len(before), _ROWS):  # whose arrays stay in the caches
@@ -173,8 +162,8 @@ def _fits(
     return fits
 
 
-def _fitted(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the affine map of least squares between points, (4, 4).
+def _fitted(before, after):
+    """Affine map of least squares between points, (4, 4).
 
     Points in a plane say nothing of the direction across it. It is mapped across the plane that
     they lie in now, by the mean scale within it, and not mirrored. None for points on a line.

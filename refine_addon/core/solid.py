@@ -10,7 +10,6 @@ that rays are cast only from the points of the others.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -87,7 +86,7 @@ class Solid:
             object.__setattr__(self, name, value)
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which points, (N, 3) floating, lie inside, (N,); none that is not finite."""
+        """Which points, (N, 3) floating, lie inside, (N,); none that is not finite."""
         inside = np.zeros(len(points), np.bool_)
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         rows = np.flatnonzero(((points >= low) & (points < high)).all(axis=1))
@@ -103,22 +102,20 @@ class Solid:
         inside[rows] = self._crossed(near)
         return inside
 
-    def _crossed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which points, (N, 3), lie inside, each by its own ray."""
+    def _crossed(self, points):
+        """Which points, (N, 3), lie inside, each by its own ray."""
         turns = np.zeros(len(points))
         for rows, heights, signs in self._crossings(points[:, :2]):
             above = heights > points[rows, 2]
             turns += np.bincount(rows[above], signs[above], len(points))
         return self._holds(turns)
 
-    def _holds(self, turns: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which winding numbers mean inside."""
+    def _holds(self, turns):
+        """Which winding numbers mean inside."""
         return np.asarray(turns != 0.0 if self.turned else turns % 2.0 == 1.0)
 
-    def _grid(
-        self, low: NDArray[np.float64], scale: NDArray[np.float64], cells: int
-    ) -> NDArray[np.bool_]:
-        """Return which cells of a grid lie inside, (G, G, G); meaningless where one is touched.
+    def _grid(self, low, scale, cells):
+        """Which cells of a grid lie inside, (G, G, G); meaningless where one is touched.
 
         It has G = `cells` each way, the lowest corner `low`, (3,), and `scale` cells a unit, (3,).
         """
@@ -132,9 +129,7 @@ class Solid:
         above = turns[:, :, ::-1].cumsum(axis=2)[:, :, ::-1] - turns
         return self._holds(above)
 
-    def _crossings(
-        self, places: NDArray[np.float64]
-    ) -> Iterator[tuple[Index, NDArray[np.float64], NDArray[np.float64]]]:
+    def _crossings(self, places):
         """Yield where rays along z through places, (N, 2), cross triangles.
 
         An edge is crossed on the same side of a ray for both of its triangles, since its vertices
@@ -158,10 +153,8 @@ class Solid:
                 signs[(x1 > px) != one_below[crossed]] = -1.0
             yield rows[crossed], heights, signs
 
-    def _apexes(
-        self, triangles: Index, height: NDArray[np.float64]
-    ) -> tuple[Index, Index, Index, NDArray[np.bool_]]:
-        """Return the corners of triangles, (C,), by the side of a line along x on which they lie.
+    def _apexes(self, triangles, height):
+        """Corners of triangles, (C,), by the side of a line along x on which they lie.
 
         `height`, (C,), is y of the line. These are the vertex that is alone on its side, the next
         in the triangle, the one before it, and whether that side is below, (C,) each.
@@ -174,10 +167,8 @@ class Solid:
         apex, after, before = (corners[every, (alone + step) % 3] for step in range(3))
         return apex, after, before, one_below
 
-    def _cut(
-        self, one: Index, other: Index, height: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return x and z where edges between vertices, (C,) each, have these y, (C,)."""
+    def _cut(self, one, other, height):
+        """X and z where edges between vertices, (C,) each, have these y, (C,)."""
         first, last = np.minimum(one, other), np.maximum(one, other)
         x, y, z = self.vertices.T
         share = (height - y[first]) / (y[last] - y[first])
@@ -187,8 +178,8 @@ class Solid:
         return cut, z[first] + share * (z[last] - z[first])
 
 
-def _edges(triangles: Index, count: int) -> tuple[int, bool]:
-    """Return how many edges belong to an odd number of triangles, and whether all turn one way."""
+def _edges(triangles, count):
+    """How many edges belong to an odd number of triangles, and whether all turn one way."""
     start = triangles.reshape(-1)
     end = np.roll(triangles, -1, axis=1).reshape(-1)
     names = np.minimum(start, end) * count + np.maximum(start, end)
@@ -198,9 +189,7 @@ def _edges(triangles: Index, count: int) -> tuple[int, bool]:
     return int(np.count_nonzero(np.bincount(edge) % 2)), not turns.any()
 
 
-def _pairs(
-    places: NDArray[np.float64], corners: NDArray[np.float64]
-) -> Iterator[tuple[Index, Index]]:
+def _pairs(places, corners):
     """Yield places and triangles whose boxes hold them, as pairs: (C,) and (C,).
 
     Places are (N, 2), corners of the triangles (T, 3, 2).
@@ -217,14 +206,12 @@ def _pairs(
         yield _joined(batch)
 
 
-def _joined(batch: list[tuple[Index, Index]]) -> tuple[Index, Index]:
+def _joined(batch):
     rows, triangles = zip(*batch, strict=True)
     return np.concatenate(rows), np.concatenate(triangles)
 
 
-def _pairs_of_groups(
-    places: NDArray[np.float64], corners: NDArray[np.float64]
-) -> Iterator[tuple[Index, Index]]:
+def _pairs_of_groups(places, corners):
     """Yield the pairs of `_pairs` for groups of places near each other.
 
     A group is halved along its longer side until few triangles may hold one of its places.
@@ -249,8 +236,8 @@ def _pairs_of_groups(
             yield rows[held[0]], triangles[held[1]]
 
 
-def _touched(vertices: NDArray[np.float64], triangles: Index, cells: int) -> NDArray[np.bool_]:
-    """Return which cells of a grid triangles touch, (G * G * G,), and some beside them.
+def _touched(vertices, triangles, cells):
+    """Which cells of a grid triangles touch, (G * G * G,), and some beside them.
 
     Triangles wider than a cell are halved until they are not; of the eight cells in which the
     others may lie, those that the triangle's plane crosses are touched. Vertices, (V, 3), are in
@@ -273,12 +260,7 @@ def _touched(vertices: NDArray[np.float64], triangles: Index, cells: int) -> NDA
     return touched
 
 
-def _touch(
-    touched: NDArray[np.bool_],
-    corners: NDArray[np.float64],
-    first: NDArray[np.float64],
-    cells: int,
-) -> None:
+def _touch(touched, corners, first, cells):
     """Set which of the eight cells from `first` on the planes of small triangles meet."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     reach = np.abs(normals).sum(axis=1) * (0.5 + _SLACK)

@@ -17,7 +17,7 @@ _DIRECTIONS = 4096
 
 
 def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
-    """Return the values of all harmonics along directions.
+    """Values of all harmonics along directions.
 
     Parameters
     ----------
@@ -44,63 +44,57 @@ def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
     return np.stack(_values(np.moveaxis(np.asarray(directions, np.float64), -1, 0), degree), -1)
 
 
-def _values(directions: NDArray[Any], degree: int) -> list[NDArray[Any]]:
-    """Return the values of `basis`, (...) each, along directions, (3, ...), in their type."""
+def _values(directions, degree):
+    """Values of `basis`, (...) each, along directions, (3, ...), in their type."""
     x, y, z = directions
     xx, yy, zz = x * x, y * y, z * z
     root = math.sqrt(1.0 / math.pi)
-    bands = [[np.full_like(x, 0.5 * root)]]
+    values = [np.full_like(x, 0.5 * root)]
     if degree >= 1:
         c = math.sqrt(3.0) / 2 * root
-        bands.append([-c * y, c * z, -c * x])
+        values += [-c * y, c * z, -c * x]
     if degree >= 2:
         c = math.sqrt(15.0) / 2 * root
-        bands.append(
-            [
-                c * x * y,
-                -c * y * z,
-                math.sqrt(5.0) / 4 * root * (2 * zz - xx - yy),
-                -c * x * z,
-                c / 2 * (xx - yy),
-            ]
-        )
+        values += [
+            c * x * y,
+            -c * y * z,
+            math.sqrt(5.0) / 4 * root * (2 * zz - xx - yy),
+            -c * x * z,
+            c / 2 * (xx - yy),
+        ]
     if degree >= 3:
         a, b = math.sqrt(35.0 / 2) / 4 * root, math.sqrt(21.0 / 2) / 4 * root
         c = math.sqrt(105.0) / 2 * root
-        bands.append(
-            [
-                -a * y * (3 * xx - yy),
-                c * x * y * z,
-                -b * y * (4 * zz - xx - yy),
-                math.sqrt(7.0) / 4 * root * z * (2 * zz - 3 * xx - 3 * yy),
-                -b * x * (4 * zz - xx - yy),
-                c / 2 * z * (xx - yy),
-                -a * x * (xx - 3 * yy),
-            ]
-        )
+        values += [
+            -a * y * (3 * xx - yy),
+            c * x * y * z,
+            -b * y * (4 * zz - xx - yy),
+            math.sqrt(7.0) / 4 * root * z * (2 * zz - 3 * xx - 3 * yy),
+            -b * x * (4 * zz - xx - yy),
+            c / 2 * z * (xx - yy),
+            -a * x * (xx - 3 * yy),
+        ]
     if degree >= 4:
         a, b = math.sqrt(35.0) * 3 / 4 * root, math.sqrt(35.0 / 2) * 3 / 4 * root
         c, d = math.sqrt(5.0) * 3 / 4 * root, math.sqrt(5.0 / 2) * 3 / 4 * root
-        bands.append(
-            [
-                a * x * y * (xx - yy),
-                -b * y * z * (3 * xx - yy),
-                c * x * y * (7 * zz - 1),
-                -d * y * z * (7 * zz - 3),
-                3 / 16 * root * (zz * (35 * zz - 30) + 3),
-                -d * x * z * (7 * zz - 3),
-                c / 2 * (xx - yy) * (7 * zz - 1),
-                -b * x * z * (xx - 3 * yy),
-                a / 4 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
-            ]
-        )
-    return [value for band in bands for value in band]
+        values += [
+            a * x * y * (xx - yy),
+            -b * y * z * (3 * xx - yy),
+            c * x * y * (7 * zz - 1),
+            -d * y * z * (7 * zz - 3),
+            3 / 16 * root * (zz * (35 * zz - 30) + 3),
+            -d * x * z * (7 * zz - 3),
+            c / 2 * (xx - yy) * (7 * zz - 1),
+            -b * x * z * (xx - 3 * yy),
+            a / 4 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
+        ]
+    return values
 
 
 def colors(
     directions: NDArray[Any], sh_dc: NDArray[Any], sh_rest: NDArray[Any]
 ) -> NDArray[np.float64]:
-    """Return the colour of each splat as viewed along a direction, (N, 3), not clipped.
+    """Colour of each splat as viewed along a direction, (N, 3), not clipped.
 
     Parameters
     ----------
@@ -119,7 +113,7 @@ def colors(
 
 
 def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what `colors` does, (3, N), in float32 throughout: a tenth of the time.
+    """What `colors` does, (3, N), in float32 throughout: a tenth of the time.
 
     Parameters
     ----------
@@ -135,7 +129,7 @@ def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> N
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return coefficients whose colour along ``rotation @ d`` is the old colour along d.
+    """Coefficients whose colour along ``rotation @ d`` is the old colour along d.
 
     Parameters
     ----------
@@ -162,9 +156,7 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.f
     return rotated
 
 
-def _map(
-    matrix: NDArray[np.float64], coefficients: NDArray[Any], result: NDArray[np.float64]
-) -> None:
+def _map(matrix, coefficients, result):
     """Write a matrix, (B, B), times the coefficients of each splat and channel, (N, B, 3)."""
     for rows in chunks(len(coefficients), _CHUNK):
         planes = np.ascontiguousarray(coefficients[rows].transpose(2, 1, 0), np.float64)
@@ -174,7 +166,7 @@ def _map(
 def stretched(
     sh_dc: NDArray[Any], sh_rest: NDArray[Any], linear: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return coefficients whose colour along ``linear @ d`` is nearly the old colour along d.
+    """Coefficients whose colour along ``linear @ d`` is nearly the old colour along d.
 
     A matrix that scales directions differently bends the sphere of directions, which harmonics of
     no degree can follow exactly: these are the nearest of the same degree, by least squares over

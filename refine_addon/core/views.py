@@ -70,7 +70,7 @@ class View:
     def turned(
         self, rotation: NDArray[np.float64], shift: NDArray[np.float64] | float = 0.0
     ) -> View:
-        """Return the view moved with the world: p goes to ``rotation @ p + shift``.
+        """View moved with the world: p goes to ``rotation @ p + shift``.
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class View:
         center = rotation @ self.center + shift
         return replace(self, rotation=self.rotation @ rotation.T, center=center)
 
-    def _check_image(self) -> None:
+    def _check_image(self):
         numbers = (self.fx, self.fy, self.cx, self.cy, self.near, self.weight)
         if not all(math.isfinite(number) for number in numbers) or math.isnan(self.far):
             raise ValueError(f"fx, fy, cx, cy, near and weight must be finite, got {numbers}")
@@ -99,13 +99,13 @@ class View:
 
 
 def is_orthonormal(matrix: NDArray[np.float64]) -> bool:
-    """Return whether a matrix (3, 3) is a rotation or a reflection, up to `ORTHONORMAL`."""
+    """Whether a matrix (3, 3) is a rotation or a reflection, up to `ORTHONORMAL`."""
     # Entries first: those of a rotation are at most 1, and squares of large ones could overflow.
     small = np.abs(matrix).max() <= 2.0
     return bool(small and np.abs(matrix @ matrix.T - np.eye(3)).max() <= ORTHONORMAL)
 
 
-def _check_pose(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> None:
+def _check_pose(rotation, center):
     if rotation.shape != (3, 3) or center.shape != (3,):
         raise ValueError(
             f"expected rotation (3, 3) and center (3,), got {rotation.shape} and {center.shape}"
@@ -146,7 +146,7 @@ class ViewSet:
             raise RefineError(f"all {len(self.views)} views have weight 0: at least one must count")
 
     def __len__(self) -> int:
-        """Return the number of views."""
+        """Number of views."""
         return len(self.views)
 
     def __iter__(self) -> Iterator[View]:
@@ -154,15 +154,15 @@ class ViewSet:
         return iter(self.views)
 
     def __getitem__(self, index: int) -> View:
-        """Return one view."""
+        """One view."""
         return self.views[index]
 
     def take(self, indices: Sequence[int] | NDArray[Any]) -> ViewSet:
-        """Return the views at `indices`, in that order."""
+        """Views at `indices`, in that order."""
         return replace(self, views=tuple(self.views[int(index)] for index in indices))
 
     def select(self, names: Sequence[str]) -> ViewSet:
-        """Return the views of these names, in the order of `names`.
+        """Views of these names, in the order of `names`.
 
         If several views have one name, the last of them is returned.
 
@@ -196,7 +196,7 @@ class ViewSet:
             return np.asarray(weights / weights.sum())
 
     def middle(self) -> tuple[NDArray[np.float64], float]:
-        """Return the middle of the views and how far they are from it; outliers hardly count.
+        """Middle of the views and how far they are from it; outliers hardly count.
 
         Returns
         -------
@@ -222,7 +222,7 @@ class ViewSet:
         return middle, _median(squared, weights)
 
     def spread(self, count: int) -> ViewSet:
-        """Return at most `count` views that cover the set evenly, in the order of the set.
+        """At most `count` views that cover the set evenly, in the order of the set.
 
         Farthest-point sampling over position and viewing direction (`places`), starting from the
         view that is farthest from the middle of the set. The choice depends neither on the frame
@@ -249,7 +249,7 @@ class ViewSet:
         return self.take(np.sort(usable[chosen]))
 
     def places(self) -> NDArray[np.float64]:
-        """Return where each view stands and looks, (V, 6), for distances between views.
+        """Where each view stands and looks, (V, 6), for distances between views.
 
         Positions are from the middle of the set and divided by the root of `middle`'s variance;
         then come the viewing directions.
@@ -259,14 +259,14 @@ class ViewSet:
         return np.hstack([offset, self.rotations[:, 2]])
 
     def by_name(self) -> list[int]:
-        """Return the indices of the views sorted by name; views of one name keep their order.
+        """Indices of the views sorted by name; views of one name keep their order.
 
         An order that neither a motion of the scene nor another order of the set changes.
         """
         return sorted(range(len(self)), key=lambda index: self.views[index].name)
 
     def by_distance(self) -> list[tuple[View, float]]:
-        """Return the views of positive weight and their weights, in an order given by the scene.
+        """Views of positive weight and their weights, in an order given by the scene.
 
         They are sorted by distance from their middle, then from the view farthest from it, equal
         ones by name. So their order depends neither on the frame nor on that of the set.
@@ -283,8 +283,8 @@ class ViewSet:
         return [(self.views[k], float(weights[k])) for k in order.tolist() if weights[k] > 0]
 
 
-def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Return the weighted median of values, (V,); the smaller one if two are in the middle."""
+def _median(values, weights):
+    """Weighted median of values, (V,); the smaller one if two are in the middle."""
     order = np.argsort(values, kind="stable")
     return float(values[order[np.searchsorted(np.cumsum(weights[order]), 0.5 - 1e-9)]])
 

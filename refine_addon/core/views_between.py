@@ -10,7 +10,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .views import View, ViewSet
 
@@ -22,7 +21,7 @@ _CANDIDATES = 64
 
 
 def views_between(views: ViewSet, most: int) -> list[View]:
-    """Return at most `most` views, each halfway between two neighbours, evenly from all there are.
+    """At most `most` views, each halfway between two neighbours, evenly from all there are.
 
     Two views are neighbours if no third is nearer to the place halfway between them than they are
     (the Gabriel graph, Gabriel and Sokal 1969), by `ViewSet.places`. A view between them has the
@@ -54,7 +53,7 @@ def views_between(views: ViewSet, most: int) -> list[View]:
 
 
 def with_views_between(views: ViewSet, count: int) -> ViewSet:
-    """Return views with about `count` more between them: all at first, then again between these.
+    """Views with about `count` more between them: all at first, then again between these.
 
     Parameters
     ----------
@@ -70,8 +69,8 @@ def with_views_between(views: ViewSet, count: int) -> ViewSet:
     return views
 
 
-def _neighbours(place: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Return the pairs of neighbours among places, (V, 6), the smaller number first, ascending."""
+def _neighbours(place):
+    """Pairs of neighbours among places, (V, 6), the smaller number first, ascending."""
     pairs = []
     for number, here in enumerate(place):
         distance = _distances(place, here)  # (V,)
@@ -85,13 +84,13 @@ def _neighbours(place: NDArray[np.float64]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _distances(place: NDArray[np.float64], here: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the squares of how far places are from one, (V,), rounded: equal ones stay equal."""
+def _distances(place, here):
+    """Squares of how far places are from one, (V,), rounded: equal ones stay equal."""
     return np.asarray(np.round(np.sum((place - here) ** 2, axis=1), 9))
 
 
-def _halfway(one: View, other: View) -> View | None:
-    """Return the view halfway between two; None where they look too far apart, or one is mirrored.
+def _halfway(one, other):
+    """View halfway between two; None where they look too far apart, or one is mirrored.
 
     The rotation is the one nearest to the mean of both. The singular values of this mean are 1 and
     the cosine of half the angle between them, so they also tell how far apart they look.

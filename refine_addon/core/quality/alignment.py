@@ -143,7 +143,7 @@ def alignment(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Alignment:
-    """Return how views stand to splats.
+    """How views stand to splats.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ picture, and nothing is assumed about which splats go together or what lies behi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -116,11 +116,11 @@ def quality_curve(
     place = np.empty(len(order), np.int64)  # of each splat in the order of removal
     place[order] = np.arange(len(order))
 
-    def removing(rays_of: RaySample, progress: Progress) -> NDArray[np.float64]:
+    def removing(rays_of, progress):
         compare = _removing(rays_of, place[rays_of.splat_rows], removed)
         return _of_views(rays_of, compare, rays_of.seeing(), progress, threads)
 
-    def gaining(number: int, rays: Rays) -> list[float]:
+    def gaining(number, rays):
         """By how much the PSNR is higher if kept splats stand in."""
         view, colors = sample.views[number][0], sample.colors(number, rays)
         truth, gains, place_of_hit = rays.colors(colors), [], place[sample.splat_rows[rays.hit]]
@@ -180,7 +180,7 @@ def psnr_against(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
 
-    def cast_again(number: int, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
+    def cast_again(number, rays):
         view = sample.views[number][0]
         footprints = projection.project(gaussians, scene, view)
         return cast_colored(splats, gaussians, footprints, view, rays.columns, rays.rows)
@@ -207,7 +207,7 @@ def mean_psnr(
     threads : int, optional
     """
 
-    def compare(number: int, rays: Rays) -> list[float]:
+    def compare(number, rays):
         other, colors = cast_again(number, rays)
         truth = rays.colors(sample.colors(number, rays))
         return [psnr_of(other.colors(colors), truth, sample.views[number][0])]
@@ -223,14 +223,14 @@ def _enough(sample):
     return sum(rays.hitting for rays in sample.rays if rays) >= MIN_RAYS_WITH_HITS
 
 
-def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]):
+def _removing(sample, place, counts):
     """A function that gives the PSNR of one view after each of L removals, dB.
 
     `place`, (M,), is that of each of the Gaussians in an order of removal: those whose place is
     below one of the ascending `counts` are removed.
     """
 
-    def compare(number: int, rays: Rays) -> list[float]:
+    def compare(number, rays):
         view, colors = sample.views[number][0], sample.colors(number, rays)
         truth, psnr, place_of_hit = rays.colors(colors), [], place.take(rays.hit)
         for count in counts:
@@ -245,7 +245,7 @@ def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]
 def _of_views(sample, compare, numbers, progress, threads):
     """Results of ``compare(number, rays)`` for each of v views, (v, L)."""
 
-    def compare_one(number: int) -> Sequence[float]:
+    def compare_one(number):
         with np.errstate(under="ignore"):
             return compare(number, sample.rays[number])
 

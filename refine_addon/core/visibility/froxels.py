@@ -89,7 +89,7 @@ def integrals(
 
 
 def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
-    """Return the share of each splat's thickness that counts as uniform over the cell, (n,).
+    """Share of each splat's thickness that counts as uniform over the cell, (n,).
 
     It is ``s^2 / (s^2 + area)``, with s the shorter sigma and the area of the cell: near 0 for a
     splat much narrower than a cell, which leaves gaps, and near 1 for a much wider one.
@@ -99,7 +99,7 @@ def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
 
 
 def transmittance(front: NDArray[np.float32], even: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the transmittance in front of each point, (m,), given the mean thickness of its cell.
+    """Transmittance in front of each point, (m,), given the mean thickness of its cell.
 
     Splats narrower than a cell leave gaps, so the thickness in front of a point differs from the
     cell's mean. It is modelled as gamma distributed with shape k, and the transmittance is the

@@ -224,7 +224,7 @@ def census(
     frustums = Frustums(views, origin, float(np.finfo(np.float64).tiny))
     numbers = np.arange(len(views))
 
-    def count_in_views(piece: slice) -> NDArray[np.int64]:
+    def count_in_views(piece):
         local = np.ones((4, piece.stop - piece.start))
         with np.errstate(invalid="ignore", over="ignore", under="ignore"):
             local[:3] = (points[piece] - origin).T

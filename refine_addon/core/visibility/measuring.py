@@ -116,7 +116,7 @@ class Measured:
     ) -> None:
         """Add what one view sees, times its weight."""
 
-        def add(piece: slice) -> None:
+        def add(piece):
             rows = measurement.rows[piece]  # no row is there twice
             self.seen[rows[measurement.inside[piece]]] += 1
             with np.errstate(under="ignore"):

@@ -93,7 +93,7 @@ def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
 
 
 def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
-    """Return the side of a cell, pixels: `cell`, or larger, which saves points.
+    """Side of a cell, pixels: `cell`, or larger, which saves points.
 
     It is larger where the image would have more cells than the footprints need (`FOOTPRINTS`), or
     more than `MAX_CELLS`, and where the footprints would have more than `MAX_POINTS` points.
@@ -116,7 +116,7 @@ def _points_needed(footprints, side, density):
 
 
 def scatter(footprints: Footprints, view: View, side: float, density: float) -> Points:
-    """Return points over all footprints, sorted into cells.
+    """Points over all footprints, sorted into cells.
 
     Parameters
     ----------

@@ -88,7 +88,7 @@ class Gaussians:
     boxes: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
-        """Return the number of splats."""
+        """Number of splats."""
         return len(self.index)
 
     def parts(self, scene: Scene, view: View, window: View) -> Iterator[tuple[int, Gaussians]]:
@@ -112,7 +112,7 @@ class Gaussians:
             )  # fmt: skip
 
     def take(self, keep: NDArray[Any]) -> Gaussians:
-        """Return the splats at `keep` (a mask or integers)."""
+        """Splats at `keep` (a mask or integers)."""
         return Gaussians(
             self.index[keep], self.means[:, keep], self.covariances[:, keep], self.largest[keep],
             self.alphas[keep], self.colors[keep],
@@ -153,7 +153,7 @@ class Footprints:
     discs: NDArray[np.float32] | None = None
 
     def take(self, rows: NDArray[np.int64]) -> Footprints:
-        """Return some footprints, in that order."""
+        """Some footprints, in that order."""
         every = {item.name: getattr(self, item.name) for item in fields(self)}
         taken: dict[str, Any] = {
             name: None if values is None else np.take(values, rows, axis=-1)
@@ -203,18 +203,11 @@ def prepare(
     return make(splats, index[order], positions[order], scene, told, threads), scene, good
 
 
-def _activate_on_disk(
-    splats: Splats,
-    index: NDArray[np.int64],
-    positions: NDArray[np.float64],
-    scene: Scene,
-    progress: Progress,
-    threads: int | None,
-) -> Gaussians:
+def _activate_on_disk(splats, index, positions, scene, progress, threads):
     """Gaussians in files beside those of the splats; the files go when these Gaussians do."""
     bare = splats.up_to_degree(0)
 
-    def columns(piece: slice) -> dict[str, NDArray[Any]]:
+    def columns(piece):
         part = activate(bare, index[piece], positions[piece], scene, silent, 1)
         low, high = part.means.min(axis=1), part.means.max(axis=1)
         made = {name: getattr(part, name) for name in ("index", "largest", "alphas", "colors")}
@@ -240,10 +233,10 @@ def _activate_on_disk(
 def classify(
     splats: Splats, *, progress: Progress = silent, threads: int | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which splats can be drawn, and which of these exceed `ALPHA_CUT`, (N,) each."""
+    """Which splats can be drawn, and which of these exceed `ALPHA_CUT`, (N,) each."""
     good, opaque = np.empty((2, len(splats)), np.bool_)
 
-    def classify_chunk(piece: slice) -> None:
+    def classify_chunk(piece):
         chunk = splats.take(piece)
         good[piece] = drawable(chunk)
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
@@ -259,7 +252,7 @@ def classify(
 def near_scene(
     splats: Splats, opaque: NDArray[np.bool_], scene: Scene, *, threads: int | None = 1
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the rows of opaque splats that are not too far away, (M,).
+    """Rows of opaque splats that are not too far away, (M,).
 
     Also return their positions in the scene's frame, (M, 3) float64.
     """
@@ -277,7 +270,7 @@ def activate(
     progress: Progress,
     threads: int | None,
 ) -> Gaussians:
-    """Return some splats as Gaussians.
+    """Some splats as Gaussians.
 
     Parameters
     ----------
@@ -302,7 +295,7 @@ def activate(
         splats.model,
     )
 
-    def fill(piece: slice) -> None:
+    def fill(piece):
         chunk = splats.take(index[piece])
         relative = np.asarray(chunk.log_scales, np.float64) - np.log(scene.size)
         scales = np.exp(relative.clip(*LOG_SCALE_RANGE))
@@ -323,7 +316,7 @@ def activate(
 
 
 def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
-    """Return the footprints of the Gaussians that may reach into the image of a view.
+    """Footprints of the Gaussians that may reach into the image of a view.
 
     The footprint is the Gaussian of covariance ``C + 0.3 I``, ``C = J W S W' J'`` (Zwicker et al.,
     "EWA splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean. Antialiased ones
@@ -341,7 +334,7 @@ _NOTHING = Footprints(
 def footprints_and_depths(
     gaussians: Gaussians, scene: Scene, view: View, window: View | None = None
 ) -> tuple[Footprints, NDArray[np.float32]]:
-    """Return the footprints of `project` in the order of the Gaussians, and their depths, (n,).
+    """Footprints of `project` in the order of the Gaussians, and their depths, (n,).
 
     Depths are along the view's axis, in scene sizes. If only those are wanted that may reach into a
     part of the image, `window` is that part as a view of its own.
@@ -393,7 +386,7 @@ def footprints_and_depths(
 
 
 def front_to_back(pieces: Sequence[tuple[Footprints, NDArray[np.float32]]]) -> Footprints:
-    """Return footprints of some Gaussians by their depth; of equal depths the first first.
+    """Footprints of some Gaussians by their depth; of equal depths the first first.
 
     Parameters
     ----------
@@ -405,10 +398,8 @@ def front_to_back(pieces: Sequence[tuple[Footprints, NDArray[np.float32]]]) -> F
     return footprints.take(_by_depth(depth))
 
 
-def _joined(
-    pieces: Sequence[tuple[Footprints, NDArray[np.float32]]],
-) -> tuple[Footprints, NDArray[np.float32]]:
-    """Return the footprints of all pieces as one, and their depths."""
+def _joined(pieces):
+    """Footprints of all pieces as one, and their depths."""
     if len(pieces) == 1:
         return pieces[0]
     every = [_NOTHING, *(footprints for footprints, _ in pieces)]
@@ -489,7 +480,7 @@ def _touches(local, largest, views, planes, low_pass):
 def boxes_touch(
     boxes: NDArray[np.float32], scene: Scene, view: View, window: View | None = None
 ) -> NDArray[np.bool_]:
-    """Return in which of B boxes a Gaussian may lie that reaches into the image of a view, (B,).
+    """In which of B boxes a Gaussian may lie that reaches into the image of a view, (B,).
 
     Parameters
     ----------

@@ -92,14 +92,14 @@ class RaySample:
         self.rays: list[Rays | None] = [None] * len(views)
 
     def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:
-        """Return the colours in which view `number` sees what its rays hit, (3, u)."""
+        """Colours in which view `number` sees what its rays hit, (3, u)."""
         return colors_from(self.splats, self.stored_rows[rays.hit], self.views[number][0])
 
     def load(self) -> None:
         """Load the hits, in a subclass that keeps them on disk."""
 
     def wants(self, number: int) -> bool:
-        """Return whether the rays of a view are wanted and have not been cast yet."""
+        """Whether the rays of a view are wanted and have not been cast yet."""
         return self.rays[number] is None and number % self._step == 0
 
     def cast(
@@ -112,7 +112,7 @@ class RaySample:
     ) -> None:
         """Project all Gaussians into some views, and cast the rays of these views."""
 
-        def cast_one(piece: slice) -> None:
+        def cast_one(piece):
             number = numbers[piece.start]
             if self.wants(number):
                 with np.errstate(under="ignore"):
@@ -136,16 +136,16 @@ class RaySample:
         self.cast(range(len(self.views)), gaussians, scene, progress, threads)
 
     def seeing(self) -> list[int]:
-        """Return the numbers of the views whose rays hit a splat."""
+        """Numbers of the views whose rays hit a splat."""
         return [k for k, rays in enumerate(self.rays) if rays is not None and len(rays.ray)]
 
     def validating(self) -> list[int]:
-        """Return the numbers of the views that validate where comparing in all would take long."""
+        """Numbers of the views that validate where comparing in all would take long."""
         seeing = self.seeing()
         return seeing[:: max(math.ceil(len(seeing) / VALIDATION_VIEWS), 1)]
 
     def hits_of_ray(self) -> float:
-        """Return how many splats a ray hits on average, hidden ones included."""
+        """How many splats a ray hits on average, hidden ones included."""
         every = [rays for rays in self.rays if rays is not None]
         return sum(len(rays.ray) for rays in every) / max(sum(rays.count for rays in every), 1)
 
@@ -153,7 +153,7 @@ class RaySample:
 def validation_rays(
     splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
 ) -> RaySample:
-    """Return the validation rays of all views, for scores that did not project splats.
+    """Validation rays of all views, for scores that did not project splats.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def cast_view(
     scoring: bool = False,
     share: float = 1.0,
 ) -> Rays:
-    """Return the rays of one of some views.
+    """Rays of one of some views.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def cast_colored(
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
 ) -> tuple[Rays, NDArray[np.float64]]:
-    """Return the rays through some pixels of a view, and the colours of what they hit, (3, u).
+    """Rays through some pixels of a view, and the colours of what they hit, (3, u).
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def cast_colored(
 
 
 def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
-    """Return the colours in which a view sees some splats, (3, n), at least 0.
+    """Colours in which a view sees some splats, (3, n), at least 0.
 
     All harmonics count. By the constant alone, which the rest of scoring uses, the estimated PSNR
     was 1.2 dB too high on an outdoor scene.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import chunks, concatenated, run_all
+from ..execute import chunks, run_all
 from ..splats import Splats
 from ..views import ViewSet
 
@@ -22,7 +22,6 @@ MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: its multiples spread numbers that differ little."""
 
 _CHUNK = 1 << 16  # rows that are computed together, which limits temporary memory
-_SORTED, _SAMPLED = 16, 256  # pieces that are sorted one by one, and sampled numbers of each
 _BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
 _SPREAD_BITS = (
     (32, 0x1F00000000FFFF),
@@ -54,13 +53,9 @@ class Scene:
     axes: NDArray[np.float64]
 
     def positions(
-        self,
-        means: NDArray[Any],
-        rows: NDArray[np.int64] | None = None,
-        *,
-        threads: int | None = 1,
+        self, means: NDArray[Any], rows: NDArray[np.int64] | None = None, *, threads: int | None = 1
     ) -> NDArray[np.float64]:
-        """Return positions in the frame, in scene sizes.
+        """Positions in the frame, in scene sizes.
 
         Parameters
         ----------
@@ -77,7 +72,7 @@ class Scene:
         count, turn = len(means) if rows is None else len(rows), self.axes.T / self.size
         places = np.empty((count, 3))
 
-        def fill(piece: slice) -> None:
+        def fill(piece):
             # At least two rows at a time: BLAS rounds the product of one otherwise.
             begin = max(min(piece.start, piece.stop - 2), 0)
             chosen = slice(begin, piece.stop) if rows is None else rows[begin : piece.stop]
@@ -89,7 +84,7 @@ class Scene:
 
 
 def size_of(median: float) -> float:
-    """Return the size of a scene, or 1 if the whole scene is one point.
+    """Size of a scene, or 1 if the whole scene is one point.
 
     Parameters
     ----------
@@ -100,13 +95,9 @@ def size_of(median: float) -> float:
 
 
 def scene_of(
-    means: NDArray[Any],
-    drawable: NDArray[np.bool_],
-    views: ViewSet,
-    *,
-    threads: int | None = 1,
+    means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet, *, threads: int | None = 1
 ) -> Scene:
-    """Return the frame of a scene.
+    """Frame of a scene.
 
     Parameters
     ----------
@@ -124,7 +115,7 @@ def scene_of(
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
 
-    def measure(piece: slice) -> None:
+    def measure(piece):
         with np.errstate(under="ignore"):
             # Undrawable splats may hold any number, such as infinity.
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
@@ -161,7 +152,7 @@ def moments(
         yield _moments(means[piece][drawable[piece]], scene)
 
 
-def _moments(means: NDArray[Any], scene: Scene) -> NDArray[np.float64]:
+def _moments(means, scene):
     """Return `moments` of n drawable splats, (4, 3)."""
     with np.errstate(under="ignore"):
         positions = scene.positions(means)  # (n, 3)
@@ -171,7 +162,7 @@ def _moments(means: NDArray[Any], scene: Scene) -> NDArray[np.float64]:
 
 
 def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the principal axes of splats as the rows of a rotation, the least variance first.
+    """Principal axes of splats as the rows of a rotation, the least variance first.
 
     Axes point to where more of the splats lie. If two variances are equal, two axes are arbitrary.
 
@@ -189,7 +180,7 @@ def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
-    """Return a hash of each row's values, (N,): the same number wherever the row stands.
+    """A hash of each row's values, (N,): the same number wherever the row stands.
 
     Parameters
     ----------
@@ -207,7 +198,7 @@ def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
 
 
 def splat_fingerprint(splats: Splats, rows: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Return the `fingerprint` of opacity and base colour of splats by their rows, (n,)."""
+    """The `fingerprint` of opacity and base colour of splats by their rows, (n,)."""
     return fingerprint(splats.opacity_logits[rows], *splats.sh_dc[rows].T)
 
 
@@ -217,7 +208,7 @@ def spatial_order(
     *,
     threads: int | None = 1,
 ) -> NDArray[np.int64]:
-    """Return the order of positions along a Z-shaped curve: neighbours follow (Morton, 1966).
+    """Order of positions along a Z-shaped curve: neighbours follow (Morton, 1966).
 
     Parameters
     ----------
@@ -235,15 +226,15 @@ def spatial_order(
     """
     code = np.empty(len(positions), np.int64)
 
-    def fill(piece: slice) -> None:
+    def fill(piece):
         code[piece] = spatial_code(positions[piece])
 
     run_all(fill, chunks(len(positions), _CHUNK), threads=threads)
-    return code_order(code, ties, threads=threads)
+    return code_order(code, ties)
 
 
 def spatial_code(positions: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return where positions lie along the curve of `spatial_order`, (N,)."""
+    """Where positions lie along the curve of `spatial_order`, (N,)."""
     cells = float(1 << _BITS)
     code = np.zeros(len(positions), np.int64)  # (N,), bits of the three coordinates interleaved
     # All of space is mapped into a ball, so the resolution falls with the distance.
@@ -258,13 +249,10 @@ def spatial_code(positions: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def code_order(
-    code: NDArray[np.int64],
-    ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
-    *,
-    threads: int | None = 1,
+    code: NDArray[np.int64], ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None
 ) -> NDArray[np.int64]:
-    """Return the order of the numbers of `spatial_code`; see `spatial_order`."""
-    order = _stable_order(code, threads)
+    """Order of the numbers of `spatial_code`; see `spatial_order`."""
+    order = np.argsort(code, kind="stable")
     if ties is None:
         return order
     same = np.diff(code[order]) == 0  # (N - 1,)
@@ -273,26 +261,3 @@ def code_order(
         rows = order[tied]
         order[tied] = rows[np.lexsort((ties(rows), code[rows]))]
     return order
-
-
-def _stable_order(keys: NDArray[np.int64], threads: int | None) -> NDArray[np.int64]:
-    """Return the order of numbers, equal ones as they stand: that of `argsort`, on all threads.
-
-    Each piece of it has the numbers between two that are equally many places apart in a sample.
-    """
-    count = len(keys)
-    if count <= _CHUNK:
-        return np.argsort(keys, kind="stable")
-    pieces = min(count // _CHUNK + 1, _SORTED)
-    sample = np.sort(keys[:: max(count // (pieces * _SAMPLED), 1)])
-    ends = sample[np.linspace(0, len(sample) - 1, pieces + 1).astype(int)[1:-1]]  # (pieces - 1,)
-
-    def sort(number: slice) -> NDArray[np.int64]:
-        low, high = number.start, number.start + 1
-        within = keys >= ends[low - 1] if low else np.ones(count, np.bool_)
-        if high < pieces:
-            within &= keys < ends[high - 1]
-        rows = np.flatnonzero(within)
-        return rows[np.argsort(keys[rows], kind="stable")]
-
-    return concatenated(run_all(sort, chunks(pieces, 1), threads=threads), threads)
