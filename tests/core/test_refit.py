@@ -15,7 +15,7 @@ from refine_addon.core import ViewSet, execute, spherical_harmonics
 from refine_addon.core.execute import Cancelled, silent
 from refine_addon.core.refit import linear, refit, round_rays, stored
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS
-from refine_addon.core.splats import rotation_matrices, with_model
+from refine_addon.core.splats import drawable, rotation_matrices, with_model
 from refine_addon.core.visibility import cast as casting
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import cast, cast_visible, pixels
@@ -872,8 +872,8 @@ def test_extreme_splats_make_no_warning_and_nothing_worse(value):
     found = refit.refit(strange.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2))
 
     assert found.psnr >= found.psnr_before
-    drawn_before = projection.classify(strange.take(np.arange(100)))[0]
-    np.testing.assert_array_equal(projection.classify(found.splats)[0], drawn_before)
+    drawn_before = drawable(strange.take(np.arange(100)))
+    np.testing.assert_array_equal(drawable(found.splats), drawn_before)
 
 
 def test_one_splat_one_view_and_one_pixel_are_enough():

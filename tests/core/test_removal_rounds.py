@@ -81,7 +81,7 @@ def scene():
     splats = cloud()
     gaussians, frame, _ = projection.prepare(splats, views)
     sample = RaySample(views.by_distance(), gaussians, splats, scoring=True)
-    sample.cast(range(2), gaussians, frame, silent, None)
+    sample.cast_all(gaussians, frame, silent, None)
     count = len(gaussians)
     random = np.random.default_rng(2)
     sums = (random.uniform(0.5, 2.0, count) for _ in range(2))

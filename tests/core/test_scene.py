@@ -43,7 +43,7 @@ def test_places_and_their_order_do_not_depend_on_chunks_and_threads(monkeypatch,
     drawn, views = generator.random(1473) < 0.9, four_views()
     whole = scene_of(means, drawn, views)
     places = (means - whole.origin) @ (whole.axes.T / whole.size)
-    order = np.argsort(scene.spatial_code(places), kind="stable")
+    order = scene.spatial_order(places)
 
     monkeypatch.setattr(scene, "_CHUNK", 64)
     in_chunks = scene_of(means, drawn, views, threads=1)

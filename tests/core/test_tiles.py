@@ -315,9 +315,7 @@ def test_no_box_is_left_out_that_a_splat_reaches_from(seed):
     touching = projection.boxes_touch(np.array(boxes, np.float32), scene, view)
 
     for box, piece in zip(touching, pieces, strict=True):
-        assert box or not len(
-            projection.footprints_and_depths(gaussians.take(piece), scene, view)[1]
-        )
+        assert box or not len(projection.project(gaussians.take(piece), scene, view).index)
 
 
 @pytest.mark.parametrize("model", ["default", "2dgs"])
@@ -330,14 +328,13 @@ def test_a_few_splats_are_seen_as_they_are_among_all(views, model, count):
     splats = replace(read_ply(ROOM / "point_cloud.ply").splats(), model=model)
     gaussians, scene, _ = projection.prepare(splats, views)
     view = views.views[0]
-    of_all, depths = projection.footprints_and_depths(gaussians, scene, view)
-    few = of_all.index[len(of_all.index) // 2 :][:count]
+    of_all = projection.project(gaussians, scene, view)
+    few = of_all.index[len(of_all.index) // 2 :][:count]  # front to back
 
-    of_few, depths_of_few = projection.footprints_and_depths(gaussians.take(few), scene, view)
+    of_few = projection.project(gaussians.take(few), scene, view)
 
-    where = np.searchsorted(of_all.index, few[of_few.index])
-    assert len(where) == count
-    np.testing.assert_array_equal(depths_of_few, depths[where])
+    assert of_few.index.tolist() == list(range(count))
+    where = len(of_all.index) // 2 + of_few.index
     expected = of_all.take(where)
     for item in ("centers", "major", "minor", "alphas", "discs"):
         np.testing.assert_array_equal(getattr(of_few, item), getattr(expected, item))

@@ -8,7 +8,6 @@ picture, and nothing is assumed about which splats go together or what lies behi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +19,6 @@ from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import projection
 from ..visibility.ray_sample import RaySample, cast_colored
-from ..visibility.rays import Rays
 from .curve import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
 
 MIN_RAYS_WITH_HITS = 256
@@ -180,42 +178,17 @@ def psnr_against(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
 
-    def cast_again(number, rays):
+    def compare(number, rays):
         view = sample.views[number][0]
         footprints = projection.project(gaussians, scene, view)
-        return cast_colored(splats, gaussians, footprints, view, rays.columns, rays.rows)
-
-    return mean_psnr(sample, cast_again, part(progress, 0.2, 1.0), threads)
-
-
-def mean_psnr(
-    sample: RaySample,
-    cast_again: Callable[[int, Rays], tuple[Rays, NDArray[np.float64]]],
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> float | None:
-    """Mean PSNR, dB, of the pictures that other rays see; None if too little is seen.
-
-    Parameters
-    ----------
-    sample : RaySample
-        Of the splats that are the truth.
-    cast_again : callable
-        ``cast_again(number, rays)`` returns rays of view `number` through the same pixels, with
-        what they hit now, and the colours of that, (3, u).
-    progress : callable
-    threads : int, optional
-    """
-
-    def compare(number, rays):
-        other, colors = cast_again(number, rays)
+        other, colors = cast_colored(splats, gaussians, footprints, view, rays.columns, rays.rows)
         truth = rays.colors(sample.colors(number, rays))
-        return [psnr_of(other.colors(colors), truth, sample.views[number][0])]
+        return [psnr_of(other.colors(colors), truth, view)]
 
     if not _enough(sample):
         return None
-    numbers = sample.validating()
-    return float(_mean(sample, _of_views(sample, compare, numbers, progress, threads), numbers)[0])
+    numbers, told = sample.validating(), part(progress, 0.2, 1.0)
+    return float(_mean(sample, _of_views(sample, compare, numbers, told, threads), numbers)[0])
 
 
 def _enough(sample):

@@ -187,10 +187,7 @@ class InMemory:
 
     def footprints(self, window: Window) -> Footprints:
         """Return the footprints in a view that may reach into a window of it."""
-        reaching = projection.footprints_and_depths(
-            self.gaussians, self.scene, window.view, window.part
-        )
-        return projection.front_to_back([reaching])
+        return projection.project(self.gaussians, self.scene, window.view, window.part)
 
     def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
         """Return the colours in which a view sees some of the Gaussians, (3, u)."""

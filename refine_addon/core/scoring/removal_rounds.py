@@ -81,7 +81,6 @@ class RemovalRounds:
         threads: int | None,
     ) -> None:
         self._measured, self._threads = measured, threads
-        scoring_rays.load()
         numbers = [k for k, rays in enumerate(scoring_rays.rays) if rays is not None]
 
         def with_colors(piece: slice) -> _ViewRays:

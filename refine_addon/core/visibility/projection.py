@@ -6,7 +6,7 @@ import itertools
 import secrets
 import shutil
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
@@ -190,15 +190,29 @@ def prepare(
     good : (N,) bool
         Which splats can be drawn.
     """
-    good, opaque = classify(splats, progress=part(progress, 0.0, 0.4), threads=threads)
+    good, opaque = np.empty((2, len(splats)), np.bool_)
+
+    def classify(piece):
+        chunk = splats.take(piece)
+        good[piece] = drawable(chunk)
+        logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
+        opaque[piece] = opacity(logits) > ALPHA_CUT
+
+    run_all(
+        classify, chunks(len(splats), 4 * _CHUNK),
+        progress=part(progress, 0.0, 0.4), what="reading", threads=threads,
+    )  # fmt: skip
     scene = scene or scene_of(splats.means, good, views, threads=threads)
     report(progress, 0.4, "reading")
-    index, positions = near_scene(splats, opaque, scene, threads=threads)
+    index = np.flatnonzero(opaque)
+    positions = scene.positions(splats.means, index, threads=threads)
+    close = np.max(np.abs(positions), axis=1, initial=0.0) <= _FARTHEST
+    index, positions = index[close], positions[close]
     report(progress, 0.4, "reading")
     order = spatial_order(
         positions, lambda rows: splat_fingerprint(splats, index[rows]), threads=threads
     )
-    make = activate if folder_of(splats) is None else _activate_on_disk
+    make = _activate if folder_of(splats) is None else _activate_on_disk
     told = part(progress, 0.4, 1.0)
     return make(splats, index[order], positions[order], scene, told, threads), scene, good
 
@@ -208,7 +222,7 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
     bare = splats.up_to_degree(0)
 
     def columns(piece):
-        part = activate(bare, index[piece], positions[piece], scene, silent, 1)
+        part = _activate(bare, index[piece], positions[piece], scene, silent, 1)
         low, high = part.means.min(axis=1), part.means.max(axis=1)
         made = {name: getattr(part, name) for name in ("index", "largest", "alphas", "colors")}
         made["boxes"] = np.concatenate([low, high, [part.largest.max()]])[None]
@@ -219,7 +233,7 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
         return made
 
     if not len(index):
-        return activate(bare, index, positions, scene, progress, threads)
+        return _activate(bare, index, positions, scene, progress, threads)
     made = run(columns, chunks(len(index), CHUNK), progress=progress, what="reading",
                threads=threads)  # fmt: skip
     folder = folder_of(splats) / f"gaussians-{secrets.token_hex(4)}"  # type: ignore[operator]
@@ -230,59 +244,8 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
     return gaussians
 
 
-def classify(
-    splats: Splats, *, progress: Progress = silent, threads: int | None = None
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which splats can be drawn, and which of these exceed `ALPHA_CUT`, (N,) each."""
-    good, opaque = np.empty((2, len(splats)), np.bool_)
-
-    def classify_chunk(piece):
-        chunk = splats.take(piece)
-        good[piece] = drawable(chunk)
-        logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
-        opaque[piece] = opacity(logits) > ALPHA_CUT
-
-    run_all(
-        classify_chunk, chunks(len(splats), 4 * _CHUNK),
-        progress=progress, what="reading", threads=threads,
-    )  # fmt: skip
-    return good, opaque
-
-
-def near_scene(
-    splats: Splats, opaque: NDArray[np.bool_], scene: Scene, *, threads: int | None = 1
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows of opaque splats that are not too far away, (M,).
-
-    Also return their positions in the scene's frame, (M, 3) float64.
-    """
-    index = np.flatnonzero(opaque)
-    positions = scene.positions(splats.means, index, threads=threads)
-    close = np.max(np.abs(positions), axis=1, initial=0.0) <= _FARTHEST
-    return index[close], positions[close]
-
-
-def activate(
-    splats: Splats,
-    index: NDArray[np.int64],
-    positions: NDArray[np.float64],
-    scene: Scene,
-    progress: Progress,
-    threads: int | None,
-) -> Gaussians:
-    """Some splats as Gaussians.
-
-    Parameters
-    ----------
-    splats : Splats
-    index : (M,) int64
-        Which of them.
-    positions : (M, 3) float64
-        In the scene's frame, see `Scene.positions`.
-    scene : Scene
-    progress : callable
-    threads : int, optional
-    """
+def _activate(splats, index, positions, scene, progress, threads):
+    """Some splats, (M,) rows, as Gaussians; their positions, (M, 3), are in the scene's frame."""
     count = len(index)
     result = Gaussians(
         index,
@@ -315,103 +278,62 @@ def activate(
     return result
 
 
-def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
-    """Footprints of the Gaussians that may reach into the image of a view.
+def project(
+    gaussians: Gaussians, scene: Scene, view: View, window: View | None = None
+) -> Footprints:
+    """Footprints of the Gaussians that may reach into the image of a view, front to back.
 
     The footprint is the Gaussian of covariance ``C + 0.3 I``, ``C = J W S W' J'`` (Zwicker et al.,
     "EWA splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean. Antialiased ones
-    have the opacity ``o sqrt(det C / det(C + 0.3 I))``. For discs see `_discs`.
-    """
-    return front_to_back([footprints_and_depths(gaussians, scene, view)])
-
-
-_NONE = np.empty((2, 0), np.float32)
-_NOTHING = Footprints(
-    np.empty(0, np.int64), _NONE, _NONE, _NONE, _NONE, np.empty(0, np.bool_), _NONE[0]
-)
-
-
-def footprints_and_depths(
-    gaussians: Gaussians, scene: Scene, view: View, window: View | None = None
-) -> tuple[Footprints, NDArray[np.float32]]:
-    """Footprints of `project` in the order of the Gaussians, and their depths, (n,).
-
-    Depths are along the view's axis, in scene sizes. If only those are wanted that may reach into a
-    part of the image, `window` is that part as a view of its own.
-    """
-    if not _computable(scene, view):
-        return _joined([])
-    planes = clip_planes(scene, view)
-    turned = (view.rotation @ scene.axes.T).astype(np.float32)
-    rotation = _rotation6(view.rotation @ scene.axes.T)
-    low_pass = LOW_PASS if gaussians.normals is None else DISC_LOW_PASS
-    pieces = []
-    pairs = (
-        (first, chunk, start)
-        for first, chunk in gaussians.parts(scene, view, window or view)
-        for start in range(0, len(chunk), _CHUNK)
-    )
-    for first, chunk, start in pairs:
-        checkpoint()
-        piece = slice(start, start + _CHUNK)
-        local = _local(chunk.means[:, piece], scene, view)  # (3, n of the piece)
-        touching = np.flatnonzero(
-            _touches(local, chunk.largest[piece], (view, window or view), planes, low_pass)
-        )
-        if len(touching):
-            local = np.take(local, touching, axis=1)  # (3, n), as all that follows
-            shape = _product(
-                rotation, np.take(chunk.covariances[:, piece], touching, axis=1)
-            )  # (6, n)
-            inside = frustum.contains(view, local, planes)
-            rows = touching + start
-            index, alphas = rows + first, chunk.alphas.take(rows)
-            discs = None
-            if chunk.normals is not None:
-                normals = _product(turned, np.take(chunk.normals, rows, axis=1))
-                centers, (major, minor, sigmas), discs = _discs(
-                    local, shape, normals, view, planes[0]
-                )
-            else:
-                centers, (major, minor, sigmas), kept = _ellipses(local, shape, view)
-                if gaussians.model == "antialiased":
-                    alphas *= kept
-            footprints = Footprints(index, centers, major, minor, sigmas, inside, alphas, discs)
-            depths_of_piece = local[2]
-            if gaussians.model == "antialiased":  # some are now too faint to be drawn
-                drawn = np.flatnonzero(alphas > ALPHA_CUT)
-                footprints, depths_of_piece = footprints.take(drawn), depths_of_piece.take(drawn)
-            pieces.append((footprints, depths_of_piece))
-    return _joined(pieces)
-
-
-def front_to_back(pieces: Sequence[tuple[Footprints, NDArray[np.float32]]]) -> Footprints:
-    """Footprints of some Gaussians by their depth; of equal depths the first first.
+    have the opacity ``o sqrt(det C / det(C + 0.3 I))``. For discs see `_discs`. Of equal depths the
+    first comes first.
 
     Parameters
     ----------
-    pieces : sequence of Footprints, (n,) float32
-        As `footprints_and_depths` returns them.
+    gaussians : Gaussians
+    scene : Scene
+    view : View
+    window : View, optional
+        The part of the image that counts, as a view of its own; by default all of it.
     """
-    footprints, depth = _joined(pieces)
-    checkpoint()
-    return footprints.take(_by_depth(depth))
-
-
-def _joined(pieces):
-    """Footprints of all pieces as one, and their depths."""
-    if len(pieces) == 1:
-        return pieces[0]
-    every = [_NOTHING, *(footprints for footprints, _ in pieces)]
-    arrays = (
-        np.concatenate([getattr(footprints, item.name) for footprints in every], axis=-1)
-        for item in fields(Footprints)[:-1]
+    planes, discs = clip_planes(scene, view), gaussians.normals is not None
+    turned = (view.rotation @ scene.axes.T).astype(np.float32)
+    rotation = _rotation6(view.rotation @ scene.axes.T)
+    views, low_pass = (view, window or view), DISC_LOW_PASS if discs else LOW_PASS
+    none = np.empty((7, 0), np.float32)
+    hit: tuple[NDArray[Any], ...] = (none,) if discs else ()
+    # Depths, and what footprints hold.
+    pieces = [(none[0], none[0].astype(np.int64), *[none[:2]] * 4, none[0] > 0.0, none[0], *hit)]
+    starts = (
+        (first, chunk, start)
+        for first, chunk in gaussians.parts(scene, *views)
+        for start in range(0, len(chunk) if _computable(scene, view) else 0, _CHUNK)
     )
-    discs = [footprints.discs for footprints, _ in pieces if footprints.discs is not None]
-    all_footprints = Footprints(*arrays)
-    if discs:
-        all_footprints = replace(all_footprints, discs=np.concatenate(discs, axis=-1))
-    return all_footprints, np.concatenate([_NONE[0], *(depth for _, depth in pieces)])
+    for first, chunk, start in starts:
+        checkpoint()
+        piece = slice(start, start + _CHUNK)
+        local = _local(chunk.means[:, piece], scene, view)  # (3, n of the piece)
+        touching = np.flatnonzero(_touches(local, chunk.largest[piece], views, planes, low_pass))
+        if len(touching):
+            local = np.take(local, touching, axis=1)  # (3, n), as all that follows
+            covariances = np.take(chunk.covariances[:, piece], touching, axis=1)
+            shape, rows = _product(rotation, covariances), touching + start  # (6, n), (n,)
+            alphas = chunk.alphas.take(rows)
+            if chunk.normals is not None:
+                normals = _product(turned, np.take(chunk.normals, rows, axis=1))
+                centers, axes, *hit = _discs(local, shape, normals, view, planes[0])
+            else:
+                centers, axes, kept = _ellipses(local, shape, view)
+                if gaussians.model == "antialiased":
+                    alphas *= kept
+            inside = frustum.contains(view, local, planes)
+            pieces.append((local[2], rows + first, centers, *axes, inside, alphas, *hit))
+    depth, *arrays = (np.concatenate(each, axis=-1) for each in zip(*pieces, strict=True))
+    checkpoint()
+    order, footprints = _by_depth(depth), Footprints(*arrays)
+    if gaussians.model == "antialiased":  # some are now too faint to be drawn
+        order = order[footprints.alphas[order] > ALPHA_CUT]
+    return footprints.take(order)
 
 
 def in_camera(

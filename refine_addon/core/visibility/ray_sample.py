@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import spherical_harmonics
-from ..execute import Progress, chunks, part, run_all, silent
+from ..execute import Progress, part, run_all, silent
 from ..splats import Splats
 from ..views import View, ViewSet
 from . import projection
@@ -69,8 +69,6 @@ class RaySample:
     ----------
     splat_rows : (M,) int64
         Which of all splats each Gaussian is.
-    stored_rows : (M,) int64
-        Which of `splats` it is: they need only hold those that are hit.
     share : float
         How many rays all views have together, as a part of what they usually have.
     rays : list of Rays or None
@@ -88,52 +86,33 @@ class RaySample:
     ) -> None:
         self.views, self.splats, self.scoring, self.share = views, splats, scoring, 1.0
         self._step = max(math.ceil(len(views) / VALIDATION_VIEWS), 1) if few_views else 1
-        self.splat_rows = self.stored_rows = np.asarray(gaussians.index)
+        self.splat_rows = np.asarray(gaussians.index)
         self.rays: list[Rays | None] = [None] * len(views)
 
     def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:
         """Colours in which view `number` sees what its rays hit, (3, u)."""
-        return colors_from(self.splats, self.stored_rows[rays.hit], self.views[number][0])
-
-    def load(self) -> None:
-        """Load the hits, in a subclass that keeps them on disk."""
+        return colors_from(self.splats, self.splat_rows[rays.hit], self.views[number][0])
 
     def wants(self, number: int) -> bool:
         """Whether the rays of a view are wanted and have not been cast yet."""
         return self.rays[number] is None and number % self._step == 0
 
-    def cast(
-        self,
-        numbers: Sequence[int],
-        gaussians: Gaussians,
-        scene: Scene,
-        progress: Progress,
-        threads: int | None,
-    ) -> None:
-        """Project all Gaussians into some views, and cast the rays of these views."""
-
-        def cast_one(piece):
-            number = numbers[piece.start]
-            if self.wants(number):
-                with np.errstate(under="ignore"):
-                    footprints = projection.project(gaussians, scene, self.views[number][0])
-                    self.rays[number] = cast_view(
-                        self.views, number, footprints, scoring=self.scoring, share=self.share
-                    )
-
-        run_all(
-            cast_one,
-            chunks(len(numbers), 1),
-            progress=progress,
-            what="casting rays",
-            threads=threads,
-        )
-
     def cast_all(
         self, gaussians: Gaussians, scene: Scene, progress: Progress, threads: int | None
     ) -> None:
-        """Cast the rays of all views."""
-        self.cast(range(len(self.views)), gaussians, scene, progress, threads)
+        """Project all Gaussians into the views, and cast the rays that are wanted."""
+
+        def cast_one(number):
+            with np.errstate(under="ignore"):
+                footprints = projection.project(gaussians, scene, self.views[number][0])
+                self.rays[number] = cast_view(
+                    self.views, number, footprints, scoring=self.scoring, share=self.share
+                )
+
+        run_all(
+            cast_one, filter(self.wants, range(len(self.views))),
+            progress=progress, what="casting rays", threads=threads,
+        )  # fmt: skip
 
     def seeing(self) -> list[int]:
         """Numbers of the views whose rays hit a splat."""

@@ -7,7 +7,7 @@ on the order of its splats.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -134,26 +134,11 @@ def scene_of(
     return replace(unturned, axes=principal_axes(total))
 
 
-def moments(
-    means: NDArray[Any], drawable: NDArray[np.bool_], scene: Scene
-) -> Iterator[NDArray[np.float64]]:
-    """Yield what `principal_axes` takes of splats, for one chunk at a time: (4, 3) float64 each.
+def _moments(means, scene):
+    """Sums of `principal_axes` over n drawable splats, (4, 3); of a scene without axes yet.
 
     A position at distance r has the weight 1 / (1 + r^2)^2, so that a few far ones hardly matter.
-
-    Parameters
-    ----------
-    means, drawable
-        See `scene_of`.
-    scene : Scene
-        Unturned, that is with the axes of the world.
     """
-    for piece in chunks(len(means), _CHUNK):
-        yield _moments(means[piece][drawable[piece]], scene)
-
-
-def _moments(means, scene):
-    """Return `moments` of n drawable splats, (4, 3)."""
     with np.errstate(under="ignore"):
         positions = scene.positions(means)  # (n, 3)
         nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
@@ -170,7 +155,7 @@ def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
     ----------
     total : (4, 3) float64
         Weighted sums over the splats: of the products of coordinates, and in the last row of the
-        coordinates; see `moments`.
+        coordinates; see `_moments`.
     """
     _, vectors = np.linalg.eigh(total[:3])  # in columns
     axes = (vectors * np.where(total[3] @ vectors < 0.0, -1.0, 1.0)).T
@@ -224,39 +209,24 @@ def spatial_order(
         Positions that agree in 21 bits of each coordinate are at the same place; without `ties`
         they keep their order.
     """
-    code = np.empty(len(positions), np.int64)
+    code, cells = np.empty(len(positions), np.int64), float(1 << _BITS)
 
     def fill(piece):
-        code[piece] = spatial_code(positions[piece])
+        place, interleaved = positions[piece], 0
+        # All of space is mapped into a ball, so the resolution falls with the distance.
+        with np.errstate(under="ignore"):
+            scale = cells / 2.0 / (1.0 + np.sqrt(np.einsum("ij,ij->i", place, place)))  # (n,)
+        for axis in range(3):
+            bits = (place[:, axis] * scale + cells / 2.0).clip(0.0, cells - 1.0).astype(np.int64)
+            for shift, mask in _SPREAD_BITS:
+                bits = (bits | bits << shift) & mask
+            interleaved |= bits << axis
+        code[piece] = interleaved
 
     run_all(fill, chunks(len(positions), _CHUNK), threads=threads)
-    return code_order(code, ties)
-
-
-def spatial_code(positions: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Where positions lie along the curve of `spatial_order`, (N,)."""
-    cells = float(1 << _BITS)
-    code = np.zeros(len(positions), np.int64)  # (N,), bits of the three coordinates interleaved
-    # All of space is mapped into a ball, so the resolution falls with the distance.
-    with np.errstate(under="ignore"):
-        scale = cells / 2.0 / (1.0 + np.sqrt(np.einsum("ij,ij->i", positions, positions)))  # (N,)
-    for axis in range(3):
-        bits = (positions[:, axis] * scale + cells / 2.0).clip(0.0, cells - 1.0).astype(np.int64)
-        for shift, mask in _SPREAD_BITS:
-            bits = (bits | bits << shift) & mask
-        code |= bits << axis
-    return code
-
-
-def code_order(
-    code: NDArray[np.int64], ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None
-) -> NDArray[np.int64]:
-    """Order of the numbers of `spatial_code`; see `spatial_order`."""
     order = np.argsort(code, kind="stable")
-    if ties is None:
-        return order
     same = np.diff(code[order]) == 0  # (N - 1,)
-    if same.any():
+    if ties is not None and same.any():
         tied = np.flatnonzero(np.append(same, False) | np.append(False, same))
         rows = order[tied]
         order[tied] = rows[np.lexsort((ties(rows), code[rows]))]
