@@ -4,8 +4,8 @@ A ray upward from a point counts the triangles that it crosses: those that turn 
 count 1, the others -1. The sum is the winding number of the mesh about the point, 0 outside. Where
 neighbours do not turn the same way, the number of crossings decides, odd inside.
 
-Points are sorted into a grid. A cell that no triangle touches lies inside or outside as a whole, so
-that rays are cast only from the points of the others.
+Points are halved into groups. A group whose box no triangle touches lies inside or outside as a
+whole, so that one ray tells of all its points.
 """
 
 from __future__ import annotations
@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 
 from .errors import RefineError
 
-Index = NDArray[np.int64]
-
-_GRID = 128  # cells along each axis at most; four points a cell hold more than the grid costs
-_FEW = 512  # points below which a grid does not pay
-_LEAF = 1 << 13  # pairs of point and triangle that are compared one by one
-_AT_ONCE = 1 << 20  # pairs that are computed together
-_SLACK = 1e-6  # of a cell: by how much a triangle may reach into the next by rounding
+_LEAF = 1 << 14  # pairs of point and triangle that are compared one by one
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,94 +72,69 @@ class Solid:
                 f"is not closed: {open_edges} of its edges belong to an odd number of faces; fill "
                 "the holes, or add a Remesh modifier"
             )
-        for name, value in (
-            ("vertices", vertices[order[new]]),
-            ("triangles", triangles),
-            ("turned", turned),
-        ):
+        made = {"vertices": vertices[order[new]], "triangles": triangles, "turned": turned}
+        for name, value in made.items():
             object.__setattr__(self, name, value)
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which points, (N, 3) floating, lie inside, (N,); none that is not finite."""
+        """Points, (N, 3) floating, that lie inside, (N,) bool; none that is not finite."""
         inside = np.zeros(len(points), np.bool_)
-        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
-        rows = np.flatnonzero(((points >= low) & (points < high)).all(axis=1))
-        near = np.asarray(points[rows], np.float64)
-        if len(rows) >= _FEW:
-            cells = min(int(np.cbrt(4 * len(rows))), _GRID)
-            scale = cells / (high - low)
-            place = np.minimum(((near - low) * scale).astype(np.int64), cells - 1)
-            flat = np.ravel_multi_index(tuple(place.T), (cells,) * 3)
-            inside[rows] = self._grid(low, scale, cells).reshape(-1)[flat]
-            mixed = _touched((self.vertices - low) * scale, self.triangles, cells)[flat]
-            rows, near = rows[mixed], near[mixed]
-        inside[rows] = self._crossed(near)
+        corners = self.vertices.T[:, self.triangles]
+        low, high = corners.min(axis=2), corners.max(axis=2)  # (3, T) each
+        within = (points >= low.min(axis=1)) & (points < high.max(axis=1))
+        rows = np.flatnonzero(within.all(axis=1))
+        places = np.array(points[rows].T, np.float64, order="C")  # (3, n)
+        turns, leader = np.zeros(len(rows)), np.arange(len(rows))
+        waiting = [(leader.copy(), np.arange(corners.shape[1]))] if len(rows) else []
+        while waiting:
+            group, triangles = waiting.pop()
+            of_group, lows, highs = places[:, group], low[:, triangles], high[:, triangles]
+            first, last = of_group.min(axis=1), of_group.max(axis=1)
+            reach = (lows <= last[:, None]) & (highs >= first[:, None])
+            above = reach[0] & reach[1] & (highs[2] >= first[2])
+            triangles = triangles[above]
+            if not reach[2, above].any() or (first == last).all():  # all are where one is
+                leader[group] = group[0]
+                group = group[:1]
+            if len(group) * len(triangles) > _LEAF and len(group) > 1:
+                axis = int(np.argmax(last - first))
+                half = of_group[axis] <= (first + last)[axis] / 2.0
+                half &= of_group[axis] < last[axis]
+                waiting += [(group[half], triangles), (group[~half], triangles)]
+            else:
+                turns[group] = self._turns(places[:, group], triangles, low, high)
+        inside[rows] = (turns != 0.0 if self.turned else turns % 2.0 == 1.0)[leader]
         return inside
 
-    def _crossed(self, points):
-        """Which points, (N, 3), lie inside, each by its own ray."""
-        turns = np.zeros(len(points))
-        for rows, heights, signs in self._crossings(points[:, :2]):
-            above = heights > points[rows, 2]
-            turns += np.bincount(rows[above], signs[above], len(points))
-        return self._holds(turns)
+    def _turns(self, points, triangles, low, high):
+        """Sum over the crossings of a ray upward from each point, (3, n): (n,).
 
-    def _holds(self, turns):
-        """Which winding numbers mean inside."""
-        return np.asarray(turns != 0.0 if self.turned else turns % 2.0 == 1.0)
-
-    def _grid(self, low, scale, cells):
-        """Which cells of a grid lie inside, (G, G, G); meaningless where one is touched.
-
-        It has G = `cells` each way, the lowest corner `low`, (3,), and `scale` cells a unit, (3,).
-        """
-        centers = np.arange(cells) + 0.5
-        columns = np.stack(np.meshgrid(centers, centers, indexing="ij"), -1).reshape(-1, 2)
-        turns = np.zeros(cells**3)
-        for rows, heights, signs in self._crossings(columns / scale[:2] + low[:2]):
-            level = np.clip((heights - low[2]) * scale[2], 0, cells - 1).astype(np.int64)
-            turns += np.bincount(rows * cells + level, signs, cells**3)
-        turns = turns.reshape(cells, cells, cells)
-        above = turns[:, :, ::-1].cumsum(axis=2)[:, :, ::-1] - turns
-        return self._holds(above)
-
-    def _crossings(self, places):
-        """Yield where rays along z through places, (N, 2), cross triangles.
-
+        A crossing counts 1 or -1 by the way that the triangle turns, or 1 if not all are `turned`.
         An edge is crossed on the same side of a ray for both of its triangles, since its vertices
         are taken in the same order for both, and rays through a vertex count the edges that begin
         there: so no ray slips between two triangles or hits both.
-
-        Of C crossings these are the rays, the heights, and the signs, (C,) each: 1 or -1 by the way
-        that the triangle turns, or 1 throughout if not all are `turned`.
         """
-        for rows, triangles in _pairs(places, self.vertices[self.triangles, :2]):
-            px, py = places[rows].T
-            apex, after, before, one_below = self._apexes(triangles, py)
-            # The edges that end in the apex cross the line along x through the ray here.
-            x1, z1 = self._cut(apex, after, py)
-            x2, z2 = self._cut(before, apex, py)
-            crossed = (x1 > px) != (x2 > px)
-            x1, x2, z1, z2, px = (values[crossed] for values in (x1, x2, z1, z2, px))
-            heights = z1 + (px - x1) / (x2 - x1) * (z2 - z1)
-            signs = np.ones(len(px))
-            if self.turned:
-                signs[(x1 > px) != one_below[crossed]] = -1.0
-            yield rows[crossed], heights, signs
-
-    def _apexes(self, triangles, height):
-        """Corners of triangles, (C,), by the side of a line along x on which they lie.
-
-        `height`, (C,), is y of the line. These are the vertex that is alone on its side, the next
-        in the triangle, the one before it, and whether that side is below, (C,) each.
-        """
-        corners = self.triangles[triangles]  # (C, 3)
-        below = self.vertices[corners, 1] <= height[:, None]
+        (left, bottom), (right, top) = low[:2, triangles], high[:2, triangles]
+        x, y = points[:2, :, None]
+        rows, columns = np.nonzero((x >= left) & (x < right) & (y >= bottom) & (y < top))
+        px, py, pz = points[:, rows]
+        corners = self.triangles[triangles[columns]]  # (C, 3)
+        below = self.vertices[corners, 1] <= py[:, None]
         one_below = below.sum(axis=1) == 1
+        # The vertex that is alone on its side of the line along x through the ray.
         alone = np.where(one_below, below.argmax(axis=1), below.argmin(axis=1))
-        every = np.arange(len(corners))
-        apex, after, before = (corners[every, (alone + step) % 3] for step in range(3))
-        return apex, after, before, one_below
+        apex, after, before = (
+            np.take_along_axis(corners, (alone[:, None] + step) % 3, 1)[:, 0] for step in range(3)
+        )
+        # The edges that end in it cross the line here.
+        x1, z1 = self._cut(apex, after, py)
+        x2, z2 = self._cut(before, apex, py)
+        crossed = (x1 > px) != (x2 > px)
+        signs = np.where(((x1 > px) != one_below) & self.turned, -1.0, 1.0)
+        arrays = rows, signs, px, pz, x1, x2, z1, z2
+        rows, signs, px, pz, x1, x2, z1, z2 = (values[crossed] for values in arrays)
+        above = z1 + (px - x1) / (x2 - x1) * (z2 - z1) > pz
+        return np.bincount(rows[above], signs[above], points.shape[1])
 
     def _cut(self, one, other, height):
         """X and z where edges between vertices, (C,) each, have these y, (C,)."""
@@ -179,7 +148,7 @@ class Solid:
 
 
 def _edges(triangles, count):
-    """How many edges belong to an odd number of triangles, and whether all turn one way."""
+    """Number of edges of an odd number of triangles, and whether all turn one way."""
     start = triangles.reshape(-1)
     end = np.roll(triangles, -1, axis=1).reshape(-1)
     names = np.minimum(start, end) * count + np.maximum(start, end)
@@ -187,85 +156,3 @@ def _edges(triangles, count):
     edge = edge.reshape(-1)
     turns = np.bincount(edge, np.where(start < end, 1.0, -1.0))
     return int(np.count_nonzero(np.bincount(edge) % 2)), not turns.any()
-
-
-def _pairs(places, corners):
-    """Yield places and triangles whose boxes hold them, as pairs: (C,) and (C,).
-
-    Places are (N, 2), corners of the triangles (T, 3, 2).
-    """
-    batch: list[tuple[Index, Index]] = []
-    total = 0
-    for pairs in _pairs_of_groups(places, corners):
-        batch.append(pairs)
-        total += len(pairs[0])
-        if total > _AT_ONCE:
-            yield _joined(batch)
-            batch, total = [], 0
-    if total:
-        yield _joined(batch)
-
-
-def _joined(batch):
-    rows, triangles = zip(*batch, strict=True)
-    return np.concatenate(rows), np.concatenate(triangles)
-
-
-def _pairs_of_groups(places, corners):
-    """Yield the pairs of `_pairs` for groups of places near each other.
-
-    A group is halved along its longer side until few triangles may hold one of its places.
-    """
-    low, high = corners.min(axis=1).T.copy(), corners.max(axis=1).T.copy()  # (2, T) each
-    waiting = [(np.arange(len(places)), np.arange(len(corners)))] if len(places) else []
-    while waiting:
-        rows, triangles = waiting.pop()
-        group = places[rows]
-        first, last = group.min(axis=0), group.max(axis=0)
-        (left, bottom), (right, top) = low[:, triangles], high[:, triangles]
-        near = (left <= last[0]) & (right > first[0]) & (bottom <= last[1]) & (top > first[1])
-        triangles = triangles[near]
-        if len(rows) * len(triangles) > _LEAF and len(rows) > 1:
-            half, axis = len(rows) // 2, int(np.argmax(last - first))
-            order = np.argpartition(group[:, axis], half)
-            waiting += [(rows[order[:half]], triangles), (rows[order[half:]], triangles)]
-        elif len(triangles):
-            x, y = group.T[:, :, None]
-            (left, bottom), (right, top) = low[:, triangles], high[:, triangles]
-            held = np.nonzero((x >= left) & (x < right) & (y >= bottom) & (y < top))
-            yield rows[held[0]], triangles[held[1]]
-
-
-def _touched(vertices, triangles, cells):
-    """Which cells of a grid triangles touch, (G * G * G,), and some beside them.
-
-    Triangles wider than a cell are halved until they are not; of the eight cells in which the
-    others may lie, those that the triangle's plane crosses are touched. Vertices, (V, 3), are in
-    cells.
-    """
-    touched = np.zeros(cells**3, np.bool_)
-    corners = vertices[triangles]  # (T, 3, 3)
-    while len(corners):
-        first = np.floor(corners.min(axis=1) - _SLACK)
-        wide = (np.floor(corners.max(axis=1) + _SLACK) - first > 1.0).any(axis=1)
-        _touch(touched, corners[~wide], first[~wide], cells)
-        corners = corners[wide]
-        sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)  # (T, 3)
-        every, longest = np.arange(len(corners)), sides.argmax(axis=1)
-        after = (longest + 1) % 3
-        middle = (corners[every, longest] + corners[every, after]) / 2.0
-        halves = corners.copy(), corners.copy()
-        halves[0][every, longest], halves[1][every, after] = middle, middle
-        corners = np.concatenate(halves)
-    return touched
-
-
-def _touch(touched, corners, first, cells):
-    """Set which of the eight cells from `first` on the planes of small triangles meet."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    reach = np.abs(normals).sum(axis=1) * (0.5 + _SLACK)
-    for offset in np.ndindex(2, 2, 2):
-        cell = first + offset
-        away = np.einsum("ij,ij->i", normals, cell + 0.5 - corners[:, 0])
-        place = np.clip(cell[np.abs(away) <= reach], 0, cells - 1).astype(np.int64)
-        touched[np.ravel_multi_index(tuple(place.T), (cells,) * 3)] = True
