@@ -123,11 +123,13 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         if bpy.app.background or context.window is None:
             return self.execute(context)
         self._begin(context)
-        manager = context.window_manager
-        self._timer = manager.event_timer_add(_STEP, window=context.window)
-        manager.modal_handler_add(self)
-        _watch_anew()
-        return self._go_on(context)
+        answer = self._go_on(context)
+        if "RUNNING_MODAL" in answer:  # else Blender would keep the handler of what it frees
+            manager = context.window_manager
+            self._timer = manager.event_timer_add(_STEP, window=context.window)
+            manager.modal_handler_add(self)
+            _watch_anew()
+        return answer
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Start the next render when one is over."""
@@ -159,7 +161,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         begins at the next event.
         """
         try:
-            if _watch.escaped or self._steps is None:
+            if self._shared.stopped or self._steps is None:
                 return self._stopped(context)
             step, self._next = self._next, None
             if step is None:

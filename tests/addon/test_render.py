@@ -446,13 +446,16 @@ def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon,
     waiting = SimpleNamespace(
         _steps=iter([step, step]),
         _next=None,
+        _shared=SimpleNamespace(stopped=False),
         _show=lambda: None,
         _render=lambda _context, step: begun.append(step),
         _stopped=lambda _context: {"CANCELLED"},
+        _go_on=lambda context: operators.REFINE_OT_render._go_on(waiting, context),
     )
+    timer = SimpleNamespace(type="TIMER")
 
     def event():
-        return operators.REFINE_OT_render._go_on(waiting, bpy.context)
+        return operators.REFINE_OT_render.modal(waiting, bpy.context, timer)
 
     assert [event(), event(), len(begun)] == [{"RUNNING_MODAL"}, {"RUNNING_MODAL"}, 1]
     assert event() == {"RUNNING_MODAL"}

@@ -297,3 +297,18 @@ def test_splats_stand_among_other_objects(binary: Binary, cloud: Path):
     for name in ("instance", "linked"):
         assert np.sqrt(np.mean((shown[name] - plain) ** 2)) < 0.005  # 46 dB
     assert found["real"] == 9_939
+
+
+def test_blender_lives_on_where_an_operator_that_waits_refuses(binary: Binary, blend: Path):
+    """Of those that wait all but the one that watches for Esc refuse something; none waits then."""
+    found = binary.window_step("refused", blend, size=(1200, 1400), folder=binary.work)
+
+    assert found.pop("not tried") == ["refine.watch_render"]
+    said = {what: text for what, (text, _) in found.items()}
+    assert "has no camera" in said.pop("render: no camera")
+    assert "has no splats" in said.pop("render: no splats")
+    assert "in stereo" in said.pop("render: stereo")
+    assert "got 2 files" in said.pop("import_cameras")
+    assert "a.ply" in said.pop("import_ply")
+    assert all("scale_0" in text for text in said.values())
+    assert {waiting for _, waiting in found.values()} == {0}
