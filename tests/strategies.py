@@ -161,7 +161,9 @@ def _elements(
         columns = draw(
             st.lists(
                 st.tuples(
-                    st.sampled_from(["", "uchar", "uint8", "int", "ushort"]),
+                    st.sampled_from(
+                        ["", *(["uchar", "uint8", "int", "ushort"] * (prefix == "tail"))]
+                    ),
                     st.sampled_from(sorted(TYPES)),
                 ),
                 min_size=1,

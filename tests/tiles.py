@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from refine_addon.core import read_ply
-from refine_addon.core.formats.ply_header import with_count
+from refine_addon.core.formats.ply import with_count
 
 ROOM = Path(__file__).parent / "data/room_small"
 COUNT = 5000

@@ -35,7 +35,7 @@ from pathlib import Path
 import numpy as np
 
 from refine_addon.core import SURVIVORS, Budget, read_ply
-from refine_addon.core.formats.ply_header import with_count
+from refine_addon.core.formats.ply import with_count
 
 from ..baselines import splat_transform
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from refine_addon.core import Budget, pace, prune_file, prune_tiles, read_cameras, read_ply
 from refine_addon.core.costs import Cost, Plan
-from refine_addon.core.formats.ply_header import with_count
+from refine_addon.core.formats.ply import with_count
 from refine_addon.core.levels.files import LevelsRequest, lod_file
 from refine_addon.core.levels.lod import Levels
 from refine_addon.core.operation.requests import PruneRequest

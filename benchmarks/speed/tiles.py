@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from refine_addon.core import read_ply
-from refine_addon.core.formats.format import new_header
+from refine_addon.core.formats.ply import new_header
 from refine_addon.core.formats.ply_columns import REQUIRED
 from refine_addon.core.task import METHODS
 
@@ -56,7 +56,7 @@ def make_tiles(folder: Path, splats: int, tiles: int) -> list[Path]:
         count = splats // tiles
         path = folder / f"tile_{tile:03d}.ply"
         with path.open("wb") as stream:
-            stream.write(new_header(((name, "float") for name in REQUIRED), count))
+            stream.write(new_header(np.dtype([(name, "<f4") for name in REQUIRED]), count))
             for start in range(0, count, len(room)):
                 some = room[: count - start]
                 rows = np.empty(len(some), kind)

@@ -42,13 +42,10 @@ def describe(file: SplatFile) -> dict[str, Any]:
         means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
         low = np.minimum(low, means.min(axis=0, initial=np.inf))
         high = np.maximum(high, means.max(axis=0, initial=-np.inf))
-    names, lengths = file.rows.dtype.names or (), file.row_bytes
+    names = file.rows.dtype.names or ()
+    average: float = file.row_bytes
     if file.origin is not None:
-        average: float = round(file.stored_bytes / max(len(file), 1), 1)
-    elif isinstance(lengths, int):
-        average = lengths
-    else:
-        average = round(int(lengths.sum()) / max(len(lengths), 1), 1)
+        average = round(file.stored_bytes / max(len(file), 1), 1)
     known = ("x", "y", "z", "nx", "ny", "nz", "opacity")
     extra = [n for n in names if n not in known and not n.startswith(("f_", "scale_", "rot_"))]
     return {
@@ -63,4 +60,5 @@ def describe(file: SplatFile) -> dict[str, Any]:
         "non_finite_rows": broken,
         "undrawable": undrawable,
         "extra_properties": extra,
+        **({"notes": list(file.remarks)} if file.remarks else {}),
     }

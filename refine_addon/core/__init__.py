@@ -13,7 +13,7 @@ from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
 from .errors import RefineError
 from .execute import Cancelled
 from .formats.ply import SplatFile, read_ply
-from .formats.registry import as_written, read_splats
+from .formats.registry import read_splats, write_splats
 from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
 from .operation.arranged import Arrangement, Move, convert_files
@@ -68,7 +68,6 @@ __all__ = [
     "View",
     "ViewSet",
     "Zone",
-    "as_written",
     "clean",
     "convert_files",
     "file_to_file",
@@ -88,4 +87,5 @@ __all__ = [
     "select",
     "survivor_columns",
     "with_views_between",
+    "write_splats",
 ]

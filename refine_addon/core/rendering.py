@@ -5,7 +5,7 @@ Real-Time Radiance Field Rendering", `diff-gaussian-rasterization`), which other
 except for the near plane, which is a length in scene units there.
 
 Splats are trained to be drawn in one of three ways, their *model*, and look wrong in another. The
-words are those of splat-transform and SOG; how a PLY says it: `formats.ply_header`.
+words are those of splat-transform and SOG; how a PLY says it: `formats.ply`.
 """
 
 from __future__ import annotations

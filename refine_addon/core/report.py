@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .formats.format import Format
 from .formats.ply import SplatFile
-from .formats.registry import Packed
+from .formats.registry import left_out
 from .quality.cost import expected_seconds
 from .quality.curve import FEWEST, expected, in_words, out_of_reach, parted
 from .scores import Scores
@@ -128,19 +129,21 @@ def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
 
 
 def held(
-    writer: SplatFile | Packed, keep: NDArray[np.bool_], *, written: bool = True
+    file: SplatFile, form: Format | None, keep: NDArray[np.bool_], *, written: bool = True
 ) -> dict[str, int | None]:
     """Return how many splats a file of the kept rows holds, and how many its format leaves out.
 
     Parameters
     ----------
-    writer : SplatFile or Packed
-        What writes the file.
+    file : SplatFile
+        What is written.
+    form : Format or None
+        How; None is plain PLY.
     keep : (N,) bool
     written : bool
         Whether there is a file; without one, ``written`` is None.
     """
-    missing = writer.left_out(keep)
+    missing = left_out(file, form, keep)
     count = int(np.count_nonzero(keep)) - missing
     return {"written": count if written else None, "left_out": missing}
 

@@ -52,9 +52,7 @@ def import_notes(source: SplatFile) -> tuple[str, ...]:
         )
     if len(source.before) or len(source.after):
         notes.append(f"{source.path.name}: only the element 'vertex' was imported")
-    if source.lines is not None:
-        notes.append(f"{source.path.name}: was text; an export from here is binary")
-    return tuple(notes)
+    return (*notes, *source.remarks)
 
 
 def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:

@@ -16,10 +16,8 @@ import bpy
 import numpy as np
 
 from ..core.errors import RefineError
-from ..core.formats.ply import REQUIRED, REST_COUNTS, stated_model
-from ..core.formats.ply_columns import THIRD_SCALE
-from ..core.formats.ply_header import new_header, with_model
-from ..core.formats.ply_write import PLY_TYPES
+from ..core.formats.ply import new_header, stated_model, vertex_header, with_model
+from ..core.formats.ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE
 from ..core.rendering import MODELS, Model
 from . import native
 from .native import Place
@@ -139,7 +137,7 @@ class Layout:
     @property
     def row_dtype(self) -> np.dtype[Any]:
         """Type of one row of the file."""
-        return np.dtype([(column.name, column.dtype) for column in self.columns])
+        return _row(self.columns)
 
     @property
     def model(self) -> Model:
@@ -361,7 +359,7 @@ def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
         columns.insert(index, column)
     # Of one byte order, since the header names but one.
     plain = [Column(c.name, c.dtype.replace(">", "<"), c.place) for c in columns]
-    header = _new_header(plain, count)
+    header = new_header(_row(plain), count)
     comments = re.findall(rb"^(?:comment|obj_info)\b[^\r\n]*", layout.header, re.MULTILINE)
     first = header.index(b"element")
     header = header[:first] + b"".join(line + b"\n" for line in comments) + header[first:]
@@ -416,7 +414,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
         names.remove(THIRD_SCALE)
     columns = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
     columns += _further_columns(obj.data, {*names, *(column.attribute for column in columns)})
-    header = _new_header(columns, splat_count(obj.data))
+    header = new_header(_row(columns), splat_count(obj.data))
     return Layout(tuple(columns), header, native.is_native(obj.data))
 
 
@@ -505,22 +503,6 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
     return tuple(columns)
 
 
-def vertex_header(header: bytes) -> bytes:
-    """Return a header without the elements other than ``vertex``, and binary."""
-    lines = re.findall(rb"[^\r\n]*(?:\r\n|\n|\r)", header)
-    kept, wanted = [], True
-    for line in lines:
-        words = line.split()
-        if words[:1] == [b"element"]:
-            wanted = words[1] == b"vertex"
-        elif words[:1] in ([b"comment"], [b"obj_info"], [b"end_header"]):
-            kept.append(line)
-            continue
-        if wanted:
-            kept.append(line.replace(b" ascii ", b" binary_little_endian ", 1))
-    return b"".join(kept)
-
-
-def _new_header(columns: Sequence[Column], count: int) -> bytes:
-    kinds = ((column.name, PLY_TYPES[column.dtype[1:]]) for column in columns)
-    return new_header(kinds, count)
+def _row(columns: Sequence[Column]) -> np.dtype[Any]:
+    """Type of a row of a file with these columns."""
+    return np.dtype([(column.name, column.dtype) for column in columns])

@@ -156,7 +156,7 @@ class ObjectSource:
             bytes=row * len(checked) + fixed,
             splats=gather(checked, whole=self.harmonics),
             forced=self.demands.forced(checked),
-            sizes=self._sizes(form) if form else RowSizes(row, row, fixed),
+            sizes=self._sizes(form) if form else RowSizes(row, fixed),
             stored=mesh_attributes.stored_columns(checked),
             file=lambda: mesh_attributes.file_from_object(checked),
             matrix=world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get()),
@@ -167,8 +167,8 @@ class ObjectSource:
     def _sizes(self, form: Format) -> RowSizes:
         """Return the bytes of the splats in another format than plain PLY."""
         degree = mesh_layout.sh_degree(self.checked.mesh)
-        sizes = form.sizes_without_more(len(self.checked), degree)
-        return RowSizes(sizes.row, sizes.row, sizes.fixed) if sizes else RowSizes(0.0, 0.0, 0)
+        count, degree = len(self.checked), min(degree, form.degree)
+        return RowSizes(*form.sizes(count, degree)) if form.sizes else RowSizes(0.0, 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,16 @@ from bpy_extras.io_utils import ExportHelper
 from ..core.execute import Progress, report
 from ..core.formats import sog
 from ..core.formats.ply import SplatFile
-from ..core.formats.registry import FORMATS, SUFFIXES, Packed, as_written, without_suffix
-from ..core.formats.streamed_sog import INDEX
-from ..core.formats.streamed_sog_write import StreamedSog, folder_for
+from ..core.formats.registry import (
+    FORMATS,
+    SUFFIXES,
+    format_named,
+    held_splats,
+    notes,
+    without_suffix,
+    write_splats,
+)
+from ..core.formats.streamed_sog import INDEX, StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -131,11 +138,11 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         return _Export(file, target, self.overwrite, notes)
 
     @staticmethod
-    def work(job: _Export, progress: Progress) -> SplatFile | Packed:
+    def work(job: _Export, progress: Progress) -> SplatFile:
         """Write the file."""
         report(progress, 0.0, job.target.name)
-        file = as_written(job.file(), job.target)
-        file.write(job.target, overwrite=job.overwrite)
+        file = job.file()
+        write_splats(job.target, file, overwrite=job.overwrite)
         return file
 
     def finish(
@@ -143,11 +150,12 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         _context: bpy.types.Context,
         _checked: SplatObject | None,
         job: _Export,
-        file: SplatFile | Packed,
+        file: SplatFile,
     ) -> Answer:
         """Say what was written."""
-        if isinstance(file, Packed):
-            self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
+        form = format_named(job.target)
+        if form is not None:
+            self.report({"INFO"}, "; ".join(notes(file, form, np.ones(len(file), np.bool_))))
         return self.say(job.notes, f"Wrote the splats to {self.filepath}")
 
 
@@ -202,7 +210,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
             scene = None
             for number, file in enumerate(job.files):
                 report(progress, number / len(job.files), f"level {number}")
-                splats = Packed(file(), sog.FORMAT).chosen(job.target, None, {})
+                splats = held_splats(job.target, sog.FORMAT, file(), None, {})
                 scene = scene or StreamedSog(splats.means, job.width, made)
                 scene.add(splats)
             assert scene is not None

@@ -60,7 +60,7 @@ def core(addon):
 def export(addon, checked, path, **options):
     """Write an object to a file, as *Export* does; see `read_for_export` for the options."""
     file = addon.objects.splat_object.read_for_export(checked, **options)()
-    addon.core.formats.registry.as_written(file, path).write(path)
+    addon.core.formats.registry.write_splats(path, file)
 
 
 def keep_mask(addon, obj, budget, protect=""):

@@ -34,7 +34,7 @@ def test_every_format_is_exported_and_imported(addon, small, tmp_path):
         bpy.context.view_layer.objects.active = source
         made, expected = tmp_path / f"panel{suffix}", tmp_path / f"core{suffix}"
         bpy.ops.refine.export_ply(filepath=str(made))
-        core.as_written(core.read_ply(small), expected).write(expected)
+        core.write_splats(expected, core.read_ply(small))
 
         bpy.ops.refine.import_ply(filepath=str(made))
 

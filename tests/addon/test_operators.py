@@ -568,7 +568,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.camera_import", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
-        ("ui.export_operators", "as_written", "export_ply", {"filepath": "out.ply"}),
+        ("ui.export_operators", "write_splats", "export_ply", {"filepath": "out.ply"}),
     ],
 )
 @pytest.mark.usefixtures("room_cameras")

@@ -14,10 +14,10 @@ from scipy.spatial import cKDTree
 from benchmarks.baselines import splat_transform
 from benchmarks.tables.million import write_cameras
 from refine_addon.command import main
-from refine_addon.core import Splats, View, ViewSet, as_written, read_splats
-from refine_addon.core.formats import streamed_sog_write
+from refine_addon.core import Splats, View, ViewSet, read_splats, write_splats
+from refine_addon.core.formats import streamed_sog
 from refine_addon.core.formats.registry import format_named
-from refine_addon.core.formats.streamed_sog_write import StreamedSog, folder_for
+from refine_addon.core.formats.streamed_sog import StreamedSog, folder_for
 from refine_addon.core.rendering import MODELS
 from refine_addon.core.splats import base_color, opacity, rotation_matrices
 from tests.fuzz import version_1_of
@@ -101,7 +101,7 @@ def test_it_reads_what_we_write(tmp_path, suffix, degree):
     """Ours, read by it and written as a PLY, is the source within the bounds, and what we read."""
     source, made, back = room(tmp_path, degree), tmp_path / f"a{suffix}", tmp_path / "back.ply"
     file = read_splats(source)
-    as_written(file, made).write(made)
+    write_splats(made, file)
 
     transformed(made, back)
 
@@ -165,7 +165,7 @@ def test_of_a_sog_in_a_folder_both_read_the_same(tmp_path):
 def test_of_a_sog_of_version_1_both_read_the_same(tmp_path):
     """Made of one of version 2 by putting ends in place of tables: no tool at hand writes it."""
     source = room(tmp_path, 1)
-    as_written(read_splats(source), tmp_path / "a.sog").write(tmp_path / "a.sog")
+    write_splats(tmp_path / "a.sog", read_splats(source))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         files = version_1_of({name: archive.read(name) for name in archive.namelist()})
     for name, data in files.items():
@@ -181,7 +181,7 @@ def test_of_a_sog_of_version_1_both_read_the_same(tmp_path):
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_of_a_streamed_sog_of_ours_it_reads_every_level(tmp_path, level, monkeypatch):
     """Its splats are the source's and those that we read, in chunks of 100 or less."""
-    monkeypatch.setattr(streamed_sog_write, "UNIT", 100)
+    monkeypatch.setattr(streamed_sog, "UNIT", 100)
     splats = read_splats(room(tmp_path, 3)).splats()
     levels = [splats, splats.take(slice(0, None, 2)), splats.take(slice(0, None, 9))]
     path, back = tmp_path / "lod-meta.json", tmp_path / "back.ply"
@@ -244,7 +244,7 @@ def test_our_glb_holds_the_same_numbers_as_its(tmp_path):
     """Attribute by attribute; it sorts no splats, and reads no GLB back."""
     source = room(tmp_path, 3)
     transformed(source, tmp_path / "theirs.glb")
-    as_written(read_splats(source), tmp_path / "ours.glb").write(tmp_path / "ours.glb")
+    write_splats(tmp_path / "ours.glb", read_splats(source))
 
     ours, theirs = (attributes(tmp_path / f"{name}.glb") for name in ("ours", "theirs"))
 
@@ -284,7 +284,7 @@ def test_the_validator_of_khronos_finds_no_fault_in_our_glb(tmp_path):
     What splat-transform writes has the same.
     """
     made = tmp_path / "a.glb"
-    as_written(read_splats(room(tmp_path, 3)), made).write(made)
+    write_splats(made, read_splats(room(tmp_path, 3)))
     script = (
         "const fs = require('fs');"
         f"require({json.dumps(str(VALIDATOR))})"
@@ -313,7 +313,7 @@ def test_what_is_said_of_how_splats_are_drawn_survives_both(tmp_path, suffix, mo
     held = form is None or model in form.models
     ours, theirs = tmp_path / f"ours{suffix}", tmp_path / f"theirs{suffix}"
     source.write(tmp_path / "tagged.ply")
-    as_written(source, ours).write(ours)
+    write_splats(ours, source)
 
     transformed(ours, tmp_path / "back.ply")
     transformed(tmp_path / "tagged.ply", theirs)

@@ -200,7 +200,7 @@ def test_info_says_what_is_in_a_file(folder, capsys):
 
 
 def test_info_of_a_text_file_says_how_long_a_row_is_on_average(folder):
-    """14 zeros are 28 bytes with their spaces, and 33 where five more stand: 30.5."""
+    """Of the whole file, as of other formats; and that a PLY of it is binary."""
     row = b"0 " * 13 + b"0\n"
     header = plain_header(2, splat_names(0), "ascii")
     (folder / "two.ply").write_bytes(header + row + b" " * 5 + row)
@@ -208,7 +208,8 @@ def test_info_of_a_text_file_says_how_long_a_row_is_on_average(folder):
     assert command.main(["info", "two.ply", "--report", "report.json"]) == 0
 
     entry = json.loads((folder / "report.json").read_text())["results"][0]
-    assert entry["bytes_per_splat"] == 30.5
+    assert entry["bytes_per_splat"] == (len(header) + 61) / 2
+    assert "two.ply is text; a PLY that is written of it is binary" in entry["notes"]
 
 
 def test_info_of_a_file_without_a_splat_has_no_extent(folder):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from refine_addon.core import read_ply
-from refine_addon.core.formats.ply_header import with_count
+from refine_addon.core.formats.ply import with_count
 from tests.examples import blocks, modules_with_examples
 
 ROOT = Path(__file__).parents[2]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import read_ply
-from refine_addon.core.formats.ply_header import with_count
+from refine_addon.core.formats.ply import with_count
 
 ROOT = Path(__file__).parents[2]
 ROOM = ROOT / "tests/data/room_small"

@@ -17,11 +17,11 @@ from refine_addon.core import (
     PruneRequest,
     RefineError,
     Splats,
-    as_written,
     prune_file,
     read_cameras,
     read_ply,
     read_splats,
+    write_splats,
 )
 from refine_addon.core.formats import registry
 from refine_addon.core.formats.registry import SUFFIXES
@@ -60,7 +60,7 @@ def written(folder: Path, suffix: str, columns: dict[str, np.ndarray]) -> Path:
     (folder / "in.ply").write_bytes(ply_of(columns))
     path = folder / f"made{suffix}"
     file = read_splats(folder / "in.ply")
-    as_written(file, path).write(path, overwrite=True)
+    write_splats(path, file, overwrite=True)
     return path
 
 
@@ -190,22 +190,46 @@ def test_what_cannot_be_drawn_is_left_out_with_a_note(tmp_path, suffix):
     file = read_splats(written(tmp_path, suffix, columns))
 
     source = read_splats(tmp_path / "in.ply")
-    notes = as_written(source, tmp_path / f"a{suffix}").notes(np.ones(COUNT, np.bool_))
+    notes = registry.notes(source, FORMATS[SUFFIX.index(suffix)], np.ones(COUNT, np.bool_))
     assert len(file) == COUNT - 2
     assert any(note.startswith("2 of the kept splats cannot be drawn") for note in notes)
+
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_one_colour_beyond_all_others_is_no_file_that_is_refused(tmp_path, suffix, cameras):
+    """1e20 is more than a number in JSON may be here, and so is 1e30 of a harmonic.
+
+    A .sog was written, could not be read again, and stayed where it was with exit code 1.
+    """
+    columns = scene(1)
+    columns["f_dc_1"][7], columns["f_rest_4"][9] = 1e20, -1e30
+    (tmp_path / "in.ply").write_bytes(ply_of(columns))
+    output = tmp_path / f"p{suffix}"
+
+    prune_file(tmp_path / "in.ply", output, PruneRequest(cameras, Budget(ratio=0.0)))
+
+    splats = in_order(read_splats(output).splats())
+    others = np.arange(COUNT) != 7
+    assert len(splats) == COUNT
+    assert np.isfinite(splats.sh_dc).all()
+    if suffix not in (".compressed.ply", ".sog"):  # which share their range with others
+        plain = read_splats(tmp_path / "in.ply").splats()
+        colors = base_color(splats.sh_dc[others]) - base_color(plain.sh_dc[others])
+        assert np.abs(colors).max() <= BOUNDS[suffix]["color"]
 
 
 @pytest.mark.parametrize("suffix", SUFFIX)
 def test_properties_that_a_format_does_not_hold_are_named(tmp_path, suffix):
     """A property of no splat's is left out with a note; to write one is refused."""
     (tmp_path / "in.ply").write_bytes(ply_of({**scene(), "mine": np.zeros(COUNT, np.float32)}))
-    packed = as_written(read_splats(tmp_path / "in.ply"), tmp_path / f"a{suffix}")
+    file = read_splats(tmp_path / "in.ply")
 
-    notes = packed.notes(np.ones(COUNT, np.bool_))
+    notes = registry.notes(file, FORMATS[SUFFIX.index(suffix)], np.ones(COUNT, np.bool_))
 
     assert f"{suffix} does not hold mine: left out" in notes
     with pytest.raises(RefineError, match=r"holds no property 'score'; write to a \.ply"):
-        packed.write(tmp_path / f"a{suffix}", columns={"score": np.zeros(COUNT, np.float32)})
+        score = {"score": np.zeros(COUNT, np.float32)}
+        write_splats(tmp_path / f"a{suffix}", file, columns=score)
     assert not (tmp_path / f"a{suffix}").exists()
 
 
@@ -216,8 +240,8 @@ def test_harmonics_of_a_higher_degree_are_left_out_with_a_note(tmp_path, suffix)
     file = read_splats(tmp_path / "in.ply")
     degree = FORMATS[SUFFIX.index(suffix)].degree
 
-    notes = as_written(file, tmp_path / f"a{suffix}").notes(np.ones(3, np.bool_))
-    as_written(file, tmp_path / f"a{suffix}").write(tmp_path / f"a{suffix}")
+    notes = registry.notes(file, FORMATS[SUFFIX.index(suffix)], np.ones(3, np.bool_))
+    write_splats(tmp_path / f"a{suffix}", file)
 
     assert read_splats(tmp_path / f"a{suffix}").splats().sh_degree == degree
     assert any(f"degree {degree}, the file has degree 4" in note for note in notes) == (degree < 4)
@@ -248,8 +272,8 @@ def test_a_size_is_kept_to(tmp_path, suffix, cameras):
     """Room for half a splat more than 300 and for all else: 300 stay, and the file fits."""
     (tmp_path / "in.ply").write_bytes(ply_of(scene(1)))
     form = FORMATS[SUFFIX.index(suffix)]
-    sizes = form.sizes(COUNT, min(1, form.degree))
-    limit = (sizes.fixed + 300.5 * sizes.row) / 1e6
+    row, fixed = form.sizes(COUNT, min(1, form.degree))
+    limit = (fixed + 300.5 * row) / 1e6
     path = tmp_path / f"out{suffix}"
 
     report = prune_file(
@@ -257,7 +281,7 @@ def test_a_size_is_kept_to(tmp_path, suffix, cameras):
     ).report
 
     assert report["splats"]["kept"] == len(read_splats(path)) == 300
-    assert 300 * sizes.row <= path.stat().st_size <= limit * 1e6
+    assert 300 * row <= path.stat().st_size <= limit * 1e6
     assert report["files"]["output_bytes"] == path.stat().st_size
 
 

@@ -12,7 +12,6 @@ import pytest
 
 from refine_addon.core import RefineError, read_splats
 from refine_addon.core.formats import glb
-from refine_addon.core.formats.glb_document import Document
 from refine_addon.core.spherical_harmonics import colors
 from refine_addon.core.splats import rotation_matrices
 
@@ -336,9 +335,9 @@ def test_a_mesh_is_read_once_however_many_nodes_show_it(tmp_path, monkeypatch, c
     path = tmp_path / "a.glb"
     path.write_bytes(packed(content, binary))
     accessors = []
-    accessor = Document.accessor
+    values = glb._Document.values
     monkeypatch.setattr(
-        Document, "accessor", lambda *given: accessors.append(1) or accessor(*given)
+        glb._Document, "values", lambda *given: accessors.append(1) or values(*given)
     )
 
     assert len(read_splats(path)) == 200 * 20 * count
@@ -350,11 +349,24 @@ def test_nodes_that_move_nothing_take_no_matrix(read, monkeypatch):
     content, binary = document()
     content["nodes"] = [{"children": [k + 1]} for k in range(1000)]
     content["nodes"].append({"mesh": 0, "translation": [1.0, 0.0, 0.0]})
-    made, matrix = [], glb._matrix
-    monkeypatch.setattr(glb, "_matrix", lambda *node: made.append(1) or matrix(*node))
+    made, matrices = [], glb.rotation_matrices
+    monkeypatch.setattr(glb, "rotation_matrices", lambda *q: made.append(1) or matrices(*q))
 
     assert len(read(content, binary)) == 2
     assert len(made) == 1
+
+
+def test_negative_scales_are_logarithms(tmp_path):
+    """Drafts of the extension have them; they became NaN in every row, and nothing was said."""
+    content, binary = document({**VALUES, f"{SPLATTING}:SCALE": [[-3.0, -2.0, 0.5], [-1.0] * 3]})
+    (tmp_path / "a.glb").write_bytes(packed(content, binary))
+
+    file = read_splats(tmp_path / "a.glb")
+
+    assert file.splats().log_scales.tolist() == [[-3.0, -2.0, 0.5], [-1.0] * 3]
+    assert file.notes(np.ones(2, np.bool_)) == [
+        "a.glb has negative scales: its scales are read as logarithms"
+    ]
 
 
 def test_every_node_shows_the_mesh_where_it_stands(read):

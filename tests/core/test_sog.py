@@ -12,9 +12,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, as_written, read_splats
+from refine_addon.core import RefineError, read_splats, write_splats
 from refine_addon.core.formats import images
-from refine_addon.core.formats.sog_write import _grouped
+from refine_addon.core.formats.sog import _grouped
 from tests.strategies import plain_ply
 
 pytest.importorskip("PIL", reason="needs Pillow, which a .sog does outside of Blender")
@@ -24,7 +24,7 @@ pytest.importorskip("PIL", reason="needs Pillow, which a .sog does outside of Bl
 def sog(tmp_path):
     """Return the path of a file of 40 splats of degree 1."""
     (tmp_path / "in.ply").write_bytes(plain_ply(40, 1))
-    as_written(read_splats(tmp_path / "in.ply"), tmp_path / "a.sog").write(tmp_path / "a.sog")
+    write_splats(tmp_path / "a.sog", read_splats(tmp_path / "in.ply"))
     return tmp_path / "a.sog"
 
 
@@ -252,7 +252,38 @@ def test_an_archive_without_meta_json_is_refused(sog):
         read_splats(sog)
 
 
-OUTSIDE = ["../a", "/etc/passwd", "a/../../b", "C:a", "a\\b", "a\0b", "", ".."]
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_member_that_is_packed_as_no_sog_is_refused(sog, method, damaged):
+    """Ways to compress that take any memory; a damaged one of LZMA was a traceback."""
+    with zipfile.ZipFile(sog) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(sog, "w", method) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    if damaged:
+        data = bytearray(sog.read_bytes())
+        data[60:80] = bytes(20)
+        sog.write_bytes(data)
+
+    expected = f"{sog}: 'meta.json' in the archive cannot be read (compressed by method {method})"
+    with pytest.raises(RefineError, match=re.escape(expected)):
+        read_splats(sog)
+
+
+OUTSIDE = [
+    "../a",
+    "/etc/passwd",
+    "//etc/passwd",
+    "///etc/passwd",
+    "//a/b",
+    "a/../../b",
+    "C:a",
+    "a\\b",
+    "a\0b",
+    "",
+    "..",
+]
 
 
 @pytest.mark.parametrize("name", OUTSIDE)
@@ -319,14 +350,14 @@ def test_what_is_missing_is_said(sog, monkeypatch):
     with pytest.raises(RefineError, match=r"a\.sog: WebP images need a library: run this in Blen"):
         read_splats(sog)
     with pytest.raises(RefineError, match="WebP images need a library: run this in Blender, or 'p"):
-        as_written(source, sog.with_name("b.sog")).write(sog.with_name("b.sog"))
+        write_splats(sog.with_name("b.sog"), source)
     assert not sog.with_name("b.sog").exists()
 
 
 def test_the_same_splats_make_the_same_file(sog):
     """No time of day is in it."""
     source = read_splats(sog.with_name("in.ply"))
-    as_written(source, sog).write(sog.with_name("b.sog"))
+    write_splats(sog.with_name("b.sog"), source)
 
     assert sog.read_bytes() == sog.with_name("b.sog").read_bytes()
     assert io.BytesIO(sog.read_bytes()).read(4) == b"PK\x03\x04"

@@ -12,7 +12,7 @@ import zlib
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, as_written, read_splats
+from refine_addon.core import RefineError, read_splats, write_splats
 from tests.strategies import plain_ply
 
 MEAN = bytes([0, 16, 0, 0, 240, 255, 1, 0, 0])
@@ -246,7 +246,7 @@ def test_the_steps_of_positions_follow_the_scene(tmp_path, scale, fraction):
     (tmp_path / "in.ply").write_bytes(plain_ply(50))
     file = read_splats(tmp_path / "in.ply")
     columns = {axis: (file.rows[axis] / file.rows["z"].max() * scale) for axis in "xyz"}
-    as_written(file, tmp_path / "a.spz").write(tmp_path / "a.spz", columns=columns)
+    write_splats(tmp_path / "a.spz", file, columns=columns)
 
     found = gzip.decompress((tmp_path / "a.spz").read_bytes())[13]
     means = read_splats(tmp_path / "a.spz").splats().means
@@ -263,7 +263,5 @@ def test_a_position_that_spz_cannot_hold_is_refused(tmp_path):
 
     for x, shown in ((1e7, "10000000"), (8388607.5, "8388607.5")):
         with pytest.raises(RefineError, match=f"a coordinate is {shown}: SPZ holds coordinates up"):
-            as_written(file, tmp_path / "a.spz").write(
-                tmp_path / "a.spz", columns={"x": np.full(3, x, np.float32)}
-            )
+            write_splats(tmp_path / "a.spz", file, columns={"x": np.full(3, x, np.float32)})
     assert not (tmp_path / "a.spz").exists()

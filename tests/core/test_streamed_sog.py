@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, read_splats
-from refine_addon.core.formats import streamed_sog_write
-from refine_addon.core.formats.streamed_sog_write import StreamedSog, folder_for
+from refine_addon.core.formats import images, streamed_sog
+from refine_addon.core.formats.streamed_sog import StreamedSog, folder_for
 from refine_addon.core.splats import rotation_matrices
 
 pytest.importorskip("PIL", reason="needs Pillow, which SOG does outside of Blender")
@@ -52,8 +52,8 @@ def test_a_level_is_read_with_the_environment(level, step, count):
 @pytest.fixture
 def written(tmp_path, monkeypatch):
     """Return the index of two levels of 2,485 and 498 splats in chunks of 500 or less."""
-    monkeypatch.setattr(streamed_sog_write, "UNIT", 500)
-    monkeypatch.setattr(streamed_sog_write, "LEAST", 50)
+    monkeypatch.setattr(streamed_sog, "UNIT", 500)
+    monkeypatch.setattr(streamed_sog, "LEAST", 50)
     path = tmp_path / "out/lod-meta.json"
     write(path, room(16), room(80))
     return path
@@ -143,7 +143,7 @@ def test_chunks_are_no_wider_than_asked_where_they_hold_enough(written):
 
 def test_splats_in_one_place_are_one_chunk(tmp_path, monkeypatch):
     """No plane parts them."""
-    monkeypatch.setattr(streamed_sog_write, "UNIT", 10)
+    monkeypatch.setattr(streamed_sog, "UNIT", 10)
     same = replace(room(1000), means=np.ones((40, 3), np.float32))
 
     write(tmp_path / "lod-meta.json", same)
@@ -153,26 +153,56 @@ def test_splats_in_one_place_are_one_chunk(tmp_path, monkeypatch):
 
 
 def test_only_what_an_index_names_is_replaced(written):
-    """And only when told: its folders, of more levels before; other files stay."""
+    """And only when told: its folders, of more levels before; other files and folders stay."""
     (written.parent / "0_0/notes.txt").write_text("mine")
+    (written.parent / "0_5").mkdir()
     with pytest.raises(RefineError, match="exists already"):
         write(written, room(400))
 
     write(written, room(400), overwrite=True)
 
     left = sorted(path.name for path in written.parent.iterdir())
-    assert left == ["0_0", "lod-meta.json"]
-    assert (written.parent / "0_0/notes.txt").read_text() == "mine"
+    assert left == ["0_0", "0_5", "0_6", "lod-meta.json"]
+    assert [path.name for path in (written.parent / "0_0").iterdir()] == ["notes.txt"]
+    assert not list((written.parent / "0_5").iterdir())
     assert len(read_splats(written)) == 100
 
 
-def test_a_folder_that_no_index_names_is_not_filled(tmp_path):
-    """Whatever it holds; not even with overwrite."""
-    (tmp_path / "3_1").mkdir()
+STEPS = ["rename", "write", "replace", "unlink", "rmdir"]
 
-    with pytest.raises(RefineError, match=r"3_1: exists already; write to another folder"):
-        write(tmp_path / "lod-meta.json", room(400), overwrite=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["3_1"]
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
+def test_a_replacement_that_is_stopped_leaves_one_that_is_whole(written, monkeypatch, step, after):
+    """By a signal ahead of or behind any step: the old until the index is replaced, then the new.
+
+    Index and old levels were deleted before the new ones were in their place, and the same command
+    then refused what was there.
+    """
+    before = {path: path.read_bytes() for path in written.parent.rglob("*") if path.is_file()}
+    owner = streamed_sog if step == "write" else Path
+    name = "whole_file" if step == "write" else step
+    done = getattr(owner, name)
+
+    def stopped(*given, **named):
+        if step == "replace" and given[0].parent != written.parent:
+            return done(*given, **named)
+        if after:
+            done(*given, **named)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(owner, name, stopped)
+        with pytest.raises(KeyboardInterrupt):
+            write(written, room(400), overwrite=True)
+
+    count = len(read_splats(written))
+    assert count in (100, len(room(16)))
+    if count > 100:
+        found = {path: path.read_bytes() for path in written.parent.rglob("*") if path.is_file()}
+        assert found == before
+    write(written, room(800), overwrite=True)
+    assert len(read_splats(written)) == len(room(800))
 
 
 def test_a_file_that_is_no_index_is_not_replaced(tmp_path):
@@ -232,6 +262,10 @@ FAULTS = {
         _set("filenames", 0, "../0_0/meta.json"),
         'filenames [0]: "../0_0/meta.json", expected a file in this folder or one below',
     ),
+    "from the root": (
+        _set("filenames", 0, "//etc/hostname"),
+        'filenames [0]: "//etc/hostname", expected a file in this folder or one below',
+    ),
     "away": (_set("filenames", 0, "9_9/meta.json"), 'filenames [0]: "9_9/meta.json" is not there'),
     "no tree": (_set("tree", []), "tree: expected an object, got a list of 0"),
     "children": (_set("tree", "children", {}), "tree children: expected a list, got an object"),
@@ -282,6 +316,35 @@ def test_no_splat_is_taken_twice(copied):
 
     with pytest.raises(RefineError, match=r"filenames \[0\]: the tree takes a splat twice"):
         read_splats(path)
+
+
+def test_images_that_many_folders_share_count_once(tmp_path):
+    """Images of 4,096 splats in some 45 kB, named by 40 files of 1.4 kB: 164,000 splats.
+
+    1.4 MB became 40 million splats, and 2.3 GB of memory. Each file alone holds what it says.
+    """
+    pixels = np.random.default_rng(0).integers(252, 256, (64, 64, 4)).astype(np.uint8)
+    pixels[..., :3] *= np.arange(64, dtype=np.uint8)[:, None]
+    for name in "luqsc":
+        (tmp_path / name).write_bytes(images._Pillow().encode(pixels))
+    places = {"mins": [0] * 3, "maxs": [1] * 3, "files": ["l", "u"]}
+    table = [0] * 256
+    parts = {"scales": {"codebook": table, "files": ["s"]}, "quats": {"files": ["q"]}}
+    one = {"version": 2, "count": 4096, "means": places, **parts}
+    one["sh0"] = {"codebook": table, "files": ["c"]}
+    names = [f"{number}-meta.json" for number in range(40)]
+    for name in names:
+        (tmp_path / name).write_text(json.dumps(one, separators=(",", ":")))
+    span = {"offset": 0, "count": 4096}
+    leaves = [{"lods": {"0": {"file": file, **span}}} for file in range(40)]
+    index = {"lodLevels": 1, "filenames": names, "tree": {"children": leaves}}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    size = sum(path.stat().st_size for path in tmp_path.iterdir())
+
+    assert len(read_splats(tmp_path / names[0])) == 4096 < size / 20
+    said = f"163840 splats, expected at most {size}, the bytes of all files together"
+    with pytest.raises(RefineError, match=said):
+        read_splats(tmp_path / "lod-meta.json")
 
 
 def test_folders_of_two_models_are_refused(copied):

@@ -10,7 +10,7 @@ import pytest
 
 from refine_addon.core import Splats, read_ply, survivor_columns
 from refine_addon.core.affine import transformed
-from refine_addon.core.formats import ply_write
+from refine_addon.core.formats import ply
 from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.merging.merge import Merged
 from refine_addon.core.splats import ARRAYS
@@ -86,7 +86,7 @@ def test_rows_are_written_as_their_columns_say(tmp_path, monkeypatch, wide, thre
     columns = survivor_columns(file.rows, absorbed_of(file.splats(), keep, changed, 1 / 3))
     file.write(tmp_path / "whole.ply", keep, columns=dict(columns))
 
-    monkeypatch.setattr(ply_write, "_CHANGED_ROWS", 7)
+    monkeypatch.setattr(ply, "_CHANGED_ROWS", 7)
     file.write(tmp_path / "out.ply", keep, columns=columns, threads=threads)
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()

@@ -13,9 +13,8 @@ from blenders import Binary
 from view_pictures import psnr, reference, view_in
 
 from benchmarks.tables.models import version
-from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.formats.ply import new_header, read_ply, with_model
 from refine_addon.core.formats.ply_columns import columns_from_splats
-from refine_addon.core.formats.ply_header import new_header, with_model
 from refine_addon.core.rendering import Model
 
 
@@ -85,7 +84,7 @@ def test_the_viewport_shows_every_model_as_the_reference_renderer(
     """At least 28 dB, as for ordinary splats."""
     splats = version(read_ply(cloud).splats(), model)
     columns = columns_from_splats(splats)
-    header = new_header(((name, "float") for name in columns), len(splats))
+    header = new_header(np.dtype([(name, "<f4") for name in columns]), len(splats))
     tagged = tmp_path / "point_cloud.ply"
     rows = np.column_stack([*columns.values()])
     tagged.write_bytes(with_model(header, model) + rows.tobytes())

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..splats import SH_C0, Splats, base_color, opacity, opacity_logits, scales, unit_quaternions
-from .format import Format, Sizes, codes, new_file, pieces
+from .format import Format, codes, named, new_file, pieces
 from .ply import Origin, SplatFile
 
-NAME = ".splat"
+NAME = SUFFIX = ".splat"
 
 _ROW = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
@@ -27,19 +27,7 @@ _ROW = np.dtype(
 _NO_TURN = 128.0  # code of 0 in a rotation, and the step from 0 to 1
 
 
-def matches(path: Path, head: bytes) -> bool:
-    """Return whether a file is taken for one: by its name, unless it is a PLY."""
-    return path.suffix.lower() == FORMAT.suffix and bool(head) and not head.startswith(b"ply")
-
-
-def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
-    """Read a ``.splat`` file.
-
-    Raises
-    ------
-    RefineError
-        If it ends within a splat.
-    """
+def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     size = _ROW.itemsize
     count, beyond = divmod(len(data), size)
     if beyond:
@@ -62,8 +50,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     return file
 
 
-def write(stream: BinaryIO, splats: Splats) -> None:
-    """Write splats as a ``.splat`` file."""
+def _write(stream: BinaryIO, splats: Splats) -> None:
     for piece in pieces(len(splats)):
         batch = splats.take(piece)
         rows = np.empty(len(batch), _ROW)
@@ -77,18 +64,12 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         stream.write(rows.data)
 
 
-def sizes(_count: int, _degree: int) -> Sizes:
-    """Return how large a file is."""
-    return Sizes(_ROW.itemsize, 0)
-
-
 FORMAT = Format(
     name=NAME,
-    suffix=".splat",
-    degree=0,
+    suffix=SUFFIX,
     loss="holds colour, opacity and rotation in 8 bits each",
-    matches=matches,
-    read=read,
-    write=write,
-    sizes=sizes,
+    matches=named(SUFFIX),
+    read=_read,
+    write=_write,
+    sizes=lambda _count, _degree: (_ROW.itemsize, 0),
 )

@@ -15,33 +15,19 @@ from ..execute import chunks
 from ..rendering import MODELS, Model
 from ..splats import Splats
 from ..visibility.scene import spatial_order
-from .ply import Origin, SplatFile
+from .ply import Origin, SplatFile, new_header, with_model
 from .ply_columns import empty_rows
-from .ply_header import new_header, with_model
 
 CHUNK = 1 << 15
 """Splats that are converted at a time: 8 MB at degree 3. A multiple of `compressed_ply.SPLATS`."""
 
-
-@dataclass(frozen=True)
-class Sizes:
-    """How large a file of a format is, where that follows from the number of splats.
-
-    Attributes
-    ----------
-    row : float
-        Bytes of one splat.
-    fixed : int
-        Bytes of everything else, at most.
-    """
-
-    row: float
-    fixed: int
+WXYZ, XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
+"""Components of a quaternion x y z w in our order, and of ours in that."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reader:
-    """A format of splat files that is read.
+class Format:
+    """A format of splat files; an output is known by its suffix.
 
     Attributes
     ----------
@@ -53,49 +39,41 @@ class Reader:
         ``matches(path, head)``: whether a file with these first bytes is of this format.
     read : callable
         ``read(path, data)`` returns a `SplatFile`; `data` is the file, (M,) uint8.
+    write : callable or None
+        ``write(stream, splats)``; all of the splats can be drawn. None if it is only read.
+    degree : int
+        Highest degree of harmonics that it holds.
+    loss : str
+        What it does to splats, as a sentence without its subject.
+    sizes : callable or None
+        ``sizes(count, degree)`` returns the bytes of one splat, and of everything else at most;
+        None if a file is compressed as a whole.
+    models : tuple of str
+        Which of `rendering.MODELS` its files can tell: what `write` finds in `Splats.model`.
     """
 
     name: str
     suffix: str
     matches: Callable[[Path, bytes], bool]
     read: Callable[[Path, NDArray[np.uint8]], SplatFile]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Format(Reader):
-    """A format of splat files that is read and written; an output is known by its suffix.
-
-    Attributes
-    ----------
-    name, suffix, matches, read
-        See `Reader`.
-    degree : int
-        Highest degree of harmonics that it holds.
-    loss : str
-        What it does to splats, as a sentence without its subject.
-    write : callable
-        ``write(stream, splats)``; all of the splats can be drawn.
-    sizes : callable or None
-        ``sizes(count, degree)`` returns `Sizes`; None if a file is compressed as a whole.
-    models : tuple of str
-        Which of `rendering.MODELS` its files can tell: what `write` finds in `Splats.model`.
-    """
-
-    degree: int
-    loss: str
-    write: Callable[[BinaryIO, Splats], None]
-    sizes: Callable[[int, int], Sizes] | None
+    write: Callable[[BinaryIO, Splats], None] | None = None
+    degree: int = 0
+    loss: str = ""
+    sizes: Callable[[int, int], tuple[float, int]] | None = None
     models: tuple[Model, ...] = MODELS[:1]
 
-    def sizes_without_more(self, count: int, degree: int) -> Sizes | None:
-        """Return `sizes` of splats of any degree: without the harmonics that it does not hold."""
-        return self.sizes(count, min(degree, self.degree)) if self.sizes else None
+
+def named(suffix: str) -> Callable[[Path, bytes], bool]:
+    """`Format.matches` of files without a signature: by their name, unless they are PLY."""
+    return lambda path, head: (
+        path.suffix.lower() == suffix and bool(head) and not head.startswith(b"ply")
+    )
 
 
 def new_file(
     path: Path, origin: Origin, count: int, degree: int, model: Model = "default"
 ) -> tuple[SplatFile, Splats]:
-    """Return a file of `count` splats whose values are still to be set.
+    """Make a file of `count` splats whose values are still to be set.
 
     The splats have a third scale, whatever their model.
 
@@ -107,19 +85,18 @@ def new_file(
         Views of its rows, to be assigned to.
     """
     rows, splats = empty_rows(count, degree)
-    header = new_header(((name, "float") for name in rows.dtype.names or ()), count)
     nothing = np.empty(0, np.uint8)
-    file = SplatFile(path, rows, with_model(header, model), nothing, nothing, origin=origin)
-    return file, splats
+    header = with_model(new_header(rows.dtype, count), model)
+    return SplatFile(path, rows, header, nothing, nothing, origin=origin), splats
 
 
 def pieces(count: int) -> list[slice]:
-    """Return the slices of ``range(count)`` that are converted at a time."""
+    """Slices of ``range(count)`` that are converted at a time."""
     return chunks(count, CHUNK)
 
 
 def codes(shares: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return shares of 0..1 as the nearest of 0..255; those outside count as the nearer end."""
+    """Shares of 0..1 as the nearest of 0..255; those outside count as the nearer end."""
     return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * 255), np.uint8)
 
 
@@ -132,7 +109,7 @@ def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
 
 
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the three smaller components of unit quaternions, which tell the largest.
+    """Three smaller components of unit quaternions, which tell the largest.
 
     Parameters
     ----------
@@ -153,7 +130,7 @@ def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def join_largest(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the quaternions of `split_largest`, (N, 4)."""
+    """Quaternions of `split_largest`, (N, 4)."""
     left = np.maximum(1.0 - np.einsum("ij,ij->i", others, others), 0.0)
     q = np.empty((len(others), 4))
     np.put_along_axis(q, _OTHERS[largest], others, axis=1)
@@ -166,7 +143,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def near_ones_together(means: NDArray[Any]) -> NDArray[np.int64]:
-    """Return an order of finite positions (N, 3), (N,), in which neighbours in space follow."""
+    """Order of finite positions (N, 3), (N,), in which neighbours in space follow."""
     sample = np.asarray(means[:: max(len(means) // _SAMPLE, 1)], np.float64)
     middle = np.median(sample, axis=0)
     size = float(np.median(np.abs(sample - middle))) or 1.0

@@ -8,17 +8,18 @@ about z into each other, which changes signs only. What nodes do to a primitive 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import struct
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..affine import transformed
 from ..errors import RefineError
-from ..place import Place, described
+from ..place import Place, described, is_whole
 from ..splats import (
     ARRAYS,
     SINGLE_MARGIN,
@@ -30,26 +31,24 @@ from ..splats import (
     scales,
     unit_quaternions,
 )
-from .format import Format, Sizes, codes, new_file, pieces
-from .glb_document import (
-    BINARY,
-    CHUNK,
-    HEADER,
-    JSON,
-    KINDS,
-    MAGIC,
-    SHAPES,
-    VERSION,
-    Document,
-    opened,
-)
+from .format import WXYZ, XYZW, Format, codes, new_file, pieces, refuse_short
 from .ply import Origin, SplatFile
 
 NAME = "GLB"
 EXTENSION = "KHR_gaussian_splatting"
 
+_HEADER = struct.Struct("<4sII")  # magic, version, bytes of all
+_CHUNK = struct.Struct("<I4s")  # bytes, kind
+_MAGIC, _VERSION = b"glTF", 2
+_JSON, _BINARY = b"JSON", b"BIN\0"
 _LONGEST = (1 << 32) - 1
 _DEGREES = 3
+
+_KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+"""glTF's component types that splats may have -> NumPy's."""
+
+_SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+"""Numbers of a value -> the type of its accessor."""
 
 _FLOAT, _BYTE = 5126, 5121
 _POINTS, _VERTICES = 0, 34962
@@ -58,232 +57,245 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Between the frame of captures and that of glTF, either way."""
 
 
-_MOVES = frozenset(("matrix", "translation", "rotation", "scale"))
-"""Members of a node that move what it shows."""
+class _Document(NamedTuple):
+    """A file: its place, its JSON and its binary chunk."""
 
+    place: Place
+    content: dict[str, Any]
+    binary: NDArray[np.uint8]
 
-def matches(_path: Path, head: bytes) -> bool:
-    """Return whether a file is one."""
-    return head.startswith(MAGIC)
+    def item(self, group: str, index: Any, place: Place) -> tuple[dict[str, Any], Place]:
+        """Item of a list such as ``nodes``, and its place; `place` names the index."""
+        items = self.content.get(group, [])
+        count = len(items) if isinstance(items, list) else 0
+        if not is_whole(index) or not 0 <= index < count:
+            place.fail(f"{described(index)} is none of {count} {group}")
+        where = self.place.at(f"{group}[{index}]")
+        return where.members(items[index]), where
 
-
-def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
-    """Read the splats of a binary glTF file, those of all nodes of its scene.
-
-    Raises
-    ------
-    RefineError
-        If it is truncated or damaged, or holds no splats, or holds them in a way that is not read;
-        with the place in the JSON.
-    """
-    document = opened(path, data)
-    meshes = _shown(document, len(data))
-    if not meshes:
-        raise RefineError(
-            f"{path}: no splats: no node of its scene shows a primitive with {EXTENSION}"
-        )
-    count = sum(len(mesh) * len(mesh.nodes) for mesh in meshes)
-    degree = max(mesh.degree for mesh in meshes)
-    file, splats = new_file(path, Origin(f"{NAME} with {EXTENSION}", len(data)), count, degree)
-    for mesh in meshes:
-        mesh.fill(splats)
-    return file
-
-
-def _shown(document: Document, most: int) -> list[_Mesh]:
-    """Return the meshes with splats that the nodes of a scene show, and by which nodes.
-
-    Raise `RefineError` if they show more splats than `most`: one mesh may be shown by many of them.
-    """
-    meshes: dict[int, _Mesh] = {}
-    count = 0
-    for index, place, matrix in _nodes(document):
-        if index not in meshes:
-            meshes[index] = _Mesh(document, index, place)
-        mesh = meshes[index]
-        if len(mesh):
-            mesh.nodes.append(_Node(count, place, matrix))
-        count += len(mesh)
-        if count > most:
-            document.place.fail(
-                f"its nodes show {count} splats or more, expected at most {most}, the bytes of the "
-                "file"
+    def values(self, index: Any, place: Place, width: int) -> tuple[NDArray[Any], float]:
+        """Values of an accessor as they are stored, (n, width), and what they are multiples of."""
+        held, place = self.item("accessors", index, place)
+        kind, shape = held.get("componentType"), held.get("type")
+        if not is_whole(kind) or kind not in _KINDS or shape != _SHAPES[width]:
+            got = f"{described(shape)} of {described(kind)}"
+            place.fail(f"{got}, expected {_SHAPES[width]} of {', '.join(map(str, _KINDS))}")
+        if "sparse" in held or "bufferView" not in held:
+            place.fail("sparse or without values, which splats are not read from")
+        dtype, count = np.dtype(_KINDS[kind]), _whole(held, "count", place)
+        offset = _whole(held, "byteOffset", place, 0)
+        view, where = self.item("bufferViews", held["bufferView"], place)
+        buffer, _ = self.item("buffers", view.get("buffer"), where)
+        if view["buffer"] != 0 or "uri" in buffer or "extensions" in view:
+            where.fail("in another file or compressed, expected the binary chunk")
+        start, length = _whole(view, "byteOffset", where, 0), _whole(view, "byteLength", where)
+        size = dtype.itemsize * width
+        stride = _whole(view, "byteStride", where, 0) or size
+        end = offset + stride * (count - 1) + size if count else 0
+        if stride < size or end > length or start + length > len(self.binary):
+            place.fail(
+                f"{count} values of {size} bytes from byte {offset} of a view of {length} bytes "
+                f"at byte {start} of {len(self.binary)}, expected that they fit"
             )
-    return [mesh for mesh in meshes.values() if mesh.parts]
+        values: NDArray[Any] = np.ndarray(
+            (count, width), dtype, self.binary.data, start + offset, (stride, dtype.itemsize)
+        )
+        shares = dtype.kind != "f" and held.get("normalized", False)
+        return values, float(np.iinfo(dtype).max) if shares else 1.0
 
 
-def _nodes(document: Document) -> Iterator[tuple[int, Place, NDArray[np.float64]]]:
-    """Yield the mesh of each node of a scene that has one, the node's place, its matrix (4, 4)."""
-    if "scenes" not in document.content:
-        return
-    scene, place = document.item(
-        "scenes", document.content.get("scene", 0), document.place.at("scene")
-    )
-    left = [(index, place, np.eye(4)) for index in _listed(scene, "nodes", place)[::-1]]
+class _Part(NamedTuple):
+    """The splats of a primitive."""
+
+    splats: int
+    degree: int
+    logs: bool  # whether scales are held as their logarithms, as in drafts of the extension
+    values: Callable[[str, slice], NDArray[Any]]  # of an attribute without its prefix
+
+
+def _matches(_path: Path, head: bytes) -> bool:
+    return head.startswith(_MAGIC)
+
+
+def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+    """Read the splats of all nodes of a file's scene, each where the node puts it."""
+    document = _opened(path, data)
+    meshes: dict[int, list[_Part]] = {}
+    shown: list[tuple[_Part, NDArray[np.float64], Place]] = []
+    every: list[_Part] = []
+    left: list[tuple[Any, Place, NDArray[np.float64]]] = []
     visited: set[int] = set()
+    count = 0
+    if "scenes" in document.content:
+        place = document.place.at("scene")
+        scene, place = document.item("scenes", document.content.get("scene", 0), place)
+        left = [(index, place, np.eye(4)) for index in _listed(scene, "nodes", place)[::-1]]
     while left:
-        index, above, frame = left.pop()
-        node, place = document.item("nodes", index, above)
+        index, place, matrix = left.pop()
+        node, place = document.item("nodes", index, place)
         if index in visited:
             place.fail("belongs to two nodes, expected a tree")
         visited.add(index)
-        matrix = frame
-        if not _MOVES.isdisjoint(node):
-            with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-                matrix = frame @ _matrix(node, place)
+        with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+            matrix = _moved(matrix, node, place)
         left += [(child, place, matrix) for child in _listed(node, "children", place)[::-1]]
-        if "mesh" in node:
-            document.item("meshes", node["mesh"], place)
-            yield node["mesh"], place, matrix
+        if "mesh" not in node:
+            continue
+        mesh, where = document.item("meshes", node["mesh"], place)
+        if node["mesh"] not in meshes:
+            found = _parts(document, mesh, where)
+            every += found
+            meshes[node["mesh"]] = [part for part in found if part.splats]
+        parts = meshes[node["mesh"]]
+        shown += [(part, matrix, place) for part in parts]
+        count += sum(part.splats for part in parts)
+        if count > len(data):  # many nodes may show one mesh
+            document.place.fail(
+                f"its nodes show {count} splats or more, expected at most {len(data)}, the bytes "
+                "of the file"
+            )
+    if not every:
+        raise RefineError(
+            f"{path}: no splats: no node of its scene shows a primitive with {EXTENSION}"
+        )
+    degree = max(part.degree for part in every)
+    origin = Origin(f"{NAME} with {EXTENSION}", len(data))
+    file, splats = new_file(path, origin, count, degree)
+    start = 0
+    with np.errstate(all="ignore"):  # any number may stand in a file
+        for part, matrix, place in shown:
+            for piece in pieces(part.splats):
+                target = splats.take(slice(start + piece.start, start + piece.stop))
+                _fill(target, part, piece)
+                moved = _placed(target, matrix, place)
+                for name in ARRAYS:
+                    getattr(target, name)[:] = getattr(moved, name)
+            start += part.splats
+    if any(part.logs for part in every):
+        remark = f"{path.name} has negative scales: its scales are read as logarithms"
+        return replace(file, remarks=(remark,))
+    return file
+
+
+def _opened(path: Path, data: NDArray[np.uint8]) -> _Document:
+    """Parse a file's chunks and its JSON."""
+    refuse_short(path, _HEADER.size + _CHUNK.size, len(data), "the first bytes of a GLB file")
+    _, version, length = _HEADER.unpack(data[: _HEADER.size].tobytes())
+    if version != _VERSION:
+        raise RefineError(f"{path}: glTF version {version}, expected {_VERSION}")
+    refuse_short(path, length, len(data), "all chunks")
+    chunks: dict[bytes, NDArray[np.uint8]] = {}
+    at = _HEADER.size
+    while at + _CHUNK.size <= length:
+        size, kind = _CHUNK.unpack(data[at : at + _CHUNK.size].tobytes())
+        at += _CHUNK.size
+        refuse_short(path, at + size, length, f"a chunk at byte {at} and what is before it")
+        chunks.setdefault(kind, data[at : at + size])
+        at += size
+    text = Place(path, "JSON")
+    content = text.members(text.parsed(chunks.get(_JSON, data[:0]).tobytes()))
+    return _Document(Place(path), content, chunks.get(_BINARY, data[:0]))
 
 
 def _listed(holder: dict[str, Any], key: str, place: Place) -> list[Any]:
-    """Return a list, empty if it is not there."""
+    """List, empty if it is not there."""
     return place.at(key).items(holder.get(key, []))
 
 
-def _matrix(node: dict[str, Any], place: Place) -> NDArray[np.float64]:
-    """Return the matrix of a node, (4, 4)."""
+def _whole(holder: dict[str, Any], key: str, place: Place, default: int | None = None) -> int:
+    return place.at(key).whole(holder.get(key, default))
+
+
+def _moved(frame: NDArray[np.float64], node: dict[str, Any], place: Place) -> NDArray[np.float64]:
+    """Frame of a node, (4, 4), in that of the scene; `frame` is that of the node above."""
     if "matrix" in node:
-        columns = place.at("matrix").numbers(node["matrix"], 16)
-        return np.array(columns).reshape(4, 4).T
+        return frame @ np.reshape(place.at("matrix").numbers(node["matrix"], 16), (4, 4)).T
+    if node.keys().isdisjoint(("translation", "rotation", "scale")):
+        return frame
 
-    def numbers(key: str, default: list[float]) -> list[float]:
-        return place.at(key).numbers(node.get(key, default), len(default))
+    def numbers(key: str, *default: float) -> list[float]:
+        return place.at(key).numbers(node.get(key, [*default]), len(default))
 
-    x, y, z, w = numbers("rotation", [0.0, 0.0, 0.0, 1.0])
+    turn = np.array(numbers("rotation", 0.0, 0.0, 0.0, 1.0))[WXYZ]
     matrix = np.eye(4)
-    scale = numbers("scale", [1.0, 1.0, 1.0])
-    matrix[:3, :3] = rotation_matrices(np.array([w, x, y, z])) * scale
-    matrix[:3, 3] = numbers("translation", [0.0, 0.0, 0.0])
-    return matrix
+    matrix[:3, :3] = rotation_matrices(turn) * numbers("scale", 1.0, 1.0, 1.0)
+    matrix[:3, 3] = numbers("translation", 0.0, 0.0, 0.0)
+    return frame @ matrix
 
 
-def _refuse_unread(extension: Any, place: Place) -> None:
-    """Refuse splats of another kernel, and compressed ones."""
-    held = extension if isinstance(extension, dict) else {}
-    kernel = held.get("kernel", "ellipse")
-    if kernel != "ellipse":
-        place.fail(f'splats of kernel {described(kernel)}, expected "ellipse"')
-    more = held.get("extensions")
-    if isinstance(more, dict) and more:
-        name = described(next(iter(more)))
-        place.fail(f"splats by {name}, expected plain accessors")
+def _parts(document: _Document, mesh: dict[str, Any], place: Place) -> list[_Part]:
+    """Primitives of splats of a mesh."""
+    parts = []
+    for number, item in enumerate(_listed(mesh, "primitives", place)):
+        where = place.at(f"primitives[{number}]")
+        primitive = where.members(item)
+        extensions = primitive.get("extensions")
+        if not isinstance(extensions, dict) or EXTENSION not in extensions:
+            continue
+        extension = extensions[EXTENSION] if isinstance(extensions[EXTENSION], dict) else {}
+        kernel, more = extension.get("kernel", "ellipse"), extension.get("extensions")
+        if kernel != "ellipse":
+            where.fail(f'splats of kernel {described(kernel)}, expected "ellipse"')
+        if isinstance(more, dict) and more:
+            where.fail(f"splats by {described(next(iter(more)))}, expected plain accessors")
+        if primitive.get("mode", 4) != _POINTS:
+            where.at("mode").fail(f"expected {_POINTS}, got {described(primitive.get('mode', 4))}")
+        parts.append(_part(document, primitive.get("attributes"), where.at("attributes")))
+    return parts
 
 
-@dataclass(frozen=True)
-class _Node:
-    """A node that shows a mesh."""
+def _part(document: _Document, attributes: Any, place: Place) -> _Part:
+    """Look up the attributes of a primitive of splats."""
+    attributes = place.members(attributes)
+    degree, count = 0, 0
+    while degree < _DEGREES and f"{EXTENSION}:{_harmonic(degree + 1, 0)}" in attributes:
+        degree += 1
+    held = {}
+    wanted = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1}
+    for name, width in (wanted | dict.fromkeys(_harmonics(degree), 3)).items():
+        key = name if name == "POSITION" else f"{EXTENSION}:{name}"
+        if key not in attributes:
+            place.fail(f"no {key}")
+        held[name] = document.values(attributes[key], place.at(key), width)
+        count = len(held["POSITION"][0])
+        if len(held[name][0]) != count:
+            got = len(held[name][0])
+            place.at(key).fail(f"{got} values, expected {count} as for POSITION")
 
-    start: int  # row of the file's splats at which those of this node begin
-    place: Place
-    matrix: NDArray[np.float64]  # (4, 4), from the frame of the mesh to that of the scene
+    def values(name: str, piece: slice) -> NDArray[Any]:
+        stored, unit = held[name]
+        return stored[piece] if unit == 1.0 else np.maximum(stored[piece] / unit, -1.0)
 
-
-class _Mesh:
-    """The splats of a mesh; `place` is that of the node that shows it first."""
-
-    def __init__(self, document: Document, index: int, place: Place) -> None:
-        self.parts: list[_Part] = []  # its primitives of splats
-        # The nodes that show it, in the order of their splats; empty if it has no splats.
-        self.nodes: list[_Node] = []
-        mesh, place = document.item("meshes", index, place)
-        for number, item in enumerate(_listed(mesh, "primitives", place)):
-            where = place.at(f"primitives[{number}]")
-            primitive = where.members(item)
-            extensions = primitive.get("extensions")
-            if isinstance(extensions, dict) and EXTENSION in extensions:
-                _refuse_unread(extensions[EXTENSION], where)
-                self.parts.append(_Part(document, primitive, where))
-        self.degree = max((part.degree for part in self.parts), default=0)
-        self._count = sum(map(len, self.parts))
-
-    def __len__(self) -> int:
-        return self._count
-
-    def fill(self, splats: Splats) -> None:
-        """Set the values of all splats that its nodes show, among all `splats` of the file."""
-        if not self.nodes:
-            return
-        first, *others = (splats.take(slice(n.start, n.start + len(self))) for n in self.nodes)
-        at = 0
-        with np.errstate(all="ignore"):  # any number may stand in a file
-            for part in self.parts:
-                part.fill(first.take(slice(at, at + len(part))))
-                at += len(part)
-            # The first node last: the splats of the others are computed from its untouched ones.
-            for node, target in reversed([*zip(self.nodes, (first, *others), strict=True)]):
-                for piece in pieces(len(self)):
-                    shown_there = self._moved(first.take(piece), node)
-                    for name in ARRAYS:
-                        getattr(target, name)[piece] = getattr(shown_there, name)
-
-    def _moved(self, splats: Splats, node: _Node) -> Splats:
-        """Return splats as a node shows them, in the frame of captures."""
-        if np.array_equal(node.matrix, np.eye(4)):
-            return _half_turned(splats)
-        try:
-            return transformed(splats, _HALF_TURN @ node.matrix)
-        except RefineError as error:
-            node.place.fail(str(error))
+    logs = any((values("SCALE", piece) < 0.0).any() for piece in pieces(count))
+    return _Part(count, degree, logs, values)
 
 
-class _Part:
-    """The splats of one primitive."""
-
-    def __init__(self, document: Document, primitive: dict[str, Any], place: Place) -> None:
-        self._document, self._place = document, place.at("attributes")
-        self._attributes = attributes = self._place.members(primitive.get("attributes"))
-        mode = primitive.get("mode", 4)
-        if mode != _POINTS:
-            place.at("mode").fail(f"expected {_POINTS}, got {described(mode)}")
-        self.degree = 0
-        while self.degree < _DEGREES and _harmonic(self.degree + 1, 0) in attributes:
-            self.degree += 1
-        self._means = self._values("POSITION", 3)
-        self._turns = self._values(f"{EXTENSION}:ROTATION", 4)
-        self._scales = self._values(f"{EXTENSION}:SCALE", 3)
-        self._opacities = self._values(f"{EXTENSION}:OPACITY", 1)
-        self._harmonics = [self._values(name, 3) for name in _harmonics(self.degree)]
-
-    def __len__(self) -> int:
-        return self._count
-
-    def _values(self, name: str, width: int) -> Callable[[slice], NDArray[Any]]:
-        """Return a function that returns a slice of the values of an attribute, (n, width)."""
-        if name not in self._attributes:
-            self._place.fail(f"no {name}")
-        index, place = self._attributes[name], self._place.at(name)
-        values = self._document.accessor(index, place, width)
-        if name == "POSITION":
-            self._count = len(values)
-        if len(values) != self._count:
-            place.fail(f"{len(values)} values, expected {self._count} as for POSITION")
-        if values.dtype.kind != "f" and self._document.normalized(index):
-            largest = np.iinfo(values.dtype).max
-            return lambda piece: np.maximum(values[piece] / largest, -1.0)
-        return lambda piece: values[piece]
-
-    def fill(self, splats: Splats) -> None:
-        """Set the values of `splats`, one for each of these; harmonics that are absent are 0."""
-        for piece in pieces(len(splats)):
-            target = splats.take(piece)
-            target.means[:] = self._means(piece)
-            target.log_scales[:] = np.log(self._scales(piece), dtype=np.float32)
-            target.quaternions[:] = self._turns(piece)[:, _WXYZ]
-            target.opacity_logits[:] = opacity_logits(self._opacities(piece)[:, 0], SINGLE_MARGIN)
-            target.sh_rest[:] = 0.0
-            constant, *others = self._harmonics
-            target.sh_dc[:] = constant(piece)
-            for index, values in enumerate(others):
-                target.sh_rest[:, index] = values(piece)
+def _fill(target: Splats, part: _Part, piece: slice) -> None:
+    """Set splats to those of a piece of a primitive; harmonics that are absent are 0."""
+    target.means[:] = part.values("POSITION", piece)
+    sizes = part.values("SCALE", piece)
+    target.log_scales[:] = sizes if part.logs else np.log(sizes, dtype=np.float32)
+    target.quaternions[:] = part.values("ROTATION", piece)[:, WXYZ]
+    target.opacity_logits[:] = opacity_logits(part.values("OPACITY", piece)[:, 0], SINGLE_MARGIN)
+    target.sh_rest[:] = 0.0
+    constant, *others = _harmonics(part.degree)
+    target.sh_dc[:] = part.values(constant, piece)
+    for index, name in enumerate(others):
+        target.sh_rest[:, index] = part.values(name, piece)
 
 
-_XYZW, _WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
+def _placed(splats: Splats, matrix: NDArray[np.float64], place: Place) -> Splats:
+    """Splats as a node shows them, in the frame of captures."""
+    if np.array_equal(matrix, np.eye(4)):
+        return _half_turned(splats)
+    try:
+        return transformed(splats, _HALF_TURN @ matrix)
+    except RefineError as error:
+        place.fail(str(error))
 
 
 def _half_turned(splats: Splats) -> Splats:
-    """Return splats turned half about z, to the bit: see `_HALF_TURN`."""
+    """Splats turned half about z, to the bit: see `_HALF_TURN`."""
     w, x, y, z = splats.quaternions.T
     # Half a turn multiplies the harmonic of order m by (-1)^m.
     degree = splats.sh_degree
@@ -301,16 +313,15 @@ def _half_turned(splats: Splats) -> Splats:
 
 
 def _harmonic(degree: int, order: int) -> str:
-    return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{order}"
+    return f"SH_DEGREE_{degree}_COEF_{order}"
 
 
 def _harmonics(degree: int) -> list[str]:
-    """Return the names of all coefficients up to a degree, the constant first."""
+    """Names of all coefficients up to a degree, the constant first."""
     return [_harmonic(band, n) for band in range(degree + 1) for n in range(2 * band + 1)]
 
 
-@dataclass(frozen=True)
-class _Attribute:
+class _Attribute(NamedTuple):
     """An attribute as it is written."""
 
     name: str
@@ -321,47 +332,38 @@ class _Attribute:
     @property
     def row(self) -> int:
         """Bytes of one splat."""
-        return self.width * np.dtype(KINDS[self.kind]).itemsize
+        return self.width * np.dtype(_KINDS[self.kind]).itemsize
 
 
 def _attributes(degree: int) -> list[_Attribute]:
-    """Return what is written, in the order of the binary chunk."""
-
-    def opaque(splats: Splats) -> NDArray[Any]:
-        return opacity(splats.opacity_logits)[:, None]
+    """What is written, in the order of the binary chunk."""
 
     def color(splats: Splats) -> NDArray[Any]:
-        return codes(np.hstack([base_color(splats.sh_dc), opaque(splats)]))
-
-    def scale(splats: Splats) -> NDArray[Any]:
-        return scales(splats.log_scales)
-
-    def turn(splats: Splats) -> NDArray[Any]:
-        return unit_quaternions(splats.quaternions)[:, _XYZW]
+        return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
 
     def harmonic(index: int) -> Callable[[Splats], NDArray[Any]]:
         return lambda splats: splats.sh_rest[:, index]
 
     constant, *others = _harmonics(degree)
+    written = {
+        "ROTATION": (4, lambda splats: unit_quaternions(splats.quaternions)[:, XYZW]),
+        "SCALE": (3, lambda splats: scales(splats.log_scales)),
+        "OPACITY": (1, lambda splats: opacity(splats.opacity_logits)[:, None]),
+        constant: (3, lambda splats: splats.sh_dc),
+        **{name: (3, harmonic(index)) for index, name in enumerate(others)},
+    }
     return [
         _Attribute("POSITION", 3, _FLOAT, lambda splats: splats.means),
         _Attribute("COLOR_0", 4, _BYTE, color),
-        _Attribute(f"{EXTENSION}:ROTATION", 4, _FLOAT, turn),
-        _Attribute(f"{EXTENSION}:SCALE", 3, _FLOAT, scale),
-        _Attribute(f"{EXTENSION}:OPACITY", 1, _FLOAT, opaque),
-        _Attribute(constant, 3, _FLOAT, lambda splats: splats.sh_dc),
-        *(_Attribute(name, 3, _FLOAT, harmonic(index)) for index, name in enumerate(others)),
+        *(
+            _Attribute(f"{EXTENSION}:{name}", width, _FLOAT, values)
+            for name, (width, values) in written.items()
+        ),
     ]
 
 
-def write(stream: BinaryIO, splats: Splats) -> None:
-    """Write splats as a binary glTF file with one node.
-
-    Raises
-    ------
-    RefineError
-        If the file would be longer than 4 GiB, which its format cannot say.
-    """
+def _write(stream: BinaryIO, splats: Splats) -> None:
+    """Write splats as a file with one node; refuse more than 4 GiB, which it cannot say."""
     attributes = _attributes(splats.sh_degree)
     with np.errstate(under="ignore", over="ignore"):  # doubles that are no floats
         means = np.asarray(splats.means, np.float32)
@@ -373,34 +375,30 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         )
         text = _json(attributes, len(splats), (low + 0.0).tolist(), (high + 0.0).tolist())
         body = len(splats) * sum(attribute.row for attribute in attributes)
-        total = HEADER.size + 2 * CHUNK.size + len(text) + body
+        total = _HEADER.size + 2 * _CHUNK.size + len(text) + body
         if total > _LONGEST:
             raise RefineError(
                 f"{len(splats)} splats are {total} bytes as {NAME}, which holds {_LONGEST}"
             )
-        stream.write(HEADER.pack(MAGIC, VERSION, total) + CHUNK.pack(len(text), JSON) + text)
-        stream.write(CHUNK.pack(body, BINARY))
+        stream.write(_HEADER.pack(_MAGIC, _VERSION, total) + _CHUNK.pack(len(text), _JSON) + text)
+        stream.write(_CHUNK.pack(body, _BINARY))
         for attribute in attributes:
             for piece in pieces(len(splats)):
                 values = attribute.values(_half_turned(splats.take(piece)))
-                stream.write(np.ascontiguousarray(values, KINDS[attribute.kind]).data)
+                stream.write(np.ascontiguousarray(values, _KINDS[attribute.kind]).data)
 
 
 def _json(attributes: list[_Attribute], count: int, low: list[float], high: list[float]) -> bytes:
-    """Return the JSON of a file, padded with spaces to a multiple of 4 bytes."""
+    """JSON of a file, padded with spaces to a multiple of 4 bytes."""
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     at = 0
     for index, attribute in enumerate(attributes):
         length = attribute.row * count
         views.append({"buffer": 0, "byteOffset": at, "byteLength": length, "target": _VERTICES})
+        kind, shape = attribute.kind, _SHAPES[attribute.width]
         accessors.append(
-            {
-                "bufferView": index,
-                "componentType": attribute.kind,
-                "count": count,
-                "type": SHAPES[attribute.width],
-            }
+            {"bufferView": index, "componentType": kind, "count": count, "type": shape}
         )
         at += length
     accessors[0].update(min=low, max=high)
@@ -425,13 +423,14 @@ def _json(attributes: list[_Attribute], count: int, low: list[float], high: list
     return text + b" " * (-len(text) % 4)
 
 
-def sizes(count: int, degree: int) -> Sizes:
-    """Return how large a file is, at most: its JSON has numbers of unknown length."""
+def _sizes(count: int, degree: int) -> tuple[float, int]:
+    """Bytes of a splat and of the rest, at most: its JSON has numbers of unknown length."""
     attributes = _attributes(degree)
     longest = [-1.1754943508222875e-38] * 3
     text = _json(attributes, count, longest, longest)
-    fixed = HEADER.size + 2 * CHUNK.size + len(text)
-    return Sizes(sum(attribute.row for attribute in attributes), fixed)
+    return sum(attribute.row for attribute in attributes), (
+        _HEADER.size + 2 * _CHUNK.size + len(text)
+    )
 
 
 FORMAT = Format(
@@ -439,8 +438,8 @@ FORMAT = Format(
     suffix=".glb",
     degree=_DEGREES,
     loss="holds activated values in single precision, with y up",
-    matches=matches,
-    read=read,
-    write=write,
-    sizes=sizes,
+    matches=_matches,
+    read=_read,
+    write=_write,
+    sizes=_sizes,
 )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..place import Place
 from ..splats import SH_C0, Splats, above_constant, opacity_logits, unit_quaternions
-from .format import Reader, new_file, pieces, refuse_short
+from .format import Format, named, new_file, pieces, refuse_short
 from .ply import Origin, SplatFile
 
 NAME = ".ksplat"
@@ -58,85 +57,49 @@ class _Section(NamedTuple):
     degree: int
 
     @property
-    def before_rows(self) -> int:
-        """Bytes of lengths and centres of buckets."""
-        return 4 * self.partial + self.bucket_bytes * self.bucket_count
+    def rows(self) -> int:
+        """Where its rows begin: behind lengths and centres of buckets."""
+        return self.start + 4 * self.partial + self.bucket_bytes * self.bucket_count
 
 
-@dataclass(frozen=True)
-class _Header:
-    """What the first bytes say."""
-
-    sections: int
-    count: int
-    level: int
-    least: float
-    largest: float
-
-    def row(self, degree: int) -> np.dtype[Any]:
-        """Return what is stored of a splat: rotation is w x y z, colour has opacity behind."""
-        mean, number = ("<f4", "<f4") if self.level == 0 else ("<u2", "<f2")
-        rest = ("<f4", "<f2", "u1")[self.level]
-        return np.dtype(
-            [
-                ("mean", mean, 3),
-                ("scale", number, 3),
-                ("rotation", number, 4),
-                ("color", "u1", 4),
-                ("rest", rest, 3 * above_constant(degree)),
-            ]
-        )
+def _row(level: int, degree: int) -> np.dtype[Any]:
+    """What is stored of a splat: rotation is w x y z, colour has opacity behind."""
+    mean, number = ("<f4", "<f4") if level == 0 else ("<u2", "<f2")
+    rest = ("<f4", "<f2", "u1")[level], 3 * above_constant(degree)
+    fields = [("mean", mean, 3), ("scale", number, 3), ("rotation", number, 4)]
+    return np.dtype([*fields, ("color", "u1", 4), ("rest", *rest)])
 
 
-def matches(path: Path, head: bytes) -> bool:
-    """Return whether a file is taken for one: by its name, unless it is a PLY."""
-    return path.suffix.lower() == READER.suffix and bool(head) and not head.startswith(b"ply")
-
-
-def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
-    """Read a ``.ksplat`` file.
-
-    Raises
-    ------
-    RefineError
-        If it is truncated or damaged, or of another version.
-    """
-    header = _parsed(path, data)
-    sections = list(_sections(path, data, header))
-    count = sum(section.splats for section in sections)
-    if count != header.count:
-        Place(path).fail(f"{header.count} splats by byte 16, {count} by the sections")
-    degree = max((section.degree for section in sections if section.splats), default=0)
-    origin = Origin(f"{NAME} level {header.level}", len(data))
-    file, splats = new_file(path, origin, count, degree)
-    splats.sh_rest[:] = 0.0
-    start = 0
-    # Any bits may stand in a file: scales that are no sizes, ranges that are no numbers.
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
-        for section in sections:
-            _fill(splats.take(slice(start, start + section.splats)), header, section, data)
-            start += section.splats
-    return file
-
-
-def _parsed(path: Path, data: NDArray[np.uint8]) -> _Header:
-    """Return what the first bytes say, or refuse them."""
+def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     refuse_short(path, _HEADER_BYTES, len(data), "the first bytes of a .ksplat file")
     fields = _HEADER.unpack(data[: _HEADER.size].tobytes())
-    major, minor, sections, count, level, least, largest = fields
+    major, minor, number, announced, level, least, largest = fields
     if (major, minor) != (0, 1):
         Place(path).fail(f".ksplat version {major}.{minor}, expected 0.1")
     if level >= _LEVELS:
         Place(path).fail(f"byte 20: compression level {level}, expected 0 to {_LEVELS - 1}")
-    needed = _HEADER_BYTES + sections * _SECTION_BYTES
-    refuse_short(path, needed, len(data), f"the headers of {sections} sections")
-    return _Header(sections, count, level, least or -_HARMONICS, largest or _HARMONICS)
+    sections = list(_sections(path, data, number, level))
+    count = sum(section.splats for section in sections)
+    if count != announced:
+        Place(path).fail(f"{announced} splats by byte 16, {count} by the sections")
+    degree = max((section.degree for section in sections if section.splats), default=0)
+    file, splats = new_file(path, Origin(f"{NAME} level {level}", len(data)), count, degree)
+    splats.sh_rest[:] = 0.0
+    limits = np.float32(least or -_HARMONICS), np.float32(largest or _HARMONICS)
+    start = 0
+    # Any bits may stand in a file: scales that are no sizes, ranges that are no numbers.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
+        for section in sections:
+            _fill(splats.take(slice(start, start + section.splats)), level, limits, section, data)
+            start += section.splats
+    return file
 
 
-def _sections(path: Path, data: NDArray[np.uint8], header: _Header) -> Iterator[_Section]:
+def _sections(path: Path, data: NDArray[np.uint8], count: int, level: int) -> Iterator[_Section]:
     """Yield the sections; refuse those that reach beyond the end of the file."""
-    start = _HEADER_BYTES + header.sections * _SECTION_BYTES
-    for number in range(header.sections):
+    start = _HEADER_BYTES + count * _SECTION_BYTES
+    refuse_short(path, start, len(data), f"the headers of {count} sections")
+    for number in range(count):
         at = _HEADER_BYTES + number * _SECTION_BYTES
         place = Place(path, f"section {number}")
         fields = _SECTION.unpack(data[at : at + _SECTION.size].tobytes())
@@ -146,19 +109,24 @@ def _sections(path: Path, data: NDArray[np.uint8], header: _Header) -> Iterator[
             place.fail(f"harmonics of degree {section.degree}, expected 0 to {_DEGREES - 1}")
         if section.splats > section.room:
             place.fail(f"{section.splats} splats, expected at most {section.room}, its room")
-        if header.level and section.bucket_bytes != 12:
+        if level and section.bucket_bytes != 12:
             place.fail(f"{section.bucket_bytes} bytes of a bucket, expected 12")
-        start += section.before_rows + header.row(section.degree).itemsize * section.room
+        start = section.rows + _row(level, section.degree).itemsize * section.room
         refuse_short(path, start, len(data), f"section {number} and what is before it")
         yield section
 
 
-def _fill(splats: Splats, header: _Header, section: _Section, data: NDArray[np.uint8]) -> None:
-    """Set the splats of a section."""
-    start = section.start + section.before_rows
-    dtype = header.row(section.degree)
-    stored = data[start : start + section.splats * dtype.itemsize].view(dtype)
-    centers, buckets = _buckets(section, data) if header.level else (None, None)
+def _fill(
+    splats: Splats,
+    level: int,
+    limits: tuple[np.float32, np.float32],
+    section: _Section,
+    data: NDArray[np.uint8],
+) -> None:
+    """Set the splats of a section; `limits` are those of its harmonics in level 2."""
+    dtype = _row(level, section.degree)
+    stored = data[section.rows : section.rows + section.splats * dtype.itemsize].view(dtype)
+    centers, buckets = _buckets(section, data) if level else (None, None)
     step = section.block / 2.0 / section.middle
     for piece in pieces(section.splats):
         rows = stored[piece]
@@ -172,20 +140,26 @@ def _fill(splats: Splats, header: _Header, section: _Section, data: NDArray[np.u
         shares = rows["color"] / 255.0  # (n, 4)
         splats.sh_dc[piece] = (shares[:, :3] - 0.5) / SH_C0
         splats.opacity_logits[piece] = opacity_logits(shares[:, 3])
-        splats.sh_rest[piece, : above_constant(section.degree)] = _harmonics(rows["rest"], header)
+        values, at = rows["rest"].astype(np.float32), 0
+        if level == 2:
+            values = limits[0] + values / np.float32(255.0) * (limits[1] - limits[0])
+        for band in range(1, section.degree + 1):  # each is red, then green, then blue
+            width = 2 * band + 1
+            one = values[:, 3 * at : 3 * (at + width)].reshape(-1, 3, width)
+            splats.sh_rest[piece, at : at + width] = one.swapaxes(1, 2)
+            at += width
 
 
 def _buckets(
     section: _Section, data: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Return the centres of the buckets (B, 3), and in which bucket each splat lies.
+    """Centres of the buckets (B, 3), and in which bucket each splat lies.
 
     Full buckets come first; the lengths of the others stand before the centres.
     """
     middle = section.start + 4 * section.partial
     lengths = data[section.start : middle].view("<u4").astype(np.int64)
-    end = middle + section.bucket_bytes * section.bucket_count
-    centers = data[middle:end].view("<f4").reshape(-1, 3)
+    centers = data[middle : section.rows].view("<f4").reshape(-1, 3)
     rows = np.arange(section.splats)
     in_full = min(section.full * section.bucket_size, section.splats)
     bucket = rows // max(section.bucket_size, 1)
@@ -197,20 +171,4 @@ def _buckets(
     return centers, bucket
 
 
-def _harmonics(stored: NDArray[Any], header: _Header) -> NDArray[Any]:
-    """Return harmonics (n, K, 3): each band is stored red, then green, then blue."""
-    values = stored.astype(np.float32)
-    if header.level == 2:
-        low, high = np.float32(header.least), np.float32(header.largest)
-        values = low + values / np.float32(255.0) * (high - low)
-    bands: list[NDArray[np.float32]] = []
-    at = 0
-    while at < values.shape[1]:
-        width = 2 * len(bands) + 3
-        band = values[:, at : at + 3 * width].reshape(-1, 3, width)
-        bands.append(band.swapaxes(1, 2))
-        at += 3 * width
-    return np.concatenate(bands, axis=1) if bands else values.reshape(len(values), 0, 3)
-
-
-READER = Reader(name=NAME, suffix=".ksplat", matches=matches, read=read)
+READER = Format(name=NAME, suffix=NAME, matches=named(NAME), read=_read)

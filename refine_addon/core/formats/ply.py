@@ -1,75 +1,89 @@
-"""3DGS PLY files: read through a memory map, and written with the kept rows unchanged.
+"""Plain 3DGS PLY: read through a memory map, and written with the kept rows unchanged.
 
-Binary rows are memory-mapped, so only the columns that are used are read from the disk. Text is
-read into memory.
+Only the columns that are used are read from the disk. Text is parsed into memory and written as
+binary. plyfile parses the header. It gets the header without comments (which may be in any
+encoding), with plain line ends, and with row counts of 0, since it would allocate memory for the
+rows.
 """
 
 from __future__ import annotations
 
+import io
 import mmap
+import re
 import stat
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import plyfile
 from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
+from ..execute import chunks, run
+from ..foreign_files import refuse_foreign_splats
 from ..rendering import MODELS, Model
 from ..splats import Splats
 from ..splats import with_model as drawn_as
 from ..urls import Url
 from ..whole_file import expanded, refuse_mapped, whole_file
-from .ply_body import check_counts, read_text, vertex_range
-from .ply_columns import (
-    REQUIRED,
-    REST_COUNTS,
-    THIRD_SCALE,
-    columns_from_splats,
-    splats_from_columns,
-)
-from .ply_header import (
-    TEXT,
-    Header,
-    format_of,
-    model_of,
-    read_header,
-    shown,
-    with_count,
-    with_model,
-    with_properties,
-)
-from .ply_write import declarations, longest_line, text_lines, write_rows
+from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, splats_from_columns
 
-__all__ = [
-    "REQUIRED",
-    "REST_COUNTS",
-    "SplatFile",
-    "columns_from_splats",
-    "read_ply",
-    "splats_from_columns",
-]
+HEADER_LIMIT = 1 << 20
+"""Longest header that is read, bytes."""
+
+TEXT = "="
+"""Byte order for ASCII files: their numbers are stored in that of the machine."""
+
+PLY_TYPES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
+"""Names of types in NumPy -> in PLY."""
 
 INDEXING = ("edge", "face", "tristrips")
 """Elements that by convention hold indices of vertices."""
 
 _NAMES_SHOWN = 12
 
+_MODES: dict[Model, bytes] = {"default": b"default", "antialiased": b"mip", "2dgs": b"2dgs"}
+"""Model -> Brush's word for it, in a comment ``SplatRenderMode: WORD``. Postshot's is
+``antialiased 0`` or ``1``."""
 
-@dataclass(frozen=True)
-class Origin:
-    """The file that rows come from, where it is no plain PLY.
+_MODEL_COMMENT = re.compile(
+    rb"comment[ \t]+(?:splatrendermode:[ \t]*(default|mip|2dgs)|antialiased[ \t]+([01]))[ \t\r]*",
+    re.IGNORECASE,
+)
 
-    Attributes
-    ----------
-    format : str
-        Name and version of its format.
-    size : int
-        Its bytes.
-    """
+_END = {
+    b"\n": re.compile(rb"\n[ \t]*end_header[ \t]*\r?\n"),
+    b"\r\n": re.compile(rb"\r\n[ \t]*end_header[ \t]*\r\n"),
+    b"\r": re.compile(rb"\r[ \t]*end_header[ \t]*\r"),
+}
+"""End of a header, for each kind of line end. Only that of the first line is looked for, since
+bytes of the body may look like another."""
+
+_ROWS = 1 << 12
+"""Rows copied at a time: 1 MB at degree 3, which stays in the L2 cache until it is written."""
+
+_CHANGED_ROWS = 1 << 14
+"""Rows copied at a time where columns are set, which takes a few calls for each of them."""
+
+_AHEAD = 16
+"""So many chunks may wait for those before them to be written."""
+
+
+class Origin(NamedTuple):
+    """Format and bytes of the file that rows come from, where it is no binary PLY."""
 
     format: str
     size: int
@@ -89,12 +103,12 @@ class SplatFile:
         The bytes of the header, with ``end_header`` and its line end.
     before, after : (M,) uint8
         Bytes of the body before and after the vertex rows.
-    lines : list of bytes or None
-        For ASCII files, the text of each vertex row with its line end.
     indexing : tuple of str
         Names of other elements whose rows hold indices of splats.
     origin : Origin or None
-        Where the file is no plain PLY, what it is; `write` writes a plain PLY.
+        What the file is, where it is no binary PLY; `write` writes a binary PLY.
+    remarks : tuple of str
+        What the user should know of how it was read, in sentences.
     """
 
     path: Path
@@ -102,29 +116,18 @@ class SplatFile:
     header: bytes
     before: NDArray[np.uint8]
     after: NDArray[np.uint8]
-    lines: list[bytes] | None = None
     indexing: tuple[str, ...] = ()
     origin: Origin | None = None
+    remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of splats."""
         return len(self.rows)
 
     @property
-    def row_bytes(self) -> int | NDArray[np.int64]:
-        """Bytes of one splat in the file; of each of them, (N,), if rows are text."""
-        if self.lines is not None:
-            return np.fromiter(map(len, self.lines), np.int64, len(self.lines))
+    def row_bytes(self) -> int:
+        """Bytes of one splat in the file."""
         return int(self.rows.dtype.itemsize)
-
-    @property
-    def changed_row_bytes(self) -> int:
-        """Most bytes of one splat in the file after absorbing, which may change all its numbers."""
-        if self.lines is None:
-            return int(self.rows.dtype.itemsize)
-        names = self.rows.dtype.names or ()
-        ours = [name for name in names if name in REQUIRED or name.startswith("f_rest_")]
-        return longest_line(self.rows.dtype, self.lines, ours)
 
     @property
     def fixed_bytes(self) -> int:
@@ -141,47 +144,13 @@ class SplatFile:
         """Size of the file that was read, bytes."""
         return self.size() if self.origin is None else self.origin.size
 
-    def size(
-        self,
-        keep: NDArray[np.bool_] | None = None,
-        columns: Mapping[str, NDArray[Any]] | None = None,
-    ) -> int:
-        """Return how many bytes `write` would write.
-
-        Parameters
-        ----------
-        keep, columns
-            See `write`.
-        """
-        columns = columns or {}
-        if self.lines is None:
-            count = len(self) if keep is None else int(np.count_nonzero(keep))
-            names = self.rows.dtype.names or ()
-            kinds = [columns[name].dtype for name in columns if name not in names]
-            rows = count * (self.rows.dtype.itemsize + sum(kind.itemsize for kind in kinds))
-        else:
-            rows = sum(map(len, text_lines(self.rows, self.lines, keep, columns)))
-        return len(self._new_header(keep, columns)) + len(self.before) + rows + len(self.after)
-
-    def notes(self, keep: NDArray[np.bool_]) -> list[str]:
-        """Return what the user should know about a file of the kept rows, in sentences."""
-        return [
-            f"element '{name}' beside the splats is kept as it is; "
-            "its indices may point past the end"
-            for name in ([] if keep.all() else self.indexing)
-        ]
-
-    def left_out(self, _keep: NDArray[np.bool_]) -> int:
-        """Return how many of the kept rows a file does not hold: none."""
-        return 0
-
     @property
     def model(self) -> Model:
         """How its splats are drawn, by its header; discs if they have no third scale."""
         return stated_model(self.header, self.rows.dtype) or "default"
 
     def drawn_as(self, model: Model | None) -> SplatFile:
-        """Return the file with splats that are drawn in another way; None leaves it as it is.
+        """File with splats that are drawn in another way; None leaves it as it is.
 
         Raises
         ------
@@ -199,23 +168,48 @@ class SplatFile:
         return replace(self, header=with_model(self.header, model))
 
     def without_third_scale(self) -> SplatFile:
-        """Return discs of another format without the third scale that it has a place for.
-
-        Rows of a plain PLY stay as they are, and so do splats that are no discs.
-        """
+        """Discs without a third scale; splats that are no discs stay as they are."""
         names = self.rows.dtype.names or ()
-        if self.origin is None or self.model != "2dgs" or THIRD_SCALE not in names:
+        if self.model != "2dgs" or THIRD_SCALE not in names:
             return self
         left = [name for name in names if name != THIRD_SCALE]
         rows = np.empty(len(self), [(name, self.rows.dtype[name]) for name in left])
         for name in left:
             rows[name] = self.rows[name]
-        third = f"property float {THIRD_SCALE}\n".encode()  # as `new_file` writes it
-        return replace(self, rows=rows, header=self.header.replace(third, b""))
+        return replace(
+            self, rows=rows, header=with_model(new_header(rows.dtype, len(rows)), "2dgs")
+        )
 
     def splats(self) -> Splats:
-        """Return the rows as splats; the arrays are views of the file if its layout permits."""
+        """Rows as splats; the arrays are views of the file if its layout permits."""
         return drawn_as(splats_from_columns(self.rows), self.model)
+
+    def size(
+        self,
+        keep: NDArray[np.bool_] | None = None,
+        columns: Mapping[str, NDArray[Any]] | None = None,
+    ) -> int:
+        """Bytes that `write` would write.
+
+        Parameters
+        ----------
+        keep, columns
+            See `write`.
+        """
+        header, row = self._layout(keep, columns or {})
+        count = len(self) if keep is None else int(np.count_nonzero(keep))
+        return len(header) + len(self.before) + count * row.itemsize + len(self.after)
+
+    def notes(self, keep: NDArray[np.bool_]) -> list[str]:
+        """What the user should know about a file of the kept rows, in sentences."""
+        return [
+            *self.remarks,
+            *(
+                f"element '{name}' beside the splats is kept as it is; "
+                "its indices may point past the end"
+                for name in ([] if keep.all() else self.indexing)
+            ),
+        ]
 
     def write(
         self,
@@ -226,7 +220,7 @@ class SplatFile:
         overwrite: bool = False,
         threads: int | None = 1,
     ) -> None:
-        """Write the kept rows in order; their bytes stay as they were read.
+        """Write the kept rows in order as binary; their bytes stay as they were read.
 
         Parameters
         ----------
@@ -240,7 +234,7 @@ class SplatFile:
         overwrite : bool
             Whether an existing file may be replaced, even this one.
         threads : int, optional
-            How many gather rows of a binary file, while others are written.
+            How many gather rows, while others are written.
 
         Raises
         ------
@@ -254,38 +248,57 @@ class SplatFile:
                 f"{self.path}: keep is {keep.dtype} {keep.shape}, "
                 f"expected one bool for each of {len(self)} splats"
             )
-        header = self._new_header(keep, columns)
-        if self.lines is None and not self.rows.flags.writeable:
+        header, _ = self._layout(keep, columns)
+        if not self.rows.flags.writeable:
             refuse_mapped(path, self.path)
         with whole_file(path, overwrite=overwrite) as stream:
             stream.write(header)
             stream.write(self.before.data)
-            if self.lines is not None:
-                stream.writelines(text_lines(self.rows, self.lines, keep, columns))
-            else:
-                write_rows(stream, self.rows, keep, columns, threads=threads)
+            write_rows(stream, self.rows, keep, columns, threads=threads)
             stream.write(self.after.data)
 
-    def _new_header(
+    def _layout(
         self, keep: NDArray[np.bool_] | None, columns: Mapping[str, NDArray[Any]]
-    ) -> bytes:
-        """Return the header of a file of the kept rows with these columns."""
-        count = len(self) if keep is None else int(np.count_nonzero(keep))
-        header = with_count(self.header, count)
-        declared = declarations(self.path, self.rows, columns)
-        return with_properties(header, declared) if declared else header
+    ) -> tuple[bytes, np.dtype[Any]]:
+        """Header and row of a file of the kept rows with these columns; refuse what none can be."""
+        header = with_count(self.header, len(self) if keep is None else int(np.count_nonzero(keep)))
+        names = self.rows.dtype.names or ()
+        if isinstance(columns, ChangedColumns) and columns.keys() <= set(names):
+            return header, self.rows.dtype  # they have the stored types, and need not be made
+        declared = []
+        for name, values in columns.items():
+            if values.shape != self.rows.shape:
+                raise RefineError(
+                    f"{self.path}: column '{name}' has shape {values.shape}, "
+                    f"expected {self.rows.shape}"
+                )
+            if name in names:
+                stored = self.rows.dtype[name]
+                if not np.can_cast(values.dtype, stored, "same_kind"):
+                    raise RefineError(
+                        f"{self.path}: property '{name}' is there already, of type {stored}; "
+                        f"expected one that holds {values.dtype}"
+                    )
+                continue
+            kind = PLY_TYPES.get(values.dtype.str[1:])
+            if kind is None or not re.fullmatch(r"[!-~]+", name):
+                raise RefineError(
+                    f"{self.path}: column '{name}' of type {values.dtype} cannot be a property, "
+                    f"expected ASCII without spaces and one of {', '.join(PLY_TYPES)}"
+                )
+            declared.append(f"property {kind} {name}".encode())
+        if declared:
+            lines = _lines(header)
+            index = last = _vertex_line(lines)
+            while (words := lines[index + 1].split()[:1]) not in ([b"element"], [b"end_header"]):
+                index += 1
+                last = index if words == [b"property"] else last
+            lines[last + 1 : last + 1] = declared
+            header = _line_end(header).join(lines)
+        return header, _grown(self.rows.dtype, columns)
 
 
-def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:
-    """Return how a PLY says that its splats are drawn; None if it does not.
-
-    Parameters
-    ----------
-    header : bytes
-    rows : structured dtype
-        Of its splats: without a third scale they are discs, whatever comments say.
-    """
-    return model_of(header) if THIRD_SCALE in (rows.names or ()) else "2dgs"
+# Reading.
 
 
 def read_ply(path: Path | str) -> SplatFile:
@@ -308,21 +321,6 @@ def read_ply(path: Path | str) -> SplatFile:
         names the file, the place, what was found and what was expected.
     """
     path = expanded(path)
-    header, vertex, body = _mapped(path)
-    check_counts(header, len(body))
-    filled = [e.name for e, count in zip(header.elements, header.counts, strict=True) if count]
-    indexing = tuple(name for name in filled if name in INDEXING)
-    if header.order == TEXT:
-        rows, lines, beside = read_text(header, vertex, body.tobytes())
-        before, after = (np.frombuffer(part, np.uint8) for part in beside)
-        return SplatFile(path, rows, header.raw, before, after, lines, indexing)
-    start, end = vertex_range(header, vertex, body)
-    rows = body[start:end].view(header.elements[vertex].dtype(header.order))
-    return SplatFile(path, rows, header.raw, body[:start], body[end:], indexing=indexing)
-
-
-def _mapped(path: Path) -> tuple[Header, int, NDArray[np.uint8]]:
-    """Return a file's header, which of its elements are splats, and its body, mapped."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for a writer
             raise RefineError(
@@ -333,7 +331,25 @@ def _mapped(path: Path) -> tuple[Header, int, NDArray[np.uint8]]:
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
         raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error
-    return header, vertex, np.frombuffer(whole, np.uint8)[len(header.raw) :]
+    body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
+    check_counts(header, len(body))
+    filled = [e.name for e, count in zip(header.elements, header.counts, strict=True) if count]
+    if header.order == TEXT:
+        return _text_file(header, vertex, filled, body.tobytes())
+    start, end = vertex_range(header, vertex)
+    rows = body[start:end].view(header.elements[vertex].dtype(header.order))
+    indexing = tuple(name for name in filled if name in INDEXING)
+    return SplatFile(path, rows, header.raw, body[:start], body[end:], indexing)
+
+
+class Header(NamedTuple):
+    """A parsed header."""
+
+    path: Path | Url  # the file, for messages
+    raw: bytes  # with ``end_header`` and its line end
+    elements: tuple[Any, ...]  # of plyfile: names and properties, without rows
+    counts: tuple[int, ...]  # rows that the header announces for each element
+    order: str  # byte order of the body, "<", ">" or `TEXT`
 
 
 def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
@@ -345,25 +361,86 @@ def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
         See `read_ply`.
     """
     header = read_header(path, stream)
-    vertex = _vertex_index(header)
-    _check_properties(header, vertex)
-    return header, vertex
-
-
-def _vertex_index(header: Header) -> int:
-    """Return the index of the vertex element; refuse files without one."""
     names = [element.name for element in header.elements]
     if "vertex" not in names:
         raise RefineError(
-            f"{header.path}: not a splat file: expected an element 'vertex', "
+            f"{path}: not a splat file: expected an element 'vertex', "
             f"got {_listed(names) or 'none'}"
         )
-    return names.index("vertex")
+    vertex = names.index("vertex")
+    _check_properties(header, vertex)
+    for element in header.elements[:vertex]:
+        if has_lists(element):
+            raise RefineError(
+                f"{path}: element {shown(element.name)} has a list and stands before the splats, "
+                "expected it behind them"
+            )
+    return header, vertex
 
 
-def _listed(names: list[str]) -> str:
-    """Return at most `_NAMES_SHOWN` names, cut to 40 characters each, for a message."""
-    return ", ".join(name[:40] for name in names[:_NAMES_SHOWN])
+def read_header(path: Path | Url, stream: BinaryIO) -> Header:
+    """Read the header of an open file.
+
+    Raises
+    ------
+    RefineError
+        If the file has no header, or the header is wrong; with the line.
+    """
+    head = stream.read(HEADER_LIMIT)
+    if not head:
+        raise RefineError(f"{path}: the file is empty, expected a PLY")
+    if not re.match(rb"ply[\r\n]", head):
+        refuse_foreign_splats(path, head)
+        raise RefineError(
+            f"{path}: not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
+        )
+    raw = raw_header(head)
+    if raw is None:
+        raise RefineError(
+            f"{path}: header without end: no 'end_header' line in the first {len(head)} bytes"
+        )
+    plain, counts = _plain(path, raw)
+    try:
+        data = plyfile.PlyData.read(io.BytesIO(plain))
+    except (plyfile.PlyParseError, ValueError) as error:
+        raise RefineError(f"{path}: header: {str(error)[:200]}") from error
+    order = TEXT if data.text else data.byte_order
+    return Header(path, raw, tuple(data.elements), tuple(counts), order)
+
+
+def raw_header(head: bytes) -> bytes | None:
+    """Header at the beginning of a file; None if this is no PLY, or the header has no end."""
+    if not re.match(rb"ply[\r\n]", head):
+        return None
+    end = _END[_line_end(head)].search(head)
+    return head[: end.end()] if end else None
+
+
+def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
+    """Header as plyfile gets it, see the top of this file, and the counts of rows."""
+    lines: list[bytes] = []
+    counts: list[int] = []
+    names: set[bytes] = set()
+    elements: set[bytes] = set()
+    for number, line in enumerate(_lines(raw), 1):
+        where, words = f"{path}: header line {number}", line.split()
+        keyword = words[0] if words else b""
+        if keyword in (b"comment", b"obj_info"):
+            words = []
+        elif not re.fullmatch(rb"[\t -~]*\r?", line):
+            raise RefineError(f"{where}: expected ASCII text, got {line[:80]!r}")
+        elif keyword == b"property" or (keyword == b"element" and len(words) == 3):
+            known, name = (names, words[-1]) if keyword == b"property" else (elements, words[1])
+            if known is elements:
+                if not re.fullmatch(rb"[0-9]{1,30}", words[2]):
+                    raise RefineError(f"{where}: expected a number of rows, got {shown(words[2])}")
+                counts.append(int(words[2]))
+                names, words[2] = set(), b"0"
+            if name in known:
+                raise RefineError(f"{where}: {shown(name)} is declared twice, expected once")
+            known.add(name)
+        lines.append(b" ".join(words) or b" ")  # an empty line would end the header for plyfile
+    return b"\n".join([*lines[:-1], b""]), counts
 
 
 def _check_properties(header: Header, vertex: int) -> None:
@@ -379,10 +456,15 @@ def _check_properties(header: Header, vertex: int) -> None:
         )
     missing = [name for name in REQUIRED if name not in kinds]
     if missing and missing != [THIRD_SCALE]:
+        guess = "a point cloud, not splats"
+        if "opacity" in kinds:
+            guess = "incomplete splats"
+        elif any(element.name in INDEXING for element in header.elements):
+            guess = "a mesh, not splats"
         present = _listed([*kinds])
         present += ", ..." if len(kinds) > _NAMES_SHOWN else ""
         raise RefineError(
-            f"{header.path}: {_guess(header, kinds)}: vertex lacks {', '.join(missing)} "
+            f"{header.path}: {guess}: vertex lacks {', '.join(missing)} "
             f"(it has {present or 'no property'})"
         )
     rest = [name for name in kinds if name.startswith("f_rest_")]
@@ -402,10 +484,300 @@ def _check_properties(header: Header, vertex: int) -> None:
             )
 
 
-def _guess(header: Header, kinds: Mapping[str, str]) -> str:
-    """Return what a file without all properties of splats seems to be."""
-    if "opacity" in kinds:
-        return "incomplete splats"
-    if any(element.name in INDEXING for element in header.elements):
-        return "a mesh, not splats"
-    return "a point cloud, not splats"
+def has_lists(element: Any) -> bool:
+    """Whether an element of a header has lists, so that its rows differ in length."""
+    return any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties)
+
+
+def check_counts(header: Header, available: int) -> None:
+    """Refuse a header that announces more rows than the file can hold, before memory is allocated.
+
+    Without lists, the bytes that are counted are exact.
+
+    Parameters
+    ----------
+    header : Header
+    available : int
+        Bytes after the header.
+
+    Raises
+    ------
+    RefineError
+        If that many rows would not fit even if each were as short as possible.
+    """
+    least, text = 0, header.order == TEXT
+    for element, count in zip(header.elements, header.counts, strict=True):
+        kinds = (
+            p.len_dtype if isinstance(p, plyfile.PlyListProperty) else p.val_dtype
+            for p in element.properties
+        )
+        # Of text: one digit and one separator for each number; lists have a length.
+        row = sum(2 if text else np.dtype(kind).itemsize for kind in kinds)
+        if not row and count:
+            raise RefineError(
+                f"{header.path}: element {shown(element.name)} has {count} rows and no property"
+            )
+        least += row * count
+        if least > available + text:  # plus 1 for text, whose last line may lack its line end
+            raise RefineError(
+                f"{header.path}: truncated: the header announces {count} rows of "
+                f"{shown(element.name)}, at least {least} bytes so far, but only {available} bytes "
+                "follow it"
+            )
+
+
+def vertex_range(header: Header, vertex: int) -> tuple[int, int]:
+    """Where in a binary body the rows of splats begin and end, of a header of `splat_header`."""
+    sizes = [
+        count * element.dtype(header.order).itemsize
+        for element, count in zip(header.elements[: vertex + 1], header.counts, strict=False)
+    ]
+    return sum(sizes[:-1]), sum(sizes)
+
+
+def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> SplatFile:
+    """Read an ASCII file as the binary one that holds its splats."""
+    lines, start = body.splitlines(), 0
+    for index, (element, count) in enumerate(zip(header.elements, header.counts, strict=True)):
+        if len(lines) < start + count:
+            raise RefineError(
+                f"{header.path}: truncated: the file ends in row {len(lines) - start} of {count} "
+                f"of {shown(element.name)}"
+            )
+        if index == vertex:
+            rows = _numbers(header.path, element.dtype("<"), lines[start : start + count])
+        start += count
+    left = _listed([name for name in filled if name != "vertex"])
+    remark = "is text; a PLY that is written of it is binary"
+    remark += f", without the elements beside its splats ({left})" if left else ""
+    nothing = np.empty(0, np.uint8)
+    return SplatFile(
+        Path(header.path), rows, vertex_header(header.raw), nothing, nothing,
+        origin=Origin(format_of(header.raw), len(header.raw) + len(body)),
+        remarks=(f"{header.path.name} {remark}",),
+    )  # fmt: skip
+
+
+def _numbers(path: Path | Url, dtype: np.dtype[Any], lines: list[bytes]) -> NDArray[Any]:
+    """Numbers in lines of text; the first line that is wrong is refused."""
+    try:
+        return _parsed(lines, dtype)
+    except _WRONG:
+        first, beyond = 0, len(lines)
+    while beyond - first > 1:  # the first wrong line is one of first..beyond - 1
+        middle = (first + beyond) // 2
+        if _is_right(lines[first:middle], dtype):
+            first = middle
+        else:
+            beyond = middle
+    words = lines[first].split()
+    names = dtype.names or ()
+    problem = f"expected {len(names)} numbers, got {len(words)}"
+    if len(words) == len(names):
+        index = next(i for i, word in enumerate(words) if not _is_right([word], dtype[i]))
+        got = words[index][:40].decode("ascii", "backslashreplace")
+        wanted = f"expected a number of type {dtype[index]}"
+        problem = f"property {shown(names[index])}: {wanted}, got {got!r}"
+    raise RefineError(f"{path}: vertex row {first}: {problem}")
+
+
+_WRONG = (ValueError, DeprecationWarning)
+"""What NumPy raises for text that is not a number of the type."""
+
+_NO_SPACES = bytes.maketrans(b"\x1c\x1d\x1e\x1f", b"????")
+"""Replaces four control characters: str splits words at them, bytes and the header do not."""
+
+
+def _parsed(lines: Sequence[bytes], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Numbers in lines of text; raise one of `_WRONG` if a line is wrong."""
+    if not lines:
+        return np.empty(0, dtype)
+    if not all(map(bytes.strip, lines)):
+        raise ValueError("an empty line, which NumPy would skip")
+    with warnings.catch_warnings():
+        # NumPy only deprecates 1.5 for an integer property.
+        warnings.simplefilter("error", DeprecationWarning)
+        text = (line.translate(_NO_SPACES).decode("ascii") for line in lines)
+        return np.loadtxt(text, dtype, comments=None, ndmin=1)
+
+
+def _is_right(lines: Sequence[bytes], dtype: np.dtype[Any]) -> bool:
+    try:
+        _parsed(lines, dtype)
+    except _WRONG:
+        return False
+    return True
+
+
+def shown(word: bytes | str) -> str:
+    """Word of the file for a message: in quotes, at most 40 characters."""
+    return repr((word if isinstance(word, str) else word.decode("ascii", "replace"))[:40])
+
+
+def _listed(names: list[str]) -> str:
+    """At most `_NAMES_SHOWN` names, cut to 40 characters each, for a message."""
+    return ", ".join(name[:40] for name in names[:_NAMES_SHOWN])
+
+
+# Headers.
+
+
+def new_header(rows: np.dtype[Any], count: int) -> bytes:
+    """Header of a binary PLY of one element, ``vertex``.
+
+    Parameters
+    ----------
+    rows : structured dtype
+        Of a row, little-endian.
+    count : int
+        How many vertices.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {PLY_TYPES[rows[name].str[1:]]} {name}" for name in rows.names or ()]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+def format_of(raw: bytes) -> str:
+    """Format that a header announces, such as ``binary_little_endian 1.0``."""
+    words = next((words for words in map(bytes.split, _lines(raw)) if words[:1] == [b"format"]), [])
+    return b" ".join(words[1:]).decode("ascii", "replace")
+
+
+def vertex_header(raw: bytes) -> bytes:
+    """Header without the elements other than ``vertex``, and binary."""
+    kept, wanted = [], True
+    for line in _lines(raw):
+        words = line.split()
+        if words[:1] == [b"element"]:
+            wanted = words[1] == b"vertex"
+        if words[:1] == [b"format"]:
+            line = line.replace(b"ascii", b"binary_little_endian", 1)
+        if wanted or words[:1] not in ([b"element"], [b"property"]):
+            kept.append(line)
+    return _line_end(raw).join(kept)
+
+
+def with_count(raw: bytes, count: int) -> bytes:
+    """Header with this number of vertices; nothing else in it changes."""
+    lines = _lines(raw)
+    index = _vertex_line(lines)
+    announced = re.match(rb"(\s*element\s+vertex\s+)(\d+)", lines[index])
+    if not announced or int(announced[2]) == count:
+        return raw
+    lines[index] = b"%s%d%s" % (announced[1], count, lines[index][announced.end() :])
+    return _line_end(raw).join(lines)
+
+
+def model_of(raw: bytes) -> Model | None:
+    """How the comments of a header say that its splats are drawn; None if they do not.
+
+    Of several comments the last counts, as in Brush and splat-transform.
+    """
+    found = [match for match in map(_MODEL_COMMENT.fullmatch, _lines(raw)) if match]
+    if not found:
+        return None
+    word = found[-1][1].lower() if found[-1][1] else (b"default", b"mip")[int(found[-1][2])]
+    return next(name for name, mode in _MODES.items() if mode == word)
+
+
+def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:
+    """How a PLY says that its splats are drawn; None if it does not.
+
+    Parameters
+    ----------
+    header : bytes
+    rows : structured dtype
+        Of its splats: without a third scale they are discs, whatever comments say.
+    """
+    return model_of(header) if THIRD_SCALE in (rows.names or ()) else "2dgs"
+
+
+def with_model(raw: bytes, model: Model) -> bytes:
+    """Header with a comment on how its splats are drawn, in place of what it says.
+
+    A header that says so already stays as it is, and so does one that says nothing where `model` is
+    "default".
+    """
+    if (model_of(raw) or "default") == model:
+        return raw
+    lines = [line for line in _lines(raw) if not _MODEL_COMMENT.fullmatch(line)]
+    if model != "default":
+        lines.insert(2, b"comment SplatRenderMode: " + _MODES[model])
+    return _line_end(raw).join(lines)
+
+
+def _line_end(raw: bytes) -> bytes:
+    """Line end of a header's first line, "ply"."""
+    return next(end for end in (b"\r\n", b"\n", b"\r") if raw.startswith(end, 3))
+
+
+def _lines(raw: bytes) -> list[bytes]:
+    return raw.split(_line_end(raw))
+
+
+def _vertex_line(lines: Sequence[bytes]) -> int:
+    return next(
+        index for index, line in enumerate(lines) if line.split()[:2] == [b"element", b"vertex"]
+    )
+
+
+# Writing.
+
+
+def write_rows(
+    stream: BinaryIO,
+    rows: NDArray[Any],
+    keep: NDArray[np.bool_] | None,
+    columns: Mapping[str, NDArray[Any]],
+    *,
+    threads: int | None = 1,
+) -> None:
+    """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended."""
+    plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
+    changed = columns if isinstance(columns, ChangedColumns) else None
+    if changed is not None and not changed.keys() <= set(rows.dtype.names or ()):
+        changed = None
+
+    def bytes_of(piece: slice) -> NDArray[Any]:
+        kept = slice(None) if keep is None else keep[piece]
+        chunk = plain[piece][kept]
+        if changed is not None:
+            chunk = np.array(chunk)
+            changed.put(chunk, rows.dtype, piece, None if keep is None else keep[piece])
+        elif columns:
+            chunk = _with_cells(
+                chunk, rows.dtype, {name: values[piece][kept] for name, values in columns.items()}
+            )
+        return np.ascontiguousarray(chunk)
+
+    pieces = chunks(len(plain), _CHANGED_ROWS if columns else _ROWS)
+    for batch in chunks(len(pieces), _AHEAD):
+        here = pieces[batch]
+        made = map(bytes_of, here) if threads == 1 else run(bytes_of, here, threads=threads)
+        stream.writelines(chunk.data for chunk in made)
+
+
+def _grown(dtype: np.dtype[Any], columns: Mapping[str, NDArray[Any]]) -> np.dtype[Any]:
+    """Row with further columns behind, in the byte order of x, which has several bytes."""
+    order: Any = dtype["x"].byteorder
+    more = [
+        (name, values.dtype.newbyteorder(order))
+        for name, values in columns.items()
+        if name not in (dtype.names or ())
+    ]
+    return np.dtype([*((name, dtype[name]) for name in dtype.names or ()), *more])
+
+
+def _with_cells(
+    chunk: NDArray[Any], dtype: np.dtype[Any], cells: Mapping[str, NDArray[Any]]
+) -> NDArray[Any]:
+    """n rows of bytes, (n,) void of `dtype`, with some properties set and others appended."""
+    grown = np.empty(len(chunk), _grown(dtype, cells))
+    as_bytes = grown.view(np.uint8).reshape(len(chunk), grown.dtype.itemsize)
+    stored = np.ascontiguousarray(chunk).view(np.uint8)
+    as_bytes[:, : dtype.itemsize] = stored.reshape(len(chunk), dtype.itemsize)
+    # A double may be too large or too small for a float; a signalling NaN becomes a quiet one.
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        for name, values in cells.items():
+            grown[name] = values
+    return grown

@@ -48,21 +48,18 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
     else:
         sh_rest = np.zeros((size, 0, 3), np.float32)
     flat = THIRD_SCALE not in names
+    scales = _stack(columns, REQUIRED[7 : 9 if flat else 10])
+    if flat:
+        scales = np.column_stack([scales, np.full(size, LOG_ZERO, scales.dtype)])
     return Splats(
         means=_stack(columns, ["x", "y", "z"]),
-        log_scales=_flat_scales(columns) if flat else _stack(columns, REQUIRED[7:10]),
+        log_scales=scales,
         quaternions=_stack(columns, ["rot_0", "rot_1", "rot_2", "rot_3"]),
         opacity_logits=columns["opacity"],
         sh_dc=_stack(columns, ["f_dc_0", "f_dc_1", "f_dc_2"]),
         sh_rest=sh_rest,
         model="2dgs" if flat else "default",
     )
-
-
-def _flat_scales(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> NDArray[Any]:
-    """Return the log scales of discs, (N, 3), the third of which is 0."""
-    scales = _stack(columns, REQUIRED[7:9])
-    return np.column_stack([scales, np.full(len(scales), LOG_ZERO, scales.dtype)])
 
 
 def other_properties(names: Iterable[str]) -> list[str]:

@@ -11,13 +11,14 @@ table for each axis or channel, and opacity is a logit.
 from __future__ import annotations
 
 import io
+import json
 import math
 import stat
 import zipfile
 import zlib
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn, Protocol, cast
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +27,29 @@ from ..errors import RefineError, reason_of
 from ..foreign_files import is_sog
 from ..place import Place, described
 from ..rendering import MODELS, Model
-from ..splats import Splats, above_constant, opacity_logits
+from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from ..whole_file import mode_of
-from .format import Format, Reader, join_largest, new_file, pieces
-from .images import Codec, codec_for
+from .format import Format, codes, join_largest, near_ones_together, new_file, pieces, split_largest
+from .images import codec_for
 from .ply import Origin, SplatFile
-from .sog_write import ACROSS, COORDINATE, LABEL_BITS, META, NAME, ROTATIONS, TABLE, VERSION, write
+
+NAME, VERSION = "SOG", 2
+GENERATOR = "REFINE for Blender"
+META = "meta.json"
+IMAGES = (
+    *("means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"),
+    *("shN_labels.webp", "shN_centroids.webp"),
+)
+"""Names of the files that are written; those of harmonics where there are any."""
 
 _DEGREES = 3
+_ACROSS = 64  # entries of the palette in a row of its image
+_LABEL_BITS = 16  # of the number of an entry of the palette: two channels of an image
+_TABLE = 256  # values of a table, whose places are a byte
+_COORDINATE = 65535.0  # largest code of a coordinate: two bytes, in two images
+_ROTATIONS = 252  # in the alpha of a rotation: this, and which component is the largest
+_NO_SIZE = -20.0  # log scale written for anything smaller, since tables hold finite numbers
+_MOST_PIXELS = 16383  # of a side of a WebP image
 
 _META_LIMIT = 1 << 20
 """Bytes of the longest ``meta.json`` that is read; with four tables it has some 20,000."""
@@ -47,111 +63,42 @@ _BROKEN = (
 )  # fmt: skip
 """What reading a damaged archive raises."""
 
-
-def matches(path: Path, head: bytes) -> bool:
-    """Return whether a file is one: an archive that lists images and ``meta.json``."""
-    return is_sog(path, head)
+_PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""How files of an archive may be compressed: the other ways take any memory, raise anything."""
 
 
-class _Files(Protocol):
-    """The files beside a ``meta.json``."""
-
-    def read(self, name: str, limit: int) -> bytes:
-        """Return what a file holds, at most `limit` bytes; more are refused."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class _Archived:
-    """The files of an archive, in a folder of it."""
-
-    path: Path
-    archive: zipfile.ZipFile
-    folder: str = ""
-
-    def read(self, name: str, limit: int) -> bytes:
-        """See `_Files`."""
-        label = (self.folder + name)[:80]
-        try:
-            with self.archive.open(self.folder + name) as stream:
-                data = stream.read(limit + 1)
-        except _BROKEN as error:
-            raise RefineError(
-                f"{self.path}: {label!r} in the archive cannot be read ({str(error)[:100]})"
-            ) from error
-        if len(data) > limit:
-            raise RefineError(f"{self.path}: {label!r} in the archive has more than {limit} bytes")
-        return data
-
-
-@dataclass(frozen=True, eq=False)
-class _Beside:
-    """The files in the folder of a ``meta.json``."""
-
-    place: Place
-
-    def path(self, name: str) -> Path:
-        """Return the path of a file; refuse one that is elsewhere or none."""
-        return beside(self.place, name)
-
-    def read(self, name: str, limit: int) -> bytes:
-        """See `_Files`."""
-        path = self.path(name)
-        try:
-            with path.open("rb") as stream:
-                data = stream.read(limit + 1)
-        except OSError as error:
-            self.place.fail(f"{name[:80]!r} cannot be read ({reason_of(error)})")
-        if len(data) > limit:
-            self.place.fail(f"{name[:80]!r} has more than {limit} bytes")
-        return data
-
-
-def beside(place: Place, name: str) -> Path:
-    """Return the path of a file that a JSON file names, in its folder or one below.
-
-    Raises
-    ------
-    RefineError
-        If it lies elsewhere, as an absolute path or one up, or is no file; with `place`.
-    """
-    steps = PurePosixPath(name).parts
-    if not steps or steps[0] == "/" or ".." in steps or not set("\\:\0").isdisjoint(name):
-        place.fail(f"{described(name)}, expected a file in this folder or one below")
-    path = place.path.parent.joinpath(*steps)
-    try:
-        mode = mode_of(path)
-    except (OSError, ValueError):  # a name too long, a folder that may not be entered
-        mode = 0
-    if not stat.S_ISREG(mode):
-        place.fail(f"{described(name)} is not there")
-    return path
-
-
-@dataclass(frozen=True, eq=False)
 class Bundle:
     """A ``meta.json``, what it says and the files that it names.
 
-    Attributes
+    Parameters
     ----------
     place : Place
-    files : _Files
-    meta : dict
-    size : int
-        Bytes of all files.
-    codec : Codec
+        Of the ``meta.json``.
+    data : bytes
+        What that holds.
+    opened : callable
+        ``opened(name, limit)`` returns what a file beside it holds; more bytes are refused.
+    files : callable
+        ``files(meta)`` returns the bytes of each file that it is made of, by what tells it from
+        others.
     """
 
-    place: Place
-    files: _Files
-    meta: dict[str, Any]
-    size: int
-    codec: Codec
-
-    @property
-    def version(self) -> int:
-        """1 or 2."""
-        return VERSION if "version" in self.meta else 1
+    def __init__(
+        self,
+        place: Place,
+        data: bytes,
+        opened: Callable[[str, int], bytes],
+        files: Callable[[dict[str, Any]], dict[Any, int]],
+    ) -> None:
+        self.place, self._opened = place, opened
+        self.meta = place.members(place.parsed(data))
+        if self.meta.get("version", VERSION) != VERSION:
+            version = described(self.meta["version"])
+            place.at("version").fail(f"expected {VERSION}, got {version}")
+        self.version = VERSION if "version" in self.meta else 1
+        self.files = files(self.meta)
+        self.size = sum(self.files.values())
+        self._codec = codec_for(place.path)
 
     @property
     def count(self) -> int:
@@ -169,7 +116,8 @@ class Bundle:
         if word not in MODELS:
             wanted = ", ".join(MODELS)
             self.place.at("model").fail(f"expected one of {wanted}, got {described(word)}")
-        return cast("Model", word)
+        model: Model = word
+        return model
 
     @property
     def degree(self) -> int:
@@ -179,66 +127,61 @@ class Bundle:
         section, place = self.section("shN")
         if self.version == VERSION:
             return place.at("bands").whole(section.get("bands"), 1, _DEGREES)
-        across, _ = self._size("shN", 0, self._data("shN", 0))
-        degrees = {ACROSS * above_constant(degree): degree for degree in range(1, _DEGREES + 1)}
+        _, across, _ = self._image("shN", 0)
+        degrees = {_ACROSS * above_constant(degree): degree for degree in range(1, _DEGREES + 1)}
         if across not in degrees:
             place.fail(f"a palette {across} pixels wide, expected {', '.join(map(str, degrees))}")
         return degrees[across]
 
     def section(self, name: str) -> tuple[dict[str, Any], Place]:
-        """Return what is said of an attribute, and its place."""
+        """What is said of an attribute, and its place."""
         place = self.place.at(name)
         return place.members(self.meta.get(name)), place
 
     def numbers(self, name: str, key: str, count: int) -> NDArray[np.float64]:
-        """Return a list of numbers."""
+        """List of numbers."""
         section, place = self.section(name)
         return np.array(place.at(key).numbers(section.get(key), count))
 
     def tables(self, name: str, channels: int) -> NDArray[np.float64]:
-        """Return the values of which pixels of an attribute are places, (256, channels)."""
+        """Values of which pixels of an attribute are places, (256, channels)."""
         if self.version == VERSION:
-            return self.numbers(name, "codebook", TABLE)[:, None].repeat(channels, axis=1)
+            return self.numbers(name, "codebook", _TABLE)[:, None].repeat(channels, axis=1)
         low, high = (self.numbers(name, key, channels) for key in ("mins", "maxs"))
-        return low + (high - low) * (np.arange(TABLE)[:, None] / (TABLE - 1.0))
+        return low + (high - low) * (np.arange(_TABLE)[:, None] / (_TABLE - 1.0))
 
     def pixels(
         self, name: str, index: int, least: int, most: int, width: int = 0
     ) -> NDArray[np.uint8]:
-        """Return an image of `least` to `most` pixels, (height, width, 4): a file of an attribute.
+        """Image of `least` to `most` pixels, (height, width, 4): a file of an attribute.
 
         Another width than `width` is refused, unless that is 0.
         """
-        data = self._data(name, index)
-        across, down = self._size(name, index, data)
+        data, across, down = self._image(name, index)
         if not least <= across * down <= most:
             self._fail(name, index, f"{across} x {down} pixels, expected {least}")
         if width and across != width:
             self._fail(name, index, f"{across} pixels wide, expected {width}")
         try:
-            return self.codec.decode(data)
+            return self._codec.decode(data)
         except ValueError as error:
             self._fail(name, index, f"cannot be read ({str(error)[:100]})")
 
     def rows(self, name: str, index: int, count: int) -> NDArray[np.uint8]:
-        """Return the pixels of `count` splats, (count, 4), of an image.
-
-        Far more pixels are refused.
-        """
+        """Pixels of `count` splats, (count, 4), of an image; far more pixels are refused."""
         image = self.pixels(name, index, count, 4 * count + _SPARE_PIXELS)
         return image.reshape(-1, 4)[:count]
 
-    def _size(self, name: str, index: int, data: bytes) -> tuple[int, int]:
+    def _image(self, name: str, index: int) -> tuple[bytes, int, int]:
+        """File of an image, its width and its height."""
+        data = self._opened(self._file(name, index), 4 * self.size)
         try:
-            return self.codec.size(data)
+            return data, *self._codec.size(data)
         except ValueError as error:
             self._fail(name, index, f"cannot be read ({str(error)[:100]})")
 
-    def _data(self, name: str, index: int) -> bytes:
-        return self.files.read(self._file(name, index), 4 * self.size)
-
     def _file(self, name: str, index: int) -> str:
-        """Return the name of an image."""
+        """Name of an image."""
         section, place = self.section(name)
         files = place.at("files").items(section.get("files"))
         if len(files) <= index:
@@ -247,98 +190,106 @@ class Bundle:
 
     def _fail(self, name: str, index: int, problem: str) -> NoReturn:
         """Raise the error of an image."""
-        replace(self.place, where="").fail(f"image {self._file(name, index)[:80]!r}: {problem}")
+        Place(self.place.path).fail(f"image {self._file(name, index)[:80]!r}: {problem}")
+
+    def read(self) -> SplatFile:
+        """Read its splats."""
+        origin = Origin(f"{NAME} version {self.version}", self.size)
+        file, splats = new_file(self.place.path, origin, self.count, self.degree, self.model)
+        with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in meta.json
+            _fill_means(self, splats)
+            _fill_rotations(self, splats)
+            _fill_from_tables(self, splats)
+            if splats.sh_degree:
+                _fill_harmonics(self, splats)
+        return file
 
 
-def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
-    """Read a SOG file: an archive.
-
-    Raises
-    ------
-    RefineError
-        If it is damaged or of another version, or there is no library for its images.
-    """
-    with _opened(path, data) as archive:
-        names = (name for name in archive.namelist() if name.split("/")[-1] == META)
-        name = next(names, None)
-        if name is None:
-            raise RefineError(f"{path}: no {META} in the archive, which a SOG file has")
-        files = _Archived(path, archive, name.removesuffix(META))
-        return read_bundle(
-            _bundle(Place(path, META), files, files.read(META, _META_LIMIT), len(data))
-        )
-
-
-def _opened(path: Path, data: NDArray[np.uint8]) -> zipfile.ZipFile:
+def _read_archive(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     try:
-        return zipfile.ZipFile(io.BytesIO(data.tobytes()))
+        archive = zipfile.ZipFile(io.BytesIO(data.tobytes()))
     except _BROKEN as error:
         raise RefineError(f"{path}: the archive cannot be read ({str(error)[:100]})") from error
+    names = (name for name in archive.namelist() if name.split("/")[-1] == META)
+    meta = next(names, None)
+    if meta is None:
+        raise RefineError(f"{path}: no {META} in the archive, which a SOG file has")
+    folder = meta.removesuffix(META)
+
+    def opened(name: str, limit: int) -> bytes:
+        label = f"{path}: {(folder + name)[:80]!r} in the archive"
+        try:
+            info = archive.getinfo(folder + name)
+            if info.compress_type not in _PACKED:
+                raise NotImplementedError(f"compressed by method {info.compress_type}")
+            with archive.open(info) as stream:
+                content = stream.read(limit + 1)
+        except _BROKEN as error:
+            raise RefineError(f"{label} cannot be read ({str(error)[:100]})") from error
+        if len(content) > limit:
+            raise RefineError(f"{label} has more than {limit} bytes")
+        return content
+
+    with archive:
+        text = opened(META, _META_LIMIT)
+        return Bundle(Place(path, META), text, opened, lambda _meta: {path: len(data)}).read()
 
 
-def matches_meta(path: Path, head: bytes) -> bool:
-    """Return whether a file is the ``meta.json`` of images beside it: by its name."""
-    return path.name.lower().endswith(META) and head.lstrip().startswith(b"{")
-
-
-def read_meta(path: Path, data: NDArray[np.uint8]) -> SplatFile:
-    """Read the ``meta.json`` of a SOG whose images lie beside it.
+def bundle_beside(path: Path) -> Bundle:
+    """Open a ``meta.json`` with the images beside it.
 
     Raises
     ------
     RefineError
-        See `read`; also if it names a file that lies elsewhere.
-    """
-    return read_bundle(bundle_beside(path, data.tobytes()))
-
-
-def bundle_beside(path: Path, data: bytes | None = None) -> Bundle:
-    """Return a ``meta.json`` and the images beside it; `data` is what the file holds, if known.
-
-    Raises
-    ------
-    RefineError
-        See `read_meta`.
+        If it is damaged or of another version, names a file that lies elsewhere, or there is no
+        library for images; reading it may raise the same.
     """
     place = Place(path)
-    files = _Beside(place)
-    if data is None:
-        data = files.read(path.name, _META_LIMIT)
-    if len(data) > _META_LIMIT:
-        place.fail(f"{len(data)} bytes, expected at most {_META_LIMIT}")
-    bundle = _bundle(place, files, data, len(data))
-    sections = [section for section in bundle.meta.values() if isinstance(section, dict)]
-    named = [section["files"] for section in sections if isinstance(section.get("files"), list)]
-    names = {name for group in named for name in group if isinstance(name, str)}
-    sizes = (files.path(name).stat().st_size for name in names)
-    return replace(bundle, size=len(data) + sum(sizes))
+
+    def held(there: Path, limit: int) -> bytes:
+        try:
+            with there.open("rb") as stream:
+                content = stream.read(limit + 1)
+        except OSError as error:
+            place.fail(f"{there.name[:80]!r} cannot be read ({reason_of(error)})")
+        if len(content) > limit:
+            place.fail(f"{there.name[:80]!r} has more than {limit} bytes")
+        return content
+
+    def files(meta: dict[str, Any]) -> dict[Any, int]:
+        named = [part.get("files") for part in meta.values() if isinstance(part, dict)]
+        names = {name for group in named if isinstance(group, list) for name in group}
+        paths = [path, *(beside(place, name) for name in names if isinstance(name, str))]
+        return {there.resolve(): there.stat().st_size for there in paths}
+
+    text = held(path, _META_LIMIT)
+    return Bundle(place, text, lambda name, limit: held(beside(place, name), limit), files)
 
 
-def _bundle(place: Place, files: _Files, data: bytes, size: int) -> Bundle:
-    meta = place.members(place.parsed(data))
-    version = meta.get("version", VERSION)
-    if version != VERSION:
-        place.at("version").fail(f"expected {VERSION}, got {described(version)}")
-    return Bundle(place, files, meta, size, codec_for(place.path))
-
-
-def read_bundle(bundle: Bundle) -> SplatFile:
-    """Return the splats of a bundle.
+def beside(place: Place, name: str) -> Path:
+    """Path of a file that a JSON file names, in its folder or one below.
 
     Raises
     ------
     RefineError
-        See `read`.
+        If it lies elsewhere, as an absolute path or one up, or is no file; with `place`.
     """
-    origin = Origin(f"{NAME} version {bundle.version}", bundle.size)
-    file, splats = new_file(bundle.place.path, origin, bundle.count, bundle.degree, bundle.model)
-    with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in meta.json
-        _fill_means(bundle, splats)
-        _fill_rotations(bundle, splats)
-        _fill_from_tables(bundle, splats)
-        if splats.sh_degree:
-            _fill_harmonics(bundle, splats)
-    return file
+    steps = PurePosixPath(name).parts
+    if not steps or name.startswith("/") or ".." in steps or not set("\\:\0").isdisjoint(name):
+        place.fail(f"{described(name)}, expected a file in this folder or one below")
+    path = place.path.parent.joinpath(*steps)
+    try:
+        mode = mode_of(path)
+    except (OSError, ValueError):  # a name too long, a folder that may not be entered
+        mode = 0
+    if not stat.S_ISREG(mode):
+        place.fail(f"{described(name)} is not there")
+    return path
+
+
+def _matches_meta(path: Path, head: bytes) -> bool:
+    """Whether a file is the ``meta.json`` of images beside it: by its name."""
+    return path.name.lower().endswith(META) and head.lstrip().startswith(b"{")
 
 
 def _fill_means(bundle: Bundle, splats: Splats) -> None:
@@ -346,42 +297,38 @@ def _fill_means(bundle: Bundle, splats: Splats) -> None:
     lower, upper = (bundle.rows("means", index, len(splats)) for index in (0, 1))
     for piece in pieces(len(splats)):
         code = lower[piece, :3] + upper[piece, :3] * 256.0
-        logs = low + (high - low) * (code / COORDINATE)
+        logs = low + (high - low) * (code / _COORDINATE)
         splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
 
 
 def _fill_rotations(bundle: Bundle, splats: Splats) -> None:
     """Set quaternions from pixels: three smaller components, and which is left out."""
     pixels = bundle.rows("quats", 0, len(splats))
-    wrong = pixels[:, 3] < ROTATIONS
+    wrong = pixels[:, 3] < _ROTATIONS
     if wrong.any():
         index = int(np.argmax(wrong))
         Place(bundle.place.path, f"rotation of splat {index}").fail(
-            f"alpha {pixels[index, 3]}, expected {ROTATIONS} to 255"
+            f"alpha {pixels[index, 3]}, expected {_ROTATIONS} to 255"
         )
     for piece in pieces(len(splats)):
         others = (pixels[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
-        largest = (pixels[piece, 3] - ROTATIONS).astype(np.intp)
+        largest = (pixels[piece, 3] - _ROTATIONS).astype(np.intp)
         splats.quaternions[piece] = join_largest(largest, others)
 
 
 def _fill_from_tables(bundle: Bundle, splats: Splats) -> None:
     """Set scales, colours and, from the alpha of the colours' image, opacities."""
+    first = bundle.version == 1
     scales, scale_tables = bundle.rows("scales", 0, len(splats)), bundle.tables("scales", 3)
-    with_opacity = 4 if bundle.version == 1 else 3
-    colors, color_tables = bundle.rows("sh0", 0, len(splats)), bundle.tables("sh0", with_opacity)
+    colors, color_tables = bundle.rows("sh0", 0, len(splats)), bundle.tables("sh0", 3 + first)
+    axes = np.arange(3)
     for piece in pieces(len(splats)):
-        splats.log_scales[piece] = _looked_up(scale_tables, scales[piece, :3])
-        splats.sh_dc[piece] = _looked_up(color_tables[:, :3], colors[piece, :3])
+        splats.log_scales[piece] = scale_tables[scales[piece, :3], axes]
+        splats.sh_dc[piece] = color_tables[colors[piece, :3], axes]
         alpha = colors[piece, 3]
         splats.opacity_logits[piece] = (
-            color_tables[alpha, 3] if bundle.version == 1 else opacity_logits(alpha / 255.0)
+            color_tables[alpha, 3] if first else opacity_logits(alpha / 255.0)
         )
-
-
-def _looked_up(tables: NDArray[np.float64], places: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the values of places (n, C) in a table for each channel, (256, C)."""
-    return np.asarray(tables[places, np.arange(places.shape[1])])
 
 
 def _fill_harmonics(bundle: Bundle, splats: Splats) -> None:
@@ -399,23 +346,176 @@ def _fill_harmonics(bundle: Bundle, splats: Splats) -> None:
 
 
 def _palette(bundle: Bundle, degree: int) -> NDArray[np.float32]:
-    """Return the palette of harmonics, (P, K, 3)."""
+    """Palette of harmonics, (P, K, 3)."""
     coefficients = above_constant(degree)
-    width, most = ACROSS * coefficients, 1 << LABEL_BITS
+    width, most = _ACROSS * coefficients, 1 << _LABEL_BITS
     section, place = bundle.section("shN")
     if bundle.version == VERSION:
         table = bundle.tables("shN", 1)[:, 0]
         entries = place.at("count").whole(section.get("count"), 1, most)
-        needed = width * -(-entries // ACROSS)
+        needed = width * -(-entries // _ACROSS)
         image = bundle.pixels("shN", 0, needed, 4 * needed + _SPARE_PIXELS, width)
     else:
         low, high = (place.at(key).number(section.get(key)) for key in ("mins", "maxs"))
-        table = np.linspace(low, high, TABLE)
+        table = np.linspace(low, high, _TABLE)
         image = bundle.pixels("shN", 0, width, most * coefficients, width)
-        entries = ACROSS * len(image)
-    height = -(-entries // ACROSS)
-    places = image[:height, :, :3].reshape(height * ACROSS, coefficients, 3)[:entries]
+        entries = _ACROSS * len(image)
+    height = -(-entries // _ACROSS)
+    places = image[:height, :, :3].reshape(height * _ACROSS, coefficients, 3)[:entries]
     return np.asarray(table.astype(np.float32)[places])
+
+
+def _write(stream: BinaryIO, splats: Splats) -> None:
+    """Write splats, sorted so that neighbours in space are neighbours in images."""
+    path = Path(str(getattr(stream, "name", NAME)))
+    # A ZipInfo has no date of today, so a file is the same whenever it is made.
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, data in contents(path, splats.take(near_ones_together(splats.means))):
+            archive.writestr(zipfile.ZipInfo(name), data)
+
+
+def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
+    """Yield the files that hold splats, with their names: `META`, then the images.
+
+    Parameters
+    ----------
+    path : Path
+        What errors name.
+    splats : Splats
+        In the order in which the file has them.
+
+    Raises
+    ------
+    RefineError
+        If there is no library for images, or there are more splats than pixels in them.
+    """
+    count, codec = len(splats), codec_for(path)
+    across = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)  # nearly square, divisible by 4
+    if across > _MOST_PIXELS:
+        raise RefineError(f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}")
+
+    def image(values: NDArray[Any]) -> NDArray[np.uint8]:
+        """Image of a pixel for each splat, of which `values`, (N, C), are the first channels."""
+        pixels = np.zeros((-(-count // across), across, 4), np.uint8)
+        pixels[..., 3] = 255
+        pixels.reshape(-1, 4)[:count, : values.shape[1]] = values
+        return pixels
+
+    means = np.asarray(splats.means, np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    extent = np.where(high > low, high - low, 1.0)
+    code = np.rint((logs - low) / extent * _COORDINATE).astype(np.uint16)
+    largest, others = split_largest(unit_quaternions(splats.quaternions))
+    scale_table, scales = _tabulated(np.maximum(splats.log_scales, _NO_SIZE))
+    color_table, colors = _tabulated(splats.sh_dc)
+    with np.errstate(under="ignore"):
+        alpha = codes(opacity(splats.opacity_logits))
+    meta: dict[str, Any] = {
+        "version": VERSION,
+        "asset": {"generator": GENERATOR},
+        "count": count,
+        "means": {
+            "mins": low.tolist(),
+            "maxs": (low + extent).tolist(),
+            "files": ["means_l.webp", "means_u.webp"],
+        },
+        "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
+    }
+    if splats.model != MODELS[0]:
+        meta["model"] = splats.model
+    turns = np.column_stack([codes(others * math.sqrt(0.5) + 0.5), largest + _ROTATIONS])
+    images = {
+        "means_l.webp": image(code & 255),
+        "means_u.webp": image(code >> 8),
+        "quats.webp": image(turns),
+        "scales.webp": image(scales),
+        "sh0.webp": image(np.column_stack([colors, alpha])),
+    }
+    if splats.sh_degree:
+        labels = _grouped(splats.sh_rest.reshape(count, -1))
+        entries = int(labels.max()) + 1
+        table, images["shN_centroids.webp"] = _centroids(splats.sh_rest, labels, entries)
+        images["shN_labels.webp"] = image(np.column_stack([labels & 255, labels >> 8]))
+        meta["shN"] = {
+            "count": entries,
+            "bands": splats.sh_degree,
+            "codebook": table.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    yield META, json.dumps(meta).encode()
+    for name in IMAGES[: len(images)]:
+        yield name, codec.encode(images[name])
+
+
+def _tabulated(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Table of 256 values, and the place of the nearest for each of `values`.
+
+    Half of the table are equal steps from the least to the largest value, so that no value is off
+    by more than half a step; the other half are quantiles of the values.
+    """
+    flat = np.sort(values, axis=None)
+    half = _TABLE // 2
+    shares = np.linspace(0.0, 1.0, half)
+    even = flat[0] + (float(flat[-1]) - float(flat[0])) * shares
+    quantiles = flat[np.rint(shares * (len(flat) - 1)).astype(np.intp)]
+    table = np.sort(np.concatenate([even, quantiles])).astype(np.float32)
+    bounds = (table[1:].astype(np.float64) + table[:-1]) / 2.0
+    return table, np.searchsorted(bounds, values).astype(np.uint8)
+
+
+def _grouped(rows: NDArray[Any]) -> NDArray[np.int64]:
+    """Group for each of N rows (N, D): similar rows share one. Numbers start at 0.
+
+    All rows are one group first; every group is halved at its mean along the axis in which it
+    varies most, again and again, until there are 65,536 or as many as half of the rows.
+    """
+    columns = np.ascontiguousarray(np.asarray(rows, np.float32).T)  # (D, N)
+    labels = np.zeros(rows.shape[0], np.int64)
+    for _ in range(min(_LABEL_BITS, int(rows.shape[0]).bit_length() - 1)):
+        axis, middle = _widest(columns, labels)
+        above = columns[axis[labels], np.arange(len(labels))] > middle[labels]
+        labels = np.unique(2 * labels + above, return_inverse=True)[1].reshape(-1)
+    return labels
+
+
+def _widest(
+    columns: NDArray[np.float32], labels: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """In which of D columns (D, N) each group varies most, and its mean there, (G,) each."""
+    sizes = np.bincount(labels)
+    groups = len(sizes)
+    largest = np.full(groups, -1.0)
+    axis, middle = np.zeros(groups, np.intp), np.zeros(groups)
+    for index, column in enumerate(columns):
+        with np.errstate(under="ignore"):
+            mean = np.bincount(labels, column, groups) / sizes
+            square = np.bincount(labels, np.square(column, dtype=np.float64), groups) / sizes
+            variance = square - np.square(mean)
+        wider = variance > largest
+        largest[wider], axis[wider], middle[wider] = variance[wider], index, mean[wider]
+    return axis, middle
+
+
+def _centroids(
+    sh_rest: NDArray[Any], labels: NDArray[np.int64], entries: int
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Table and the image of a palette: the mean harmonics of each group."""
+    coefficients = sh_rest.shape[1]
+    sizes = np.bincount(labels, minlength=entries)
+    means = np.empty((entries, coefficients, 3))
+    for k in range(coefficients):
+        for channel in range(3):
+            column = np.asarray(sh_rest[:, k, channel], np.float64)
+            means[:, k, channel] = np.bincount(labels, column, entries) / sizes
+    table, places = _tabulated(means)
+    rows = -(-entries // _ACROSS)
+    image = np.zeros((rows * _ACROSS, coefficients, 4), np.uint8)
+    image[..., 3] = 255
+    image[:entries, :, :3] = places
+    return table, image.reshape(rows, _ACROSS * coefficients, 4)
 
 
 FORMAT = Format(
@@ -423,11 +523,15 @@ FORMAT = Format(
     suffix=".sog",
     degree=_DEGREES,
     loss="holds positions in 16 bits, all else in 8, takes harmonics from a palette, and sorts",
-    matches=matches,
-    read=read,
-    write=write,
-    sizes=None,
+    matches=is_sog,
+    read=_read_archive,
+    write=_write,
     models=MODELS,
 )
 
-META_READER = Reader(name=NAME, suffix=META, matches=matches_meta, read=read_meta)
+META_READER = Format(
+    name=NAME,
+    suffix=META,
+    matches=_matches_meta,
+    read=lambda path, _data: bundle_beside(path).read(),
+)

@@ -11,9 +11,8 @@ import io
 import math
 import struct
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,17 @@ from ..errors import RefineError
 from ..foreign_files import GZIP, SPZ, is_spz
 from ..rendering import Model
 from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
-from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
+from .format import (
+    WXYZ,
+    XYZW,
+    Format,
+    codes,
+    join_largest,
+    new_file,
+    pieces,
+    refuse_short,
+    split_largest,
+)
 from .ply import Origin, SplatFile
 
 NAME = "SPZ"
@@ -62,54 +71,47 @@ _STEP = 1 << 12
 """Bytes of a gzip stream that are unpacked at a time where what they hold is not used."""
 
 
-@dataclass(frozen=True)
-class _Header:
+class _Header(NamedTuple):
     """What the first bytes say."""
 
+    magic: bytes
     version: int
-    count: int
+    splats: int
     degree: int
     fraction: int
+    flags: int
     streams: int
-    model: Model
 
     def blocks(self) -> dict[str, int]:
-        """Return the bytes of each attribute by its name, in their order."""
+        """Bytes of each attribute by its name, in their order."""
         turn = 3 if self.version == _ONE_TURN else 4
         rest = 3 * above_constant(self.degree)
         widths = {"mean": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": turn, "rest": rest}
-        return {name: width * self.count for name, width in widths.items()}
+        return {name: width * self.splats for name, width in widths.items()}
 
 
-def matches(path: Path, head: bytes) -> bool:
-    """Return whether a file is one: its signature stands in the open or in a gzip stream.
+def _matches(path: Path, head: bytes) -> bool:
+    """Whether the signature stands in the open or in a gzip stream.
 
     A gzip stream of its name is one that may be damaged at its beginning.
     """
     return is_spz(head) or (path.suffix.lower() == FORMAT.suffix and head.startswith(GZIP))
 
 
-def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
-    """Read an SPZ file.
-
-    Raises
-    ------
-    RefineError
-        If it is truncated or damaged, of another version, or of version 4 and there is no module
-        for zstd.
-    """
-    packed = not data[: len(SPZ)].tobytes().startswith(SPZ)
-    if packed:
+def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+    """Read a file; version 4 needs a module for zstd."""
+    if not data[: len(SPZ)].tobytes().startswith(SPZ):
         header, blocks = _unpacked(path, data)
     else:
-        header = _parsed(path, data[: _HEADER.size].tobytes())
+        header = _parsed(path, data[: _HEADER.size].tobytes(), len(data))
         if header.version == _ZSTD:
             blocks = _streams(path, data, header)
         else:
             blocks = _split(path, header, data[_HEADER.size :])
     origin = Origin(f"{NAME} version {header.version}", len(data))
-    file, splats = new_file(path, origin, header.count, header.degree, header.model)
-    for piece in pieces(header.count):
+    model: Model = "antialiased" if header.flags & _ANTIALIASED else "default"
+    file, splats = new_file(path, origin, header.splats, header.degree, model)
+    for piece in pieces(header.splats):
         stored = {name: block[piece] for name, block in blocks.items()}
         splats.means[piece] = _positions(stored["mean"], header.fraction)
         splats.opacity_logits[piece] = opacity_logits(stored["opacity"][:, 0] / 255.0)
@@ -121,56 +123,50 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     return file
 
 
-def _parsed(path: Path, head: bytes) -> _Header:
-    """Return what the first bytes say, or refuse them."""
+def _parsed(path: Path, head: bytes, size: int) -> _Header:
+    """What the first bytes of a file of `size` bytes say; refuse what it cannot hold."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
-    magic, version, count, degree, fraction, flags, streams = _HEADER.unpack(head)
-    if magic != SPZ:
-        raise RefineError(
-            f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {SPZ!r}"
+    header = _Header(*_HEADER.unpack(head))
+    problem = ""
+    if header.magic != SPZ:
+        problem = f"no SPZ file: its gzip stream begins with {header.magic!r}, expected {SPZ!r}"
+    elif header.version not in _VERSIONS:
+        problem = f"SPZ version {header.version}, expected {', '.join(map(str, _VERSIONS))}"
+    elif header.degree >= _DEGREES:
+        problem = f"byte 12: harmonics of degree {header.degree}, expected 0 to {_DEGREES - 1}"
+    elif header.fraction > _LARGEST_CODE.bit_length():
+        problem = f"byte 13: {header.fraction} fractional bits, expected 0 to 23"
+    elif (needed := sum(header.blocks().values())) > _INFLATION * size:
+        problem = (
+            f"truncated: {header.splats} splats need {needed} bytes unpacked, a file of "
+            f"{size} bytes holds at most {_INFLATION * size}"
         )
-    if version not in _VERSIONS:
-        raise RefineError(
-            f"{path}: SPZ version {version}, expected {', '.join(map(str, _VERSIONS))}"
-        )
-    if degree >= _DEGREES:
-        raise RefineError(
-            f"{path}: byte 12: harmonics of degree {degree}, expected 0 to {_DEGREES - 1}"
-        )
-    if fraction > _LARGEST_CODE.bit_length():
-        raise RefineError(f"{path}: byte 13: {fraction} fractional bits, expected 0 to 23")
-    model: Model = "antialiased" if flags & _ANTIALIASED else "default"
-    return _Header(version, count, degree, fraction, streams, model)
-
-
-def _refuse_many(path: Path, header: _Header, size: int) -> None:
-    """Raise `RefineError` if a file of `size` bytes cannot hold the splats that it announces."""
-    needed, most = sum(header.blocks().values()), _INFLATION * size
-    if needed > most:
-        raise RefineError(
-            f"{path}: truncated: {header.count} splats need {needed} bytes unpacked, a file of "
-            f"{size} bytes holds at most {most}"
-        )
+    if problem:
+        raise RefineError(f"{path}: {problem}")
+    return header
 
 
 def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, NDArray[np.uint8]]]:
-    """Return header and attributes of a gzip stream."""
+    """Header and attributes of a gzip stream."""
     engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
-        header = _parsed(path, engine.decompress(data.data, _HEADER.size))
+        header = _parsed(path, engine.decompress(data.data, _HEADER.size), len(data))
         if header.version == _ZSTD:
             raise RefineError(
                 f"{path}: SPZ version 4 inside of gzip, expected its own header first"
             )
-        _refuse_many(path, header, len(data))
         needed = sum(header.blocks().values())
         body = engine.decompress(engine.unconsumed_tail, needed) if needed else b""
-        if len(body) == needed:
-            _test_checksum(engine)
+        # The rest, extensions that are not read, a step at a time: its end has the checksum. No
+        # bytes at last: what zlib still holds comes out.
+        rest = memoryview(engine.unconsumed_tail)
+        for at in range(0, len(rest) + 1, _STEP) if len(body) == needed else ():
+            if not engine.eof:
+                engine.decompress(rest[at : at + _STEP])
     except zlib.error as error:
-        at = _damaged_at(data)
         raise RefineError(
-            f"{path}: a damaged SPZ file: its gzip stream breaks at byte {at} ({error})"
+            f"{path}: a damaged SPZ file: its gzip stream breaks at byte {_damaged_at(data)} "
+            f"({error})"
         ) from error
     blocks = _split(path, header, np.frombuffer(body, np.uint8))
     if not engine.eof:
@@ -178,17 +174,8 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, N
     return header, blocks
 
 
-def _test_checksum(engine: Any) -> None:
-    """Unpack the rest of a gzip stream, extensions that are not read: its end has the checksum."""
-    rest = memoryview(engine.unconsumed_tail)
-    for at in range(0, len(rest) + 1, _STEP):  # no bytes at last: what zlib still holds comes out
-        if engine.eof:
-            return
-        engine.decompress(rest[at : at + _STEP])
-
-
 def _damaged_at(data: NDArray[np.uint8]) -> int:
-    """Return which byte of a gzip stream zlib cannot go on from."""
+    """Byte of a gzip stream that zlib cannot go on from."""
     engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
     at = 0
     for size in (_STEP, 1):  # the step with the damage, then the byte
@@ -203,12 +190,12 @@ def _damaged_at(data: NDArray[np.uint8]) -> int:
 
 
 def _split(path: Path, header: _Header, body: NDArray[np.uint8]) -> dict[str, NDArray[np.uint8]]:
-    """Return the attributes that follow each other in `body`, (count, bytes) each."""
+    """Attributes that follow each other in `body`, (count, bytes) each."""
     lengths = header.blocks()
-    refuse_short(path, sum(lengths.values()), len(body), f"{header.count} splats (unpacked)")
+    refuse_short(path, sum(lengths.values()), len(body), f"{header.splats} splats (unpacked)")
     blocks, at = {}, 0
     for name, length in lengths.items():
-        blocks[name] = _table(body[at : at + length], header.count)
+        blocks[name] = _table(body[at : at + length], header.splats)
         at += length
     return blocks
 
@@ -218,17 +205,16 @@ def _table(block: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
 
 
 def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, NDArray[np.uint8]]:
-    """Return the attributes of version 4."""
+    """Attributes of version 4."""
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
     (at,) = _TABLE_AT.unpack(data[_HEADER.size : first].tobytes())
-    _refuse_many(path, header, len(data))
     lengths = {name: length for name, length in header.blocks().items() if length}
     if header.streams < len(lengths):
         raise RefineError(f"{path}: byte 15: {header.streams} streams, expected {len(lengths)}")
     start = at + header.streams * _STREAM.size
     refuse_short(path, start, len(data), "the table of streams")
-    blocks = {name: np.empty((header.count, 0), np.uint8) for name in header.blocks()}
+    blocks = {name: np.empty((header.splats, 0), np.uint8) for name in header.blocks()}
     for name, length in lengths.items():
         packed, announced = _STREAM.unpack(data[at : at + _STREAM.size].tobytes())
         at += _STREAM.size
@@ -239,15 +225,23 @@ def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, 
         end = start + packed
         refuse_short(path, end, len(data), f"stream '{name}' and what is before it")
         content = _zstd(path, name, data[start:end].tobytes(), length)
-        blocks[name] = _table(np.frombuffer(content, np.uint8), header.count)
+        blocks[name] = _table(np.frombuffer(content, np.uint8), header.splats)
         start = end
     return blocks
 
 
 def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
-    """Return what is in a zstd stream; refuse it if that has another length."""
+    """What is in a zstd stream; refuse it if that has another length."""
+    reader: Any
+    failure: type[Exception]
     try:
-        reader, failure = _zstd_reader(packed)
+        try:
+            module: Any = importlib.import_module("compression.zstd")  # Python 3.14 and later
+            reader, failure = module.ZstdFile(io.BytesIO(packed)), module.ZstdError
+        except ImportError:
+            module = importlib.import_module("zstandard")
+            reader = module.ZstdDecompressor().stream_reader(packed)
+            failure = module.ZstdError
     except ImportError as error:
         raise RefineError(
             f"{path}: SPZ version 4 needs a module for zstd: run this in Blender, which brings "
@@ -265,18 +259,8 @@ def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
     return content
 
 
-def _zstd_reader(packed: bytes) -> tuple[Any, type[Exception]]:
-    """Return a file of what is in a zstd stream, and what it raises; `ImportError` without one."""
-    try:
-        module: Any = importlib.import_module("compression.zstd")  # Python 3.14 and later
-    except ImportError:
-        module = importlib.import_module("zstandard")
-        return module.ZstdDecompressor().stream_reader(packed), module.ZstdError
-    return module.ZstdFile(io.BytesIO(packed)), module.ZstdError
-
-
 def _positions(block: NDArray[np.uint8], fraction: int) -> NDArray[np.float64]:
-    """Return positions (n, 3) of 24-bit numbers, (n, 9) bytes."""
+    """Positions (n, 3) of 24-bit numbers, (n, 9) bytes."""
     parts = block.reshape(-1, 3, 3).astype(np.int32)
     whole = parts[..., 0] | (parts[..., 1] << 8) | (parts[..., 2] << 16)
     # Shifting up and down again repeats the sign.
@@ -284,7 +268,7 @@ def _positions(block: NDArray[np.uint8], fraction: int) -> NDArray[np.float64]:
 
 
 def _rotations(block: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return quaternions w x y z; in the file they are x y z w."""
+    """Quaternions w x y z; in the file they are x y z w."""
     if block.shape[1] == 3:
         others = block / 127.5 - 1.0
         return join_largest(np.zeros(len(block), np.intp), others)
@@ -294,24 +278,15 @@ def _rotations(block: NDArray[np.uint8]) -> NDArray[np.float64]:
         code = packed >> np.uint32(shift)
         size = (code & np.uint32(511)) * (math.sqrt(0.5) / 511.0)
         others[:, index] = np.where(code & np.uint32(512), -size, size)
-    return join_largest((packed >> np.uint32(30)).astype(np.intp), others)[:, _WXYZ]
+    return join_largest((packed >> np.uint32(30)).astype(np.intp), others)[:, WXYZ]
 
 
-_XYZW, _WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
-
-
-def write(stream: BinaryIO, splats: Splats) -> None:
-    """Write splats as an SPZ file of version 3.
-
-    Raises
-    ------
-    RefineError
-        If a coordinate is beyond 8388607 either way, the largest that the format holds.
-    """
+def _write(stream: BinaryIO, splats: Splats) -> None:
+    """Write version 3; refuse coordinates beyond 8388607, the largest that it holds."""
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
     fraction = _fraction(splats)
-    header = _Header(3, count, splats.sh_degree, fraction, 0, splats.model)
     flags = _ANTIALIASED if splats.model == "antialiased" else 0
+    header = _Header(SPZ, 3, count, splats.sh_degree, fraction, flags, 0)
     blocks = {name: np.empty((count, n // count), np.uint8) for name, n in header.blocks().items()}
     for piece in pieces(count):
         batch = splats.take(piece)
@@ -327,13 +302,13 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         if rest:
             blocks["rest"][piece] = _harmonic_codes(batch.sh_rest).reshape(-1, rest)
     engine = zlib.compressobj(wbits=16 + zlib.MAX_WBITS)
-    stream.write(engine.compress(_HEADER.pack(SPZ, 3, count, header.degree, fraction, flags, 0)))
+    stream.write(engine.compress(_HEADER.pack(*header)))
     stream.writelines(engine.compress(block.data) for block in blocks.values())
     stream.write(engine.flush())
 
 
 def _fraction(splats: Splats) -> int:
-    """Return how many bits a position has behind the point.
+    """How many bits a position has behind the point.
 
     Usually 12, as other writers have it: 4096 steps a unit. Fewer where coordinates are too large
     for that, more where the largest is below 32, so that it is still some 2^17 steps.
@@ -351,7 +326,7 @@ def _fraction(splats: Splats) -> int:
 
 
 def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
-    largest, others = split_largest(unit_quaternions(quaternions)[:, _XYZW])
+    largest, others = split_largest(unit_quaternions(quaternions)[:, XYZW])
     packed = largest.astype("<u4")
     for index in range(3):
         size = np.rint(np.abs(others[:, index]) * (511.0 * math.sqrt(2.0))).astype(np.uint32)
@@ -361,7 +336,7 @@ def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def _harmonic_codes(sh_rest: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the codes of harmonics (n, K, 3), where 128 is 0, rounded to `_BUCKETS`."""
+    """The codes of harmonics (n, K, 3), where 128 is 0, rounded to `_BUCKETS`."""
     steps = np.rint(np.clip(sh_rest, -1.0, 1.0) * np.float32(128.0)).astype(np.int16) + 128
     for bucket, band in zip(_BUCKETS, (slice(3), slice(3, None)), strict=True):
         steps[:, band] = (steps[:, band] + bucket // 2) // bucket * bucket
@@ -373,9 +348,8 @@ FORMAT = Format(
     suffix=".spz",
     degree=_DEGREES - 1,
     loss="holds positions in 24 bits, all else in 8 to 10, and harmonics in 4 to 5",
-    matches=matches,
-    read=read,
-    write=write,
-    sizes=None,
+    matches=_matches,
+    read=_read,
+    write=_write,
     models=("default", "antialiased"),
 )

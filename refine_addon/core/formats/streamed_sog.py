@@ -3,67 +3,56 @@
 ``lod-meta.json`` holds a tree over space. A leaf, a *chunk*, says for each level which rows of
 which SOG have its splats: folders below of ``meta.json`` and images. A level is read, 0 being the
 finest, with the environment, which viewers always show.
+
+All levels are written. The tree follows the finest; the splats of every other level go where they
+lie in it. As splat-transform has it, consecutive chunks share a folder until it holds `UNIT`
+splats, and rows of a chunk are sorted along a curve. Viewers choose a level for each chunk by its
+size in the image, so a chunk is no wider than the distance from which the cameras saw the scene.
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import json
+import re
+import shutil
+import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RefineError, reason_of
+from ..execute import checkpoint
 from ..place import Place, described
-from ..splats import ARRAYS, Splats
-from .format import Reader, new_file
+from ..splats import ARRAYS, Splats, rotation_matrices, scales
+from ..whole_file import mode_of, new_folder, refuse_existing, whole_file
+from .format import Format, near_ones_together, new_file, pieces
 from .ply import Origin, SplatFile
-from .sog import Bundle, beside, bundle_beside, read_bundle
+from .sog import GENERATOR, IMAGES, META, Bundle, beside, bundle_beside, contents
 
 NAME, VERSION = "streamed SOG", 1
 INDEX = "lod-meta.json"
 
+UNIT = 1 << 19
+"""A folder is closed once it holds more splats than this; a chunk of the finest level has at most
+as many. The default of splat-transform."""
+
+LEAST = 1 << 13
+"""A chunk with fewer splats of the finest level is not split for its width, as in splat-transform:
+chunks cost the viewer the same, however little they hold."""
+
 _MOST_LEVELS = 1 << 10
 
-
-class _Span(NamedTuple):
-    """Rows of a SOG."""
-
-    start: int
-    end: int
+_FOLDER = re.compile(rf"(\d+_\d+)/{re.escape(META)}")
+"""A folder as an index names it, as splat-transform has it: of the level, and counted."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Unit:
-    """A SOG, and which of its rows are read."""
-
-    bundle: Bundle
-    spans: list[_Span]
-
-    @property
-    def count(self) -> int:
-        """How many splats are read."""
-        return sum(span.end - span.start for span in self.spans)
-
-    def fill(self, splats: Splats) -> None:
-        """Set splats, (count,), to those of the rows."""
-        stored, at = read_bundle(self.bundle).splats(), 0
-        for span in self.spans:
-            rows = slice(at, at + span.end - span.start)
-            for name in ARRAYS:
-                values = getattr(stored, name)[span.start : span.end]
-                if name == "sh_rest":
-                    splats.sh_rest[rows, : values.shape[1]] = values
-                    splats.sh_rest[rows, values.shape[1] :] = 0.0
-                else:
-                    getattr(splats, name)[rows] = values
-            at = rows.stop
-
-
-def matches(path: Path, head: bytes) -> bool:
-    """Return whether a file is one: by its name, which all readers go by."""
+def _matches(path: Path, head: bytes) -> bool:
+    """Whether this is an index: by its name, which all readers go by."""
     return path.name.lower().endswith(INDEX) and head.lstrip().startswith(b"{")
 
 
@@ -82,7 +71,7 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
     ------
     RefineError
         If it is damaged or of another version, has no such level, or names a file that lies
-        elsewhere; see also `sog.read`.
+        elsewhere; see also `sog.bundle_beside`.
     """
     place = Place(path)
     meta = place.members(place.parsed(data.tobytes()))
@@ -95,24 +84,34 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
     units = list(_units(place, meta, level))
     if not units:
         place.fail(f"no splats in level {level}")
-    first = units[0].bundle
-    for unit in units:
-        if unit.bundle.model != first.model:
-            unit.bundle.place.fail(f"model {unit.bundle.model}, others have {first.model}")
-    size = len(data) + sum(unit.bundle.size for unit in units)
-    count, degree = sum(unit.count for unit in units), max(unit.bundle.degree for unit in units)
-    file, splats = new_file(
-        path, Origin(f"{NAME}, level {level}", size), count, degree, first.model
-    )
+    model, files = units[0][0].model, {path: len(data)}
+    for bundle, _ in units:
+        files |= bundle.files
+        if bundle.model != model:
+            bundle.place.fail(f"model {bundle.model}, others have {model}")
+    size, count = sum(files.values()), sum(len(rows) for _, spans in units for rows in spans)
+    if count > size:  # many may share their images
+        place.fail(f"{count} splats, expected at most {size}, the bytes of all files together")
+    degree = max(bundle.degree for bundle, _ in units)
+    file, splats = new_file(path, Origin(f"{NAME}, level {level}", size), count, degree, model)
+    splats.sh_rest[:] = 0.0
     start = 0
-    for unit in units:
-        unit.fill(splats.take(slice(start, start + unit.count)))
-        start += unit.count
+    for bundle, spans in units:
+        stored = bundle.read().splats()
+        for rows in spans:
+            target = splats.take(slice(start, start + len(rows)))
+            for name in ARRAYS:
+                values = getattr(stored, name)[rows.start : rows.stop]
+                held = getattr(target, name)
+                if name == "sh_rest":
+                    held = held[:, : values.shape[1]]
+                held[:] = values
+            start += len(rows)
     return file
 
 
-def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[_Unit]:
-    """Yield what of which SOG is of a level, and the environment."""
+def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[tuple[Bundle, list[range]]]:
+    """Yield which rows of which SOG are of a level, and the environment."""
     names = place.at("filenames").items(meta.get("filenames"))
     spans = _spans(place.at("tree"), meta.get("tree"), level, len(names))
     opened: set[Path] = set()
@@ -126,21 +125,20 @@ def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[_Unit]:
 
     for file in sorted(spans):
         where = place.at(f"filenames [{file}]")
-        unit = _Unit(bundle(where, names[file]), sorted(spans[file]))
-        count = unit.bundle.count
-        if unit.spans[-1].end > count:
-            where.fail(f"holds {count} splats, the tree takes those up to {unit.spans[-1].end}")
-        if any(before.end > after.start for before, after in pairwise(unit.spans)):
+        unit, rows = bundle(where, names[file]), sorted(spans[file], key=lambda span: span.start)
+        if rows[-1].stop > unit.count:
+            where.fail(f"holds {unit.count} splats, the tree takes those up to {rows[-1].stop}")
+        if any(before.stop > after.start for before, after in itertools.pairwise(rows)):
             where.fail("the tree takes a splat twice")
-        yield unit
+        yield unit, rows
     if spans and meta.get("environment") is not None:
         around = bundle(place.at("environment"), meta["environment"])
-        yield _Unit(around, [_Span(0, around.count)])
+        yield around, [range(around.count)]
 
 
-def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[_Span]]:
-    """Return the rows of a level by the number of their file; those without splats do not count."""
-    spans: dict[int, list[_Span]] = {}
+def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[range]]:
+    """Rows of a level by the number of their file; those without splats do not count."""
+    spans: dict[int, list[range]] = {}
     left, number = [tree], 0
     while left:
         node = place.members(left.pop())
@@ -155,8 +153,234 @@ def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[_S
         start = where.at("offset").whole(held.get("offset"))
         count = where.at("count").whole(held.get("count"))
         if count:
-            spans.setdefault(file, []).append(_Span(start, start + count))
+            spans.setdefault(file, []).append(range(start, start + count))
     return spans
 
 
-READER = Reader(name=NAME, suffix=INDEX, matches=matches, read=read)
+class _Split(NamedTuple):
+    """A plane across an axis: what lies below `value` belongs to `below`."""
+
+    axis: int
+    value: float
+    below: _Tree
+    above: _Tree
+
+
+_Tree: TypeAlias = "_Split | int"
+"""Its leaves are numbers of chunks."""
+
+
+def _planted(means: NDArray[np.float64], width: float) -> tuple[_Tree, int]:
+    """Tree over positions (N, 3), and how many chunks it has.
+
+    A chunk is halved across its longest side at the median of its splats while it has more than
+    `UNIT` of them, or is wider than `width` and has more than `LEAST`.
+    """
+    numbers = itertools.count()
+
+    def grown(rows: NDArray[np.intp]) -> _Tree:
+        here = means[rows]
+        low, high = here.min(axis=0), here.max(axis=0)
+        axis = int(np.argmax(high - low))
+        longest = high[axis] - low[axis]
+        if (len(rows) <= UNIT and (len(rows) <= LEAST or longest <= width)) or not longest:
+            return next(numbers)
+        along = here[:, axis]
+        value = np.partition(along, len(along) // 2)[len(along) // 2]
+        if value == low[axis]:  # more than half of them lie there
+            value = along[along > value].min()
+        below = along < value
+        return _Split(axis, float(value), grown(rows[below]), grown(rows[~below]))
+
+    return grown(np.arange(len(means))), next(numbers)
+
+
+class StreamedSog:
+    """A streamed SOG that is written level by level.
+
+    Parameters
+    ----------
+    finest : (N, 3) floating
+        Positions of the finest level, which the chunks follow.
+    width : float
+        Of a chunk, at most, where it holds many splats.
+    folder : Path
+        Where SOG folders are made until they are published; see `folder_for`.
+    """
+
+    def __init__(self, finest: NDArray[Any], width: float, folder: Path) -> None:
+        self._tree, count = _planted(np.asarray(finest, np.float64), width)
+        self._low, self._high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+        self._rows: list[dict[str, dict[str, int]]] = [{} for _ in range(count)]
+        self._folder = folder
+        self._levels: list[int] = []  # that of each folder
+        self._counts: list[int] = []  # splats of each level
+
+    def add(self, splats: Splats) -> int:
+        """Write the next level, the finest first; return the bytes of its files.
+
+        Raises
+        ------
+        RefineError
+            If a file cannot be written, or there is no library for images.
+        """
+        level, size, waiting = len(self._counts), 0, 0
+        self._counts.append(len(splats))
+        unit: list[NDArray[np.intp]] = []
+        for number, rows in self._chunks_of(np.asarray(splats.means, np.float64)):
+            rows = rows[near_ones_together(splats.means[rows])]
+            self._widen(number, splats, rows)
+            place = {"file": len(self._levels), "offset": waiting, "count": len(rows)}
+            self._rows[number][str(level)] = place
+            unit.append(rows)
+            waiting += len(rows)
+            if waiting > UNIT:
+                size += self._write_unit(level, splats.take(np.concatenate(unit)))
+                unit, waiting = [], 0
+        if unit:
+            size += self._write_unit(level, splats.take(np.concatenate(unit)))
+        return size
+
+    def _chunks_of(self, means: NDArray[np.float64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+        """Yield the number of each chunk that has some of the positions (N, 3), and which."""
+        left: list[tuple[_Tree, NDArray[np.intp]]] = [(self._tree, np.arange(len(means)))]
+        while left:
+            node, rows = left.pop()
+            if isinstance(node, int):
+                if len(rows):
+                    yield node, rows
+                continue
+            below = means[rows, node.axis] < node.value
+            left += [(node.above, rows[~below]), (node.below, rows[below])]
+
+    def _widen(self, number: int, splats: Splats, rows: NDArray[np.intp]) -> None:
+        """Let the box of a chunk hold boxes around ellipsoids of one deviation."""
+        for piece in pieces(len(rows)):
+            batch = splats.take(rows[piece])
+            turns = np.abs(rotation_matrices(batch.quaternions))
+            half = np.einsum("nij,nj->ni", turns, scales(batch.log_scales))
+            means = np.asarray(batch.means, np.float64)
+            self._low[number] = np.minimum(self._low[number], (means - half).min(axis=0))
+            self._high[number] = np.maximum(self._high[number], (means + half).max(axis=0))
+
+    def _write_unit(self, level: int, splats: Splats) -> int:
+        """Write the next folder; return its bytes."""
+        folder, size = self._folder / str(len(self._levels)), 0
+        self._levels.append(level)
+        try:
+            folder.mkdir()
+            for file, data in contents(self._folder / INDEX, splats):
+                (folder / file).write_bytes(data)
+                size += len(data)
+        except OSError as error:
+            raise RefineError(f"{folder}: cannot be written ({reason_of(error)})") from error
+        return size
+
+    def publish(self, path: Path, *, overwrite: bool) -> None:
+        """Move the folders beside `path`, under names that are free, and write the index there.
+
+        An index that is replaced, and the folders that it names, stay until the new index is in
+        their place, so that one of the two is whole whenever this is stopped.
+
+        Raises
+        ------
+        RefineError
+            If the index may not be replaced, or the system cannot write it.
+        Cancelled
+            See `execute.checkpoint`; all is as it was.
+        """
+        checkpoint()
+        refuse_existing(path, overwrite=overwrite)
+        old, text = _folders_of(path), b""
+        moved: list[Path] = []
+        try:
+            for number, level in enumerate(self._levels):
+                free = (path.parent / f"{level}_{index}" for index in itertools.count())
+                moved.append(next(there for there in free if not there.exists()))
+                (self._folder / str(number)).rename(moved[-1])
+            index = self._index([there.name for there in moved])
+            text = json.dumps(index, allow_nan=False).encode() + b"\n"
+            with whole_file(path, overwrite=overwrite) as stream:
+                stream.write(text)
+        except BaseException as error:
+            in_place = False
+            with contextlib.suppress(OSError):
+                in_place = bool(text) and path.read_bytes() == text
+            for there in () if in_place else moved:
+                shutil.rmtree(there, ignore_errors=True)
+            if isinstance(error, OSError):
+                raise RefineError(f"{path}: cannot be written ({reason_of(error)})") from error
+            raise
+        for name in old:
+            for file in (META, *IMAGES):
+                with contextlib.suppress(OSError):
+                    (path.parent / name / file).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # it holds something else
+                (path.parent / name).rmdir()
+
+    def _index(self, names: list[str]) -> dict[str, Any]:
+        """What ``lod-meta.json`` says, with folders of these names."""
+        return {
+            "version": VERSION,
+            "asset": {"generator": GENERATOR},
+            "count": sum(self._counts),
+            "counts": self._counts,
+            "lodLevels": len(self._counts),
+            "lodErrors": False,
+            "filenames": [f"{name}/{META}" for name in names],
+            "tree": self._branch(self._tree),
+        }
+
+    def _branch(self, node: _Tree) -> dict[str, Any]:
+        """What the index says of a part of the tree."""
+        if isinstance(node, int):
+            bound = {"min": self._low[node].tolist(), "max": self._high[node].tolist()}
+            return {"bound": bound, "lods": self._rows[node]}
+        children = [self._branch(node.below), self._branch(node.above)]
+        ends = [[child["bound"][end] for child in children] for end in ("min", "max")]
+        low, high = np.min(ends[0], axis=0), np.max(ends[1], axis=0)
+        return {"bound": {"min": low.tolist(), "max": high.tolist()}, "children": children}
+
+
+@contextlib.contextmanager
+def folder_for(path: Path, *, overwrite: bool) -> Iterator[Path]:
+    """Yield an empty folder in which to make a `StreamedSog`; remove what is left of it.
+
+    Parameters
+    ----------
+    path : Path
+        The index to make, ``lod-meta.json``; its folder is made if it is not there.
+    overwrite : bool
+        Whether an index there, and the folders that it names, may be replaced.
+
+    Raises
+    ------
+    RefineError
+        If something is there that may not be replaced, or the system cannot write there.
+    """
+    with new_folder(path.parent):
+        refuse_existing(path, overwrite=overwrite)
+        _folders_of(path)
+        try:
+            with tempfile.TemporaryDirectory(prefix=".refine-", dir=path.parent) as made:
+                yield Path(made)
+        except OSError as error:
+            raise RefineError(f"{path}: cannot be written ({reason_of(error)})") from error
+
+
+def _folders_of(path: Path) -> list[str]:
+    """Names of the folders beside an index that it names; none if it is not there."""
+    if not mode_of(path):
+        return []
+    place = Place(path)
+    try:
+        meta = place.members(place.parsed(path.read_bytes()), ("lodLevels",))
+        names = place.at("filenames").items(meta.get("filenames"))
+    except RefineError as error:
+        error.add_note("it is no index of levels: write to another folder")
+        raise
+    found = (_FOLDER.fullmatch(name) for name in names if isinstance(name, str))
+    return [name[1] for name in found if name]
+
+
+READER = Format(name=NAME, suffix=INDEX, matches=_matches, read=read)

@@ -17,9 +17,8 @@ from ..execute import Progress, silent
 from ..formats import sog
 from ..formats.format import Format
 from ..formats.images import codec_for
-from ..formats.registry import Packed, as_written, scene_name
-from ..formats.streamed_sog import INDEX
-from ..formats.streamed_sog_write import StreamedSog, folder_for
+from ..formats.registry import format_named, held_splats, notes, scene_name, write_splats
+from ..formats.streamed_sog import INDEX, StreamedSog, folder_for
 from ..operation.files import FileSource
 from ..operation.loaded import Loaded
 from ..operation.run import Request, Runtime, Written, run
@@ -242,18 +241,18 @@ class FolderSink(LevelSink):
 
     def _add(self, loaded: Loaded, level: Level) -> tuple[dict[str, Any], list[str]]:
         path = self._paths(level.number)[-1]
-        writer = as_written(loaded.file(), path)
+        file, form = loaded.file(), format_named(path)
         columns = loaded.columns(level.absorbed)
-        writer.write(path, level.keep, columns=columns, overwrite=self.request.overwrite)
+        write_splats(path, file, level.keep, columns=columns, overwrite=self.request.overwrite)
         self.written.append(path)
-        counts = held(writer, level.keep)
+        counts = held(file, form, level.keep)
         facts = {
             "splats": counts["written"],
             "left_out": counts["left_out"],
             "file": path.name,
             "bytes": path.stat().st_size,
         }
-        return facts, writer.notes(level.keep)
+        return facts, notes(file, form, level.keep)
 
     def _finish(self) -> list[str]:
         """Name levels of a run before, which had more."""
@@ -280,7 +279,7 @@ class StreamedSink(LevelSink):
     def opened(self) -> Iterator[None]:
         """Refuse what cannot be written, also for want of a library for images.
 
-        See `streamed_sog_write.folder_for`.
+        See `streamed_sog.folder_for`.
         """
         codec_for(self.target)
         with folder_for(self.target, overwrite=self.request.overwrite) as made:
@@ -288,25 +287,25 @@ class StreamedSink(LevelSink):
             yield
 
     def _add(self, loaded: Loaded, level: Level) -> tuple[dict[str, Any], list[str]]:
-        writer = Packed(loaded.file(), sog.FORMAT)
-        notes = []
+        file, said = loaded.file(), []
         if level.number == 1:
             out = loaded.forced.out
             whole = np.ones(len(loaded.splats), np.bool_) if out is None else ~out
-            finest = writer.chosen(self.target, whole, {})
+            finest = held_splats(self.target, sog.FORMAT, file, whole, {})
             self.scene.append(StreamedSog(finest.means, _width(level), self.made[0]))
             self.scene[0].add(finest)
-            notes = writer.notes(whole)
+            said = notes(file, sog.FORMAT, whole)
         columns = loaded.columns(level.absorbed)
-        size = self.scene[0].add(writer.chosen(self.target, level.keep, columns))
-        counts = held(writer, level.keep)
+        splats = held_splats(self.target, sog.FORMAT, file, level.keep, columns)
+        size = self.scene[0].add(splats)
+        counts = held(file, sog.FORMAT, level.keep)
         facts = {
             "splats": counts["written"],
             "left_out": counts["left_out"],
-            "file": f"{level.number}_*/{sog.META_READER.suffix}",
+            "file": f"{level.number}_*/{sog.META}",
             "bytes": size,
         }
-        return facts, notes
+        return facts, said
 
     def _finish(self) -> list[str]:
         """Put all in its place."""

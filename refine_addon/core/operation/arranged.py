@@ -188,10 +188,11 @@ def _curve(means: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _notes(files: Sequence[SplatFile]) -> tuple[str, ...]:
-    """Return which properties of files go, in a sentence."""
+    """How files were read, and which of their properties go, in sentences."""
     more = {name for file in files for name in other_properties(file.rows.dtype.names or ())}
     names = ", ".join(sorted(more))
-    return (f"splats are written anew, without {names}",) if more else ()
+    said = [remark for file in files for remark in file.remarks]
+    return (*said, *([f"splats are written anew, without {names}"] if more else []))
 
 
 def convert_files(

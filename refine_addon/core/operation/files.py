@@ -11,8 +11,9 @@ from typing import TypeVar
 import numpy as np
 
 from ..execute import Progress, report, silent
+from ..formats import registry
 from ..formats.format import Format
-from ..formats.registry import as_written, format_named, read_splats
+from ..formats.registry import format_named, read_splats, write_splats
 from ..rendering import Model
 from ..report import files_facts, held
 from ..task import Result
@@ -182,18 +183,18 @@ class FileSink:
             See `SplatFile.write`.
         """
         report(runtime.progress, 0.0, "writing")
-        writer = as_written(loaded.file(), self.path)
+        file = loaded.file()
         columns = choice.columns if isinstance(choice, Kept) else loaded.columns(choice.absorbed)
-        path, size = self.written, writer.size(choice.keep, columns)
+        path, size = self.written, registry.written_size(file, self.form, choice.keep, columns)
         if path is not None:
-            writer.write(
-                path, choice.keep, columns=columns, overwrite=self.overwrite,
+            write_splats(
+                path, file, choice.keep, columns=columns, overwrite=self.overwrite,
                 threads=runtime.threads,
             )  # fmt: skip
             size = path.stat().st_size
         return Written(
             files=files_facts(loaded.name, str(path) if path else None, loaded.bytes, size),
             path=path,
-            splats=held(writer, choice.keep, written=path is not None),
-            notes=[*writer.notes(choice.keep), *loaded.notes],
+            splats=held(file, self.form, choice.keep, written=path is not None),
+            notes=[*registry.notes(file, self.form, choice.keep), *loaded.notes],
         )

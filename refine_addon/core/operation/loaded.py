@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from ..formats.format import Format
 from ..formats.ply import SplatFile
 from ..formats.ply_columns import Columns
-from ..formats.registry import Packed
+from ..formats.registry import row_sizes
 from ..merging.merge import Merged
-from ..selection import Budget, RowBytes
 from ..splats import Splats
 from ..survivors import survivor_columns
 from ..volumes import Forced
@@ -26,27 +25,19 @@ class RowSizes:
 
     Attributes
     ----------
-    row : float or (N,) int64
-        Of one splat, or of each of them where rows are text.
-    changed : float
-        Most bytes of one splat whose numbers may have changed.
+    row : float
+        Of one splat.
     fixed : int
         Of everything else in the file.
     """
 
-    row: RowBytes
-    changed: float
+    row: float
     fixed: int
 
     @classmethod
     def of(cls, file: SplatFile, form: Format | None) -> RowSizes:
         """Return those of a file's splats in a format; None is plain PLY."""
-        writer = file if form is None else Packed(file, form)
-        return cls(writer.row_bytes, writer.changed_row_bytes, writer.fixed_bytes)
-
-    def take(self, rows: NDArray[np.bool_]) -> RowSizes:
-        """Return those of some of the splats, (N,) bool."""
-        return replace(self, row=self.row[rows]) if isinstance(self.row, np.ndarray) else self
+        return cls(*row_sizes(file, form))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,24 +86,7 @@ class Loaded:
 
     def take(self, rows: NDArray[np.bool_]) -> Loaded:
         """Return what decides on some of the splats, (N,) bool; `stored` and `file` stay whole."""
-        return replace(
-            self,
-            splats=self.splats.take(rows),
-            forced=self.forced.of(rows),
-            sizes=self.sizes.take(rows),
-        )
-
-    def counted(self, budget: Budget, *, changed: bool) -> Loaded:
-        """Return this with the bytes of each splat as they count for a budget.
-
-        If survivors change, each may become as long as the longest row of text can.
-        """
-        out, sizes = self.forced.out, self.sizes
-        rest = np.ones(len(self.splats), np.bool_) if out is None else ~out
-        count = int(np.count_nonzero(rest))
-        if not changed or budget.removals(count, sizes.take(rest).row, sizes.fixed) == 0:
-            return self
-        return replace(self, sizes=replace(sizes, row=sizes.changed))
+        return replace(self, splats=self.splats.take(rows), forced=self.forced.of(rows))
 
     def columns(self, absorbed: Merged | None) -> Mapping[str, NDArray[Any]]:
         """Return the stored properties with what survivors became; none if they did not change."""

@@ -127,7 +127,6 @@ class PruneRequest(Request["Loaded", "Result"]):
         RefineError, Cancelled
             See `clean` and `pipeline.decide`.
         """
-        loaded = loaded.counted(self.budget, changed=self.absorb)
         if self.cleaning is None:
             return self._decide(loaded, runtime)
         forced = loaded.forced

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..affine import is_uniform, transformed
-from ..formats.registry import format_named, read_written
+from ..formats.registry import format_named, read_splats
 from ..quality.psnr import psnr_against
 from ..scores import Scores
 from ..splats import Splats
@@ -43,13 +43,13 @@ def written_facts(
     dict
         ``written_psnr``: the estimated PSNR in dB against the pictures of all splats, with what the
         format rounds and leaves out; None where nothing tells it, where the file may not be read
-        (see `read_written`), or the matrix scales directions differently, which harmonics cannot
+        (see `written_splats`), or the matrix scales directions differently, which harmonics cannot
         express.
 
     Raises
     ------
     RefineError
-        See `read_written`.
+        See `read_splats`.
     """
     if format_named(path) is None:
         return {}
@@ -60,13 +60,18 @@ def written_facts(
     return {"written_psnr": None if psnr is None else round(psnr, 2)}
 
 
-def written_splats(path: Path, matrix: NDArray[np.float64] | None = None) -> Splats | None:
+def written_splats(path: Path, matrix: NDArray[Any] | None = None) -> Splats | None:
     """Return what a file of a lossy format holds, in the frame of the views.
 
-    None where `read_written` has none, or `matrix` scales directions differently; see
-    `written_facts`.
+    None for a plain PLY, which is exact; for a file that may not be read, since one that replaced
+    another has its permissions; and where `matrix` scales directions differently.
     """
-    if matrix is None or np.array_equal(matrix, np.eye(4)):
-        return read_written(path)
-    splats = read_written(path) if is_uniform(matrix) else None
-    return None if splats is None else transformed(splats, matrix)
+    matrix = np.eye(4) if matrix is None else matrix
+    try:
+        path.open("rb").close()
+    except PermissionError:
+        return None
+    if format_named(path) is None or not is_uniform(matrix):
+        return None
+    splats = read_splats(path).splats()
+    return splats if np.array_equal(matrix, np.eye(4)) else transformed(splats, matrix)

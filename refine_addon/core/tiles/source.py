@@ -12,10 +12,16 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, run
-from ..formats.ply import splat_header, stated_model
-from ..formats.ply_body import check_counts, has_lists
+from ..formats.ply import (
+    HEADER_LIMIT,
+    TEXT,
+    check_counts,
+    format_of,
+    splat_header,
+    stated_model,
+    vertex_range,
+)
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
-from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..rendering import Model
 from ..splats import Splats, joined, on_disk, with_model
 from ..urls import Url
@@ -123,11 +129,8 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
             f"{place}: is {format_of(header.raw)}, expected a plain binary PLY as a tile, which "
             "'refine convert IN OUT.ply' makes of other formats"
         )
-    before = [*zip(header.elements[:vertex], header.counts, strict=False)]
-    if any(has_lists(element) for element, _ in before):
-        raise RefineError(f"{place}: has lists before the splats, expected none in a tile")
     check_counts(header, size - len(header.raw))
-    begin = sum(count * element.dtype(header.order).itemsize for element, count in before)
+    begin, _ = vertex_range(header, vertex)
     dtype, stated = header.elements[vertex].dtype(header.order), None
     stated = stated_model(header.raw, dtype) or "default"
     if model not in (None, stated) and THIRD_SCALE not in (dtype.names or ()):

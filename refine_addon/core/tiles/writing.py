@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
+from ..formats.ply import with_count, with_model, write_rows
 from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
-from ..formats.ply_header import with_count, with_model
-from ..formats.ply_write import write_rows
 from ..mapped import Interrupted, Mapped, note, noted, writing
 from ..splats import Splats
 from ..urls import Url
