@@ -387,7 +387,7 @@ def _touches(local, largest, views, planes, low_pass):
     """Which footprints may reach into the image, (M,); on the safe side.
 
     It is `frustum.contains` with the image widened by how far each footprint reaches. Of `views`,
-    the first is drawn, and the second is the part of it that counts; see `footprints_and_depths`.
+    the first is drawn, and the second is the part of it that counts; see `project`.
     """
     x, y, z = local
     touching = (z >= planes[0]) & (z <= planes[1])
@@ -410,7 +410,7 @@ def boxes_touch(
         Least and greatest coordinates of the means, and the longest standard deviation, in the
         scene's frame, in scene sizes.
     scene, view, window
-        See `footprints_and_depths`.
+        See `project`.
     """
     if not _computable(scene, view):
         return np.zeros(len(boxes), np.bool_)
