@@ -54,18 +54,18 @@ class Layers:
     background: NDArray[Any] | None = None
 
     def left(self) -> NDArray[np.float64]:
-        """Return how much is seen of what is behind the first 0 to K of them, (K + 1, H, W)."""
+        """How much is seen of what is behind the first 0 to K of them, (K + 1, H, W)."""
         left = np.ones((len(self.alphas) + 1, *self.alphas.shape[1:]))
         np.cumprod(1.0 - self.alphas, axis=0, out=left[1:])
         return left
 
     def over_nothing(self) -> NDArray[np.float64]:
-        """Return their colours, blended, without the background, (3, H, W)."""
+        """Their colours, blended, without the background, (3, H, W)."""
         return np.asarray(np.einsum("kchw,khw->chw", self.colors, self.left()[:-1]))
 
 
 def in_order(layers: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]) -> Layers:
-    """Return layers, each in an order of its own, in the order of their depths in each pixel.
+    """Layers, each in an order of its own, in the order of their depths in each pixel.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def draw(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.float64]:
-    """Return what a view sees of splats, and of layers among them.
+    """What a view sees of splats, and of layers among them.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def draw(
 
 
 def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
-    """Return the splats with the colours that they show to a place, the same in all directions.
+    """The splats with the colours that they show to a place, the same in all directions.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def picture(
     progress: Progress,
     threads: int | None,
 ) -> NDArray[np.float64]:
-    """Return what `draw` does, of footprints.
+    """What `draw` returns, of footprints.
 
     Parameters
     ----------
@@ -176,42 +176,36 @@ def picture(
             strip = _strip(footprints, colors, np.arange(view.width), rows, cut)
         return strip.reshape(4, len(rows), view.width)
 
-    rows = max(_PIXELS // view.width, 1)
-    strips = run_all(
-        work, chunks(view.height, rows), progress=progress, what="drawing", threads=threads
-    )
+    pieces = chunks(view.height, max(_PIXELS // view.width, 1))
+    strips = run_all(work, pieces, progress=progress, what="drawing", threads=threads)
     return np.concatenate(strips, axis=1).clip(0.0, 1.0)
 
 
 class _Cut:
     """Layers between the splats of a strip of R rows, in P pixels."""
 
-    def __init__(self, layers: Layers, depths: NDArray[Any], rows: slice) -> None:
-        count = len(layers.depths)
-        self._depths = depths  # (n,), of the footprints
-        self._limits = layers.depths[:, rows].reshape(count, -1)  # (K, P)
-        self._left = layers.left()[:, rows].reshape(count + 1, -1)  # (K + 1, P)
-        self._colors = layers.colors[:, :, rows].reshape(count, 3, -1)
-        back = layers.background
-        self._background = None if back is None else back[:, rows].reshape(3, -1)
+    def __init__(self, layers, depths, rows):
+        def flat(planes):
+            return planes[..., rows, :].reshape(*planes.shape[:-2], -1)
+
+        self._depths, self._limits = depths, flat(layers.depths)  # (n,) of footprints, (K, P)
+        self._left, self._colors = flat(layers.left()), flat(layers.colors)  # (K + 1, P), (K, 3, P)
+        self._background = None if layers.background is None else flat(layers.background)
         self._log_front = np.zeros(self._limits.shape)  # transmittance of splats in front of each
 
-    def shows(self, footprint: NDArray[np.int64], pixel: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return which splats they do not hide, (p,)."""
-        return np.asarray(self._left_of(self._layers_before(footprint, pixel), pixel) > 0.0)
+    def shows(self, footprint, pixel):
+        """Splats that they do not hide, (p,) bool."""
+        return self._left[self._before(footprint, pixel), pixel] > 0.0
 
-    def shares(
-        self, footprint: NDArray[np.int64], pixel: NDArray[Any], alpha: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
-        """Return how much of each hit they let through, (h,), and note what is before them."""
-        before = self._layers_before(footprint, pixel)
+    def shares(self, footprint, pixel, alpha):
+        """Shares of each hit that they let through, (h,); notes what is before them."""
+        before = self._before(footprint, pixel)
         log_passed = np.log1p(-alpha)
-        for layer in range(len(self._log_front)):
-            of_front = np.bincount(pixel, log_passed * (before <= layer), self._left.shape[1])
-            self._log_front[layer] += of_front
-        return self._left_of(before, pixel)
+        for layer, log_front in enumerate(self._log_front):
+            log_front += np.bincount(pixel, log_passed * (before <= layer), len(log_front))
+        return self._left[before, pixel]
 
-    def insert(self, image: NDArray[np.float64], log_left: NDArray[np.float64]) -> None:
+    def insert(self, image, log_left):
         """Add them to the picture of the splats, (4, P), whose transmittance is (P,)."""
         passed = np.exp(log_left)
         for layer, log_front in enumerate(self._log_front):
@@ -220,30 +214,13 @@ class _Cut:
             image[:3] += passed * self._background
         image[3] = 1.0 - passed * self._left[-1]
 
-    def _layers_before(
-        self, footprint: NDArray[np.int64], pixel: NDArray[Any]
-    ) -> NDArray[np.uint8]:
-        """Return how many layers are in front of each splat in its pixel, (p,)."""
-        depths = self._depths.take(footprint)
-        before = np.zeros(len(depths), np.uint8)
-        for limits in self._limits:
-            before += depths >= limits.take(pixel)
-        return before
-
-    def _left_of(self, before: NDArray[np.uint8], pixel: NDArray[Any]) -> NDArray[np.float64]:
-        """Return how much is seen behind so many layers, (p,)."""
-        place = before.astype(np.int64) * self._left.shape[1] + pixel
-        return np.asarray(self._left.reshape(-1).take(place))
+    def _before(self, footprint, pixel):
+        """Number of layers in front of each splat in its pixel, (p,)."""
+        return np.count_nonzero(self._depths[footprint] >= self._limits[:, pixel], axis=0)
 
 
-def _strip(
-    footprints: Footprints,
-    colors: NDArray[np.float64],
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    cut: _Cut | None = None,
-) -> NDArray[np.float64]:
-    """Return the pixels in C columns and R rows, ascending, as `draw` does, (4, R * C).
+def _strip(footprints, colors, columns, rows, cut):
+    """Pixels in C columns and R rows, ascending, as of `draw`, (4, R * C).
 
     Footprints come front to back, some at a time; pixels through which nothing more is seen are
     left out of those that follow. Their colours are (3, n) float64.
@@ -251,29 +228,27 @@ def _strip(
     pixels = len(columns) * len(rows)
     log_left, image = np.zeros(pixels), np.zeros((4, pixels))  # logarithm of the transmittance
 
-    def wanted(footprint: NDArray[np.int64], pixel: NDArray[np.int32]) -> NDArray[np.bool_]:
+    def wanted(footprint, pixel):
         unfinished = (log_left > LOG_OPAQUE).take(pixel)
         return unfinished if cut is None else unfinished & cut.shows(footprint, pixel)
 
     for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, wanted):
         order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
-        sorted_owner, sorted_pixel, sorted_alpha = owner[order], pixel[order], alpha[order]
-        weight = _weights(sorted_pixel, sorted_alpha, log_left)
+        owner, pixel, alpha = owner[order], pixel[order], alpha[order]
+        weight = _weights(pixel, alpha, log_left)
         if cut is not None:
-            weight *= cut.shares(sorted_owner, sorted_pixel, sorted_alpha)
+            weight *= cut.shares(owner, pixel, alpha)
         for channel in range(3):
-            light = weight * colors[channel].take(sorted_owner)
-            image[channel] += np.bincount(sorted_pixel, light, pixels)
+            light = weight * colors[channel].take(owner)
+            image[channel] += np.bincount(pixel, light, pixels)
     image[3] = 1.0 - np.exp(log_left)
     if cut is not None:
         cut.insert(image, log_left)
     return image
 
 
-def _weights(
-    pixel: NDArray[Any], alpha: NDArray[np.float32], log_left: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the share of its pixel that each hit makes up, (h,), and darken what lies behind.
+def _weights(pixel, alpha, log_left):
+    """Share of its pixel that each hit makes up, (h,); darkens what lies behind.
 
     Hits come pixel by pixel, ascending, and front to back in each. `log_left`, (P,), is the
     logarithm of the transmittance of each pixel in front of these hits; afterwards behind them.

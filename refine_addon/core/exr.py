@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ _TYPES = {1: "<f2", 2: "<f4"}  # of numbers in a channel
 
 
 def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Return the channels of an image by their names.
+    """Channels of an image by their names.
 
     Parameters
     ----------
@@ -39,8 +40,7 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
         If the file cannot be read, or is packed, has several parts, or channels of integers.
     """
     try:
-        data = path.read_bytes()
-        return _channels(data)
+        return _channels(path.read_bytes())
     except OSError as error:
         raise RefineError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, KeyError, IndexError, struct.error) as error:
@@ -49,48 +49,33 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
         ) from error
 
 
-def _channels(data: bytes) -> dict[str, NDArray[np.float32]]:
+def _channels(data):
     magic, version = struct.unpack_from("<II", data)
     if magic != _MAGIC or version & _MULTI_PART:
         raise ValueError(f"it begins with {magic}, version {version:#x}")
-    header, start = _header(data)
-    if header["compression"] != b"\0":
-        raise ValueError(f"its compression is number {header['compression'][0]}")
-    left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
-    width, height = right - left + 1, bottom - top + 1
-    line = np.dtype(
-        [("head", f"V{_LINE_HEAD}")]
-        + [(name, kind, (width,)) for name, kind in _names(header["channels"])]
-    )
-    lines = np.frombuffer(data, line, height, start + 8 * height)
-    names = line.names or ()
-    return {name: lines[name].astype(np.float32) for name in names if name != "head"}
-
-
-def _header(data: bytes) -> tuple[dict[str, bytes], int]:
-    """Return the attributes, and where the table of offsets begins."""
-    attributes, at = {}, 8
+    header, at = {}, 8
     while data[at]:
         name, at = _text(data, at)
         _, at = _text(data, at)  # its type
         (size,) = struct.unpack_from("<i", data, at)
-        attributes[name] = data[at + 4 : at + 4 + size]
+        header[name] = data[at + 4 : at + 4 + size]
         at += 4 + size
-    return attributes, at + 1
-
-
-def _names(listed: bytes) -> list[tuple[str, str]]:
-    """Return names and types of channels, in the order in which lines hold them."""
-    channels, at = [], 0
-    while listed[at]:
-        name, at = _text(listed, at)
-        (kind,) = struct.unpack_from("<i", listed, at)
-        channels.append((name, _TYPES[kind]))
-        at += 16
-    return channels
+    if header["compression"] != b"\0":
+        raise ValueError(f"its compression is number {header['compression'][0]}")
+    left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
+    width, height = right - left + 1, bottom - top + 1
+    parts: list[Any] = [("head", f"V{_LINE_HEAD}")]
+    listed, place = header["channels"], 0
+    while listed[place]:  # in the order in which lines hold them
+        name, place = _text(listed, place)
+        (kind,) = struct.unpack_from("<i", listed, place)
+        parts.append((name, _TYPES[kind], (width,)))
+        place += 16
+    lines = np.frombuffer(data, np.dtype(parts), height, at + 1 + 8 * height)
+    return {name: lines[name].astype(np.float32) for name, *_ in parts[1:]}
 
 
 def _text(data: bytes, start: int) -> tuple[str, int]:
-    """Return the text that begins here, and where it is over."""
+    """Text that begins here, and where it is over."""
     end = data.index(b"\0", start)
     return data[start:end].decode(errors="replace"), end + 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import Any
 
 from .errors import RefineError
 from .execute import Progress, silent
-from .pictures import AMPLIFIED, CAMERAS, Comparison, compare
+from .pictures import AMPLIFIED, CAMERAS, compare
 from .png import png
 from .splats import Splats
 from .views import ViewSet
@@ -93,44 +94,35 @@ class PictureFiles:
         """
         drawn = chosen(views)
         comparisons = compare(before, after, drawn, progress=progress, threads=threads)
-        paths = self._paths(drawn)
-        for comparison, files in zip(comparisons, paths, strict=True):
-            for kind, path in files.items():
-                self._write(path, png(getattr(comparison, kind)))
-        mean = sum(comparison.psnr for comparison in comparisons) / len(comparisons)
-        facts = [*map(_facts, comparisons, paths)]
-        return {"psnr": round(mean, 2), "amplified": AMPLIFIED, "views": facts}
-
-    def _write(self, path: Path, data: bytes) -> None:
+        facts = []
         try:
-            with whole_file(path, overwrite=self.overwrite) as stream:
-                stream.write(data)
+            for made, files in zip(comparisons, self._paths(drawn), strict=True):
+                for kind, path in files.items():
+                    with whole_file(path, overwrite=self.overwrite) as stream:
+                        stream.write(png(getattr(made, kind)))
+                size, names = [made.view.width, made.view.height], {k: str(files[k]) for k in files}
+                camera = {"camera": made.view.name, "size": size, "psnr": round(made.psnr, 2)}
+                facts.append(camera | names)
         except RefineError as error:
             raise RefineError(f"{error}; the pruning itself is done") from error
+        mean = sum(comparison.psnr for comparison in comparisons) / len(comparisons)
+        return {"psnr": round(mean, 2), "amplified": AMPLIFIED, "views": facts}
 
     def _paths(self, views: ViewSet) -> list[dict[str, Path]]:
-        """Return the files of each view, by `KINDS`."""
-        name = _plain(self.name)
+        """Files of each view, by `KINDS`."""
         return [
-            {kind: self.folder / f"{name}-{label}-{kind}.png" for kind in KINDS}
+            {kind: self.folder / f"{_plain(self.name)}-{label}-{kind}.png" for kind in KINDS}
             for label in _labels([view.name for view in views])
         ]
 
 
-def _facts(comparison: Comparison, paths: dict[str, Path]) -> dict[str, Any]:
-    """Return what the report says of a view."""
-    view = comparison.view
-    facts = {"camera": view.name, "size": [view.width, view.height]}
-    return facts | {"psnr": round(comparison.psnr, 2)} | {k: str(p) for k, p in paths.items()}
-
-
 def chosen(views: ViewSet) -> ViewSet:
-    """Return the views that are drawn: a few that are spread evenly over all."""
+    """Views that are drawn: a few that are spread evenly over all."""
     return views.spread(CAMERAS)
 
 
 def in_words(facts: dict[str, Any]) -> str:
-    """Return what was measured in pictures, as one sentence.
+    """What was measured in pictures, as one sentence.
 
     >>> views = [{"psnr": 38.0}, {"psnr": 36.0}]
     >>> in_words({"psnr": 37.0, "amplified": 8, "views": views})
@@ -146,22 +138,21 @@ def in_words(facts: dict[str, Any]) -> str:
 
 
 def _labels(names: list[str]) -> list[str]:
-    """Return a different part of a file name for each camera.
+    """A different part of a file name for each camera.
 
     >>> _labels(["left/0.png", "left/0.png", ""])
     ['left_0', 'left_0_2', 'view']
     """
     labels: list[str] = []
     for name in names:
-        end = _plain(_IMAGE.sub("", name)).encode()[-_LONGEST:]
-        label = new = end.decode(errors="ignore") or "view"
-        number = 2
-        while new in labels:
-            new, number = f"{label}_{number}", number + 1
-        labels.append(new)
+        end = _plain(_IMAGE.sub("", name)).encode()[-_LONGEST:].decode(errors="ignore") or "view"
+        numbered = (f"{end}_{number}" for number in itertools.count(2))
+        labels.append(
+            next(label for label in itertools.chain([end], numbered) if label not in labels)
+        )
     return labels
 
 
 def _plain(name: str) -> str:
-    """Return a name with only what every system takes within the name of a file."""
+    """A name with only what every system takes within the name of a file."""
     return re.sub(r"[^\w.() -]", "_", name)

@@ -17,9 +17,7 @@ from .rendering import NEAR_RELATIVE
 from .splats import Splats
 from .views import View, ViewSet
 from .visibility import frustum, projection
-from .visibility.projection import Gaussians
 from .visibility.ray_sample import colors_from
-from .visibility.scene import Scene
 
 LONGEST = 960
 """Pixels along the longer side of a picture, at most: views of more are drawn smaller."""
@@ -103,7 +101,7 @@ def compare(
 
 
 def fitted(view: View) -> View:
-    """Return a view of the same field of view, at most `LONGEST` pixels along its longer side.
+    """View of the same field of view, at most `LONGEST` pixels along its longer side.
 
     Examples
     --------
@@ -118,19 +116,13 @@ def fitted(view: View) -> View:
         return view
     width, height = (max(round(size * scale), 1) for size in (view.width, view.height))
     across, down = width / view.width, height / view.height
-    return replace(
-        view,
-        fx=view.fx * across,
-        fy=view.fy * down,
-        cx=view.cx * across,
-        cy=view.cy * down,
-        width=width,
-        height=height,
-    )
+    fx, cx = view.fx * across, view.cx * across
+    fy, cy = view.fy * down, view.cy * down
+    return replace(view, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
 
-def _drawn(view: View, scene: Scene) -> View:
-    """Return a view in the size of its picture, with the near plane that scoring gives it.
+def _drawn(view, scene):
+    """A view in the size of its picture, with the near plane that scoring gives it.
 
     Otherwise a scene of fewer splats, whose size is another, would begin elsewhere.
     """
@@ -138,30 +130,23 @@ def _drawn(view: View, scene: Scene) -> View:
     return replace(fitted(view), near=near if near < far else view.near)
 
 
-def _pictures(
-    splats: Splats,
-    gaussians: Gaussians,
-    scene: Scene,
-    views: ViewSet,
-    progress: Progress,
-    threads: int | None,
-) -> list[NDArray[np.float64]]:
-    """Return the picture of each view, (3, H, W), 0..1."""
+def _pictures(splats, gaussians, scene, views, progress, threads):
+    """Picture of each view, (3, H, W), 0..1."""
     pictures = []
     for number, view in enumerate(views):
-        progress_of_view = part(progress, number / len(views), (number + 1) / len(views))
+        of_view = part(progress, number / len(views), (number + 1) / len(views))
         with np.errstate(under="ignore"):
             footprints = projection.project(gaussians, scene, view)
             colors = colors_from(splats, gaussians.index[footprints.index], view)
-        drawn = picture(footprints, colors, view, progress=progress_of_view, threads=threads)
+        drawn = picture(footprints, colors, view, progress=of_view, threads=threads)
         pictures.append(drawn[:3])
     return pictures
 
 
-def _rounded(picture: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return a picture of 0..1, (3, H, W), in 8 bits, (H, W, 3)."""
+def _rounded(picture):
+    """A picture of 0..1, (3, H, W), in 8 bits, (H, W, 3)."""
     return np.ascontiguousarray(np.rint(picture * 255.0).astype(np.uint8).transpose(1, 2, 0))
 
 
-def _psnr(after: NDArray[np.float64], before: NDArray[np.float64], view: View) -> float:
+def _psnr(after, before, view):
     return psnr_of(after.reshape(3, -1), before.reshape(3, -1), view)

@@ -14,7 +14,7 @@ _UP = 2  # the filter that stores each row's difference to the one above
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
-    r"""Return a PNG image of pixels (H, W, 3), the top row first.
+    r"""PNG image of pixels (H, W, 3), the top row first.
 
     Examples
     --------
@@ -27,9 +27,7 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
     filtered[:, 1:] = np.diff(rows, axis=0, prepend=np.zeros((1, rows.shape[1]), np.uint8))
     header = struct.pack(">IIBBBBB", width, height, 8, _TRUECOLOR, 0, 0, 0)
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes())), (b"IEND", b""))
-    return _SIGNATURE + b"".join(_chunk(kind, data) for kind, data in chunks)
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    """Return a chunk: its length, its kind, its data, and a checksum of kind and data."""
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return _SIGNATURE + b"".join(  # of each chunk: length, kind, data, checksum of kind and data
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
