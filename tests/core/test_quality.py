@@ -429,7 +429,7 @@ def test_every_method_reaches_a_psnr(method, goal):
 def test_absorbing_reaches_a_psnr_with_fewer(goal):
     """By its own estimate, to `absorb_splats.CLOSE` or as near as three tries come."""
     splats, views = cloud(1500), ring()
-    plain = prune(splats, views, Budget(psnr=goal), Settings("occlusion"))
+    plain = prune(splats, views, Budget(psnr=goal), Settings("occlusion"), survivors="unchanged")
     merged = prune(splats, views, Budget(psnr=goal), survivors="absorb")
 
     assert merged.report["estimated_psnr"] == pytest.approx(goal, abs=1.5)
@@ -444,7 +444,10 @@ def test_protected_splats_stay_and_the_psnr_is_kept_all_the_same():
     scores = score(splats, views, Settings("occlusion"))
     protected = scores.values <= np.median(scores.values)
 
-    result = prune(splats, views, Budget(psnr=30.0), Settings("occlusion"), protected=protected)
+    result = prune(
+        splats, views, Budget(psnr=30.0), Settings("occlusion"),
+        protected=protected, survivors="unchanged",
+    )  # fmt: skip
 
     assert result.keep[protected].all()
     assert result.report["estimated_psnr"] == pytest.approx(30.0, abs=1.0)
@@ -452,7 +455,8 @@ def test_protected_splats_stay_and_the_psnr_is_kept_all_the_same():
 
 def test_the_report_has_the_estimate_and_the_curve():
     """Plain numbers: of the result, of absorbing instead, and of all shares."""
-    done = prune(cloud(), ring(), Budget(ratio=0.5), Settings("occlusion")).report
+    settings = Settings("occlusion")
+    done = prune(cloud(), ring(), Budget(ratio=0.5), settings, survivors="unchanged").report
 
     at = done["quality"]["shares"].index(0.5)
     assert done["estimated_psnr"] == pytest.approx(done["quality"]["psnr"][at], abs=0.01)
@@ -467,7 +471,8 @@ def test_the_report_has_the_estimate_and_the_curve():
 @pytest.mark.slow
 def test_what_absorbing_would_reach_is_told_of_many_splats_alone():
     """With few it was off by up to 7 dB. What it did reach is always told."""
-    few = prune(cloud(), ring(), Budget(ratio=0.5), Settings("occlusion"))
+    settings = Settings("occlusion")
+    few = prune(cloud(), ring(), Budget(ratio=0.5), settings, survivors="unchanged")
     curve = few.scores.quality
     assert curve is not None
     many = replace(few.scores, quality=replace(curve, foretold=True))
