@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from refine_addon import core
-from refine_addon.core import Scores, Settings
-from refine_addon.core.scoring.occlusion import Occlusion
+from refine_addon.core import Occlusion, Scores, Settings
 
 from ..baselines.refine import refine
 from .evaluate import Evaluator

@@ -22,13 +22,12 @@ from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, Scor
 from .pipeline import prune, score
 from .refit.refit import Refit, Refitted, refit, refit_rounds
 from .scores import Scores
-from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .solid import Solid
 from .splats import Splats
 from .survivor_choice import CHOICES, SURVIVORS
 from .survivors import survivor_columns
-from .task import METHODS, Result, Settings
+from .task import METHODS, Occlusion, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
 from .views_between import with_views_between

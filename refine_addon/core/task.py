@@ -13,16 +13,23 @@ from .execute import Cancelled
 from .merging.merge import Merged
 from .refit.refit import Refit
 from .scores import Scores
-from .scoring.occlusion import Occlusion
 from .selection import Budget, RowBytes
 from .splats import Splats, among_all
 from .survivor_choice import SurvivorChoice, refuse_unknown
 from .views import ViewSet, refuse_other
+from .visibility.measuring import Sampling
 from .visibility.ray_sample import RaySample
 from .volumes import refuse_all
 
 METHODS = ("occlusion", "closed-form")
 """The first is the default."""
+
+
+@dataclass(frozen=True)
+class Occlusion(Sampling):
+    """Settings of the occlusion method: `rounds`, see `occlusion.score`."""
+
+    rounds: int = 8
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ pytest.importorskip("numba")
 
 from benchmarks.renderer import rasterizer
 from refine_addon.core import Splats, View, ViewSet
-from refine_addon.core.scoring.occlusion import Occlusion
 from refine_addon.core.visibility import measuring, projection
-from refine_addon.core.visibility.measuring import Measured
+from refine_addon.core.visibility.measuring import Measured, Sampling
 
 SIDES = (12.0, 6.0, 3.0, 1.5)
 
@@ -40,7 +39,7 @@ def measured(splats: Splats, side: float) -> Measured:
     views = ViewSet((view(),))
     gaussians, frame, _ = projection.prepare(splats, views, threads=1)
     total = Measured.zero(len(gaussians))
-    settings = Occlusion(cell=side, density=8.0)
+    settings = Sampling(cell=side, density=8.0)
     total.add_view(measuring.measure_view(gaussians, frame, view(), settings)[1], 1.0)
     back = np.argsort(gaussians.index)
     return Measured(total.contribution[back], total.error[back], total.seen[back])

@@ -11,14 +11,13 @@ import pytest
 from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, execute
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, occlusion
-from refine_addon.core.scoring.occlusion import Occlusion
 from refine_addon.core.splats import ARRAYS, SH_C0, rotation_matrices
 from refine_addon.core.visibility import froxels, lattices, measuring, projection
 from refine_addon.core.visibility import points as points_module
-from refine_addon.core.visibility.measuring import Measured, Measuring
+from refine_addon.core.visibility.measuring import Measured, Measuring, Sampling
 
-ONCE = Occlusion(rounds=1)
 CUT = 1.0 / 255.0
+SAMPLING = Sampling()
 
 
 def look_along_z(center=(0.0, 0.0, 0.0), **changes) -> View:
@@ -45,12 +44,12 @@ def splats_of(means, alphas=0.5, scales=0.05, gray=0.5) -> Splats:
     )
 
 
-def measured(splats: Splats, *views: View, settings: Occlusion = ONCE) -> Measured:
+def measured(splats: Splats, *views: View, sampling: Sampling = SAMPLING) -> Measured:
     """Return sums over views, in the order of the splats."""
     gaussians, frame, _ = projection.prepare(splats, ViewSet(views), threads=1)
     total = Measured.zero(len(gaussians))
     for view in views:
-        total.add_view(measuring.measure_view(gaussians, frame, view, settings)[1], 1.0)
+        total.add_view(measuring.measure_view(gaussians, frame, view, sampling)[1], 1.0)
     back = np.argsort(gaussians.index)
     return Measured(total.contribution[back], total.error[back], total.seen[back])
 
@@ -323,12 +322,12 @@ def test_a_splat_covers_no_more_of_a_cell_than_its_opacity():
 
     Of its thickness log 2 the share 4.3 / (4.3 + 16) is even, the rest gamma distributed.
     """
-    settings = Occlusion(cell=4.0, density=1.0, rounds=1)  # one point for each
+    sampling = Sampling(cell=4.0, density=1.0)  # one point for each
     middle = np.array([0.02, 0.02])  # 2 px off the middle of the image: that of a cell
     front = splats_of([[*middle, 1.0], [*middle * 2, 2.0]], scales=[[0.02] * 3, [0.04] * 3])
 
-    found = measured(front, square(), settings=settings)
-    alone = measured(front.take(slice(1, 2)), square(), settings=settings)
+    found = measured(front, square(), sampling=sampling)
+    alone = measured(front.take(slice(1, 2)), square(), sampling=sampling)
 
     even = (2.0**2 + 0.3) / (2.0**2 + 0.3 + 16.0)
     k = froxels.GAMMA_SHAPE
@@ -470,7 +469,7 @@ def test_a_view_of_thrice_the_weight_counts_thrice():
     splats, (one, two) = cloud(), ring(2)
 
     def measured(*views):
-        return occlusion.measure_part(splats, ViewSet(views), ONCE, 0, 1)[0]
+        return occlusion.measure_part(splats, ViewSet(views), 0, 1)[0]
 
     alone = [measured(view) for view in (one, two)]
 
@@ -488,16 +487,16 @@ def test_parts_of_the_views_take_turns_and_make_up_the_whole():
     splats, views = cloud(), ring(11)
     views = ViewSet((*views.views[:4], replace(views[4], weight=3.0), *views.views[5:]))
 
-    found = [occlusion.measure_part(splats, views, ONCE, turn, 3) for turn in range(4)]
+    found = [occlusion.measure_part(splats, views, turn, 3) for turn in range(4)]
 
-    whole, _ = occlusion.measure_part(splats, views, ONCE, 0, 1)
+    whole, _ = occlusion.measure_part(splats, views, 0, 1)
     for name in ("contribution", "error", "seen"):
         total = sum(getattr(part, name) for part, _ in found[:3])
         np.testing.assert_allclose(total, getattr(whole, name), rtol=1e-12)
         np.testing.assert_array_equal(getattr(found[3][0], name), getattr(found[0][0], name))
     assert sum(share for _, share in found[:3]) == pytest.approx(1.0)
     assert {round(share * 13) for _, share in found} <= {3, 4, 5, 6}
-    assert occlusion.measure_part(splats, ring(1), ONCE, 5, 3)[1] == 1.0
+    assert occlusion.measure_part(splats, ring(1), 5, 3)[1] == 1.0
 
 
 @pytest.mark.slow
@@ -520,8 +519,7 @@ def test_a_round_orders_what_it_removes_and_the_next_one_the_rest_anew():
     splats, views = cloud(), ring()
 
     two, three = (
-        np.argsort(occlusion.score(splats, views, Occlusion(rounds=rounds)).values)
-        for rounds in (2, 3)
+        np.argsort(occlusion.score(splats, views, rounds=rounds).values) for rounds in (2, 3)
     )
 
     np.testing.assert_array_equal(two[:205], three[:205])
@@ -536,7 +534,7 @@ def test_a_budget_ends_the_rounds_and_changes_no_place_up_to_it():
     One also for .684, which the first removes to the splat: no round is begun for what stays.
     """
     splats, views = cloud(), ring()
-    whole = np.argsort(occlusion.score(splats, views, Occlusion(rounds=3)).values)
+    whole = np.argsort(occlusion.score(splats, views, rounds=3).values)
 
     for settled, same, next_round in (
         (150, 205, 270),
@@ -544,7 +542,7 @@ def test_a_budget_ends_the_rounds_and_changes_no_place_up_to_it():
         (210, 270, 300),
         (300, 300, 300),
     ):
-        found = occlusion.score(splats, views, Occlusion(rounds=3), settled=settled)
+        found = occlusion.score(splats, views, rounds=3, settled=settled)
         order = np.argsort(found.values)
         assert found.settled == settled
         np.testing.assert_array_equal(order[:same], whole[:same])
@@ -560,7 +558,7 @@ def test_what_no_renderer_draws_goes_first_the_least_first():
     splats.sh_dc[faint] = 0.0
     splats.opacity_logits[faint] = np.random.default_rng(6).permutation(20) * 0.1 - 9.0
 
-    values = occlusion.score(splats, ring(), Occlusion(rounds=3)).values
+    values = occlusion.score(splats, ring(), rounds=3).values
 
     assert (
         np.argsort(values)[:20].tolist() == faint[np.argsort(splats.opacity_logits[faint])].tolist()
@@ -575,7 +573,7 @@ def test_a_large_splat_that_one_view_does_not_show_outlasts_a_faint_one_that_it_
         [[0.1] * 3, [0.02] * 3, [0.1] * 3],
     )
 
-    values = occlusion.score(splats, ViewSet((look_along_z(),)), ONCE).values
+    values = occlusion.score(splats, ViewSet((look_along_z(),)), rounds=1).values
 
     assert values.tolist() == pytest.approx([1.0, 1 / 3, 2 / 3])
 
@@ -681,9 +679,9 @@ def test_the_order_of_splats_does_not_matter():
     splats, views = cloud(), ring()
     order = np.random.default_rng(2).permutation(len(splats))
 
-    found = occlusion.score(splats.take(order), views, ONCE).values
+    found = occlusion.score(splats.take(order), views, rounds=1).values
 
-    expected = occlusion.score(splats, views, ONCE).values[order]
+    expected = occlusion.score(splats, views, rounds=1).values[order]
     np.testing.assert_allclose(found, expected, atol=2.5 / len(splats))
 
 
@@ -693,9 +691,9 @@ def test_the_unit_of_the_scene_does_not_matter(factor):
     matrix = np.diag([factor, factor, factor, 1.0])
     scaled = ViewSet(tuple(replace(view, center=view.center * factor) for view in views))
 
-    found = occlusion.score(transformed(splats, matrix, rotate_sh=False), scaled, ONCE).values
+    found = occlusion.score(transformed(splats, matrix, rotate_sh=False), scaled, rounds=1).values
 
-    expected = occlusion.score(splats, views, ONCE).values
+    expected = occlusion.score(splats, views, rounds=1).values
     assert agreement(found, expected) > 0.99
     np.testing.assert_allclose(found, expected, atol=0.1)
 
@@ -713,9 +711,9 @@ def test_a_rigid_motion_does_not_matter():
         )
     )
 
-    found = occlusion.score(transformed(splats, matrix, rotate_sh=False), moved, ONCE).values
+    found = occlusion.score(transformed(splats, matrix, rotate_sh=False), moved, rounds=1).values
 
-    expected = occlusion.score(splats, views, ONCE).values
+    expected = occlusion.score(splats, views, rounds=1).values
     assert agreement(found, expected) > 0.99
     np.testing.assert_allclose(found, expected, atol=0.1)
 
@@ -724,7 +722,7 @@ def test_a_rigid_motion_does_not_matter():
 def test_threads_change_nothing_at_all():
     splats, views = cloud(), ring(11)
 
-    results = [occlusion.score(splats, views, Occlusion(), threads=n).values for n in (1, 2, 5)]
+    results = [occlusion.score(splats, views, threads=n).values for n in (1, 2, 5)]
 
     np.testing.assert_array_equal(results[0], results[1])
     np.testing.assert_array_equal(results[0], results[2])
@@ -733,9 +731,9 @@ def test_threads_change_nothing_at_all():
 def test_the_order_of_views_does_not_matter():
     splats, views = cloud(), ring(11)
 
-    found = occlusion.score(splats, views.take(np.arange(11)[::-1]), ONCE).values
+    found = occlusion.score(splats, views.take(np.arange(11)[::-1]), rounds=1).values
 
-    expected = occlusion.score(splats, views, ONCE).values
+    expected = occlusion.score(splats, views, rounds=1).values
     np.testing.assert_allclose(found, expected, atol=2.5 / len(splats))
 
 
@@ -743,7 +741,7 @@ def test_rounds_give_every_splat_its_own_place():
     """The progressive score is a ranking: 1 / N to 1, each once."""
     splats = cloud(200)
 
-    found = occlusion.score(splats, ring(), Occlusion(rounds=4))
+    found = occlusion.score(splats, ring(), rounds=4)
 
     np.testing.assert_allclose(np.sort(found.values), np.arange(1, 201) / 200, rtol=1e-6)
 
@@ -781,7 +779,7 @@ def test_no_scene_makes_numpy_complain(focal, spread):
     views = ViewSet(tuple(replace(view, fx=focal, fy=focal * 1.1) for view in ring()[:2]))
 
     with np.errstate(all="raise"):
-        found = occlusion.score(splats, views, Occlusion(rounds=2), threads=1)
+        found = occlusion.score(splats, views, rounds=2, threads=1)
 
     assert np.isfinite(found.values).all()
     assert (found.values > 0).all()
@@ -841,7 +839,7 @@ def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):
                 steps.append(what)
             return len(steps) < last
 
-        occlusion.measure_part(cloud(300), ring(1), Occlusion(), 0, 1, progress=progress, threads=1)
+        occlusion.measure_part(cloud(300), ring(1), 0, 1, progress=progress, threads=1)
 
     scoring()
     total = len(steps)
@@ -905,7 +903,7 @@ def test_an_image_of_any_shape_has_few_enough_cells():
         side = points_module.cell_size(footprints, view, 4.0, 3.2)
 
         assert math.ceil(width / side) * math.ceil(height / side) <= points_module.MAX_CELLS
-        assert np.isfinite(occlusion.score(splats, ViewSet((view,)), ONCE).values).all()
+        assert np.isfinite(occlusion.score(splats, ViewSet((view,)), rounds=1).values).all()
 
 
 @pytest.mark.parametrize("size", [(40.0, 1600.0), (39.2, 1599.5)])
@@ -933,10 +931,15 @@ def test_views_that_see_nothing_are_an_error():
         occlusion.score(replace(cloud(2), opacity_logits=np.full(2, -np.inf)), ring())
 
 
-@pytest.mark.parametrize("name", ["cell", "density", "rounds"])
-def test_settings_that_cannot_be_are_refused(name):
+@pytest.mark.parametrize("name", ["cell", "density"])
+def test_a_sampling_that_cannot_be_is_refused(name):
     with pytest.raises(RefineError, match=name):
-        Occlusion(**{name: 0})
+        Sampling(**{name: 0})
+
+
+def test_no_rounds_are_refused():
+    with pytest.raises(RefineError, match="rounds is 0"):
+        occlusion.score(cloud(3), ring(1), rounds=0)
 
 
 def test_weights_that_are_nearly_as_good_do_not_jump():

@@ -507,9 +507,8 @@ def test_the_closed_form_says_that_it_made_no_estimate():
 def test_absorbing_casts_rays_of_no_more_views_than_validate_it():
     """Of 60 views every third validates, at most 24: the same estimate as with the rays of all."""
     splats, views = cloud(), ring(60)
-    settings = occlusion.Occlusion()
-    some, _ = occlusion.score_once(splats, views, settings, few_views=True)
-    every, _ = occlusion.score_once(splats, views, settings)
+    some, _ = occlusion.score_once(splats, views, few_views=True)
+    every, _ = occlusion.score_once(splats, views)
     other = replace(splats, sh_dc=splats.sh_dc + 0.1)
 
     assert [rays is not None for rays in some.ray_sample.rays] == [True, False, False] * 20

@@ -230,12 +230,6 @@ def test_no_view_has_more_rays_than_numbers_of_16_bits_tell_apart():
     assert 59_000 < rays.count < 1 << 16
 
 
-def test_one_round_needs_no_rays_that_order():
-    run = occlusion.MemoryScoring(cloud(), ring(), occlusion.Occlusion(rounds=1))
-
-    assert run.scoring_rays is None
-
-
 @pytest.mark.parametrize(("width", "height"), [(200_000, 1), (1, 200_000), (300, 200)])
 def test_rays_are_no_more_than_asked_for_in_images_of_any_shape(width, height):
     view = replace(ring()[0], width=width, height=height)
@@ -260,17 +254,6 @@ def test_a_view_has_no_more_hits_than_memory_is_for(monkeypatch):
 
     assert one == pytest.approx(10_000, rel=0.02)
     assert of_eight == pytest.approx(65_536 / 8, rel=0.02)
-
-
-def test_rays_are_let_go_as_splats_go():
-    """16 bytes for each hit, not twice that."""
-    run = occlusion.MemoryScoring(cloud(), ring(), occlusion.Occlusion(rounds=2))
-    run.measure(range(run.measuring.count))
-    assert run.scoring_rays is not None
-
-    run.rank(silent)
-
-    assert run.scoring_rays is None
 
 
 @pytest.mark.slow

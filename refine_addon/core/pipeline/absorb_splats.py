@@ -304,7 +304,7 @@ def absorb_removed(
         now: Splats, expected: NDArray[np.float64], stage_progress: Progress
     ) -> NDArray[np.float64]:
         measured, share = occlusion.measure_part(
-            now, used, settings.occlusion, next(turns), PARTS,
+            now, used, next(turns), PARTS, sampling=settings.occlusion,
             progress=stage_progress, threads=threads,
         )  # fmt: skip
         return np.array([measured.contribution, measured.error]) + (1.0 - share) * expected

@@ -88,7 +88,7 @@ def score(
     with np.errstate(under="ignore"):
         if settings.method == "occlusion":
             scores = occlusion.score(
-                splats, used, settings.occlusion,
+                splats, used, rounds=settings.occlusion.rounds, sampling=settings.occlusion,
                 settled=settled, progress=scoring, threads=threads,
             )  # fmt: skip
         else:
@@ -105,7 +105,7 @@ def scoring_plans(
 ) -> list[Plan]:
     """Return the costs of scores, of validation rays, of checks and of a curve; see `score`."""
     count, used = len(splats), costs.Images.of(views.spread(settings.views))
-    stays = occlusion.survivors_of_rounds(count, settings.occlusion.rounds, settled)
+    stays = occlusion.kept_after_rounds(count, settings.occlusion.rounds, settled)
     scored, rays, checked, told = costs.scoring(count, used, settings.method, stays)
     if not (quality or settings.estimates):
         rays = told = []
@@ -178,7 +178,7 @@ def score_once(
     scoring, checking = phases(progress, *plans, threads=threads)
     with np.errstate(under="ignore"):  # as in `score`
         scores, measured = occlusion.score_once(
-            splats, used, settings.occlusion, few_views=not curve,
+            splats, used, sampling=settings.occlusion, few_views=not curve,
             progress=scoring, threads=threads,
         )  # fmt: skip
     return _with_views(scores, splats, views, used, checking, threads), measured

@@ -20,7 +20,7 @@ Splats are read once, in chunks, and may lie in files: 49 bytes of each are kept
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,16 +75,6 @@ _SMALLEST_SQUARE = 1e-300
 _NOISE = 1e-12  # a smaller statistic counts as 0: rounding leaves about this much of a zero
 
 
-class Rows(Protocol):
-    """Splats in memory, or read when a slice is taken."""
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-
-    def take(self, piece: slice, /) -> Splats:
-        """Return some of them; an empty slice has the dtypes of all."""
-
-
 class _Columns(NamedTuple):
     """What the formula needs of N splats."""
 
@@ -102,7 +92,7 @@ class _Columns(NamedTuple):
 
 
 def score(
-    splats: Rows,
+    splats: Splats,
     views: ViewSet,
     *,
     depth: Literal["z", "distance"] = "z",
@@ -115,8 +105,8 @@ def score(
 
     Parameters
     ----------
-    splats : Splats or Rows
-        N splats in the frame and unit of the views.
+    splats : Splats
+        N splats in the frame and unit of the views; they may lie in files.
     views : ViewSet
         All of them are used.
     depth : {"z", "distance"}
@@ -155,12 +145,12 @@ def score(
     size = size_of(float(np.median(used, overwrite_input=True)))
     del squared, used
     eta, near = ETA_RELATIVE * size * size, NEAR_RELATIVE * size
-    counted = _Views(views, origin, near, eta, by_distance=depth == "distance", frustum=frustum)
+    counted = _Views(views, origin, near, eta, depth == "distance", frustum)
     visibility, seen = _sum_views(columns, counted, summing, threads)
     axes = principal_axes(moments) / size
     cells = np.zeros(total if local else 0, np.int32)
 
-    def complete(piece: slice) -> list[float]:
+    def complete(piece):
         points = np.empty((3, piece.stop - piece.start))
         np.subtract(columns.means[piece].T, origin[:, None], out=points)
         alone = visibility[piece]
@@ -192,7 +182,7 @@ def score(
     factors = np.divide(weights, means, out=np.zeros(3), where=means > 0.0)
     values = np.empty(total, np.float32)
 
-    def add(piece: slice) -> None:
+    def add(piece):
         with np.errstate(under="ignore"):
             terms = zip(factors, columns.three_g(piece), strict=True)
             whole = sum(factor * (visibility[piece] * g) for factor, g in terms)
@@ -242,13 +232,7 @@ def lambdas(
     )
 
 
-def _read(
-    splats: Rows,
-    origin: NDArray[np.float64],
-    spread: float,
-    progress: Progress,
-    threads: int | None,
-) -> tuple[_Columns, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _read(splats, origin, spread, progress, threads):
     """Columns, squared distances to the views, tallies of chunks, and sums for `principal_axes`."""
     count = len(splats)
     kind = splats.take(slice(0, 0)).means.dtype.newbyteorder("=")
@@ -259,11 +243,11 @@ def _read(
     )
     squared = np.empty(count)
 
-    def read(piece: slice) -> tuple[tuple[float, ...], NDArray[np.float64]]:
+    def read(piece):
         chunk = splats.take(piece).by_columns()
         good = columns.good[piece] = drawable(chunk)  # (n,)
 
-        def clean(values: NDArray[Any], instead: float = 0.0) -> NDArray[Any]:
+        def clean(values, instead=0.0):
             keep = good.reshape(-1, *[1] * (values.ndim - 1))
             return values if good.all() else np.where(keep, values, values.dtype.type(instead))
 
@@ -297,7 +281,7 @@ def _read(
     return columns, squared, np.array(tallies), np.sum(moments, axis=0)
 
 
-def _axes(logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+def _axes(logs):
     """Product of the two largest scales, longest over shortest, and longest, (n,) each."""
     a, b, c = logs.T  # (n,) each
     low, high = np.minimum(a, b), np.maximum(a, b)
@@ -308,7 +292,7 @@ def _axes(logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     return np.exp(area), np.exp(ratio), np.exp(largest)
 
 
-def _statistics(tallies: NDArray[np.float64]) -> dict[str, float]:
+def _statistics(tallies):
     """The arguments of `lambdas`, from the tallies of chunks."""
     count, ratios, translucency, luma, squares = tallies.T  # (chunks,) each
     total = count.sum()
@@ -321,17 +305,15 @@ def _statistics(tallies: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
-def _sum_views(
-    columns: _Columns, counted: _Views, progress: Progress, threads: int | None
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _sum_views(columns, counted, progress, threads):
     """H without its factor alpha, which takes the place of `reach`; views that each lies in."""
     total = len(columns.good)
     seen, order = np.empty(total, np.int32), np.arange(total, dtype=np.int32)
 
-    def sort(rows: slice) -> None:
+    def sort(rows):
         order[rows] = rows.start + near_order(columns.means[rows])
 
-    def sum_views(piece: slice) -> None:
+    def sum_views(piece):
         rows = order[piece]
         points = np.ones((4, len(rows)))  # x, y, z, 1
         near = np.take(columns.means, rows, axis=0)
@@ -349,23 +331,12 @@ def _sum_views(
 class _Views:
     """Views that sum what splats are worth to them."""
 
-    def __init__(
-        self,
-        views: ViewSet,
-        origin: NDArray[np.float64],
-        near: float,
-        eta: float,
-        *,
-        by_distance: bool,
-        frustum: bool,
-    ) -> None:
+    def __init__(self, views, origin, near, eta, by_distance, frustum):
         self.origin, self.weights, self.eta = origin, views.weights, eta
         self.by_distance, self.frustum = by_distance, frustum
         self.frustums = Frustums(views, origin, near)
 
-    def sums(
-        self, points: NDArray[np.float64], reach: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    def sums(self, points, reach):
         """H without alpha, and the number of views that each lies in, of n splats, (n,) each.
 
         `points` is (4, n) around the origin, `reach` (n,). Splats of a run lie near each other, so
@@ -391,13 +362,7 @@ class _Views:
                 )
         return visibility, seen
 
-    def _of_run(
-        self,
-        points: NDArray[np.float64],
-        reach: NDArray[np.float64],
-        views: NDArray[np.int64],
-        partly: int,
-    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    def _of_run(self, points, reach, views, partly):
         """The same of a run that some views see, (v,); the first `partly` of them not all of it."""
         total = np.zeros(len(reach))
         seen = np.full(len(reach), len(views) - partly, np.int32)
@@ -432,9 +397,7 @@ class _Views:
             total += summed
         return total, seen
 
-    def _squared(
-        self, points: NDArray[np.float64], depth: NDArray[np.float64], views: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def _squared(self, points, depth, views):
         """d^2, (V, n); `depth` is overwritten by it."""
         if not self.by_distance:
             return np.multiply(depth, depth, out=depth)
@@ -445,20 +408,15 @@ class _Views:
         return depth
 
 
-def _cells(place: NDArray[np.float64]) -> NDArray[np.int32]:
+def _cells(place):
     """Neighbourhoods of places in scene sizes, (3, n); `place` is overwritten."""
     # All of space is mapped into a ball, so cells grow with the distance.
     place *= CELLS / 2 / (1.0 + np.sqrt(np.einsum("in,in->n", place, place)))
     x, y, z = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
-    return np.asarray((x * CELLS + y) * CELLS + z)
+    return (x * CELLS + y) * CELLS + z
 
 
-def _compare(
-    values: NDArray[np.float32],
-    cells: NDArray[np.int32],
-    good: NDArray[np.bool_],
-    threads: int | None,
-) -> None:
+def _compare(values, cells, good, threads):
     """Divide each score by a power of the mean score around it."""
     end = int(cells.max()) + 1
     powers, count = np.zeros(end), np.zeros(end, np.int64)
@@ -471,7 +429,7 @@ def _compare(
     powers /= overall
     powers = -0.5 * np.log(np.maximum(powers, np.finfo(np.float32).tiny))
 
-    def compare(piece: slice) -> None:
+    def compare(piece):
         plain = values[piece].astype(np.float64)
         weight = plain / (plain + LOCAL_HALF * overall)
         with np.errstate(under="ignore"):
@@ -480,9 +438,7 @@ def _compare(
     run_all(compare, chunks(len(values), 4 * _CHUNK), threads=threads)
 
 
-def _store(
-    into: NDArray[np.float32], values: NDArray[np.float64], good: NDArray[np.bool_], piece: slice
-) -> None:
+def _store(into, values, good, piece):
     """Set the scores of some splats, where underflow is ignored; undrawable ones score 0."""
     stored = values.astype(np.float32)
     # A drawable splat must not tie with undrawable ones by underflow.

@@ -22,7 +22,6 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..costs import SAMPLE
 from ..visibility.projection import Gaussians
 from ..visibility.scene import MIX, fingerprint
 
@@ -37,6 +36,9 @@ LEAST_FLOOR_WEIGHTS = (0.0, 0.0, 0.03, 0.03, 0.03)
 """Smallest weight for each of `SHARES`: it costs tenths of a dB on views like those given, and
 gains up to 20 dB on other views."""
 
+SAMPLE = 1 << 16
+"""How many splats are enough to choose the floor's weights."""
+
 TIED = 0.002
 """Weights whose losses differ by about this much count as equally good; the mean of their
 logarithms is taken, so that a change in the last digits does not switch to another weight."""
@@ -50,7 +52,7 @@ _NO_WEIGHT = 10.0**-5.5  # stands for 0 in a mean of logarithms
 
 
 def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> NDArray[np.float64]:
-    """Return what each splat may be worth to views that were not given, (n,).
+    """Worth of each splat to views that were not given, (n,).
 
     A splat's centre lies in `seen` views. If none of them shows the splat, the next view shows it
     with a probability of about ``1 / (1 + seen)``, by the rule of succession.
@@ -70,12 +72,12 @@ def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> 
 def with_floor(
     scores: NDArray[np.float64], floors: NDArray[np.float64], weight: float
 ) -> NDArray[np.float64]:
-    """Return ``scores / mean(scores) + weight floors``, (n,)."""
+    """``scores / mean(scores) + weight floors``, (n,)."""
     return _unit(scores) + weight * floors
 
 
 def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
-    """Return the best weight of the floor for each of `SHARES`.
+    """Best weight of the floor for each of `SHARES`.
 
     Parameters
     ----------
@@ -105,7 +107,7 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
 
 
 def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
-    """Return the rows of `count` splats, or of all if there are fewer, ascending.
+    """Rows of `count` splats, or of all if there are fewer, ascending.
 
     They are chosen by a hash of opacity and colour, so the choice is the same every time, whatever
     the order of the splats and the frame of the scene.
@@ -118,7 +120,7 @@ def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
     total = len(gaussians)
     if total <= count:
         return np.arange(total)
-    key = fingerprint(gaussians.alphas, *gaussians.colors.T)  # (N,)
+    key = fingerprint(np.asarray(gaussians.alphas), *np.asarray(gaussians.colors).T)  # (N,)
     # The lower half depends on the row, so equal splats are taken evenly from the whole scene.
     order = np.arange(total, dtype=np.uint64) * MIX
     key = key >> np.uint64(32) << np.uint64(32) | order >> np.uint64(32)
@@ -132,7 +134,7 @@ def order(
     floor_weights: Sequence[float],
     stops: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """Return all n rows in the order of removal, exact up to the last of `stops`.
+    """All n rows in the order of removal, exact up to the last of `stops`.
 
     Parameters
     ----------
@@ -156,14 +158,14 @@ def order(
     return np.concatenate([*going, left])
 
 
-def _unit(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values over their mean, (n,); zeros if the mean is 0."""
+def _unit(values):
+    """Values over their mean, (n,); zeros if the mean is 0."""
     mean = float(np.mean(values)) if len(values) else 0.0
     return values / mean if mean > 0.0 else np.zeros_like(values)
 
 
-def _losses(scores: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the logarithm of the share of each view's error that is removed, (v, shares).
+def _losses(scores, errors):
+    """Logarithm of the share of each view's error that is removed, (v, shares).
 
     The lowest scores, (n,), are removed first, equal ones together; the errors of each splat in
     each of v views are (v, n).

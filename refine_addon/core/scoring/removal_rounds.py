@@ -1,10 +1,9 @@
 """What each splat is worth while others go, told by scoring rays.
 
 Splats hide each other, so what one is worth rises as those around it go. Rays that were cast once
-(`seeing.ray_sample`) tell it at any time without measuring the views again: the hits of a ray are
-known, front to back, and so is what it would show without any one of them. Few rays hit a small
-splat, so what they tell is weighed against what the views measured of all splats
-(`seeing.measuring`)::
+(`ray_sample`) tell it at any time without measuring the views again: the hits of a ray are known,
+front to back, and so is what it would show without any one of them. Few rays hit a small splat, so
+what they tell is weighed against what the views measured of all splats (`measuring`)::
 
     error_i = (n_i  error on the rays now  +  KNOWN  error measured, grown) / (n_i + KNOWN)
 
@@ -14,15 +13,12 @@ n_i is how many rays hit the splat while all were there. A measured sum grows as
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, part, run_all
+from ..execute import Progress, part, run_all
 from ..visibility.measuring import Measured
 from ..visibility.ray_sample import RaySample
-from ..visibility.rays import Rays
 
 Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -30,24 +26,6 @@ KNOWN = 10.0
 """What was measured counts as much as so many rays."""
 
 _LOADING = 0.3  # share of the time that getting colours takes, to show progress
-
-
-@dataclass(frozen=True, eq=False)
-class _ViewRays:
-    """The scoring rays of one view."""
-
-    rays: Rays
-    colors: NDArray[np.float32]  # (3, u), of the splats that they hit
-    area: float  # of the image for each ray, px^2, times the view's weight
-
-    def keeping(self, keep: NDArray[np.bool_]) -> _ViewRays:
-        """Return them with their hits on some of all M Gaussians alone."""
-        return replace(self, rays=self.rays.keeping(keep.take(self.rays.hit)))
-
-    def removal_errors(self) -> Sums:
-        """Return error and contribution of the splats that are hit, (u,) each; see `measuring`."""
-        error, contribution = self.rays.removal_errors(self.colors)
-        return np.asarray(self.area * error), np.asarray(self.area * contribution)
 
 
 class RemovalRounds:
@@ -81,24 +59,22 @@ class RemovalRounds:
         threads: int | None,
     ) -> None:
         self._measured, self._threads = measured, threads
-        numbers = [k for k, rays in enumerate(scoring_rays.rays) if rays is not None]
 
-        def with_colors(piece: slice) -> _ViewRays:
-            number: int = numbers[piece.start]
+        def colored(number):
             rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
-            assert rays is not None
             with np.errstate(under="ignore"):
                 colors = scoring_rays.colors(number, rays).astype(np.float32)
-            return _ViewRays(rays, colors, weight * view.width * view.height / rays.count)
+            return rays, colors, weight * view.width * view.height / rays.count
 
-        self._views: list[_ViewRays] = run_all(
-            with_colors, chunks(len(numbers), 1),
+        # Of each view: rays, (3, u) colours of what they hit, and the area of the image for each
+        # ray, px^2, times the view's weight.
+        self._views = run_all(
+            colored, [k for k, rays in enumerate(scoring_rays.rays) if rays is not None],
             progress=part(progress, 0.0, _LOADING), what="scoring", threads=threads,
         )  # fmt: skip
         self._rays_hitting = np.zeros(len(measured.seen), np.int64)  # (M,), n_i
-        for view in self._views:
-            hit = view.rays.hit
-            self._rays_hitting[hit] += np.bincount(view.rays.owner, minlength=len(hit))
+        for rays, _, _ in self._views:
+            self._rays_hitting[rays.hit] += np.bincount(rays.owner, minlength=len(rays.hit))
         every = np.arange(len(self._rays_hitting))
         self._first = self._sums(every, part(progress, _LOADING, 1.0))
 
@@ -127,37 +103,34 @@ class RemovalRounds:
         error = (count * now[0] + KNOWN * error) / (count + KNOWN)
         return Measured(contribution, error, self._measured.seen[left])
 
-    def _sums(self, left: NDArray[np.int64], progress: Progress) -> Sums:
-        """Return error and contribution of Gaussians that are left, (n,) each, by the rays."""
+    def _sums(self, left, progress):
+        """Error and contribution of Gaussians that are left, (n,) each, by the rays."""
         keep = np.zeros(len(self._rays_hitting), np.bool_)
         keep[left] = True
         nothing_gone = len(left) == len(keep)
 
-        def removal_errors(piece: slice) -> Sums:
-            view: _ViewRays = self._views[piece.start]
+        def removal_errors(number):
+            rays, colors, area = self._views[number]
             if not nothing_gone:
-                view = self._views[piece.start] = view.keeping(keep)
+                rays = rays.keeping(keep.take(rays.hit))
+                self._views[number] = rays, colors, area
             with np.errstate(under="ignore"):
-                return view.removal_errors()
+                error, contribution = rays.removal_errors(colors)
+                return area * error, area * contribution
 
         of_views = run_all(
-            removal_errors, chunks(len(self._views), 1),
+            removal_errors, range(len(self._views)),
             progress=progress, what="scoring", threads=self._threads,
         )  # fmt: skip
         error, contribution = np.zeros(len(keep)), np.zeros(len(keep))
-        for view, (errors, contributions) in zip(self._views, of_views, strict=True):
-            error[view.rays.hit] += errors
-            contribution[view.rays.hit] += contributions
+        for (rays, _, _), (errors, contributions) in zip(self._views, of_views, strict=True):
+            error[rays.hit] += errors
+            contribution[rays.hit] += contributions
         return error[left], contribution[left]
 
 
-def _grown(
-    measured: NDArray[np.float64],
-    before: NDArray[np.float64],
-    now: NDArray[np.float64],
-    known: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return measured sums times what they have grown by since, (n,).
+def _grown(measured, before, now, known):
+    """Measured sums times what they have grown by since, (n,).
 
     The growth of a splat is what the rays tell of it, and the mean growth of the scene as if that
     were so many rays more::
