@@ -6,12 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import radix
 from .errors import RefineError
 from .quality.curve import PSNR_CAP, Quality
 from .scores import Scores
@@ -339,58 +337,22 @@ def quality_of(scores: Scores) -> Quality:
     return scores.quality
 
 
-def lowest(
-    keys: NDArray[np.unsignedinteger[Any]],
-    edge: int,
-    left: int,
-    weights: NDArray[np.int64] | None = None,
-) -> NDArray[np.bool_]:
-    """Return which splats go, (N,): those below an edge, and the first of those at it.
-
-    Parameters
-    ----------
-    keys : (N,) unsigned
-        `radix.keys_of` their scores.
-    edge : int
-        The key of the last one that goes.
-    left : int
-        Weight that the splats at the edge which go have together, at least; the first of them go.
-    weights : (N,) int64, optional
-        By default 1 each.
-    """
-    gone: NDArray[np.bool_] = keys < edge
-    ties = np.flatnonzero(keys == edge)
-    if weights is None:
-        gone[ties[: max(left, 0)]] = True
-    else:
-        each = weights[ties]
-        gone[ties[np.cumsum(each) - each < left]] = True
-    return gone
-
-
-def _remove_lowest(
-    keep: NDArray[np.bool_],
-    values: NDArray[np.float32],
-    free: NDArray[np.bool_],
-    amount: int,
-    weights: NDArray[np.int64] | None = None,
-) -> None:
+def _remove_lowest(keep, values, free, amount, weights=None):
     """Set `keep` to False for the lowest `free` values; of equal ones, for the first.
 
     As many of them as have the weight `amount` together, or more; by default each weighs 1.
     """
-    rows: slice | NDArray[np.bool_] = slice(None) if free.all() else free
-    keys = radix.keys_of(values[rows])
-    weights = None if weights is None else weights[rows]
-    amount = min(amount, len(keys) if weights is None else int(weights.sum()))
-    if amount <= 0:
-        return
-
-    def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
-        return radix.counts(keys, prefixes, shift, weights)
-
-    edge, below = radix.find(count, 8 * keys.dtype.itemsize, [amount - 1])[0]
-    keep[rows] = ~lowest(keys, edge, amount - below, weights)
+    rows = np.flatnonzero(free)
+    chosen = np.where(np.isnan(values[rows]), np.float32(np.inf), values[rows])
+    if weights is not None:
+        order = rows[np.argsort(chosen, kind="stable")]
+        each = weights[order]
+        keep[order[np.cumsum(each) - each < amount]] = False
+    elif amount := min(amount, len(rows)):
+        edge = np.partition(chosen, amount - 1)[amount - 1]
+        gone, ties = chosen < edge, np.flatnonzero(chosen == edge)
+        gone[ties[: amount - np.count_nonzero(gone)]] = True
+        keep[rows[gone]] = False
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
