@@ -58,13 +58,12 @@ def refuse_foreign_splats(path: Path | Url, head: bytes) -> None:
         If it is one of them; with advice.
     """
     refuse_pointer(path, head)
-    problem = foreign_kind(path, head)
-    if problem:
+    if problem := foreign_kind(path, head):
         raise RefineError(f"{path}: {problem}")
 
 
 def foreign_kind(path: Path | Url, head: bytes) -> str:
-    """Return what a file in another format is and what to do with it; "" if it is not known.
+    """What a file in another format is and what to do with it; "" if it is not known.
 
     Parameters
     ----------
@@ -87,7 +86,7 @@ def foreign_kind(path: Path | Url, head: bytes) -> str:
 
 
 def is_spz(head: bytes) -> bool:
-    """Return whether a file with these first bytes is an SPZ file, as it is or within gzip."""
+    """Whether a file with these first bytes is an SPZ file, as it is or within gzip."""
     if head.startswith(SPZ):
         return True
     try:
@@ -98,17 +97,12 @@ def is_spz(head: bytes) -> bool:
 
 
 def is_sog(path: Path | Url, head: bytes) -> bool:
-    """Return whether a file is a SOG file: a ZIP archive by that name or with what SOG holds."""
-    return head.startswith(_ZIP) and (path.suffix.lower() == ".sog" or _lists_sog(path))
-
-
-def _lists_sog(path: Path | Url) -> bool:
-    """Return whether a ZIP archive lists what SOG is made of: meta.json and images."""
+    """Whether a file is a SOG file: a ZIP archive by that name or with meta.json and images."""
+    if not head.startswith(_ZIP) or path.suffix.lower() == ".sog":
+        return head.startswith(_ZIP)
     try:
         with zipfile.ZipFile(path) as archive:
             names = [PurePosixPath(name) for name in archive.namelist()]
     except (OSError, ValueError, ArithmeticError, NotImplementedError, zipfile.BadZipFile):
         return False
-    return any(name.name == "meta.json" for name in names) and any(
-        name.suffix == ".webp" for name in names
-    )
+    return any(n.name == "meta.json" for n in names) and any(n.suffix == ".webp" for n in names)

@@ -21,7 +21,7 @@ NEIGHBOURS = 8
 
 
 def combined(before: NDArray[np.bool_], taken: NDArray[np.bool_], mode: Mode) -> NDArray[np.bool_]:
-    """Return a selection, (N,), once some splats were taken, (N,).
+    """A selection, (N,), once some splats were taken, (N,).
 
     Examples
     --------
@@ -37,7 +37,7 @@ def combined(before: NDArray[np.bool_], taken: NDArray[np.bool_], mode: Mode) ->
 
 
 def polygon(corners: Sequence[tuple[float, float]], width: int, height: int) -> NDArray[np.bool_]:
-    """Return the pixels whose centres lie in a polygon, (height, width), by the even-odd rule.
+    """Pixels whose centres lie in a polygon, (height, width), by the even-odd rule.
 
     Parameters
     ----------
@@ -78,12 +78,10 @@ def paint(
     radius : float
         Pixels.
     """
-    height, width = area.shape
-    limits = []
-    for axis, size in enumerate((width, height)):
-        low, high = sorted((start[axis], end[axis]))
-        limits.append((max(math.floor(low - radius), 0), min(math.ceil(high + radius) + 1, size)))
-    (left, right), (top, bottom) = limits
+    (left, right), (top, bottom) = (
+        (max(math.floor(min(ends) - radius), 0), min(math.ceil(max(ends) + radius) + 1, size))
+        for ends, size in zip(zip(start, end, strict=True), area.shape[::-1], strict=True)
+    )
     if left >= right or top >= bottom:
         return
     across = np.arange(left, right) + 0.5 - start[0]  # from the start, pixels
@@ -96,7 +94,7 @@ def paint(
 
 
 def grown(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a selection, (N,), and the neighbours of its splats.
+    """A selection, (N,), and the neighbours of its splats.
 
     Parameters
     ----------
@@ -110,12 +108,12 @@ def grown(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray
 
 
 def shrunk(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a selection, (N,), without the splats that have a neighbour outside it."""
+    """A selection, (N,), without the splats that have a neighbour outside it."""
     return ~grown(neighbours, ~selected)
 
 
 def neighbours_of(means: NDArray[Any], *, progress: Progress = silent) -> NDArray[np.int32]:
-    """Return the `NEIGHBOURS` nearest of each splat, (N, K), of centres (N, 3).
+    """The `NEIGHBOURS` nearest of each splat, (N, K), of centres (N, 3).
 
     Splats that are not finite have neighbours of no meaning.
     """
@@ -146,7 +144,7 @@ class Axis:
 
     @classmethod
     def of(cls, values: NDArray[Any], *, logarithmic: bool = False) -> Axis:
-        """Return an axis that holds all finite values; logarithmic, all but the least hundredth."""
+        """Axis that holds all finite values; logarithmic, all but the least hundredth."""
         usable = values[np.isfinite(values) & ((values > 0.0) | (not logarithmic))]
         if not len(usable):
             return cls(0.0, 1.0, logarithmic)
@@ -156,7 +154,7 @@ class Axis:
         return cls(low, high if high > low else low + 1.0, logarithmic)
 
     def places(self, values: NDArray[Any]) -> NDArray[np.float64]:
-        """Return where values, (N,), lie, 0 to 1; those beyond an end lie at it, as NaN at 0."""
+        """Places of values, (N,), 0 to 1; those beyond an end lie at it, as NaN at 0."""
         numbers = np.asarray(values, np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             numbers = np.log10(numbers) if self.logarithmic else numbers
@@ -164,7 +162,7 @@ class Axis:
         return np.nan_to_num(shares, nan=0.0, posinf=1.0, neginf=0.0).clip(0.0, 1.0)
 
     def value(self, place: float) -> float:
-        """Return the value at a place of the axis.
+        """Value at a place of the axis.
 
         Examples
         --------

@@ -95,7 +95,7 @@ class Sight:
     visible: NDArray[np.bool_]
 
     def in_area(self, area: NDArray[np.bool_], *, hidden: bool = False) -> NDArray[np.bool_]:
-        """Return which splats have their centre in an area of the image, (N,).
+        """Splats whose centre lies in an area of the image, (N,) bool.
 
         Parameters
         ----------
@@ -104,20 +104,19 @@ class Sight:
         hidden : bool
             Whether those that are not visible count too.
         """
-        return self._of(area[self.pixels[1], self.pixels[0]], hidden=hidden)
+        return self._of(area[self.pixels[1], self.pixels[0]], hidden)
 
     def in_ball(
         self, center: NDArray[np.float64], radius: float, *, hidden: bool = False
     ) -> NDArray[np.bool_]:
-        """Return which splats in the image lie in a ball in space, (N,)."""
+        """Splats in the image that lie in a ball in space, (N,) bool."""
         away = self.prepared.splats.means[self.rows] - center
-        near = np.einsum("ij,ij->i", away, away) <= radius * radius
-        return self._of(near, hidden=hidden)
+        return self._of(np.einsum("ij,ij->i", away, away) <= radius * radius, hidden)
 
     def of_color(
         self, color: NDArray[np.float64], tolerance: float, *, hidden: bool = False
     ) -> NDArray[np.bool_]:
-        """Return which splats in the image have nearly a colour, (N,).
+        """Splats in the image that have nearly a colour, (N,) bool.
 
         Parameters
         ----------
@@ -128,14 +127,14 @@ class Sight:
         hidden : bool
             See `in_area`.
         """
+        gaussians = self.prepared.gaussians
         place = np.full(len(self.prepared.splats), -1)
-        place[self.prepared.gaussians.index] = np.arange(len(self.prepared.gaussians))
-        colors = self.prepared.gaussians.colors[place[self.rows]]
-        apart = np.abs(np.minimum(colors, 1.0) - color).max(axis=1)
-        return self._of(apart <= tolerance, hidden=hidden)
+        place[gaussians.index] = np.arange(len(gaussians))
+        colors = np.minimum(gaussians.colors[place[self.rows]], 1.0)
+        return self._of(np.abs(colors - color).max(axis=1) <= tolerance, hidden)
 
     def surface(self, column: int, row: int) -> Surface | None:
-        """Return what lies under a pixel, None where there is next to nothing."""
+        """What lies under a pixel, None where there is next to nothing."""
         pieces = list(hits(self.footprints, np.array([column]), np.array([row]), _PAIRS))
         if not pieces:
             return None
@@ -155,20 +154,20 @@ class Sight:
         place = view.center + view.rotation.T @ ray * depth
         return Surface(place, shares @ colors / shown[-1], view.fx / depth)
 
-    def _of(self, chosen: NDArray[np.bool_], *, hidden: bool) -> NDArray[np.bool_]:
+    def _of(self, chosen, hidden):
         mask = np.zeros(len(self.prepared.splats), np.bool_)
         mask[self.rows[chosen if hidden else chosen & self.visible]] = True
         return mask
 
 
 def prepare(splats: Splats, view: View) -> Prepared:
-    """Return splats ready to be looked at; the view is one of those to come."""
+    """Splats ready to be looked at; the view is one of those to come."""
     gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
     return Prepared(splats, gaussians, scene)
 
 
 def look(prepared: Prepared, view: View) -> Sight:
-    """Return what a view shows of splats."""
+    """What a view shows of splats."""
     gaussians = prepared.gaussians
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, prepared.scene, view)
@@ -178,26 +177,19 @@ def look(prepared: Prepared, view: View) -> Sight:
         step = max(LEAST_STEP, math.ceil(math.sqrt(view.width * view.height / RAYS)))
         ends = surfaces(footprints, centers[2], view, step)
     columns, rows = np.floor(footprints.centers).astype(np.int64)
-    shown = np.flatnonzero(
-        footprints.inside
-        & ((columns >= 0) & (columns < view.width) & (rows >= 0) & (rows < view.height))
-    )
+    across, down = (columns >= 0) & (columns < view.width), (rows >= 0) & (rows < view.height)
+    shown = np.flatnonzero(footprints.inside & across & down)
     thick = THICKNESS * np.sqrt(np.maximum(covariances[5, shown], 0.0))
     end = ends[rows[shown] // step, columns[shown] // step]
-    return Sight(
-        prepared,
-        view,
-        footprints,
-        gaussians.index[footprints.index[shown]],
-        np.stack([columns[shown], rows[shown]]),
-        centers[2, shown] <= end + thick,
-    )
+    pixels, visible = np.stack([columns[shown], rows[shown]]), centers[2, shown] <= end + thick
+    index = gaussians.index[footprints.index[shown]]
+    return Sight(prepared, view, footprints, index, pixels, visible)
 
 
 def surfaces(
     footprints: Footprints, depths: NDArray[np.float32], view: View, step: int
 ) -> NDArray[np.float32]:
-    """Return the depth of the hit behind which a ray has `LIGHT_LEFT`, infinite where none is.
+    """Depth of the hit behind which a ray has `LIGHT_LEFT`, infinite where none is.
 
     Parameters
     ----------
@@ -234,12 +226,12 @@ def surfaces(
 
 
 def pinhole(
-    matrix: NDArray[np.float64],
-    projection_matrix: NDArray[np.float64],
+    matrix: NDArray[Any],
+    projection_matrix: NDArray[Any],
     size: tuple[int, int],
     means: NDArray[Any],
 ) -> View:
-    """Return the view of a camera that is given by OpenGL's matrices.
+    """View of a camera that is given by OpenGL's matrices.
 
     A camera without perspective is looked at from `FAR` extents of the splats away, where rays are
     parallel but for a thousandth.
@@ -260,10 +252,10 @@ def pinhole(
     center = -rotation.T @ flip @ matrix[:3, 3]
     if projection_matrix[3, 3] == 0.0:
         return view_through(projection_matrix, (rotation, center), size)
-    finite = means[np.isfinite(means).all(axis=1)]
-    middle = np.median(finite, axis=0) if len(finite) else center
-    width = 2.0 / projection_matrix[0, 0]
-    extent = float(max([*np.ptp(finite, axis=0), width])) if len(finite) else 1.0
+    finite, middle, extent = means[np.isfinite(means).all(axis=1)], center, 1.0
+    if len(finite):
+        middle = np.median(finite, axis=0)
+        extent = float(max([*np.ptp(finite, axis=0), 2.0 / projection_matrix[0, 0]]))
     depth = float((rotation @ (middle - center))[2])
     return view_through(projection_matrix, (rotation, center), size, (depth, FAR * extent))
 
@@ -274,7 +266,7 @@ def view_through(
     size: tuple[int, int],
     parallel: tuple[float, float] = (0.0, 1.0),
 ) -> View:
-    """Return the view of a camera with one of OpenGL's projection matrices.
+    """View of a camera with one of OpenGL's projection matrices.
 
     Parameters
     ----------
