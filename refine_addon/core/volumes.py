@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -19,7 +21,7 @@ class Volume(Protocol):
     """A part of space."""
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which points, (N, 3) floating, lie inside, (N,); none that is not finite."""
+        """Points, (N, 3) floating, that lie inside, (N,) bool; none that is not finite."""
         ...
 
 
@@ -51,7 +53,7 @@ class Box:
                 )
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which points, (N, 3), lie inside, (N,)."""
+        """Points, (N, 3), that lie inside, (N,) bool."""
         between = ((points >= self.low) & (points < self.high)).all(axis=1)
         return np.asarray(between & np.isfinite(points).all(axis=1))
 
@@ -79,12 +81,11 @@ class Sphere:
             raise RefineError(f"sphere has radius {self.radius:g}, expected more than 0")
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which points, (N, 3), lie inside, (N,)."""
+        """Points, (N, 3), that lie inside, (N,) bool."""
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             away: NDArray[np.float64] = points - np.asarray(self.center, np.float64)
-            return np.asarray(
-                np.einsum("ij,ij->i", away, away) <= np.square(np.float64(self.radius))
-            )
+            squared = np.square(np.float64(self.radius))
+            return np.asarray(np.einsum("ij,ij->i", away, away) <= squared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +109,12 @@ class MovedVolume:
             raise RefineError(f"is flat (scales {scales}), expected a volume")
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which points, (N, 3), lie inside, (N,)."""
+        """Points, (N, 3), that lie inside, (N,) bool."""
         return self.volume.inside(moved(points, np.linalg.inv(self.matrix)))
 
 
 def parse(text: str) -> Volume | None:
-    """Return the volume that a text gives in numbers, None where it is a name.
+    """The volume that a text gives in numbers, None where it is a name.
 
     Raises
     ------
@@ -131,16 +132,13 @@ def parse(text: str) -> Volume | None:
     if not colon or kind not in _FORMS:
         return None
     try:
-        numbers = [float(word) for word in rest.split(",")]
+        numbers: Any = tuple(map(float, rest.split(",")))
     except ValueError:
-        numbers = []
+        numbers = ()
     if len(numbers) != len(_FORMS[kind].split(",")):
         raise RefineError(f"expected {kind}:{_FORMS[kind]} in numbers, got '{text}'")
-    a, b, c, *others = numbers
     try:
-        if kind == "sphere":
-            return Sphere((a, b, c), others[0])
-        return Box((a, b, c), (others[0], others[1], others[2]))
+        return Box(numbers[:3], numbers[3:]) if kind == "box" else Sphere(numbers[:3], numbers[3])
     except RefineError as error:
         raise RefineError(f"'{text}': {error}") from error
 
@@ -189,16 +187,14 @@ class Forced:
     facts: tuple[dict[str, Any], ...] = ()
 
     def counts(self) -> dict[str, int]:
-        """Return how many splats are ``protected`` and how many ``forced`` out."""
+        """How many splats are ``protected`` and how many ``forced`` out."""
         masks = (("protected", self.protected), ("forced", self.out))
         return {n: 0 if mask is None else int(np.count_nonzero(mask)) for n, mask in masks}
 
     def of(self, rows: NDArray[np.bool_]) -> Forced:
-        """Return the same for the splats in `rows`, (N,) bool, alone."""
-        protected, out = (
-            None if mask is None else mask[rows] for mask in (self.protected, self.out)
-        )
-        return replace(self, protected=protected, out=out)
+        """The same for the splats in `rows`, (N,) bool, alone."""
+        kept, out = (None if mask is None else mask[rows] for mask in (self.protected, self.out))
+        return Forced(kept, out, self.facts)
 
 
 FREE = Forced()
@@ -211,7 +207,7 @@ def forced(
     protected: NDArray[np.bool_] | None = None,
     out: NDArray[np.bool_] | None = None,
 ) -> Forced:
-    """Return what must stay and what must go by volumes.
+    """What must stay and what must go by volumes.
 
     Parameters
     ----------
@@ -230,27 +226,28 @@ def forced(
     RefineError
         If a volume holds no splat and is not `Zone.idle`, or all splats would go.
     """
-    masks: dict[str, NDArray[np.bool_]] = {}
-    facts = []
-    for zone in zones:
-        inside = zone.volume.inside(means)
-        count = int(np.count_nonzero(inside))
-        if not count and not zone.idle:
+    inside = [(zone, zone.volume.inside(means)) for zone in zones]
+    for zone, mask in inside:
+        if not zone.idle and not mask.any():
             raise RefineError(f"{zone.name} holds the centre of no splat ({_extent(means)})")
-        facts.append({"role": zone.role, "name": zone.name, "splats": count})
-        masks[zone.role] = masks[zone.role] | inside if zone.role in masks else inside
-    if "keep" in masks:
-        masks["keep"] = ~masks["keep"]
-    for role in ("remove", "keep"):
-        if role in masks:
-            out = masks[role] if out is None else out | masks[role]
-    if "protect" in masks:
-        protected = masks["protect"] if protected is None else protected | masks["protect"]
+    facts = tuple(
+        {"role": zone.role, "name": zone.name, "splats": int(np.count_nonzero(mask))}
+        for zone, mask in inside
+    )
+    protect, remove, keep = (
+        _any(*(mask for zone, mask in inside if zone.role == role))
+        for role in ("protect", "remove", "keep")
+    )
+    protected, out = _any(protected, protect), _any(out, remove, None if keep is None else ~keep)
     if out is not None:
-        if protected is not None:
-            out = out & ~protected
+        out = out if protected is None else out & ~protected
         refuse_all(out)
-    return Forced(protected, out, tuple(facts))
+    return Forced(protected, out, facts)
+
+
+def _any(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    given = [mask for mask in masks if mask is not None]
+    return reduce(or_, given) if given else None
 
 
 def refuse_all(removed: NDArray[np.bool_]) -> None:
@@ -260,7 +257,7 @@ def refuse_all(removed: NDArray[np.bool_]) -> None:
 
 
 def _extent(means: NDArray[Any]) -> str:
-    """Return in words from where to where splats lie."""
+    """In words, from where to where splats lie."""
     finite = means[np.isfinite(means).all(axis=1)]
     if not len(finite):
         return "there is none with a finite centre"
