@@ -503,7 +503,7 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
     """
     asked, seen = [], []
 
-    def quarter(splats, _views, _settings, turn, parts, **_):
+    def quarter(splats, _views, turn, parts, **_):
         asked.append((turn, parts))
         ones = np.ones(len(splats))
         return Measured(ones, 2.0 * ones, np.zeros(len(splats), np.int32)), 0.25
@@ -572,8 +572,9 @@ def test_scores_of_one_budget_are_refused_for_a_larger_one(small, views):
     splats = read_ply(small).splats()
     protected = np.arange(len(splats)) % 5 == 0
     scores = prune(
-        splats, views, Budget(ratio=0.2), Settings("occlusion", views=8), protected=protected
-    ).scores
+        splats, views, Budget(ratio=0.2), Settings("occlusion", views=8),
+        protected=protected, survivors="unchanged",
+    ).scores  # fmt: skip
     settled = int(0.3 * len(splats)) + np.count_nonzero(protected)
 
     assert scores.settled == settled
