@@ -28,7 +28,7 @@ import numpy as np
 from refine_addon import core
 from refine_addon.core import Settings
 from refine_addon.core.execute import silent
-from refine_addon.core.refit.refit import SIMPLER, Refit, Refitted, refit_on
+from refine_addon.core.refit.refit import Refitted, refit_on
 from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
@@ -52,21 +52,20 @@ class Cheaper(NamedTuple):
 
     Attributes
     ----------
-    settings : Refit
+    rounds : int, optional
     views, rays : float
         Shares of the views that it casts rays from, and of the rays that it casts.
     """
 
-    settings: Refit = Refit()
+    rounds: int | None = None
     views: float = 1.0
     rays: float = 1.0
 
 
 CHEAPER = {
     "as it is": Cheaper(),
-    "colours and opacities alone": Cheaper(Refit(geometry=False), rays=SIMPLER),
-    "1 round": Cheaper(Refit(rounds=1)),
-    "2 rounds": Cheaper(Refit(rounds=2)),
+    "1 round": Cheaper(rounds=1),
+    "2 rounds": Cheaper(rounds=2),
     "half of the views": Cheaper(views=0.5),
     "a quarter of the views": Cheaper(views=0.25),
     "half of the rays": Cheaper(rays=0.5),
@@ -132,7 +131,7 @@ def _timed(
     views = views.spread(max(round(way.views * len(views)), 1))
     began, compared = time.process_time(), 0.0
     rays = RoundRays.of(splats, views, round(way.rays * len(left)), silent, 1)
-    for refitted in refit_on(rays, left, way.settings, threads=1):
+    for refitted in refit_on(rays, left, way.rounds, threads=1):
         pause = time.process_time()
         yield pause - began - compared, refitted
         compared += time.process_time() - pause

@@ -24,7 +24,6 @@ from ..core import (
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.levels.files import GOAL
-from ..core.refit.refit import Refit
 from ..core.rendering import MODELS
 from ..core.survivor_choice import SurvivorChoice
 from ..core.urls import Url, is_url, refuse_url
@@ -578,8 +577,8 @@ def _path(text: str) -> Path:
 
 def settings(options: argparse.Namespace) -> Settings:
     """Return how to score and to refit, or raise `RefineError` where a value cannot be."""
-    method, refit = options.method or Settings.method, Refit(getattr(options, "rounds", None))
-    return Settings(method, most_views(options), refit=refit)
+    method, rounds = options.method or Settings.method, getattr(options, "rounds", None)
+    return Settings(method, most_views(options), rounds=rounds)
 
 
 def most_views(options: argparse.Namespace) -> int:

@@ -20,7 +20,7 @@ from .operation.arranged import Arrangement, Move, convert_files
 from .operation.files import file_to_file, prune_file
 from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, ScoreRequest
 from .pipeline import prune, score
-from .refit.refit import Refit, Refitted, refit, refit_rounds
+from .refit.refit import Refitted, refit, refit_rounds
 from .scores import Scores
 from .selection import Budget, rank, select
 from .solid import Solid
@@ -54,7 +54,6 @@ __all__ = [
     "Occlusion",
     "PruneRequest",
     "RefineError",
-    "Refit",
     "Refitted",
     "Result",
     "ScoreRequest",

@@ -77,7 +77,7 @@ class Refit(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        refit.Refit(self.rounds)  # refuses what is out of range
+        refit.check_rounds(self.rounds)
 
 
 METHODS: dict[str, type[Method]] = {

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from .formats.format import Format
 from .formats.ply import SplatFile
 from .formats.registry import left_out
+from .merging.merge import Merged
 from .quality.cost import expected_seconds
 from .quality.curve import FEWEST, expected, in_words, out_of_reach, parted
 from .scores import Scores
@@ -206,7 +207,7 @@ def conclude(
     scores: Scores,
     keep: NDArray[np.bool_],
     psnr: float | None,
-    absorbed: Any,
+    absorbed: Merged | None,
     why: str,
 ) -> None:
     """Add to a report what it says about the quality of the pictures and about absorbing.
@@ -219,7 +220,7 @@ def conclude(
     keep : (N,) bool
     psnr : float or None
         The estimate for the result, dB.
-    absorbed : merging.merge.Merged or tiles.absorbing.Survivors or None
+    absorbed : Merged or None
         What was merged, if anything was.
     why : str
         See `remark`.
@@ -242,14 +243,8 @@ def conclude(
     if why:
         facts["notes"].append(why)
     if absorbed is not None:
-        changed = int(np.count_nonzero(absorbed.changed))
-        facts["absorbed"] = {
-            "changed": changed, "merged": absorbed.merged, "deleted": absorbed.deleted
-        }  # fmt: skip
-        facts["notes"].append(
-            f"{changed:,} survivors absorbed {absorbed.merged:,} splats; "
-            f"{absorbed.deleted:,} were deleted"
-        )
+        facts["absorbed"] = absorbed.facts()
+        facts["notes"].append(absorbed.note())
 
 
 def little_seen(seen: NDArray[np.int32]) -> str:

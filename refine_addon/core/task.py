@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .errors import RefineError
 from .execute import Cancelled
 from .merging.merge import Merged
-from .refit.refit import Refit
+from .refit.refit import check_rounds
 from .scores import Scores
 from .selection import Budget, RowBytes
 from .splats import Splats, among_all
@@ -45,14 +45,14 @@ class Settings:
         Use at most this many views, spread evenly; 0 uses all.
     occlusion : Occlusion
         Settings of this method.
-    refit : Refit
-        Settings of refitting.
+    rounds : int, optional
+        Refit up to so many times, see `refit_rounds`.
     """
 
     method: Literal["occlusion", "closed-form"] = "occlusion"
     views: int = 64
     occlusion: Occlusion = field(default_factory=Occlusion)
-    refit: Refit = field(default_factory=Refit)
+    rounds: int | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -60,6 +60,7 @@ class Settings:
             raise RefineError(f"method is {self.method!r}, expected one of {', '.join(METHODS)}")
         if self.views < 0:
             raise RefineError(f"views is {self.views}, expected 0 (all) or more")
+        check_rounds(self.rounds)
 
     @property
     def estimates(self) -> bool:

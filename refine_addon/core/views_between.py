@@ -11,10 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from .errors import RefineError
 from .views import View, ViewSet
 
 WIDEST = math.radians(90.0)
 """Views that are turned farther than that from each other have nothing between them."""
+
+MOST = 1000
+"""So many may be added at most: each is compared with all others, so more would take minutes."""
 
 _CANDIDATES = 64
 """So many of the nearest views of each are looked at for neighbours."""
@@ -59,8 +63,15 @@ def with_views_between(views: ViewSet, count: int) -> ViewSet:
     ----------
     views : ViewSet
     count : int
-        How many to add; fewer where there are none left.
+        How many to add, 0 to `MOST`; fewer where there are none left.
+
+    Raises
+    ------
+    RefineError
+        If `count` is out of range.
     """
+    if not 0 <= count <= MOST:
+        raise RefineError(f"views in between are {count:,}, expected 0 to {MOST:,}")
     while count > 0:
         more = views_between(views, count)
         if not more:

@@ -23,7 +23,6 @@ from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from ..core.levels.lod import Levels
-from ..core.refit.refit import Refit
 from ..core.rendering import MODELS
 from ..core.selection import Budget
 from ..core.task import Settings
@@ -362,7 +361,7 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         RefineError
             If they cannot be.
         """
-        return Settings(self.method, self.views, refit=Refit(self.rounds or None))
+        return Settings(self.method, self.views, rounds=self.rounds or None)
 
     def to_budget(self) -> Budget:
         """Return the budget of core.

@@ -105,9 +105,7 @@ def test_settings_reach_core_as_they_were_typed(addon):
     assert settings.to_budget() == core.Budget(ratio=0.5)
 
     settings.method, settings.views, settings.rounds = "closed-form", 7, 3
-    assert settings.to_settings() == core.Settings(
-        "closed-form", views=7, refit=core.Refit(rounds=3)
-    )
+    assert settings.to_settings() == core.Settings("closed-form", views=7, rounds=3)
 
 
 def test_scoring_writes_scores_ranks_views_and_colours(addon, room, room_cameras):

@@ -28,7 +28,6 @@ from refine_addon.core import (
 from refine_addon.core.execute import Cancelled
 from refine_addon.core.pipeline import decide
 from refine_addon.core.quality.psnr import psnr_against
-from refine_addon.core.refit.refit import Refit
 from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
@@ -88,7 +87,7 @@ def test_refitting_comes_closer_than_absorbing_and_says_by_how_much(small, views
 def test_rounds_are_as_many_as_asked_for_where_each_gains(small, views):
     """More rounds come closer on rays that none of them went by."""
     splats = read_ply(small).splats()
-    few = [replace(FEW, refit=Refit(rounds)) for rounds in (1, 3)]
+    few = [replace(FEW, rounds=rounds) for rounds in (1, 3)]
 
     told = [
         prune(splats, views, HALF, asked, survivors="refit").report["refitted"] for asked in few

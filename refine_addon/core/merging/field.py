@@ -123,13 +123,9 @@ class MeasuredField(NamedTuple):
             ``[[contribution, its sum if nothing hid anything], [error, the same of it]]``. The sums
             of the parts of a scene add up to those of the scene.
         """
-        unhidden = self.mass * self.field.opacity
-        return np.array(
-            [
-                [self.field.contribution.sum(), self.seen @ self.mass],
-                [self.field.error.sum(), self.seen @ unhidden],
-            ]
-        )
+        seen = self.field.contribution.sum(), self.field.error.sum()
+        whole = self.seen @ self.mass, self.seen @ (self.mass * self.field.opacity)
+        return np.stack([seen, whole], axis=1)
 
     def with_bias(self, scene: Array) -> Field:
         """The field with the bias; `scene`, (2, 2), is `seen_and_whole` of the whole scene."""

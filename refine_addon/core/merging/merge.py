@@ -76,6 +76,17 @@ class Merged:
     merged: int
     deleted: int
 
+    def facts(self) -> dict[str, int]:
+        """The counts, for a report."""
+        changed = int(np.count_nonzero(self.changed))
+        return {"changed": changed, "merged": self.merged, "deleted": self.deleted}
+
+    def note(self) -> str:
+        """The counts as a sentence, for the user."""
+        return "{changed:,} survivors absorbed {merged:,} splats; {deleted:,} were deleted".format(
+            **self.facts()
+        )
+
 
 def merge_penalty(share: float) -> float:
     """Factor on the cost of merging, given the share of the splats that goes.
@@ -205,10 +216,8 @@ def stage_counts(count: int, goal: int, alone: float = ALONE) -> list[int]:
         return []
     share = max(goal, 1) / count
     number = 1 if share >= alone else math.ceil(math.log(share) / math.log(STAGE) + FINER)
-    return [
-        max(round(count * (goal / count) ** ((stage + 1) / number)), goal)
-        for stage in range(number)
-    ]
+    shares = [(goal / count) ** ((stage + 1) / number) for stage in range(number)]
+    return [max(round(count * share), goal) for share in shares]
 
 
 def mergeable(

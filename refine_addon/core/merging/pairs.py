@@ -482,8 +482,7 @@ def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Ar
     """
     beside = deviation - np.einsum("ij,ij->i", deviation, direction)[:, None] * direction
     size = np.maximum(np.sqrt(np.einsum("ij,ij->i", beside, beside)), ASIDE)
-    lengths = (np.ones(len(size)), size)
-    units = (direction, normalized(beside))
+    lengths, units = (np.ones(len(size)), size), (direction, normalized(beside))
     scaled, back = (
         sum(
             ((length**power - ASIDE**power)[:, None] * unit)[:, :, None] * unit[:, None, :]

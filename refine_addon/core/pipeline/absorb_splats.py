@@ -18,6 +18,7 @@ from ..merging.merge import Merged, copied, merge, stage_counts
 from ..pace import phases
 from ..quality.curve import left_to_lose
 from ..quality.psnr import psnr_against
+from ..refit.refit import expected_rounds
 from ..refit.round_rays import limits
 from ..scores import Scores
 from ..scoring import occlusion
@@ -120,7 +121,7 @@ def _to_count(task: Task, left: int) -> list[Plan]:
     absorbed = _stages(count, left, costs.Images.of(used))
     if task.survivors != "refit":
         return [absorbed, compared, [], []]
-    rounds = task.settings.refit.expected_rounds(left)
+    rounds = expected_rounds(left, task.settings.rounds)
     refitted = costs.refitting(count, left, len(used), limits(left)[0], rounds)
     return [absorbed, 2 * compared, costs.joined(refitted), compared]
 

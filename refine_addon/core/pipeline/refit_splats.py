@@ -79,8 +79,7 @@ class Made:
         """Return the same as sentences, for the user."""
         notes = []
         if self.refitted is not None:
-            none = "refitting gains nothing on rays that nothing was fitted to"
-            notes.append(self.refitted.note(self.seconds) if self.refitted.rounds else none)
+            notes.append(self.refitted.note(self.seconds))
         if self.began == "unchanged":
             told = [in_words(psnr) for psnr in self.before.values() if psnr is not None]
             notes.append(f"refitting began with plain deletion: {told[0]}, absorbing {told[1]}")
@@ -133,7 +132,7 @@ def refit_made(task: Task, made: Made, progress: Progress, threads: int | None) 
     return_freed()
     try:
         for reached in refit_rounds(
-            absorbed.splats, original, views.spread(task.settings.views), task.settings.refit,
+            absorbed.splats, original, views.spread(task.settings.views), task.settings.rounds,
             protected=None if task.protected is None else task.protected[absorbed.keep],
             progress=named(progress, DOING), threads=threads,
         ):  # fmt: skip

@@ -9,8 +9,8 @@ The colour changes with the constant of the harmonics and with their first degre
 that these have in the direction of view. Those of higher degrees stay.
 
 Alpha is ``o exp(-d' A d / 2)`` at the distance d, in pixels, from the footprint's centre, with
-``A = (J W S W' J' + .3 I)^-1`` (`seeing.projection`). With ``g = W' J' A d``, and h_j its component
-along the splat's axis j, whose scale is s_j and the longest of which is s::
+``A = (J W S W' J' + .3 I)^-1`` (`visibility.projection`). With ``g = W' J' A d``, and h_j its
+component along the splat's axis j, whose scale is s_j and the longest of which is s::
 
     da / d logit(o)      = a (1 - o)
     da / d mean_j        = a s h_j                      the mean along axis j, in units of s
@@ -32,12 +32,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, run
+from ..execute import Progress, run
 from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..spherical_harmonics import basis
 from ..splats import SH_C0, Splats, rotation_matrices
@@ -83,85 +83,69 @@ class Shapes:
         Of each of the splat's axes, its components in the scene's frame.
     scales : (3, M) float32
         Standard deviations along these, scene sizes.
-    geometry : bool
-        Whether it is of interest how colours change with means, scales and turns.
     """
 
     gaussians: Gaussians
     scene: Scene
     axes: NDArray[np.float32]
     scales: NDArray[np.float32]
-    geometry: bool
 
     @classmethod
-    def of(
-        cls, splats: Splats, gaussians: Gaussians, scene: Scene, *, geometry: bool = True
-    ) -> Shapes:
-        """Return the shapes of the splats that some Gaussians were made of."""
-        if not geometry:
-            none = np.empty((3, 3, 0), np.float32)
-            return cls(gaussians, scene, none, none[0], geometry)
+    def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene) -> Shapes:
+        """Shapes of the splats that some Gaussians were made of."""
         chosen = splats.take(gaussians.index)
         axes = np.einsum("ij,njk->kin", scene.axes, rotation_matrices(chosen.quaternions))
         logs = chosen.log_scales.astype(np.float64).T - np.log(scene.size)
         scales = np.exp(logs.clip(*projection.LOG_SCALE_RANGE))
-        return cls(
-            gaussians, scene, np.ascontiguousarray(axes, np.float32), scales.astype(np.float32),
-            geometry,
-        )  # fmt: skip
+        axes = np.ascontiguousarray(axes, np.float32)
+        return cls(gaussians, scene, axes, scales.astype(np.float32))
 
     def __len__(self) -> int:
-        """Return the number of Gaussians."""
+        """How many Gaussians there are."""
         return len(self.gaussians)
 
     def take(self, hit: NDArray[np.integer[Any]]) -> Shapes:
-        """Return some of them."""
-        axes, scales = self.axes, self.scales
-        if self.geometry:
-            axes, scales = axes.take(hit, axis=2), scales.take(hit, axis=1)
-        return Shapes(self.gaussians.take(hit), self.scene, axes, scales, self.geometry)
+        """Some of them."""
+        axes, scales = self.axes.take(hit, axis=2), self.scales.take(hit, axis=1)
+        return Shapes(self.gaussians.take(hit), self.scene, axes, scales)
 
     def in_scene(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return changed parameters, (22, M), as changes in the frame of the scene.
+        """Changed parameters, (22, M), as changes in the frame of the scene.
 
         Returns
         -------
         (22, M) float32
             Of the colour, of the first degree of the harmonics as it is, of the logarithm of the
-            opacity, m, and the six numbers of S (`PAIRS`); without geometry the first 13 alone.
+            opacity, m, and the six numbers of S (`PAIRS`).
         """
-        result = np.zeros((COUNT if self.geometry else MEAN.start, len(self)), np.float32)
+        result = np.zeros((COUNT, len(self)), np.float32)
         result[COLOR] = np.float32(SH_C0) * change[COLOR]
         result[DEGREE_1] = change[DEGREE_1]
         result[OPACITY] = (np.float32(1.0) - self.gaussians.alphas) * change[OPACITY]
-        if self.geometry:
-            moved = self.scales.max(axis=0) * change[MEAN]
-            np.einsum("kin,kn->in", self.axes, moved, out=result[MEAN])
-            for parameter, strength, one, other in self._quadratic():
-                by = strength * change[parameter]
-                for row, (i, k) in enumerate(PAIRS, SCALE.start):
-                    result[row] += by * (one[i] * other[k] + one[k] * other[i])
+        moved = self.scales.max(axis=0) * change[MEAN]
+        np.einsum("kin,kn->in", self.axes, moved, out=result[MEAN])
+        for parameter, strength, one, other in self._quadratic():
+            by = strength * change[parameter]
+            for row, (i, k) in enumerate(PAIRS, SCALE.start):
+                result[row] += by * (one[i] * other[k] + one[k] * other[i])
         return result
 
     def by_parameter(self, sums: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the transpose of `in_scene`: of such sums, see `LinearView.backward`, (22, M)."""
+        """The transpose of `in_scene`: of such sums, see `LinearView.backward`, (22, M)."""
         result = np.zeros((COUNT, len(self)), np.float32)
         result[COLOR] = np.float32(SH_C0) * sums[COLOR]
         result[DEGREE_1] = sums[DEGREE_1]
         result[OPACITY] = (np.float32(1.0) - self.gaussians.alphas) * sums[OPACITY]
-        if self.geometry:
-            np.einsum("kin,in->kn", self.axes, sums[MEAN], out=result[MEAN])
-            result[MEAN] *= self.scales.max(axis=0)
-            for parameter, strength, one, other in self._quadratic():
-                for row, (i, k) in enumerate(PAIRS, SCALE.start):
-                    result[parameter] += sums[row] * (one[i] * other[k] + one[k] * other[i])
-                result[parameter] *= strength
+        np.einsum("kin,in->kn", self.axes, sums[MEAN], out=result[MEAN])
+        result[MEAN] *= self.scales.max(axis=0)
+        for parameter, strength, one, other in self._quadratic():
+            for row, (i, k) in enumerate(PAIRS, SCALE.start):
+                result[parameter] += sums[row] * (one[i] * other[k] + one[k] * other[i])
+            result[parameter] *= strength
         return result
 
-    def _quadratic(
-        self,
-    ) -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]]:
-        """Yield for scales and turns the number of the parameter, and half of its factor.
+    def _quadratic(self) -> Iterator[tuple[int, Any, Any, Any]]:
+        """Yield for scales and turns the number of the parameter, and half of its factor, (M,).
 
         And the two axes, (3, M) each, of which S is the symmetric product.
         """
@@ -171,15 +155,6 @@ class Shapes:
             yield SCALE.start + axis, half * squared[axis], self.axes[axis], self.axes[axis]
             turned = half * (squared[after] - squared[last])
             yield TURN.start + axis, turned, self.axes[after], self.axes[last]
-
-
-class _Hits(NamedTuple):
-    """The hits of a view as numbers to compute with, (h,) each."""
-
-    owner: NDArray[np.intp]
-    weight: NDArray[np.float32]
-    by_log_alpha: list[NDArray[np.float32]]
-    steepness: list[NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,12 +179,12 @@ class LinearView:
         How the colour changes with the logarithm of alpha, ``T a (c - B)``; 0 where alpha is
         clipped, and does not change.
     steepness : (2, h) or (3, h) uint16
-        ``A d`` across and down, 1/px; (0, h) if geometry does not change. Of discs also whether the
-        disc is hit, 1, or its low-pass, 0, which no scale and no turn changes.
+        ``A d`` across and down, 1/px. Of discs also whether the disc is hit, 1, or its low-pass, 0,
+        which no scale and no turn changes.
     unclipped : (3, u) bool
         Where the colour changes with the harmonics.
     jacobian : (2, 3, u) float32
-        Rows of J W: pixels for a step of one scene size; none if geometry does not change.
+        Rows of J W: pixels for a step of one scene size.
     basis : (3, u) float32
         Values of the harmonics of the first degree in the direction of view.
     """
@@ -226,108 +201,106 @@ class LinearView:
     jacobian: NDArray[np.float32]
     basis: NDArray[np.float32]
 
-    def forward(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return by how much the colours change, (3, P), to first order.
+    def forward(
+        self, change: NDArray[np.float32], hits: tuple[Any, ...] | None = None
+    ) -> NDArray[np.float32]:
+        """By how much the colours change, (3, P), to first order.
 
         Parameters
         ----------
-        change : (22, M) or (13, M) float32
+        change : (22, M) float32
             Of all Gaussians, in the frame of the scene: see `Shapes.in_scene`.
+        hits : tuple, optional
+            See `hits`.
         """
-        return self._forward(change, self._hits())
-
-    def backward(self, errors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the transpose of `forward` times some errors of the colours.
-
-        Parameters
-        ----------
-        errors : (3, P) float32
-
-        Returns
-        -------
-        (22, u) or (13, u) float32
-            Off the diagonal of S, half of it.
-        """
-        return self._backward(errors, self._hits())
-
-    def normal(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return `backward` of `forward`."""
-        hits = self._hits()
-        return self._backward(self._forward(change, hits), hits)
-
-    def _hits(self) -> _Hits:
-        halves = self.by_log_alpha, self.steepness
-        return _Hits(
-            self.owner.astype(np.intp), _floats(self.weight),
-            *([_floats(row) for row in rows] for rows in halves),
-        )  # fmt: skip
-
-    def _forward(self, change: NDArray[np.float32], hits: _Hits) -> NDArray[np.float32]:
+        owner, weight, by_log_alpha, (across, down, *on_plane) = hits or self.hits()
         mine = [row.take(self.hit) for row in change]
-        log_alpha = mine[OPACITY.start].take(hits.owner)
-        if hits.steepness:
-            across, down, *on_plane = hits.steepness
-            x, y, xx, xy, yy = (each.take(hits.owner) for each in self._polynomials(mine))
-            for where in on_plane:
-                xx, xy, yy = xx * where, xy * where, yy * where
-            xx *= across
-            x += xx
-            xy *= down
-            x += xy
-            x *= across
-            log_alpha += x
-            yy *= down
-            y += yy
-            y *= down
-            log_alpha += y
+        log_alpha = mine[OPACITY.start].take(owner)
+        x, y, xx, xy, yy = (each.take(owner) for each in self._polynomials(mine))
+        for where in on_plane:
+            xx, xy, yy = xx * where, xy * where, yy * where
+        xx *= across
+        x += xx
+        xy *= down
+        x += xy
+        x *= across
+        log_alpha += x
+        yy *= down
+        y += yy
+        y *= down
+        log_alpha += y
         result = np.zeros_like(self.errors)
         if not len(self.counts):
             return result
         first = np.cumsum(self.counts) - self.counts
         for channel, (row, unclipped, seen, slope) in enumerate(
-            zip(result, self.unclipped, mine[COLOR], hits.by_log_alpha, strict=True)
+            zip(result, self.unclipped, mine[COLOR], by_log_alpha, strict=True)
         ):
             turning = _dot([*self.basis], mine[_of_channel(channel)])
-            light = ((seen + turning) * unclipped).take(hits.owner)
-            light *= hits.weight
+            light = ((seen + turning) * unclipped).take(owner)
+            light *= weight
             light += slope * log_alpha
             row[self.hitting] = np.add.reduceat(light, first)
         return result
 
-    def _backward(self, errors: NDArray[np.float32], hits: _Hits) -> NDArray[np.float32]:
-        result = np.zeros((COUNT if hits.steepness else MEAN.start, len(self.hit)), np.float32)
-        value = np.zeros(len(hits.owner), np.float32)
-        for channel, slope in enumerate(hits.by_log_alpha):
+    def backward(
+        self, errors: NDArray[np.float32], hits: tuple[Any, ...] | None = None
+    ) -> NDArray[np.float32]:
+        """The transpose of `forward` times some errors of the colours.
+
+        Parameters
+        ----------
+        errors : (3, P) float32
+        hits : tuple, optional
+            See `hits`.
+
+        Returns
+        -------
+        (22, u) float32
+            Off the diagonal of S, half of it.
+        """
+        owner, weight, by_log_alpha, (across, down, *on_plane) = hits or self.hits()
+        result = np.zeros((COUNT, len(self.hit)), np.float32)
+        value = np.zeros(len(owner), np.float32)
+        for channel, slope in enumerate(by_log_alpha):
             error = np.repeat(errors[channel].take(self.hitting), self.counts)
             value += slope * error
-            error *= hits.weight
-            result[channel] = self._sum(error, hits.owner)
+            error *= weight
+            result[channel] = self._sum(error, owner)
         result[COLOR] *= self.unclipped
         for channel, total in enumerate(result[COLOR]):
             result[_of_channel(channel)] = self.basis * total
-        result[OPACITY] = self._sum(value, hits.owner)
-        if hits.steepness:
-            across, down, *on_plane = hits.steepness
-            x, y = value * across, value * down
-            moments = [x, y]
-            for where in on_plane:
-                x, y = x * where, y * where
-            moments += [x * across, x * down, y * down]
-            sums = [self._sum(each, hits.owner).astype(np.float32) for each in moments]
-            one, other = self.jacobian
-            result[MEAN] = one * sums[0] + other * sums[1]
-            for row, (i, k) in enumerate(PAIRS, SCALE.start):
-                result[row] = (
-                    one[i] * one[k] * sums[2]
-                    + (one[i] * other[k] + one[k] * other[i]) * sums[3]
-                    + other[i] * other[k] * sums[4]
-                )
-                if i != k:
-                    result[row] *= np.float32(2.0)
+        result[OPACITY] = self._sum(value, owner)
+        x, y = value * across, value * down
+        moments = [x, y]
+        for where in on_plane:
+            x, y = x * where, y * where
+        moments += [x * across, x * down, y * down]
+        sums = [self._sum(each, owner) for each in moments]
+        one, other = self.jacobian
+        result[MEAN] = one * sums[0] + other * sums[1]
+        for row, (i, k) in enumerate(PAIRS, SCALE.start):
+            result[row] = (
+                one[i] * one[k] * sums[2]
+                + (one[i] * other[k] + one[k] * other[i]) * sums[3]
+                + other[i] * other[k] * sums[4]
+            )
+            if i != k:
+                result[row] *= np.float32(2.0)
         return result
 
+    def normal(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
+        """`backward` of `forward`."""
+        hits = self.hits()
+        return self.backward(self.forward(change, hits), hits)
+
+    def hits(self) -> tuple[Any, ...]:
+        """Owner, weight, derivatives and steepness of the hits as numbers, (h,) each."""
+        halves = ([_floats(row) for row in rows] for rows in (self.by_log_alpha, self.steepness))
+        return self.owner.astype(np.intp), _floats(self.weight), *halves
+
     def _polynomials(self, change: list[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-        """Return the coefficients of x, y, x^2, x y, y^2 of changed geometry, (u,) each."""
+        """Coefficients of x, y, x^2, x y, y^2 of changed geometry, (u,) each."""
         xx, xy, xz, yy, yz, zz = change[SCALE.start :]
         one, other = self.jacobian
         rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
@@ -338,7 +311,7 @@ class LinearView:
         ]  # fmt: skip
 
     def diagonal(self, shapes: Shapes) -> NDArray[np.float32]:
-        """Return the squared length of each column, that is of each parameter, (22, u).
+        """Squared length of each column, that is of each parameter, (22, u).
 
         Of the three harmonics of a degree the mean, which does not turn with the axes of the world.
 
@@ -347,28 +320,26 @@ class LinearView:
         shapes : Shapes
             Of the Gaussians that are hit.
         """
-        result, hits = np.zeros((COUNT, len(self.hit)), np.float32), self._hits()
-        result[COLOR] = np.float32(SH_C0**2) * self._sum(np.square(hits.weight), hits.owner)
+        owner, weight, by_log_alpha, (x, y, *on_plane) = self.hits()
+        result = np.zeros((COUNT, len(self.hit)), np.float32)
+        result[COLOR] = np.float32(SH_C0**2) * self._sum(np.square(weight), owner, np.float64)
         result[COLOR] *= self.unclipped
         for channel, squared in enumerate(result[COLOR]):
             # Squared harmonics of a degree are on average those of the constant (Unsoeld 1927).
             result[_of_channel(channel)] = squared
-        value = np.square(hits.by_log_alpha[0])
-        for slope in hits.by_log_alpha[1:]:
+        value = np.square(by_log_alpha[0])
+        for slope in by_log_alpha[1:]:
             value += np.square(slope)
-        result[OPACITY] = self._sum(value, hits.owner)
+        result[OPACITY] = self._sum(value, owner)
         result[OPACITY] *= np.square(np.float32(1.0) - shapes.gaussians.alphas)
-        if not hits.steepness:
-            return result
-        x, y, *on_plane = hits.steepness
         products = (x, x), (x, y), (y, y)
         second = [value * one * other for one, other in products]
-        of_second = [self._sum(each, hits.owner).astype(np.float32) for each in second]
+        of_second = [self._sum(each, owner) for each in second]
         for where in on_plane:
             second = [each * where for each in second]
         # One at a time: of all these arrays together a view's peak of memory would be made.
         of_fourth = [
-            self._sum(second[k] * (one * other), hits.owner).astype(np.float32)
+            self._sum(second[k] * (one * other), owner)
             for k, (one, other) in [*((0, each) for each in products), (1, (y, y)), (2, (y, y))]
         ]
         in_image = [[_dot(row, axis) for axis in shapes.axes] for row in self.jacobian]
@@ -384,18 +355,20 @@ class LinearView:
             result[TURN.start + axis] = _squared(turned, of_fourth)
         return result
 
-    def _sum(self, values: NDArray[np.float32], owner: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the sum of values of hits over the hits of each splat, (u,)."""
-        return np.asarray(np.bincount(owner, values, len(self.hit)), np.float64)
+    def _sum(
+        self, values: NDArray[np.float32], owner: NDArray[np.intp], kind: Any = np.float32
+    ) -> NDArray[Any]:
+        """Sums of values of hits over the hits of each splat, (u,)."""
+        return np.bincount(owner, values, len(self.hit)).astype(kind, copy=False)
 
 
 def _of_channel(channel: int) -> slice:
-    """Return the rows of the parameters that are harmonics of the first degree of a channel."""
+    """Rows of the parameters that are harmonics of the first degree of a channel."""
     return slice(DEGREE_1.start + channel, DEGREE_1.stop, 3)
 
 
 def _basis(shapes: Shapes, view: View) -> NDArray[np.float32]:
-    """Return the values of the harmonics of the first degree in the direction of view, (3, u)."""
+    """Values of the harmonics of the first degree in the direction of view, (3, u)."""
     scene = shapes.scene
     from_view = shapes.gaussians.means.astype(np.float64)
     from_view -= scene.positions(view.center[None])[0][:, None]
@@ -405,17 +378,14 @@ def _basis(shapes: Shapes, view: View) -> NDArray[np.float32]:
 
 
 def _dot(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the inner products of vectors, three components each, (u,)."""
-    result = one[0] * other[0]
-    for k in (1, 2):
-        result += one[k] * other[k]
-    return np.asarray(result)
+    """Inner products of vectors, three components each, (u,)."""
+    return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
 
 
 def _squared(
     polynomial: NDArray[np.float32], sums: Sequence[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """Return the sums over hits of squared polynomials, (u,)."""
+    """Sums over hits of squared polynomials, (u,)."""
     a, b, c = polynomial
     result = a * a * sums[0] + (b * b + 2.0 * a * c) * sums[2] + c * c * sums[4]
     result += 2.0 * b * (a * sums[1] + c * sums[3])
@@ -429,7 +399,8 @@ class LinearRays:
     Attributes
     ----------
     shapes : Shapes
-    views : Stored of LinearView
+    views : Stored
+        A `LinearView` of each view.
     residual, diagonal : (22, M) float32
         J'r and the diagonal of J'J, see `refit`.
     count : int
@@ -437,53 +408,43 @@ class LinearRays:
     """
 
     shapes: Shapes
-    views: Stored[LinearView]
+    views: Stored
     residual: NDArray[np.float32]
     diagonal: NDArray[np.float32]
     count: int
 
     @classmethod
-    def of(cls, shapes: Shapes, seen: Iterable[SeenView]) -> LinearRays:
+    def of(cls, shapes: Shapes, seen: Iterable[Seen]) -> LinearRays:
         """Put views together, each as soon as it is there."""
-        views, count = Stored(LinearView), 0
-        residual = np.zeros((COUNT if shapes.geometry else MEAN.start, len(shapes)), np.float32)
-        diagonal = np.zeros((COUNT, len(shapes)), np.float32)
-        for each in seen:
-            views.append(each.linear)
-            count += each.linear.errors.shape[1]
-            _add(residual, each.linear.hit, each.residual)
-            _add(diagonal, each.linear.hit, each.diagonal)
+        views, count = Stored(), 0
+        residual, diagonal = (np.zeros((COUNT, len(shapes)), np.float32) for _ in range(2))
+        for view, of_residual, of_diagonal in seen:
+            views.append(view)
+            count += view.errors.shape[1]
+            _add(residual, view.hit, of_residual)
+            _add(diagonal, view.hit, of_diagonal)
         return cls(shapes, views, shapes.by_parameter(residual), diagonal, count)
 
     def normal(
         self, change: NDArray[np.float32], progress: Progress, threads: int | None
     ) -> NDArray[np.float32]:
-        """Return J'J times some change of the parameters, (22, M)."""
+        """J'J times some change of the parameters, (22, M)."""
         in_scene = self.shapes.in_scene(change)
         total = np.zeros_like(in_scene)
 
-        def of_view(piece: slice) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-            view = self.views[piece.start]
+        def of_view(number: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+            view = self.views[number]
             with np.errstate(under="ignore"):
                 return view.hit, view.normal(in_scene)
 
-        for hit, values in run(
-            of_view,
-            chunks(len(self.views), 1),
-            progress=progress,
-            what="refitting",
-            threads=threads,
-        ):
-            _add(total, hit, values)
+        every = range(len(self.views))
+        for of_hit in run(of_view, every, progress=progress, what="refitting", threads=threads):
+            _add(total, *of_hit)
         return self.shapes.by_parameter(total)
 
 
-class SeenView(NamedTuple):
-    """A view, with what it adds to `LinearRays`."""
-
-    linear: LinearView
-    residual: NDArray[np.float32]
-    diagonal: NDArray[np.float32]
+Seen = tuple[LinearView, NDArray[np.float32], NDArray[np.float32]]
+"""A view, with what it adds to the residual and to the diagonal of `LinearRays`, (22, u) each."""
 
 
 def _add(total: NDArray[np.float32], hit: NDArray[np.int64], values: NDArray[np.float32]) -> None:
@@ -499,8 +460,8 @@ def linear_view(
     colors: NDArray[np.float32],
     shapes: Shapes,
     view: View,
-) -> SeenView:
-    """Return how the colours of the rays of a view change with the splats that they hit.
+) -> tuple[LinearView, Shapes]:
+    """How the colours of the rays of a view change with the splats that they hit, and their shapes.
 
     Parameters
     ----------
@@ -516,20 +477,6 @@ def linear_view(
         Of the first Gaussians; what else is hit does not change.
     view : View
     """
-    linear, shapes = _linear(visible, footprints, truth, colors, shapes, view)
-    del visible, footprints  # as far as the caller lets go, too
-    return SeenView(linear, linear.backward(linear.errors), linear.diagonal(shapes))
-
-
-def _linear(
-    visible: VisibleRays,
-    footprints: Footprints,
-    truth: NDArray[np.float32],
-    colors: NDArray[np.float32],
-    shapes: Shapes,
-    view: View,
-) -> tuple[LinearView, Shapes]:
-    """Return how the colours change, and the shapes that are hit; see `linear_view`."""
     rays, transmittance = visible
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit
     weight, counts = transmittance * rays.alpha, rays.counts()
@@ -553,11 +500,9 @@ def _linear(
     of_hits = trust.take(ray)
     hit, shapes = rays.hit[:movable], shapes.take(rays.hit[:movable])
     first = np.flatnonzero(np.diff(ray, prepend=-1))
-    steepness, jacobian = np.empty((2, len(kept)), np.float32)[:0], np.empty((2, 3, 0), np.float32)
-    if shapes.geometry:
-        steepness = _steepness(replace(rays, hit=hit), kept, footprints)
-        rows = np.stack(projection.jacobian(shapes.gaussians, shapes.scene, view))
-        jacobian = np.ascontiguousarray(rows.transpose(0, 2, 1), np.float32)
+    steepness = _steepness(replace(rays, hit=hit), kept, footprints)
+    rows = np.stack(projection.jacobian(shapes.gaussians, shapes.scene, view))
+    jacobian = np.ascontiguousarray(rows.transpose(0, 2, 1), np.float32)
     linear = LinearView(
         hit, trust * errors, ray.take(first).astype(np.int64), np.diff(first, append=len(ray)),
         owner.astype(np.uint16 if movable < 1 << 16 else np.int32),
@@ -569,7 +514,7 @@ def _linear(
 
 
 def _trust(errors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return how much the rays of a view count, of their errors, (3, P): roots of weights, (P,).
+    """How much the rays of a view count, of their errors, (3, P): roots of weights, (P,).
 
     Errors of more than `HUBER` times their root mean square count in proportion, not squared
     (Huber's loss, by one step of reweighted least squares).
@@ -581,19 +526,19 @@ def _trust(errors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _halves(values: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Return the upper halves of the bits of some numbers, rounded: they keep them to 1 / 256."""
+    """The upper halves of the bits of some numbers, rounded: they keep them to 1 / 256."""
     return ((values.view(np.uint32) + np.uint32(1 << 15)) >> np.uint32(16)).astype(np.uint16)
 
 
 def _floats(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Return the numbers of `_halves`."""
+    """The numbers of `_halves`."""
     return (halves.astype(np.uint32) << np.uint32(16)).view(np.float32)
 
 
 def _steepness_on_discs(
     discs: NDArray[np.float32], step: list[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """Return `_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
+    """`_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
 
     With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian.
     Where its low-pass is what is drawn, only the mean matters; see `LinearView.steepness`.
@@ -615,7 +560,7 @@ def _steepness_on_discs(
 
 
 def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> NDArray[np.float32]:
-    """Return `LinearView.steepness` of some hits, (2, h) or (3, h), as numbers."""
+    """`LinearView.steepness` of some hits, (2, h) or (3, h), as numbers."""
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
     place[footprints.index] = np.arange(len(footprints.index))
     mine = footprints.take(place[rays.hit])

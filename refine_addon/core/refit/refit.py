@@ -1,8 +1,8 @@
-"""Refitting: survivors learn the colours that the unpruned splats have on rays.
+"""Refitting: kept splats learn the colours that the unpruned splats have on rays.
 
-Deleting and absorbing leave survivors with the numbers that they had, or that one merge at a time
+Deleting and merging leave kept splats with the numbers that they had, or that one merge at a time
 gave them. On rays it is known what the unpruned splats look like, and how the colours change with
-every parameter of the survivors (`linear`). So in rounds, each on rays through other pixels, the
+every parameter of the kept splats (`linear`). So in rounds, each on rays through other pixels, the
 squared difference of colours is made small by damped least squares (Levenberg, Marquardt)::
 
     minimise over x   |J x - r|^2  +  sum over parameters p of  (k (D_p + m_p) + K_p) x_p^2
@@ -14,10 +14,11 @@ learn from the rays of all of them, not from the last alone: each has a share in
 becomes. The sum is made small by a few steps of conjugate gradients, preconditioned by the
 diagonal. What these and the damping leave of J'r, half of it is added to that of the next round.
 
-k is `DAMPING` over how many rays there are for each survivor: the more rays, the less damping.
+k is `DAMPING` over how many rays there are for each kept splat: the more rays, the less damping.
 
-Validation rays, which nothing is learned from, compare survivors before and after a round. One that
-loses is undone, and the next is damped more. Rounds end where little is gained, or after many rays.
+Validation rays, which nothing is learned from, compare kept splats before and after a round. One
+that loses is undone, and the next is damped more. Rounds end where little is gained, or after many
+rays.
 """
 
 from __future__ import annotations
@@ -25,15 +26,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import costs
 from ..errors import RefineError
 from ..execute import Progress, part, silent
-from ..pace import phases
 from ..splats import Splats, rotation_matrices, unit_quaternions
 from ..views import ViewSet
 from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, LinearRays
@@ -43,8 +42,8 @@ STEPS = 8
 """Steps of conjugate gradients in a round."""
 
 DAMPING, LEAST_DAMPING = 4.0, 0.1
-"""Damping counts as so many rays for each survivor: k is this over how many there are, but at least
-so much, as colours change with parameters in straight lines near by alone."""
+"""Damping counts as so many rays for each kept splat: k is this over how many there are, but at
+least so much, as colours change with parameters in straight lines near by alone."""
 
 CARRIED = 0.5
 """How much of what a round leaves of J'r counts in the next one."""
@@ -54,14 +53,17 @@ MORE_DAMPING = 8.0
 
 MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
 """By default there are so many rounds, and fewer where these have had so many rays for each
-survivor and so many in all: of large scenes each round takes as long as absorbing."""
+kept splat and so many in all: of large scenes each round takes as long as merging."""
 
-SIMPLER, ENOUGH_SIMPLER = 0.4, 0.25
-"""How many times as many rays a round has, and are enough, for colours and opacities alone: 13 of
-22 parameters, and colours change with most of these in straight lines."""
+MOST_ROUNDS = 100
+"""No more may be asked for: after some ten none gains."""
 
 LEAST_GAIN = 0.05
 """Rounds end where the PSNR of the validation rays rises by less, dB."""
+
+ONE_PLACE = "nothing was refitted: what fits views in one place looks worse from others"
+"""What is said where no view can move (`round_rays.steps_of`). Validation rays begin where those of
+the rounds do, and cannot tell: one view gains 9 dB by them, and in others -0.6 to 0.5 dB."""
 
 MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3}
 """How far a parameter moves in a round: as `linear` has them, means by the longest scale."""
@@ -70,45 +72,38 @@ LEAST_MOVE = 0.02
 """A mean that would move by less in a round stays, in longest scales; see `_worthwhile`."""
 
 
+_FIRST = 0.1  # share of progress until the first round
+_CASTING, _SOLVED = 0.35, 0.9  # of that of a round
 _NOTHING = 1e-30  # rays that tell less of a parameter tell nothing; 1 over it is a float32
 
 
-@dataclass(frozen=True)
-class Refit:
-    """Settings of refitting.
+@dataclass(frozen=True, eq=False)
+class Refitted:
+    """What some rounds have made of N kept splats.
 
     Attributes
     ----------
-    rounds : int, optional
-        At most so many; by default see `MAX_ROUNDS`. They end before where little is gained.
-    geometry : bool
-        Whether means, scales and rotations are refitted too, or colours and opacities alone.
+    splats : Splats
+        As they are now.
+    changed : (N,) bool
+        Which of them may not be what they were; all others are equal to the bit.
+    rounds : int
+        How many rounds made them so.
+    psnr_before, psnr : float
+        Of the splats as given, and as they are now, dB, on rays that nothing was learned from.
+    why_not : str
+        Why there was no round that made them better, for the user.
     """
 
-    rounds: int | None = None
-    geometry: bool = True
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if self.rounds is not None and self.rounds < 1:
-            raise RefineError(f"rounds is {self.rounds}, expected 1 or more")
-
-    def expected_rounds(self, count: int) -> int:
-        """Return how many rounds it takes to refit so many survivors, if all of them gain."""
-        enough = max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
-        return self.rounds or min(math.ceil(enough / limits(count)[0]), MAX_ROUNDS)
-
-
-class Gains:
-    """What refitting changed and gained; see `Refitted`."""
-
+    splats: Splats
     changed: NDArray[np.bool_]
     rounds: int
     psnr_before: float
     psnr: float
+    why_not: str = "refitting gains nothing on rays that nothing was fitted to"
 
     def facts(self, seconds: float) -> dict[str, float]:
-        """Return it for a report, with how long it took."""
+        """The same for a report, with how long it took."""
         return {
             "rounds": self.rounds,
             "changed": int(np.count_nonzero(self.changed)),
@@ -118,164 +113,136 @@ class Gains:
         }
 
     def note(self, seconds: float) -> str:
-        """Return it as a sentence, for the user."""
-        return (
+        """The same as a sentence, for the user."""
+        told = (
             "{changed:,} survivors were refitted in {rounds} rounds: {psnr_before:.1f} -> "
             "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s"
-        ).format(**self.facts(seconds))
+        )
+        return told.format(**self.facts(seconds)) if self.rounds else self.why_not
 
 
-@dataclass(frozen=True, eq=False)
-class Refitted(Gains):
-    """What some rounds have made of survivors.
-
-    Attributes
-    ----------
-    splats : Splats
-        As they are now.
-    changed : (N,) bool
-        Which of them are not what they were.
-    rounds : int
-        How many rounds made them so.
-    psnr_before, psnr : float
-        Of the survivors as given, and as they are now, dB, on rays that nothing was learned from.
-    """
-
-    splats: Splats
-    changed: NDArray[np.bool_]
-    rounds: int
-    psnr_before: float
-    psnr: float
+def check_rounds(rounds: int | None) -> None:
+    """Raise `RefineError` if so many rounds cannot be asked for; None leaves it open."""
+    if rounds is not None and not 1 <= rounds <= MOST_ROUNDS:
+        raise RefineError(f"rounds is {rounds}, expected 1 to {MOST_ROUNDS}")
 
 
-def refit(
-    survivors: Splats,
-    original: Splats,
-    views: ViewSet,
-    settings: Refit = Refit(),
-    *,
-    protected: NDArray[np.bool_] | None = None,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Refitted:
-    """Refit survivors to what the views see of the unpruned splats.
+def expected_rounds(count: int, rounds: int | None = None) -> int:
+    """How many rounds it takes to refit so many splats if all of them gain.
 
     Parameters
     ----------
-    survivors : Splats
-        N splats, in the frame and unit of the views.
-    original : Splats
-        The unpruned splats, in the same frame.
-    views : ViewSet
-        All of them are used.
-    settings : Refit
-    protected : (N,) bool, optional
-        Survivors that do not change.
-    progress : callable, optional
-        See `refine_addon.core.execute.Progress`.
-    threads : int, optional
-
-    Returns
-    -------
-    Refitted
-        Never below what it began with, on rays that nothing was learned from.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``; `refit_rounds` gives what was reached by then.
-
-    Notes
-    -----
-    Memory: about 900 bytes a survivor. 14 bytes for each hit of a round, see `round_rays.limits`,
-    lie in a temporary file.
+    count : int
+    rounds : int, optional
+        So many, if given.
     """
-    *_, last = refit_rounds(
-        survivors, original, views, settings,
-        protected=protected, progress=progress, threads=threads,
-    )  # fmt: skip
+    enough = max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
+    return rounds or min(math.ceil(enough / limits(count)[0]), MAX_ROUNDS)
+
+
+def refit(*arguments: Any, **options: Any) -> Refitted:
+    """What `refit_rounds` yields last."""
+    *_, last = refit_rounds(*arguments, **options)
     return last
 
 
 def refit_rounds(
-    survivors: Splats,
+    splats: Splats,
     original: Splats,
     views: ViewSet,
-    settings: Refit = Refit(),
+    rounds: int | None = None,
     *,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Iterator[Refitted]:
-    """Yield what survivors are before the first round, and after each that gains.
+    """Yield kept splats as they are, and after each round that gains.
 
-    Parameters and errors are those of `refit`.
+    Parameters
+    ----------
+    splats : Splats
+        N kept splats, in the frame and unit of the views.
+    original : Splats
+        The unpruned splats, in the same frame.
+    views : ViewSet
+        All of them are used.
+    rounds : int, optional
+        At most so many, up to `MOST_ROUNDS`; by default see `MAX_ROUNDS`. They end before where
+        little is gained.
+    protected : (N,) bool, optional
+        Kept splats that do not change.
+    progress : callable, optional
+        See `refine_addon.core.execute.Progress`.
+    threads : int, optional
+
+    Yields
+    ------
+    Refitted
+        Never below what it began with, on rays that nothing was learned from.
+
+    Raises
+    ------
+    RefineError
+        If `rounds` is out of range.
+    Cancelled
+        If `progress` answers ``False``.
+
+    Notes
+    -----
+    Memory: about 900 bytes a kept splat. 14 bytes for each hit of a round, see `round_rays.limits`,
+    lie in a temporary file.
     """
-    share = 1.0 if settings.geometry else SIMPLER
-    count = round(share * len(survivors))
-    rounds = settings.expected_rounds(len(survivors))
-    most = limits(count)[0]
-    preparing, *plans = costs.refitting(len(original), len(survivors), len(views), most, rounds)
-    prepared, refitting = phases(progress, preparing, costs.joined(plans), threads=threads)
-    rays = RoundRays.of(original, views, count, prepared, threads)
-    yield from refit_on(
-        rays, survivors, settings,
-        protected=protected, progress=refitting, threads=threads,
-    )  # fmt: skip
+    check_rounds(rounds)
+    rays = RoundRays.of(original, views, len(splats), part(progress, 0.0, 0.03), threads)
+    later = part(progress, 0.03, 1.0)
+    yield from refit_on(rays, splats, rounds, protected=protected, progress=later, threads=threads)
 
 
 def refit_on(
     rays: RoundRays,
-    survivors: Splats,
-    settings: Refit,
+    splats: Splats,
+    rounds: int | None = None,
     *,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Iterator[Refitted]:
     """Yield what `refit_rounds` does, of some rays."""
-    moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry
-    moving[: COUNT if geometry else MEAN.start] = True
-    moving[DEGREE_1] = survivors.sh_rest.shape[1] > 0
-    moving[SCALE.stop - 1] &= survivors.model != "2dgs"  # discs have no third scale
-    movable = moving[:, None] & ~(
-        np.zeros(len(survivors), np.bool_) if protected is None else protected
-    )
-    rounds, cast = settings.rounds or MAX_ROUNDS, 0
-    ahead = settings.expected_rounds(len(survivors))
-    checked, one_round = rays.costs(len(survivors))
-    validating, later = phases(progress, checked, ahead * costs.joined(one_round))
-    psnr = rays.psnr(survivors, validating)
-    best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, psnr, psnr)
+    count = len(splats)
+    moving = np.ones(COUNT, np.bool_)
+    moving[DEGREE_1] = splats.sh_rest.shape[1] > 0
+    moving[SCALE.stop - 1] &= splats.model != "2dgs"  # discs have no third scale
+    fixed = np.zeros(count, np.bool_) if protected is None else protected
+    movable = moving[:, None] & ~fixed
+    ahead, cast, done = expected_rounds(count, rounds), 0, _FIRST
+    enough = np.inf if rounds else max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
+    psnr = rays.psnr(splats, part(progress, 0.0, done))
+    best = Refitted(splats, np.zeros(count, np.bool_), 0, psnr, psnr)
+    if not any(window.step for window in rays.windows):
+        yield replace(best, why_not=ONE_PLACE)
+        return
     yield best
-    enough = np.inf if settings.rounds else max(ENOUGH_RAYS[0] * len(survivors), ENOUGH_RAYS[1])
-    enough *= 1.0 if geometry else ENOUGH_SIMPLER
-    before = _Told(*np.zeros((2, COUNT, len(survivors)), np.float32))
-    more = 1.0 if geometry else SIMPLER
-    undone = False
-    for number in range(1, rounds + 1):
-        casting, solving, checking, later = phases(
-            later, *one_round, (ahead - number) * costs.joined(one_round)
-        )
-        linear = rays.linear(
-            best.splats, number,
-            geometry=geometry, progress=casting,
-        )  # fmt: skip
+    before: Told = np.zeros((COUNT, count), np.float32), np.zeros((COUNT, count), np.float32)
+    more, undone = 1.0, False
+    for number in range(1, (rounds or MAX_ROUNDS) + 1):
+        start, done = done, done + (1.0 - done) / max(ahead - number + 1, 1)
+        of_round = part(progress, start, done)
+        linear = rays.linear(best.splats, number, part(of_round, 0.0, _CASTING))
         cast += linear.count
-        if not settings.rounds:
-            ahead = max(min(math.ceil(enough * number / cast), rounds), number)
-            (later,) = phases(later, (ahead - number) * costs.joined(one_round))
-        damping = more * max(DAMPING * len(survivors) / linear.count, LEAST_DAMPING)
+        if not rounds:
+            ahead = max(min(math.ceil(enough * number / cast), MAX_ROUNDS), number)
+        damping = more * max(DAMPING * count / linear.count, LEAST_DAMPING)
+        solving = part(of_round, _CASTING, _SOLVED)
         change, told = _solve(linear, movable, damping, before, progress=solving, threads=threads)
         del linear  # the hits, before those of the next round
         if not change.any():
             return
-        trial = _moved(best.splats, _worthwhile(change))
-        psnr = rays.psnr(trial, checking)
+        change = _worthwhile(change)
+        trial = _moved(best.splats, change)
+        psnr = rays.psnr(trial, part(of_round, _SOLVED, 1.0))
         gain = psnr - best.psnr
         if gain > 0.0:
-            before = told
-            changed = ~_same(survivors, trial)
+            before, changed = told, best.changed | change.any(axis=0)
             best = Refitted(trial, changed, best.rounds + 1, best.psnr_before, psnr)
             yield best
             if gain < LEAST_GAIN or cast >= enough:
@@ -286,31 +253,30 @@ def refit_on(
             more, undone = more * MORE_DAMPING, True
 
 
-class _Told(NamedTuple):
-    """What rounds have told of the parameters of N survivors, and the next one goes on from."""
-
-    diagonal: NDArray[np.float32]
-    left: NDArray[np.float32]
+Told = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""What rounds have told of the parameters of N splats, (22, N) each: K, and what is left of J'r."""
 
 
 def _solve(
     linear: LinearRays,
     movable: NDArray[np.bool_],
     damping: float,
-    before: _Told,
+    before: Told,
     *,
     progress: Progress,
     threads: int | None,
-) -> tuple[NDArray[np.float32], _Told]:
-    """Return by how much to change the parameters of N survivors, (22, N), and what rays told."""
+) -> tuple[NDArray[np.float32], Told]:
+    """By how much to change the parameters of N splats, (22, N), and what rays told."""
     index = linear.shapes.gaussians.index
     moving = movable[:, index]
     steps = [part(progress, k / STEPS, (k + 1) / STEPS) for k in range(STEPS)]
-    residual = linear.residual + np.float32(CARRIED) * before.left[:, index]
+    residual = linear.residual + np.float32(CARRIED) * before[1][:, index]
     residual *= moving
     diagonal = linear.diagonal * moving
-    prior = np.float32(damping) * (diagonal + _medians(diagonal)[:, None])
-    damped = prior + before.diagonal[:, index]
+    # The median over splats of what rays tell, 1 where they tell nothing.
+    medians = [np.median(row[row > 0.0]) if row.any() else 1.0 for row in diagonal]
+    prior = np.float32(damping) * (diagonal + np.array(medians, np.float32)[:, None])
+    damped = prior + before[0][:, index]
     inverse = np.divide(
         1.0, diagonal + damped, out=np.zeros_like(damped), where=diagonal > _NOTHING
     )
@@ -325,18 +291,12 @@ def _solve(
     prior *= change
     residual += prior
     result = np.zeros(movable.shape, np.float32)
-    told = _Told(before.diagonal.copy(), np.float32(CARRIED) * before.left)
+    told = before[0].copy(), np.float32(CARRIED) * before[1]
     for row, values in enumerate(zip(change, diagonal, residual, strict=True)):
         result[row, index] = values[0]
-        told.diagonal[row, index] += values[1]
-        told.left[row, index] = values[2]
+        told[0][row, index] += values[1]
+        told[1][row, index] = values[2]
     return result, told
-
-
-def _medians(diagonal: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the median over splats of what rays tell, 1 where they tell nothing, (22,)."""
-    medians = [np.median(row[row > 0.0]) if row.any() else 1.0 for row in diagonal]
-    return np.array(medians, np.float32)
 
 
 def _conjugate_gradients(
@@ -345,7 +305,7 @@ def _conjugate_gradients(
     inverse: NDArray[np.float32],
     steps: list[Progress],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return about the solution x of ``product(x) = residual``, by a few steps from 0.
+    """About the solution x of ``product(x) = residual``, by a few steps from 0.
 
     And what it leaves of the residual.
     """
@@ -369,12 +329,12 @@ def _conjugate_gradients(
 
 
 def _dot(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
-    """Return the inner product of two arrays, (22, N), summed in float64."""
+    """The inner product of two arrays, (22, N), summed in float64."""
     return float(sum(np.sum(a * b, dtype=np.float64) for a, b in zip(one, other, strict=True)))
 
 
 def _worthwhile(change: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a change in which means move only where that is worth it, (22, N).
+    """A change in which means move only where that is worth it, (22, N).
 
     Splats are drawn in the order of their means, and each move puts some behind others that were
     behind them, which no derivative tells of. The squared error that costs grows in proportion to
@@ -392,13 +352,14 @@ def _worthwhile(change: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
-    """Return splats with changed parameters; those that do not change keep their bits."""
+    """Splats with changed parameters; those that do not change keep their bits."""
     rows = np.flatnonzero(change.any(axis=0))
     some, change = splats.take(rows), change[:, rows].astype(np.float64)
     quaternions = unit_quaternions(some.quaternions)
     logs = some.log_scales.astype(np.float64)
     longest = np.exp(logs.max(axis=1))
-    step = _turned(quaternions, _limited(change[MEAN], MAX_STEP["mean"]).T) * longest[:, None]
+    along = _limited(change[MEAN], MAX_STEP["mean"]).T  # the axes of the splats
+    step = np.einsum("nij,nj->ni", rotation_matrices(quaternions), along) * longest[:, None]
     limit = MAX_STEP["color"]
     values = {
         "means": some.means + step,
@@ -423,18 +384,13 @@ def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
 
 
 def _limited(vectors: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
-    """Return vectors, (3, n), no longer than a length."""
+    """Vectors, (3, n), no longer than a length."""
     lengths = np.linalg.norm(vectors, axis=0)
     return np.asarray(vectors * np.minimum(1.0, longest / np.maximum(lengths, longest)))
 
 
-def _turned(quaternions: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vectors along the axes of splats, (n, 3), in the world."""
-    return np.asarray(np.einsum("nij,nj->ni", rotation_matrices(quaternions), vectors))
-
-
 def _product(quaternions: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return unit quaternions, (n, 4), of splats that are turned about their own axes first."""
+    """Unit quaternions, (n, 4), of splats that are turned about their own axes first."""
     angle = np.linalg.norm(turns, axis=0)
     sine = 0.5 * np.sinc(angle / (2.0 * np.pi))  # sin(angle / 2) / angle
     w, x, y, z = quaternions.T
@@ -448,11 +404,3 @@ def _product(quaternions: NDArray[np.float64], turns: NDArray[np.float64]) -> ND
         ],
         axis=1,
     )
-
-
-def _same(one: Splats, other: Splats) -> NDArray[np.bool_]:
-    """Return which rows of two arrays of splats are equal, (N,)."""
-    same = one.opacity_logits == other.opacity_logits
-    for name in ("means", "log_scales", "quaternions", "sh_dc"):
-        same &= (getattr(one, name) == getattr(other, name)).all(axis=1)
-    return np.asarray(same & (one.sh_rest[:, :3] == other.sh_rest[:, :3]).all(axis=(1, 2)))
