@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from refine_addon.core.formats.ply import read_ply
-from refine_addon.core.formats.ply_columns import columns_from_splats
+from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.splats import SH_C0, Splats, drawable, joined, opacity, rotation_matrices
 from refine_addon.core.task import METHODS
 from refine_addon.core.views import ViewSet
@@ -145,7 +145,7 @@ def _logit(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def write_ply(path: Path, splats: Splats) -> None:
     """Write splats as a 3DGS PLY of float32."""
-    columns = columns_from_splats(splats)
+    columns = {name: values.astype(np.float32) for name, values in values_by_name(splats).items()}
     rows = np.empty(len(splats), [(name, "<f4") for name in columns])
     for name, values in columns.items():
         rows[name] = values

@@ -502,7 +502,9 @@ def test_who_turns_sizes_and_rotations_as_well_is_left_alone(addon, imported):
     checked = addon.mesh.layout.check(imported)
     splats = addon.objects.splat_object.gather(checked, whole=True)
     turned = addon.core.affine.transformed(splats, np.array(SOMEWHERE))
-    addon.mesh.attributes.write_columns(checked, addon.core.formats.ply.columns_from_splats(turned))
+    values = addon.core.formats.ply_columns.values_by_name(turned)
+    columns = {name: column.astype(np.float32) for name, column in values.items()}
+    addon.mesh.attributes.write_columns(checked, columns)
 
     assert told_of(addon, imported) == []
 

@@ -9,7 +9,7 @@ import pytest
 
 from refine_addon.core import RefineError, Splats, View, ViewSet, read_splats
 from refine_addon.core.formats import ply
-from refine_addon.core.formats.ply_columns import columns_from_splats
+from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.formats.registry import FORMATS
 from refine_addon.core.levels.files import LevelsRequest, lod_file
 from refine_addon.core.levels.lod import Levels
@@ -40,7 +40,7 @@ def cloud(count, seed=0):
 
 def write(path, splats, comments=()):
     """Write splats as a plain PLY whose header has these comments."""
-    columns = columns_from_splats(splats)
+    columns = {name: values.astype(np.float32) for name, values in values_by_name(splats).items()}
     header = ply.new_header(np.dtype([(name, "<f4") for name in columns]), len(splats)).split(b"\n")
     header[1:1] = [b"comment " + comment for comment in comments]
     path.write_bytes(b"\n".join(header) + np.column_stack([*columns.values()]).tobytes())

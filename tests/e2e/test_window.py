@@ -14,7 +14,7 @@ from view_pictures import psnr, reference, view_in
 
 from benchmarks.tables.models import version
 from refine_addon.core.formats.ply import new_header, read_ply, with_model
-from refine_addon.core.formats.ply_columns import columns_from_splats
+from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.rendering import Model
 
 
@@ -83,7 +83,7 @@ def test_the_viewport_shows_every_model_as_the_reference_renderer(
 ):
     """At least 28 dB, as for ordinary splats."""
     splats = version(read_ply(cloud).splats(), model)
-    columns = columns_from_splats(splats)
+    columns = {name: values.astype(np.float32) for name, values in values_by_name(splats).items()}
     header = new_header(np.dtype([(name, "<f4") for name in columns]), len(splats))
     tagged = tmp_path / "point_cloud.ply"
     rows = np.column_stack([*columns.values()])

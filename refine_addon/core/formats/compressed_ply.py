@@ -19,20 +19,8 @@ from numpy.typing import NDArray
 from ..errors import RefineError
 from ..rendering import MODELS
 from ..splats import SH_C0, Splats, above_constant, opacity, opacity_logits, unit_quaternions
+from . import ply
 from .format import Format, join_largest, near_ones_together, new_file, pieces, split_largest
-from .ply import (
-    HEADER_LIMIT,
-    TEXT,
-    Origin,
-    SplatFile,
-    check_counts,
-    has_lists,
-    model_of,
-    raw_header,
-    read_header,
-    shown,
-    with_model,
-)
 from .ply_columns import REST_COUNTS
 
 NAME = "compressed PLY"
@@ -40,11 +28,10 @@ NAME = "compressed PLY"
 SPLATS = 256
 """Splats of a chunk."""
 
-_POSITION, _SCALE, _COLOR = (
-    ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z"),
-    tuple(f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"),
-    tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"),
-)
+_NAMES = [(end, axis) for end in ("min", "max") for axis in "xyz"]
+_POSITION = tuple(f"{end}_{axis}" for end, axis in _NAMES)
+_SCALE = tuple(f"{end}_scale_{axis}" for end, axis in _NAMES)
+_COLOR = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
 """Properties of a chunk, each group the lower ends of its three ranges and then the upper ones."""
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -67,24 +54,28 @@ REST_RANGE = 8.0
 
 def _matches(_path: Path, head: bytes) -> bool:
     """Whether this is a PLY whose header has packed positions."""
-    header = raw_header(head) or b""
+    header = ply.raw_header(head) or b""
     words = (line.split() for line in header.splitlines())
     return any(line[:1] == [b"property"] and line[2:] == [b"packed_position"] for line in words)
 
 
-def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
-    header = read_header(path, io.BytesIO(data[:HEADER_LIMIT].tobytes()))
-    if header.order == TEXT:
+def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
+    header = ply.read_header(path, io.BytesIO(data[: ply.HEADER_LIMIT].tobytes()))
+    if header.order == ply.TEXT:
         raise RefineError(f"{path}: a compressed PLY in ASCII, expected a binary one")
     body = data[len(header.raw) :]
-    check_counts(header, len(body))
+    ply.check_counts(header, len(body))
     elements: dict[str, NDArray[Any]] = {}
     at = 0
     for element, count in zip(header.elements, header.counts, strict=True):
-        if has_lists(element):
-            raise RefineError(f"{path}: element {shown(element.name)} has a list, expected numbers")
+        if ply.has_lists(element):
+            raise RefineError(
+                f"{path}: element {ply.shown(element.name)} has a list, expected numbers"
+            )
         kind = np.dtype(element.dtype(header.order))
-        end = at + count * kind.itemsize  # which is there: `check_counts` is exact without lists
+        end = (
+            at + count * kind.itemsize
+        )  # which is there: `ply.check_counts` is exact without lists
         elements[element.name] = body[at:end].view(kind) if count else np.empty(0, kind)
         at = end
 
@@ -96,9 +87,8 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         for key in properties:
             stored = rows.dtype[key].str[1:] if key in (rows.dtype.names or ()) else "none"
             if stored != kind:
-                raise RefineError(
-                    f"{path}: element '{name}': property '{key}' is {stored}, expected {kind}"
-                )
+                place = f"{path}: element '{name}': property '{key}'"
+                raise RefineError(f"{place} is {stored}, expected {kind}")
         return rows
 
     packed = rows_of("vertex", _PACKED, "u4")
@@ -114,22 +104,24 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         held = elements["sh"]
         names = [f"f_rest_{index}" for index in range(len(held.dtype.names or ()))]
         if len(held) != count or len(names) not in REST_COUNTS:
-            raise RefineError(
-                f"{path}: element 'sh' has {len(held)} rows of {len(names)} properties, expected "
-                f"{count} rows of 9, 24, 45 or 72"
-            )
+            got = f"element 'sh' has {len(held)} rows of {len(names)} properties"
+            raise RefineError(f"{path}: {got}, expected {count} rows of 9, 24, 45 or 72")
         held = rows_of("sh", tuple(names), "u1")
         order = [(held.dtype.names or ()).index(name) for name in names]
         rest = held.view(np.uint8).reshape(count, len(names))[:, order]
-    model, degree = model_of(header.raw) or "default", REST_COUNTS[rest.shape[1]]
-    file, splats = new_file(path, Origin(NAME, len(data)), count, degree, model)
+    model, degree = ply.model_of(header.raw) or "default", REST_COUNTS[rest.shape[1]]
+    file, splats = new_file(path, ply.Origin(NAME, len(data)), count, degree, model)
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite
         for piece in pieces(count):
             rows, here = packed[piece], ranges[_chunks_of(piece)]
-            splats.means[piece] = _between(rows["packed_position"], here, _POSITION)
-            splats.log_scales[piece] = _between(rows["packed_scale"], here, _SCALE)
+            splats.means[piece] = _between(
+                _unpacked(rows["packed_position"], _PLACES), here, _POSITION
+            )
+            splats.log_scales[piece] = _between(
+                _unpacked(rows["packed_scale"], _PLACES), here, _SCALE
+            )
             shares = _unpacked(rows["packed_color"], _CHANNELS)
-            colors = _lerp(shares[:, :3], here, _COLOR) if colored else shares[:, :3]
+            colors = _between(shares[:, :3], here, _COLOR) if colored else shares[:, :3]
             splats.sh_dc[piece] = (colors - 0.5) / SH_C0
             splats.opacity_logits[piece] = opacity_logits(shares[:, 3])
             turns = rows["packed_rotation"]
@@ -165,22 +157,13 @@ def _packed(shares: NDArray[Any], fields: tuple[tuple[int, int], ...]) -> NDArra
 
 
 def _between(
-    values: NDArray[Any], chunks: NDArray[Any], names: tuple[str, ...]
-) -> NDArray[np.float64]:
-    """Vectors (n, 3) from packed fractions of the ranges of their chunks."""
-    return _lerp(_unpacked(values, _PLACES), chunks, names)
-
-
-def _lerp(
     shares: NDArray[np.float64], chunks: NDArray[Any], names: tuple[str, ...]
 ) -> NDArray[np.float64]:
-    for axis in range(3):
-        low, high = (
-            np.repeat(chunks[name].astype(np.float64), SPLATS)[: len(shares)]
-            for name in (names[axis], names[axis + 3])
-        )
-        share = shares[:, axis]
-        shares[:, axis] = low * (1.0 - share) + high * share
+    """Vectors (n, 3) of shares of the ranges of their chunks."""
+    for axis, share in enumerate(shares.T):
+        ends = (chunks[name].astype(np.float64) for name in (names[axis], names[axis + 3]))
+        low, high = (np.repeat(end, SPLATS)[: len(shares)] for end in ends)
+        share[:] = low * (1.0 - share) + high * share
     return shares
 
 
@@ -192,7 +175,7 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
     """Write splats as a compressed PLY, sorted so that neighbours in space share a chunk."""
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
     order = near_ones_together(splats.means)
-    stream.write(with_model(_header(count, rest), splats.model))
+    stream.write(ply.with_model(_header(count, rest), splats.model))
     ranges = np.empty((-(-count // SPLATS), 18), "<f4")
     packed = np.empty((count, 4), "<u4")
     harmonics = np.empty((count, rest), np.uint8)
@@ -224,11 +207,8 @@ def _places(values: NDArray[Any], ranges: NDArray[np.float32]) -> NDArray[np.flo
     starts = np.arange(0, len(values), SPLATS)
     ranges[:, :3] = np.minimum.reduceat(values, starts, axis=0)
     ranges[:, 3:] = np.maximum.reduceat(values, starts, axis=0)
-    low, high = (
-        np.repeat(ends.astype(np.float64), SPLATS, axis=0)[: len(values)]
-        for ends in (ranges[:, :3], ranges[:, 3:])
-    )
-    extent = high - low
+    each = np.repeat(ranges.astype(np.float64), SPLATS, axis=0)[: len(values)]
+    low, extent = each[:, :3], each[:, 3:] - each[:, :3]
     return np.asarray((values - low) / np.where(extent > 0.0, extent, 1.0))
 
 
@@ -248,18 +228,9 @@ def _sizes(count: int, degree: int) -> tuple[float, int]:
     The header has a comment unless the splats are of the default model.
     """
     rest = 3 * above_constant(degree)
-    chunk, header = 18 * 4, with_model(_header(count, rest), "antialiased")
+    chunk, header = 18 * 4, ply.with_model(_header(count, rest), "antialiased")
     return 16 + rest + chunk / SPLATS, len(header) + chunk
 
 
-FORMAT = Format(
-    name=NAME,
-    suffix=".compressed.ply",
-    degree=3,
-    loss="holds every value in 8 to 11 bits, and sorts the splats",
-    matches=_matches,
-    read=_read,
-    write=_write,
-    sizes=_sizes,
-    models=MODELS,
-)
+_LOSS = "holds every value in 8 to 11 bits, and sorts the splats"
+FORMAT = Format(NAME, ".compressed.ply", _matches, _read, _write, 3, _LOSS, _sizes, MODELS)

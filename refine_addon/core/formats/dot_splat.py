@@ -17,7 +17,7 @@ from ..splats import SH_C0, Splats, base_color, opacity, opacity_logits, scales,
 from .format import Format, codes, named, new_file, pieces
 from .ply import Origin, SplatFile
 
-NAME = SUFFIX = ".splat"
+NAME = ".splat"
 
 _ROW = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
@@ -64,12 +64,5 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
         stream.write(rows.data)
 
 
-FORMAT = Format(
-    name=NAME,
-    suffix=SUFFIX,
-    loss="holds colour, opacity and rotation in 8 bits each",
-    matches=named(SUFFIX),
-    read=_read,
-    write=_write,
-    sizes=lambda _count, _degree: (_ROW.itemsize, 0),
-)
+_LOSS = "holds colour, opacity and rotation in 8 bits each"
+FORMAT = Format(NAME, NAME, named(NAME), _read, _write, 0, _LOSS, lambda *_: (_ROW.itemsize, 0))

@@ -25,7 +25,7 @@ WXYZ, XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
 """Components of a quaternion x y z w in our order, and of ours in that."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Format:
     """A format of splat files; an output is known by its suffix.
 
@@ -85,9 +85,8 @@ def new_file(
         Views of its rows, to be assigned to.
     """
     rows, splats = empty_rows(count, degree)
-    nothing = np.empty(0, np.uint8)
     header = with_model(new_header(rows.dtype, count), model)
-    return SplatFile(path, rows, header, nothing, nothing, origin=origin), splats
+    return SplatFile(path, rows, header, origin=origin), splats
 
 
 def pieces(count: int) -> list[slice]:
@@ -103,9 +102,8 @@ def codes(shares: NDArray[Any]) -> NDArray[np.uint8]:
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
     """Raise `RefineError` if a file of `available` bytes is too short for what it announces."""
     if needed > available:
-        raise RefineError(
-            f"{path}: truncated: {what} need {needed} bytes, the file has {available}"
-        )
+        problem = f"{what} need {needed} bytes, the file has {available}"
+        raise RefineError(f"{path}: truncated: {problem}")
 
 
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,10 @@ class _Document(NamedTuple):
 
     def values(self, index: Any, place: Place, width: int) -> tuple[NDArray[Any], float]:
         """Values of an accessor as they are stored, (n, width), and what they are multiples of."""
+
+        def whole(key: str, default: int | None = None) -> int:
+            return where.at(key).whole(view.get(key, default))
+
         held, place = self.item("accessors", index, place)
         kind, shape = held.get("componentType"), held.get("type")
         if not is_whole(kind) or kind not in _KINDS or shape != _SHAPES[width]:
@@ -82,15 +86,15 @@ class _Document(NamedTuple):
             place.fail(f"{got}, expected {_SHAPES[width]} of {', '.join(map(str, _KINDS))}")
         if "sparse" in held or "bufferView" not in held:
             place.fail("sparse or without values, which splats are not read from")
-        dtype, count = np.dtype(_KINDS[kind]), _whole(held, "count", place)
-        offset = _whole(held, "byteOffset", place, 0)
+        dtype, view, where = np.dtype(_KINDS[kind]), held, place
+        count, offset = whole("count"), whole("byteOffset", 0)
         view, where = self.item("bufferViews", held["bufferView"], place)
         buffer, _ = self.item("buffers", view.get("buffer"), where)
         if view["buffer"] != 0 or "uri" in buffer or "extensions" in view:
             where.fail("in another file or compressed, expected the binary chunk")
-        start, length = _whole(view, "byteOffset", where, 0), _whole(view, "byteLength", where)
+        start, length = whole("byteOffset", 0), whole("byteLength")
         size = dtype.itemsize * width
-        stride = _whole(view, "byteStride", where, 0) or size
+        stride = whole("byteStride", 0) or size
         end = offset + stride * (count - 1) + size if count else 0
         if stride < size or end > length or start + length > len(self.binary):
             place.fail(
@@ -111,10 +115,6 @@ class _Part(NamedTuple):
     degree: int
     logs: bool  # whether scales are held as their logarithms, as in drafts of the extension
     values: Callable[[str, slice], NDArray[Any]]  # of an attribute without its prefix
-
-
-def _matches(_path: Path, head: bytes) -> bool:
-    return head.startswith(_MAGIC)
 
 
 def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
@@ -200,10 +200,6 @@ def _opened(path: Path, data: NDArray[np.uint8]) -> _Document:
 def _listed(holder: dict[str, Any], key: str, place: Place) -> list[Any]:
     """List, empty if it is not there."""
     return place.at(key).items(holder.get(key, []))
-
-
-def _whole(holder: dict[str, Any], key: str, place: Place, default: int | None = None) -> int:
-    return place.at(key).whole(holder.get(key, default))
 
 
 def _moved(frame: NDArray[np.float64], node: dict[str, Any], place: Place) -> NDArray[np.float64]:
@@ -298,16 +294,12 @@ def _half_turned(splats: Splats) -> Splats:
     """Splats turned half about z, to the bit: see `_HALF_TURN`."""
     w, x, y, z = splats.quaternions.T
     # Half a turn multiplies the harmonic of order m by (-1)^m.
-    degree = splats.sh_degree
-    signs = np.array(
-        [(-1.0) ** m for band in range(1, degree + 1) for m in range(-band, band + 1)], np.float32
-    )
-    return Splats(
+    bands = range(1, splats.sh_degree + 1)
+    signs = np.array([(-1.0) ** m for n in bands for m in range(-n, n + 1)], np.float32)
+    return replace(
+        splats,
         means=splats.means * np.array([-1.0, -1.0, 1.0], np.float32),
-        log_scales=splats.log_scales,
         quaternions=np.stack([-z, -y, x, w], axis=1),
-        opacity_logits=splats.opacity_logits,
-        sh_dc=splats.sh_dc,
         sh_rest=splats.sh_rest * signs[:, None],
     )
 
@@ -321,18 +313,8 @@ def _harmonics(degree: int) -> list[str]:
     return [_harmonic(band, n) for band in range(degree + 1) for n in range(2 * band + 1)]
 
 
-class _Attribute(NamedTuple):
-    """An attribute as it is written."""
-
-    name: str
-    width: int  # numbers of one splat
-    kind: int  # their component type
-    values: Callable[[Splats], NDArray[Any]]  # (n, width), for splats in the frame of glTF
-
-    @property
-    def row(self) -> int:
-        """Bytes of one splat."""
-        return self.width * np.dtype(_KINDS[self.kind]).itemsize
+_Attribute: TypeAlias = tuple[str, int, int, Callable[[Splats], NDArray[Any]]]
+"""Name, component type, numbers of one splat, and these, (n, width), in the frame of glTF."""
 
 
 def _attributes(degree: int) -> list[_Attribute]:
@@ -344,21 +326,16 @@ def _attributes(degree: int) -> list[_Attribute]:
     def harmonic(index: int) -> Callable[[Splats], NDArray[Any]]:
         return lambda splats: splats.sh_rest[:, index]
 
-    constant, *others = _harmonics(degree)
-    written = {
-        "ROTATION": (4, lambda splats: unit_quaternions(splats.quaternions)[:, XYZW]),
-        "SCALE": (3, lambda splats: scales(splats.log_scales)),
-        "OPACITY": (1, lambda splats: opacity(splats.opacity_logits)[:, None]),
-        constant: (3, lambda splats: splats.sh_dc),
-        **{name: (3, harmonic(index)) for index, name in enumerate(others)},
-    }
+    constant, *others = (f"{EXTENSION}:{name}" for name in _harmonics(degree))
+    turn = f"{EXTENSION}:ROTATION", _FLOAT, 4
     return [
-        _Attribute("POSITION", 3, _FLOAT, lambda splats: splats.means),
-        _Attribute("COLOR_0", 4, _BYTE, color),
-        *(
-            _Attribute(f"{EXTENSION}:{name}", width, _FLOAT, values)
-            for name, (width, values) in written.items()
-        ),
+        ("POSITION", _FLOAT, 3, lambda splats: splats.means),
+        ("COLOR_0", _BYTE, 4, color),
+        (*turn, lambda splats: unit_quaternions(splats.quaternions)[:, XYZW]),
+        (f"{EXTENSION}:SCALE", _FLOAT, 3, lambda splats: scales(splats.log_scales)),
+        (f"{EXTENSION}:OPACITY", _FLOAT, 1, lambda splats: opacity(splats.opacity_logits)[:, None]),
+        (constant, _FLOAT, 3, lambda splats: splats.sh_dc),
+        *((name, _FLOAT, 3, harmonic(index)) for index, name in enumerate(others)),
     ]
 
 
@@ -366,15 +343,9 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
     """Write splats as a file with one node; refuse more than 4 GiB, which it cannot say."""
     attributes = _attributes(splats.sh_degree)
     with np.errstate(under="ignore", over="ignore"):  # doubles that are no floats
-        means = np.asarray(splats.means, np.float32)
-        low, high = means.min(axis=0), means.max(axis=0)
-        # Half a turn about z: x and y change sign.
-        low, high = (
-            np.array([-high[0], -high[1], low[2]], np.float64),
-            np.array([-low[0], -low[1], high[2]], np.float64),
-        )
-        text = _json(attributes, len(splats), (low + 0.0).tolist(), (high + 0.0).tolist())
-        body = len(splats) * sum(attribute.row for attribute in attributes)
+        means = np.asarray(splats.means, np.float32) * np.array([-1.0, -1.0, 1.0], np.float32)
+        ends = [(end.astype(np.float64) + 0.0).tolist() for end in (means.min(0), means.max(0))]
+        text, body = _json(attributes, len(splats), *ends)
         total = _HEADER.size + 2 * _CHUNK.size + len(text) + body
         if total > _LONGEST:
             raise RefineError(
@@ -382,64 +353,53 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
             )
         stream.write(_HEADER.pack(_MAGIC, _VERSION, total) + _CHUNK.pack(len(text), _JSON) + text)
         stream.write(_CHUNK.pack(body, _BINARY))
-        for attribute in attributes:
+        for _, kind, _, values in attributes:
             for piece in pieces(len(splats)):
-                values = attribute.values(_half_turned(splats.take(piece)))
-                stream.write(np.ascontiguousarray(values, _KINDS[attribute.kind]).data)
+                written = values(_half_turned(splats.take(piece)))
+                stream.write(np.ascontiguousarray(written, _KINDS[kind]).data)
 
 
-def _json(attributes: list[_Attribute], count: int, low: list[float], high: list[float]) -> bytes:
-    """JSON of a file, padded with spaces to a multiple of 4 bytes."""
+def _json(
+    attributes: list[_Attribute], count: int, low: list[float], high: list[float]
+) -> tuple[bytes, int]:
+    """JSON of a file, padded with spaces to a multiple of 4 bytes, and the bytes behind it."""
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     at = 0
-    for index, attribute in enumerate(attributes):
-        length = attribute.row * count
+    for index, (_, kind, width, _) in enumerate(attributes):
+        length = width * np.dtype(_KINDS[kind]).itemsize * count
         views.append({"buffer": 0, "byteOffset": at, "byteLength": length, "target": _VERTICES})
-        kind, shape = attribute.kind, _SHAPES[attribute.width]
-        accessors.append(
-            {"bufferView": index, "componentType": kind, "count": count, "type": shape}
-        )
+        accessor = {"bufferView": index, "componentType": kind, "count": count}
+        accessors.append({**accessor, "type": _SHAPES[width]})
         at += length
     accessors[0].update(min=low, max=high)
     accessors[1]["normalized"] = True
-    primitive = {
-        "attributes": {attribute.name: index for index, attribute in enumerate(attributes)},
-        "mode": _POINTS,
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
-    }
+    kernel = {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
+    names = {name: index for index, (name, *_) in enumerate(attributes)}
     content = {
         "asset": {"version": "2.0", "generator": "REFINE for Blender"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [{"attributes": names, "mode": _POINTS, "extensions": kernel}]}],
         "buffers": [{"byteLength": at}],
         "bufferViews": views,
         "accessors": accessors,
     }
     text = json.dumps(content, separators=(",", ":")).encode()
-    return text + b" " * (-len(text) % 4)
+    return text + b" " * (-len(text) % 4), at
 
 
 def _sizes(count: int, degree: int) -> tuple[float, int]:
     """Bytes of a splat and of the rest, at most: its JSON has numbers of unknown length."""
-    attributes = _attributes(degree)
     longest = [-1.1754943508222875e-38] * 3
-    text = _json(attributes, count, longest, longest)
-    return sum(attribute.row for attribute in attributes), (
-        _HEADER.size + 2 * _CHUNK.size + len(text)
-    )
+    text, _ = _json(_attributes(degree), count, longest, longest)
+    _, row = _json(_attributes(degree), 1, longest, longest)
+    return row, _HEADER.size + 2 * _CHUNK.size + len(text)
 
 
+_LOSS = "holds activated values in single precision, with y up"
 FORMAT = Format(
-    name=NAME,
-    suffix=".glb",
-    degree=_DEGREES,
-    loss="holds activated values in single precision, with y up",
-    matches=_matches,
-    read=_read,
-    write=_write,
-    sizes=_sizes,
+    NAME, ".glb", lambda _, head: head.startswith(_MAGIC), _read, _write, _DEGREES, _LOSS, _sizes
 )

@@ -171,4 +171,4 @@ def _buckets(
     return centers, bucket
 
 
-READER = Format(name=NAME, suffix=NAME, matches=named(NAME), read=_read)
+READER = Format(NAME, NAME, named(NAME), _read)

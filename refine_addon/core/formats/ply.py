@@ -14,7 +14,7 @@ import re
 import stat
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -38,16 +38,8 @@ HEADER_LIMIT = 1 << 20
 TEXT = "="
 """Byte order for ASCII files: their numbers are stored in that of the machine."""
 
-PLY_TYPES = {
-    "i1": "char",
-    "u1": "uchar",
-    "i2": "short",
-    "u2": "ushort",
-    "i4": "int",
-    "u4": "uint",
-    "f4": "float",
-    "f8": "double",
-}
+PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort"}
+PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
 """Names of types in NumPy -> in PLY."""
 
 INDEXING = ("edge", "face", "tristrips")
@@ -64,11 +56,8 @@ _MODEL_COMMENT = re.compile(
     re.IGNORECASE,
 )
 
-_END = {
-    b"\n": re.compile(rb"\n[ \t]*end_header[ \t]*\r?\n"),
-    b"\r\n": re.compile(rb"\r\n[ \t]*end_header[ \t]*\r\n"),
-    b"\r": re.compile(rb"\r[ \t]*end_header[ \t]*\r"),
-}
+_ENDS = {b"\n": rb"\n[ \t]*end_header[ \t]*\r?\n"}
+_ENDS |= {end: end + rb"[ \t]*end_header[ \t]*" + end for end in (b"\r\n", b"\r")}
 """End of a header, for each kind of line end. Only that of the first line is looked for, since
 bytes of the body may look like another."""
 
@@ -114,8 +103,8 @@ class SplatFile:
     path: Path
     rows: NDArray[Any]
     header: bytes
-    before: NDArray[np.uint8]
-    after: NDArray[np.uint8]
+    before: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
+    after: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     indexing: tuple[str, ...] = ()
     origin: Origin | None = None
     remarks: tuple[str, ...] = ()
@@ -162,9 +151,8 @@ class SplatFile:
         if model not in MODELS:
             raise RefineError(f"model is {model!r}, expected one of {', '.join(MODELS)}")
         if THIRD_SCALE not in (self.rows.dtype.names or ()):
-            raise RefineError(
-                f"{self.path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
-            )
+            problem = f"splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
+            raise RefineError(f"{self.path}: {problem}")
         return replace(self, header=with_model(self.header, model))
 
     def without_third_scale(self) -> SplatFile:
@@ -202,14 +190,9 @@ class SplatFile:
 
     def notes(self, keep: NDArray[np.bool_]) -> list[str]:
         """What the user should know about a file of the kept rows, in sentences."""
-        return [
-            *self.remarks,
-            *(
-                f"element '{name}' beside the splats is kept as it is; "
-                "its indices may point past the end"
-                for name in ([] if keep.all() else self.indexing)
-            ),
-        ]
+        said = "beside the splats is kept as it is; its indices may point past the end"
+        beside = [] if keep.all() else self.indexing
+        return [*self.remarks, *(f"element '{name}' {said}" for name in beside)]
 
     def write(
         self,
@@ -244,10 +227,8 @@ class SplatFile:
         """
         path, columns = expanded(path), columns or {}
         if keep is not None and (keep.shape != self.rows.shape or keep.dtype != np.bool_):
-            raise RefineError(
-                f"{self.path}: keep is {keep.dtype} {keep.shape}, "
-                f"expected one bool for each of {len(self)} splats"
-            )
+            wanted = f"expected one bool for each of {len(self)} splats"
+            raise RefineError(f"{self.path}: keep is {keep.dtype} {keep.shape}, {wanted}")
         header, _ = self._layout(keep, columns)
         if not self.rows.flags.writeable:
             refuse_mapped(path, self.path)
@@ -267,26 +248,20 @@ class SplatFile:
             return header, self.rows.dtype  # they have the stored types, and need not be made
         declared = []
         for name, values in columns.items():
+            stored = self.rows.dtype[name] if name in names else None
+            kind, problem = PLY_TYPES.get(values.dtype.str[1:]), ""
             if values.shape != self.rows.shape:
-                raise RefineError(
-                    f"{self.path}: column '{name}' has shape {values.shape}, "
-                    f"expected {self.rows.shape}"
-                )
-            if name in names:
-                stored = self.rows.dtype[name]
-                if not np.can_cast(values.dtype, stored, "same_kind"):
-                    raise RefineError(
-                        f"{self.path}: property '{name}' is there already, of type {stored}; "
-                        f"expected one that holds {values.dtype}"
-                    )
-                continue
-            kind = PLY_TYPES.get(values.dtype.str[1:])
-            if kind is None or not re.fullmatch(r"[!-~]+", name):
-                raise RefineError(
-                    f"{self.path}: column '{name}' of type {values.dtype} cannot be a property, "
-                    f"expected ASCII without spaces and one of {', '.join(PLY_TYPES)}"
-                )
-            declared.append(f"property {kind} {name}".encode())
+                problem = f"column '{name}' has shape {values.shape}, expected {self.rows.shape}"
+            elif stored is not None and not np.can_cast(values.dtype, stored, "same_kind"):
+                problem = f"property '{name}' is there already, of type {stored}; "
+                problem += f"expected one that holds {values.dtype}"
+            elif stored is None and not (kind and re.fullmatch(r"[!-~]+", name)):
+                problem = f"column '{name}' of type {values.dtype} cannot be a property, "
+                problem += f"expected ASCII without spaces and one of {', '.join(PLY_TYPES)}"
+            if problem:
+                raise RefineError(f"{self.path}: {problem}")
+            if stored is None:
+                declared.append(f"property {kind} {name}".encode())
         if declared:
             lines = _lines(header)
             index = last = _vertex_line(lines)
@@ -323,9 +298,8 @@ def read_ply(path: Path | str) -> SplatFile:
     path = expanded(path)
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for a writer
-            raise RefineError(
-                f"{path}: is a {'folder' if path.is_dir() else 'device'}, expected a PLY file"
-            )
+            kind = "folder" if path.is_dir() else "device"
+            raise RefineError(f"{path}: is a {kind}, expected a PLY file")
         with path.open("rb") as stream:
             header, vertex = splat_header(path, stream)
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
@@ -363,18 +337,14 @@ def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
     header = read_header(path, stream)
     names = [element.name for element in header.elements]
     if "vertex" not in names:
-        raise RefineError(
-            f"{path}: not a splat file: expected an element 'vertex', "
-            f"got {_listed(names) or 'none'}"
-        )
+        wanted = f"expected an element 'vertex', got {_listed(names) or 'none'}"
+        raise RefineError(f"{path}: not a splat file: {wanted}")
     vertex = names.index("vertex")
     _check_properties(header, vertex)
     for element in header.elements[:vertex]:
         if has_lists(element):
-            raise RefineError(
-                f"{path}: element {shown(element.name)} has a list and stands before the splats, "
-                "expected it behind them"
-            )
+            problem = "has a list and stands before the splats, expected it behind them"
+            raise RefineError(f"{path}: element {shown(element.name)} {problem}")
     return header, vertex
 
 
@@ -391,14 +361,12 @@ def read_header(path: Path | Url, stream: BinaryIO) -> Header:
         raise RefineError(f"{path}: the file is empty, expected a PLY")
     if not re.match(rb"ply[\r\n]", head):
         refuse_foreign_splats(path, head)
-        raise RefineError(
-            f"{path}: not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
-        )
+        wanted = f"it starts with {head[:8]!r}, expected 'ply' and a line end"
+        raise RefineError(f"{path}: not a PLY: {wanted}")
     raw = raw_header(head)
     if raw is None:
-        raise RefineError(
-            f"{path}: header without end: no 'end_header' line in the first {len(head)} bytes"
-        )
+        problem = f"no 'end_header' line in the first {len(head)} bytes"
+        raise RefineError(f"{path}: header without end: {problem}")
     plain, counts = _plain(path, raw)
     try:
         data = plyfile.PlyData.read(io.BytesIO(plain))
@@ -412,7 +380,7 @@ def raw_header(head: bytes) -> bytes | None:
     """Header at the beginning of a file; None if this is no PLY, or the header has no end."""
     if not re.match(rb"ply[\r\n]", head):
         return None
-    end = _END[_line_end(head)].search(head)
+    end = re.search(_ENDS[_line_end(head)], head)
     return head[: end.end()] if end else None
 
 
@@ -449,39 +417,27 @@ def _check_properties(header: Header, vertex: int) -> None:
         prop.name: "list" if isinstance(prop, plyfile.PlyListProperty) else prop.val_dtype
         for prop in header.elements[vertex].properties
     }
-    if "packed_position" in kinds:
-        raise RefineError(
-            f"{header.path}: a compressed splat PLY, which 'refine convert IN OUT.ply' makes a "
-            "plain one of"
-        )
     missing = [name for name in REQUIRED if name not in kinds]
-    if missing and missing != [THIRD_SCALE]:
-        guess = "a point cloud, not splats"
-        if "opacity" in kinds:
-            guess = "incomplete splats"
-        elif any(element.name in INDEXING for element in header.elements):
-            guess = "a mesh, not splats"
-        present = _listed([*kinds])
-        present += ", ..." if len(kinds) > _NAMES_SHOWN else ""
-        raise RefineError(
-            f"{header.path}: {guess}: vertex lacks {', '.join(missing)} "
-            f"(it has {present or 'no property'})"
-        )
     rest = [name for name in kinds if name.startswith("f_rest_")]
-    if len(rest) not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(len(rest))):
-        raise RefineError(
-            f"{header.path}: found {len(rest)} f_rest properties, "
-            "expected f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
-        )
-    for name, kind in kinds.items():
+    problem = ""
+    if "packed_position" in kinds:
+        problem = "a compressed splat PLY, which 'refine convert IN OUT.ply' makes a plain one of"
+    elif missing and missing != [THIRD_SCALE]:
+        mesh = any(element.name in INDEXING for element in header.elements)
+        guess = f"a {'mesh' if mesh else 'point cloud'}, not splats"
+        guess = "incomplete splats" if "opacity" in kinds else guess
+        has = (_listed([*kinds]) or "no property") + ", ..." * (len(kinds) > _NAMES_SHOWN)
+        problem = f"{guess}: vertex lacks {', '.join(missing)} (it has {has})"
+    elif len(rest) not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(len(rest))):
+        problem = f"found {len(rest)} f_rest properties, "
+        problem += "expected f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
+    for name, kind in () if problem else kinds.items():
         if kind == "list":
-            raise RefineError(
-                f"{header.path}: property {shown(name)} is a list, expected one number a splat"
-            )
-        if kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
-            raise RefineError(
-                f"{header.path}: property {shown(name)} is of type {kind}, expected float or double"
-            )
+            problem = f"property {shown(name)} is a list, expected one number a splat"
+        elif kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
+            problem = f"property {shown(name)} is of type {kind}, expected float or double"
+    if problem:
+        raise RefineError(f"{header.path}: {problem}")
 
 
 def has_lists(element: Any) -> bool:
@@ -507,31 +463,23 @@ def check_counts(header: Header, available: int) -> None:
     """
     least, text = 0, header.order == TEXT
     for element, count in zip(header.elements, header.counts, strict=True):
-        kinds = (
-            p.len_dtype if isinstance(p, plyfile.PlyListProperty) else p.val_dtype
-            for p in element.properties
-        )
+        kinds = (getattr(prop, "len_dtype", prop.val_dtype) for prop in element.properties)
         # Of text: one digit and one separator for each number; lists have a length.
         row = sum(2 if text else np.dtype(kind).itemsize for kind in kinds)
+        least, problem, name = least + row * count, "", shown(element.name)
         if not row and count:
-            raise RefineError(
-                f"{header.path}: element {shown(element.name)} has {count} rows and no property"
-            )
-        least += row * count
-        if least > available + text:  # plus 1 for text, whose last line may lack its line end
-            raise RefineError(
-                f"{header.path}: truncated: the header announces {count} rows of "
-                f"{shown(element.name)}, at least {least} bytes so far, but only {available} bytes "
-                "follow it"
-            )
+            problem = f"element {name} has {count} rows and no property"
+        elif least > available + text:  # plus 1 for text, whose last line may lack its line end
+            problem = f"truncated: the header announces {count} rows of {name}, at least {least} "
+            problem += f"bytes so far, but only {available} bytes follow it"
+        if problem:
+            raise RefineError(f"{header.path}: {problem}")
 
 
 def vertex_range(header: Header, vertex: int) -> tuple[int, int]:
     """Where in a binary body the rows of splats begin and end, of a header of `splat_header`."""
-    sizes = [
-        count * element.dtype(header.order).itemsize
-        for element, count in zip(header.elements[: vertex + 1], header.counts, strict=False)
-    ]
+    both = zip(header.elements[: vertex + 1], header.counts, strict=False)
+    sizes = [count * element.dtype(header.order).itemsize for element, count in both]
     return sum(sizes[:-1]), sum(sizes)
 
 
@@ -540,22 +488,19 @@ def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> S
     lines, start = body.splitlines(), 0
     for index, (element, count) in enumerate(zip(header.elements, header.counts, strict=True)):
         if len(lines) < start + count:
-            raise RefineError(
-                f"{header.path}: truncated: the file ends in row {len(lines) - start} of {count} "
-                f"of {shown(element.name)}"
-            )
+            place = f"row {len(lines) - start} of {count} of {shown(element.name)}"
+            raise RefineError(f"{header.path}: truncated: the file ends in {place}")
         if index == vertex:
             rows = _numbers(header.path, element.dtype("<"), lines[start : start + count])
         start += count
     left = _listed([name for name in filled if name != "vertex"])
     remark = "is text; a PLY that is written of it is binary"
     remark += f", without the elements beside its splats ({left})" if left else ""
-    nothing = np.empty(0, np.uint8)
+    remarks = (f"{header.path.name} {remark}",)
+    origin = Origin(format_of(header.raw), len(header.raw) + len(body))
     return SplatFile(
-        Path(header.path), rows, vertex_header(header.raw), nothing, nothing,
-        origin=Origin(format_of(header.raw), len(header.raw) + len(body)),
-        remarks=(f"{header.path.name} {remark}",),
-    )  # fmt: skip
+        Path(header.path), rows, vertex_header(header.raw), origin=origin, remarks=remarks
+    )
 
 
 def _numbers(path: Path | Url, dtype: np.dtype[Any], lines: list[bytes]) -> NDArray[Any]:

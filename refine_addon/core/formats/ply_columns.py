@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from ..splats import LOG_ZERO, Splats, above_constant
 
-REQUIRED = (
-    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
+_NAMES = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+REQUIRED = tuple(_NAMES.split())
 """Properties that every splat has."""
 
 THIRD_SCALE = "scale_2"
@@ -24,7 +22,7 @@ REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 
 
 def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> Splats:
-    """Return splats from arrays named as the properties of a 3DGS PLY.
+    """Splats from arrays named as the properties of a 3DGS PLY.
 
     Parameters
     ----------
@@ -63,13 +61,13 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
 
 
 def other_properties(names: Iterable[str]) -> list[str]:
-    """Return which of the names of a file's properties say nothing of splats, nor are normals."""
+    """Which of the names of a file's properties say nothing of splats, nor are normals."""
     known = ("nx", "ny", "nz", *REQUIRED)
     return [name for name in names if name not in known and not name.startswith("f_rest_")]
 
 
 def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
-    """Return rows of float32 in the layout of a plain 3DGS PLY without normals, to be filled.
+    """Rows of float32 in the layout of a plain 3DGS PLY without normals, to be filled.
 
     Parameters
     ----------
@@ -95,41 +93,29 @@ def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
 
 
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
-    """Return views of splats, (N,) each, by the names of properties in a 3DGS PLY.
+    """Views of splats, (N,) each, by the names of properties in a 3DGS PLY.
 
     The order is that of the reference implementation, without normals; types are those of `splats`.
     Discs (2DGS) have no third scale.
     """
     coefficients = splats.sh_rest.shape[1]
     axes = 2 if splats.model == "2dgs" else 3
+    planes = [splats.sh_rest[:, k, channel] for channel in range(3) for k in range(coefficients)]
     return {
-        **{name: splats.means[:, axis] for axis, name in enumerate("xyz")},
+        **dict(zip("xyz", splats.means.T, strict=True)),
         **{f"f_dc_{channel}": splats.sh_dc[:, channel] for channel in range(3)},
-        **{
-            f"f_rest_{channel * coefficients + index}": splats.sh_rest[:, index, channel]
-            for channel in range(3)
-            for index in range(coefficients)
-        },
+        **{f"f_rest_{index}": plane for index, plane in enumerate(planes)},
         "opacity": splats.opacity_logits,
         **{f"scale_{axis}": splats.log_scales[:, axis] for axis in range(axes)},
         **{f"rot_{index}": splats.quaternions[:, index] for index in range(4)},
     }
 
 
-def columns_from_splats(splats: Splats) -> dict[str, NDArray[np.float32]]:
-    """Return `values_by_name` as contiguous float32 arrays."""
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
-        return {
-            name: np.ascontiguousarray(values, np.float32)
-            for name, values in values_by_name(splats).items()
-        }
-
-
 class Columns(Protocol):
     """Stored properties of N splats by their names, such as a mapping or a structured array."""
 
     def __getitem__(self, name: str, /) -> NDArray[Any]:
-        """Return a property, (N,)."""
+        """A property, (N,)."""
         ...
 
 
@@ -148,16 +134,11 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
         What these M become.
     """
 
-    def __init__(
-        self,
-        stored: Columns | NDArray[Any],
-        rows: NDArray[np.int64],
-        splats: Splats,
-    ) -> None:
+    def __init__(self, stored: Columns, rows: NDArray[np.int64], splats: Splats) -> None:
         self._stored, self._rows, self._values = stored, rows, values_by_name(splats)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return a property as it becomes, (N,)."""
+        """A property as it becomes, (N,)."""
         values = self._values[name]
         column: NDArray[Any] = self._stored[name].copy()
         with np.errstate(over="ignore", under="ignore"):  # a double may be no float
@@ -169,15 +150,11 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
         return iter(self._values)
 
     def __len__(self) -> int:
-        """Return the number of properties."""
+        """The number of properties."""
         return len(self._values)
 
     def put(
-        self,
-        chunk: NDArray[Any],
-        dtype: np.dtype[Any],
-        piece: slice,
-        kept: NDArray[np.bool_] | None,
+        self, chunk: NDArray[Any], dtype: np.dtype[Any], piece: slice, kept: NDArray[Any] | None
     ) -> None:
         """Put the values into rows of a file.
 
@@ -205,7 +182,7 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
 
 
 def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:
-    """Return the named columns as (N, len(names)); a view if they are adjacent in each row."""
+    """The named columns as (N, len(names)); a view if they are adjacent in each row."""
     first = columns[names[0]]
     if isinstance(columns, np.ndarray) and columns.dtype.fields and columns.ndim == 1:
         kinds, offsets = zip(*(columns.dtype.fields[name][:2] for name in names), strict=True)

@@ -25,21 +25,12 @@ from .format import Format
 from .ply import SplatFile, read_ply
 from .ply_columns import other_properties, splats_from_columns
 
-FORMATS: tuple[Format, ...] = (
-    compressed_ply.FORMAT,
-    spz.FORMAT,
-    glb.FORMAT,
-    sog.FORMAT,
-    dot_splat.FORMAT,  # known by its name alone, if it is none of the others
-)
+# ``.splat`` is known by its name alone, if a file is none of the others.
+FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, dot_splat.FORMAT)
 """Every format that is written, but plain PLY."""
 
-READERS: tuple[Format, ...] = (
-    *FORMATS,
-    ksplat.READER,
-    streamed_sog.READER,  # before SOG, whose name its own ends in
-    sog.META_READER,
-)
+# Streamed SOG before SOG, whose name its own ends in.
+READERS = (*FORMATS, ksplat.READER, streamed_sog.READER, sog.META_READER)
 """Every format that is read, but plain PLY, in the order in which an input is tried."""
 
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
@@ -51,10 +42,8 @@ READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))
 INDEX_NAMES = (streamed_sog.INDEX, sog.META)
 """Names of files that stand for a folder."""
 
-NOT_WRITTEN = (
-    *(form.suffix for form in READERS if form.write is None),
-    *(".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip"),
-)
+_OTHERS = (".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
+NOT_WRITTEN = (*(form.suffix for form in READERS if form.write is None), *_OTHERS)
 """Endings of other splat formats and of compressed files: a PLY of such a name would mislead."""
 
 _HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed PLY has fewer
@@ -200,16 +189,14 @@ def held_splats(
         rows = rows.copy()
         for name, values in columns.items():
             if name not in (rows.dtype.names or ()):
-                raise RefineError(
-                    f"{path}: {form.suffix} holds no property '{name}'; write to a .ply"
-                )
+                problem = f"{form.suffix} holds no property '{name}'; write to a .ply"
+                raise RefineError(f"{path}: {problem}")
             rows[name] = values if keep is None else values[keep]
     splats = with_model(splats_from_columns(rows), file.model)
     good = drawable(splats)
     if not good.any():
-        raise RefineError(
-            f"{path}: none of the {len(splats)} splats can be drawn: nothing to write"
-        )
+        problem = f"none of the {len(splats)} splats can be drawn: nothing to write"
+        raise RefineError(f"{path}: {problem}")
     if not good.all():
         splats = splats.take(good)
     splats = splats.up_to_degree(form.degree)
@@ -223,15 +210,15 @@ def _tame(colors: NDArray[Any]) -> NDArray[Any]:
     return np.clip(colors, -LARGEST_NUMBER, LARGEST_NUMBER)
 
 
-def row_sizes(file: SplatFile, form: Format | None) -> tuple[float, int]:
+def row_sizes(file: SplatFile, form: Format | None, count: int | None = None) -> tuple[float, int]:
     """Bytes of one splat in a file of a format, and of everything else at most.
 
     None is plain PLY. Both are 0 where a file is compressed as a whole.
     """
     if form is None:
         return file.row_bytes, file.fixed_bytes
-    degree = min(file.splats().sh_degree, form.degree)
-    return form.sizes(len(file), degree) if form.sizes else (0.0, 0)
+    degree, count = min(file.splats().sh_degree, form.degree), len(file) if count is None else count
+    return form.sizes(count, degree) if form.sizes else (0.0, 0)
 
 
 def written_size(
@@ -243,11 +230,9 @@ def written_size(
     """Bytes of the file that `write_splats` makes, at most; None where only writing tells."""
     if form is None:
         return file.size(keep, columns)
-    if form.sizes is None:
-        return None
     count = int(np.count_nonzero(keep))
-    row, fixed = form.sizes(count, min(file.splats().sh_degree, form.degree))
-    return math.ceil(row * count) + fixed
+    row, fixed = row_sizes(file, form, count)
+    return math.ceil(row * count) + fixed if form.sizes else None
 
 
 def left_out(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> int:
@@ -261,23 +246,19 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
         return file.notes(keep)
     suffix, degree = form.suffix, file.splats().sh_degree
     said = [*file.remarks, f"{suffix} {form.loss} (docs/conventions.md, Formats)"]
-    if degree > form.degree:
-        said.append(
-            f"{suffix} holds harmonics of degree {form.degree}, "
-            f"the file has degree {degree}: the others are left out"
-        )
-    if file.model not in form.models:
-        said.append(
-            f"{suffix} does not say that splats are {file.model}: read it with --model {file.model}"
-        )
     extra = other_properties(file.rows.dtype.names or ())
+    lost = left_out(file, form, keep)
+    if degree > form.degree:
+        held = f"{suffix} holds harmonics of degree {form.degree}"
+        said.append(f"{held}, the file has degree {degree}: the others are left out")
+    if file.model not in form.models:
+        model = f"splats are {file.model}: read it with --model {file.model}"
+        said.append(f"{suffix} does not say that {model}")
     if extra:
         said.append(f"{suffix} does not hold {', '.join(extra)}: left out")
-    lost = left_out(file, form, keep)
     if lost:
-        said.append(
-            f"{lost} of the kept splats cannot be drawn and {suffix} cannot hold them: left out"
-        )
+        cannot = f"cannot be drawn and {suffix} cannot hold them"
+        said.append(f"{lost} of the kept splats {cannot}: left out")
     return said
 
 

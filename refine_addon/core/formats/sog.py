@@ -36,10 +36,8 @@ from .ply import Origin, SplatFile
 NAME, VERSION = "SOG", 2
 GENERATOR = "REFINE for Blender"
 META = "meta.json"
-IMAGES = (
-    *("means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"),
-    *("shN_labels.webp", "shN_centroids.webp"),
-)
+_PARTS = ("means_l", "means_u", "quats", "scales", "sh0", "shN_labels", "shN_centroids")
+IMAGES = tuple(f"{part}.webp" for part in _PARTS)
 """Names of the files that are written; those of harmonics where there are any."""
 
 _DEGREES = 3
@@ -57,10 +55,8 @@ _META_LIMIT = 1 << 20
 _SPARE_PIXELS = 1 << 16
 """An image has at most four times the pixels that are needed, and these: writers pad images."""
 
-_BROKEN = (
-    zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError,
-    KeyError, OSError, OverflowError, ArithmeticError,
-)  # fmt: skip
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, ArithmeticError)
+_BROKEN = (*_DAMAGED, RuntimeError, KeyError, OSError)
 """What reading a damaged archive raises."""
 
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -209,15 +205,15 @@ def _read_archive(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     try:
         archive = zipfile.ZipFile(io.BytesIO(data.tobytes()))
     except _BROKEN as error:
-        raise RefineError(f"{path}: the archive cannot be read ({str(error)[:100]})") from error
+        Place(path).fail(f"the archive cannot be read ({str(error)[:100]})")
     names = (name for name in archive.namelist() if name.split("/")[-1] == META)
     meta = next(names, None)
     if meta is None:
-        raise RefineError(f"{path}: no {META} in the archive, which a SOG file has")
+        Place(path).fail(f"no {META} in the archive, which a SOG file has")
     folder = meta.removesuffix(META)
 
     def opened(name: str, limit: int) -> bytes:
-        label = f"{path}: {(folder + name)[:80]!r} in the archive"
+        place, label = Place(path), f"{(folder + name)[:80]!r} in the archive"
         try:
             info = archive.getinfo(folder + name)
             if info.compress_type not in _PACKED:
@@ -225,9 +221,9 @@ def _read_archive(path: Path, data: NDArray[np.uint8]) -> SplatFile:
             with archive.open(info) as stream:
                 content = stream.read(limit + 1)
         except _BROKEN as error:
-            raise RefineError(f"{label} cannot be read ({str(error)[:100]})") from error
+            place.fail(f"{label} cannot be read ({str(error)[:100]})")
         if len(content) > limit:
-            raise RefineError(f"{label} has more than {limit} bytes")
+            place.fail(f"{label} has more than {limit} bytes")
         return content
 
     with archive:
@@ -306,10 +302,8 @@ def _fill_rotations(bundle: Bundle, splats: Splats) -> None:
     pixels = bundle.rows("quats", 0, len(splats))
     wrong = pixels[:, 3] < _ROTATIONS
     if wrong.any():
-        index = int(np.argmax(wrong))
-        Place(bundle.place.path, f"rotation of splat {index}").fail(
-            f"alpha {pixels[index, 3]}, expected {_ROTATIONS} to 255"
-        )
+        place = Place(bundle.place.path, f"rotation of splat {np.argmax(wrong)}")
+        place.fail(f"alpha {pixels[wrong][0, 3]}, expected {_ROTATIONS} to 255")
     for piece in pieces(len(splats)):
         others = (pixels[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
         largest = (pixels[piece, 3] - _ROTATIONS).astype(np.intp)
@@ -326,9 +320,8 @@ def _fill_from_tables(bundle: Bundle, splats: Splats) -> None:
         splats.log_scales[piece] = scale_tables[scales[piece, :3], axes]
         splats.sh_dc[piece] = color_tables[colors[piece, :3], axes]
         alpha = colors[piece, 3]
-        splats.opacity_logits[piece] = (
-            color_tables[alpha, 3] if first else opacity_logits(alpha / 255.0)
-        )
+        logits = color_tables[alpha, 3] if first else opacity_logits(alpha / 255.0)
+        splats.opacity_logits[piece] = logits
 
 
 def _fill_harmonics(bundle: Bundle, splats: Splats) -> None:
@@ -338,9 +331,8 @@ def _fill_harmonics(bundle: Bundle, splats: Splats) -> None:
     labels = pixels[:, 0] + 256 * pixels[:, 1]
     if labels.max() >= len(palette):
         index = int(np.argmax(labels >= len(palette)))
-        Place(bundle.place.path, f"splat {index}").fail(
-            f"entry {labels[index]} of {len(palette)} in the palette"
-        )
+        place = Place(bundle.place.path, f"splat {index}")
+        place.fail(f"entry {labels[index]} of {len(palette)} in the palette")
     for piece in pieces(len(splats)):
         splats.sh_rest[piece] = palette[labels[piece]]
 
@@ -415,11 +407,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
         "version": VERSION,
         "asset": {"generator": GENERATOR},
         "count": count,
-        "means": {
-            "mins": low.tolist(),
-            "maxs": (low + extent).tolist(),
-            "files": ["means_l.webp", "means_u.webp"],
-        },
+        "means": {"mins": low.tolist(), "maxs": (low + extent).tolist(), "files": [*IMAGES[:2]]},
         "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
@@ -427,27 +415,18 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
     if splats.model != MODELS[0]:
         meta["model"] = splats.model
     turns = np.column_stack([codes(others * math.sqrt(0.5) + 0.5), largest + _ROTATIONS])
-    images = {
-        "means_l.webp": image(code & 255),
-        "means_u.webp": image(code >> 8),
-        "quats.webp": image(turns),
-        "scales.webp": image(scales),
-        "sh0.webp": image(np.column_stack([colors, alpha])),
-    }
+    values = [code & 255, code >> 8, turns, scales, np.column_stack([colors, alpha])]
+    images = [*map(image, values)]
     if splats.sh_degree:
         labels = _grouped(splats.sh_rest.reshape(count, -1))
         entries = int(labels.max()) + 1
-        table, images["shN_centroids.webp"] = _centroids(splats.sh_rest, labels, entries)
-        images["shN_labels.webp"] = image(np.column_stack([labels & 255, labels >> 8]))
-        meta["shN"] = {
-            "count": entries,
-            "bands": splats.sh_degree,
-            "codebook": table.tolist(),
-            "files": ["shN_centroids.webp", "shN_labels.webp"],
-        }
+        table, palette = _centroids(splats.sh_rest, labels, entries)
+        images += [image(np.column_stack([labels & 255, labels >> 8])), palette]
+        held = {"count": entries, "bands": splats.sh_degree, "codebook": table.tolist()}
+        meta["shN"] = {**held, "files": ["shN_centroids.webp", "shN_labels.webp"]}
     yield META, json.dumps(meta).encode()
-    for name in IMAGES[: len(images)]:
-        yield name, codec.encode(images[name])
+    for name, pixels in zip(IMAGES, images, strict=False):
+        yield name, codec.encode(pixels)
 
 
 def _tabulated(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -503,13 +482,11 @@ def _centroids(
     sh_rest: NDArray[Any], labels: NDArray[np.int64], entries: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Table and the image of a palette: the mean harmonics of each group."""
-    coefficients = sh_rest.shape[1]
-    sizes = np.bincount(labels, minlength=entries)
+    coefficients, sizes = sh_rest.shape[1], np.bincount(labels, minlength=entries)
     means = np.empty((entries, coefficients, 3))
-    for k in range(coefficients):
-        for channel in range(3):
-            column = np.asarray(sh_rest[:, k, channel], np.float64)
-            means[:, k, channel] = np.bincount(labels, column, entries) / sizes
+    for k, channel in np.ndindex(coefficients, 3):
+        column = np.asarray(sh_rest[:, k, channel], np.float64)
+        means[:, k, channel] = np.bincount(labels, column, entries) / sizes
     table, places = _tabulated(means)
     rows = -(-entries // _ACROSS)
     image = np.zeros((rows * _ACROSS, coefficients, 4), np.uint8)
@@ -518,20 +495,6 @@ def _centroids(
     return table, image.reshape(rows, _ACROSS * coefficients, 4)
 
 
-FORMAT = Format(
-    name=NAME,
-    suffix=".sog",
-    degree=_DEGREES,
-    loss="holds positions in 16 bits, all else in 8, takes harmonics from a palette, and sorts",
-    matches=is_sog,
-    read=_read_archive,
-    write=_write,
-    models=MODELS,
-)
-
-META_READER = Format(
-    name=NAME,
-    suffix=META,
-    matches=_matches_meta,
-    read=lambda path, _data: bundle_beside(path).read(),
-)
+_LOSS = "holds positions in 16 bits, all else in 8, takes harmonics from a palette, and sorts"
+FORMAT = Format(NAME, ".sog", is_sog, _read_archive, _write, _DEGREES, _LOSS, models=MODELS)
+META_READER = Format(NAME, META, _matches_meta, lambda path, _data: bundle_beside(path).read())

@@ -12,14 +12,15 @@ import math
 import struct
 import zlib
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..foreign_files import GZIP, SPZ, is_spz
-from ..rendering import Model
+from ..place import Place
+from ..rendering import MODELS, Model
 from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
     WXYZ,
@@ -34,7 +35,7 @@ from .format import (
 )
 from .ply import Origin, SplatFile
 
-NAME = "SPZ"
+NAME, SUFFIX = "SPZ", ".spz"
 
 _HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, splats, degree, fractional bits, flags; then 0, or in version 4 how many streams
@@ -71,6 +72,10 @@ _STEP = 1 << 12
 """Bytes of a gzip stream that are unpacked at a time where what they hold is not used."""
 
 
+_Blocks: TypeAlias = dict[str, NDArray[np.uint8]]
+"""Bytes of each attribute, (splats, bytes of one), by its name."""
+
+
 class _Header(NamedTuple):
     """What the first bytes say."""
 
@@ -95,7 +100,7 @@ def _matches(path: Path, head: bytes) -> bool:
 
     A gzip stream of its name is one that may be damaged at its beginning.
     """
-    return is_spz(head) or (path.suffix.lower() == FORMAT.suffix and head.startswith(GZIP))
+    return is_spz(head) or (path.suffix.lower() == SUFFIX and head.startswith(GZIP))
 
 
 def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
@@ -142,19 +147,17 @@ def _parsed(path: Path, head: bytes, size: int) -> _Header:
             f"{size} bytes holds at most {_INFLATION * size}"
         )
     if problem:
-        raise RefineError(f"{path}: {problem}")
+        Place(path).fail(problem)
     return header
 
 
-def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, NDArray[np.uint8]]]:
+def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, _Blocks]:
     """Header and attributes of a gzip stream."""
     engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         header = _parsed(path, engine.decompress(data.data, _HEADER.size), len(data))
         if header.version == _ZSTD:
-            raise RefineError(
-                f"{path}: SPZ version 4 inside of gzip, expected its own header first"
-            )
+            Place(path).fail("SPZ version 4 inside of gzip, expected its own header first")
         needed = sum(header.blocks().values())
         body = engine.decompress(engine.unconsumed_tail, needed) if needed else b""
         # The rest, extensions that are not read, a step at a time: its end has the checksum. No
@@ -164,13 +167,11 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, N
             if not engine.eof:
                 engine.decompress(rest[at : at + _STEP])
     except zlib.error as error:
-        raise RefineError(
-            f"{path}: a damaged SPZ file: its gzip stream breaks at byte {_damaged_at(data)} "
-            f"({error})"
-        ) from error
+        at = _damaged_at(data)
+        Place(path).fail(f"a damaged SPZ file: its gzip stream breaks at byte {at} ({error})")
     blocks = _split(path, header, np.frombuffer(body, np.uint8))
     if not engine.eof:
-        raise RefineError(f"{path}: truncated: the gzip stream has no end")
+        Place(path).fail("truncated: the gzip stream has no end")
     return header, blocks
 
 
@@ -189,29 +190,27 @@ def _damaged_at(data: NDArray[np.uint8]) -> int:
     return at
 
 
-def _split(path: Path, header: _Header, body: NDArray[np.uint8]) -> dict[str, NDArray[np.uint8]]:
-    """Attributes that follow each other in `body`, (count, bytes) each."""
+def _split(path: Path, header: _Header, body: NDArray[np.uint8]) -> _Blocks:
+    """Attributes that follow each other in `body`."""
     lengths = header.blocks()
-    refuse_short(path, sum(lengths.values()), len(body), f"{header.splats} splats (unpacked)")
-    blocks, at = {}, 0
-    for name, length in lengths.items():
-        blocks[name] = _table(body[at : at + length], header.splats)
-        at += length
-    return blocks
+    ends = np.cumsum([*lengths.values()])
+    refuse_short(path, int(ends[-1]), len(body), f"{header.splats} splats (unpacked)")
+    parts = zip(lengths, np.split(body, ends), strict=False)
+    return {name: _table(part, header.splats) for name, part in parts}
 
 
 def _table(block: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
     return block.reshape(count, len(block) // count if count else 0)
 
 
-def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, NDArray[np.uint8]]:
+def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> _Blocks:
     """Attributes of version 4."""
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
     (at,) = _TABLE_AT.unpack(data[_HEADER.size : first].tobytes())
     lengths = {name: length for name, length in header.blocks().items() if length}
     if header.streams < len(lengths):
-        raise RefineError(f"{path}: byte 15: {header.streams} streams, expected {len(lengths)}")
+        Place(path).fail(f"byte 15: {header.streams} streams, expected {len(lengths)}")
     start = at + header.streams * _STREAM.size
     refuse_short(path, start, len(data), "the table of streams")
     blocks = {name: np.empty((header.splats, 0), np.uint8) for name in header.blocks()}
@@ -219,9 +218,8 @@ def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, 
         packed, announced = _STREAM.unpack(data[at : at + _STREAM.size].tobytes())
         at += _STREAM.size
         if announced != length:
-            raise RefineError(
-                f"{path}: stream '{name}' announces {announced} bytes, expected {length}"
-            )
+            problem = f"announces {announced} bytes, expected {length}"
+            Place(path).fail(f"stream '{name}' {problem}")
         end = start + packed
         refuse_short(path, end, len(data), f"stream '{name}' and what is before it")
         content = _zstd(path, name, data[start:end].tobytes(), length)
@@ -242,20 +240,18 @@ def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
             module = importlib.import_module("zstandard")
             reader = module.ZstdDecompressor().stream_reader(packed)
             failure = module.ZstdError
-    except ImportError as error:
-        raise RefineError(
-            f"{path}: SPZ version 4 needs a module for zstd: run this in Blender, which brings "
-            "one, or 'pip install zstandard'; or write the file as version 3"
-        ) from error
+    except ImportError:
+        where = "run this in Blender, which brings one, or 'pip install zstandard'"
+        Place(path).fail(f"SPZ version 4 needs a module for zstd: {where}; or write version 3")
     content = bytearray()
     try:
         while len(content) <= length and (piece := reader.read(_PIECE)):
             content += piece
     except (failure, EOFError) as error:
-        raise RefineError(f"{path}: stream '{name}' is damaged ({error})") from error
+        Place(path).fail(f"stream '{name}' is damaged ({error})")
     if len(content) != length:
         held = "more" if len(content) > length else str(len(content))
-        raise RefineError(f"{path}: stream '{name}' holds {held} bytes, expected {length}")
+        Place(path).fail(f"stream '{name}' holds {held} bytes, expected {length}")
     return content
 
 
@@ -319,9 +315,8 @@ def _fraction(splats: Splats) -> int:
     if np.rint(math.ldexp(farthest, most)) > _LARGEST_CODE:
         most -= 1
     if most < 0:
-        raise RefineError(
-            f"a coordinate is {farthest:.10g}: {NAME} holds coordinates up to {_LARGEST_CODE}"
-        )
+        wanted = f"{NAME} holds coordinates up to {_LARGEST_CODE}"
+        raise RefineError(f"a coordinate is {farthest:.10g}: {wanted}")
     return min(max(_USUAL_FRACTION, _LEAST_STEPS - bits), most, _LARGEST_CODE.bit_length())
 
 
@@ -343,13 +338,5 @@ def _harmonic_codes(sh_rest: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.minimum(steps, 255), np.uint8)
 
 
-FORMAT = Format(
-    name=NAME,
-    suffix=".spz",
-    degree=_DEGREES - 1,
-    loss="holds positions in 24 bits, all else in 8 to 10, and harmonics in 4 to 5",
-    matches=_matches,
-    read=_read,
-    write=_write,
-    models=("default", "antialiased"),
-)
+_LOSS = "holds positions in 24 bits, all else in 8 to 10, and harmonics in 4 to 5"
+FORMAT = Format(NAME, SUFFIX, _matches, _read, _write, _DEGREES - 1, _LOSS, models=MODELS[:2])

@@ -221,25 +221,22 @@ class StreamedSog:
 
         Raises
         ------
-        RefineError
-            If a file cannot be written, or there is no library for images.
+        RefineError, OSError
+            If there is no library for images, or a file cannot be written; see `folder_for`.
         """
-        level, size, waiting = len(self._counts), 0, 0
+        level, size = len(self._counts), 0
         self._counts.append(len(splats))
-        unit: list[NDArray[np.intp]] = []
+        unit = np.empty(0, np.intp)
         for number, rows in self._chunks_of(np.asarray(splats.means, np.float64)):
             rows = rows[near_ones_together(splats.means[rows])]
             self._widen(number, splats, rows)
-            place = {"file": len(self._levels), "offset": waiting, "count": len(rows)}
+            place = {"file": len(self._levels), "offset": len(unit), "count": len(rows)}
             self._rows[number][str(level)] = place
-            unit.append(rows)
-            waiting += len(rows)
-            if waiting > UNIT:
-                size += self._write_unit(level, splats.take(np.concatenate(unit)))
-                unit, waiting = [], 0
-        if unit:
-            size += self._write_unit(level, splats.take(np.concatenate(unit)))
-        return size
+            unit = np.concatenate([unit, rows])
+            if len(unit) > UNIT:
+                size += self._write_unit(level, splats.take(unit))
+                unit = unit[:0]
+        return size + (self._write_unit(level, splats.take(unit)) if len(unit) else 0)
 
     def _chunks_of(self, means: NDArray[np.float64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
         """Yield the number of each chunk that has some of the positions (N, 3), and which."""
@@ -265,16 +262,11 @@ class StreamedSog:
 
     def _write_unit(self, level: int, splats: Splats) -> int:
         """Write the next folder; return its bytes."""
-        folder, size = self._folder / str(len(self._levels)), 0
+        folder = self._folder / str(len(self._levels))
         self._levels.append(level)
-        try:
-            folder.mkdir()
-            for file, data in contents(self._folder / INDEX, splats):
-                (folder / file).write_bytes(data)
-                size += len(data)
-        except OSError as error:
-            raise RefineError(f"{folder}: cannot be written ({reason_of(error)})") from error
-        return size
+        folder.mkdir()
+        files = contents(self._folder / INDEX, splats)
+        return sum((folder / file).write_bytes(data) for file, data in files)
 
     def publish(self, path: Path, *, overwrite: bool) -> None:
         """Move the folders beside `path`, under names that are free, and write the index there.
@@ -284,8 +276,8 @@ class StreamedSog:
 
         Raises
         ------
-        RefineError
-            If the index may not be replaced, or the system cannot write it.
+        RefineError, OSError
+            If the index may not be replaced, or the system cannot write it; see `folder_for`.
         Cancelled
             See `execute.checkpoint`; all is as it was.
         """
@@ -302,21 +294,18 @@ class StreamedSog:
             text = json.dumps(index, allow_nan=False).encode() + b"\n"
             with whole_file(path, overwrite=overwrite) as stream:
                 stream.write(text)
-        except BaseException as error:
+        except BaseException:
             in_place = False
             with contextlib.suppress(OSError):
                 in_place = bool(text) and path.read_bytes() == text
             for there in () if in_place else moved:
                 shutil.rmtree(there, ignore_errors=True)
-            if isinstance(error, OSError):
-                raise RefineError(f"{path}: cannot be written ({reason_of(error)})") from error
             raise
-        for name in old:
-            for file in (META, *IMAGES):
-                with contextlib.suppress(OSError):
-                    (path.parent / name / file).unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # it holds something else
-                (path.parent / name).rmdir()
+        for folder in (path.parent / name for name in old):
+            with contextlib.suppress(OSError):  # it is not there, or holds something else
+                for file in (META, *IMAGES):
+                    (folder / file).unlink(missing_ok=True)
+                folder.rmdir()
 
     def _index(self, names: list[str]) -> dict[str, Any]:
         """What ``lod-meta.json`` says, with folders of these names."""
@@ -383,4 +372,4 @@ def _folders_of(path: Path) -> list[str]:
     return [name[1] for name in found if name]
 
 
-READER = Format(name=NAME, suffix=INDEX, matches=_matches, read=read)
+READER = Format(NAME, INDEX, _matches, read)
