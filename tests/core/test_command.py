@@ -567,7 +567,6 @@ USAGE = {
     "equal pictures": [*PRUNE, "-o", "out.ply", "--psnr", "100"],
     "no pictures": [*PRUNE, "-o", "out.ply", "--psnr", "0"],
     "seen by too many": [*PRUNE, "-o", "out.ply", "--min-seen", "101"],
-    "a score of any method": [*PRUNE, "-o", "out.ply", "--threshold", "1"],
     "views below 0": [*PRUNE, "-o", "out.ply", "--views", "-1"],
     "rounds of nothing": [*PRUNE, "-o", "out.ply", "--rounds", "2"],
     "no rounds": [*PRUNE, "-o", "out.ply", "--survivors", "refit", "--rounds", "0"],
