@@ -14,7 +14,7 @@ from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.splats import ARRAYS, SH_C0, rotation_matrices
 from refine_addon.core.visibility import froxels, lattices, measuring, projection
 from refine_addon.core.visibility import points as points_module
-from refine_addon.core.visibility.measuring import Measured, Measuring, Sampling
+from refine_addon.core.visibility.measuring import Measured, Sampling
 
 CUT = 1.0 / 255.0
 SAMPLING = Sampling()
@@ -504,14 +504,14 @@ def test_views_are_measured_once_and_scoring_rays_tell_the_rest(monkeypatch):
     """All rounds after the first ask the rays that were cast then."""
     asked = []
 
-    def measure_groups(self, gaussians, groups, *args, original=Measuring.measure_groups):
+    def measure(gaussians, scene, views, groups, *args, original=occlusion.measure, **how):
         asked.append(groups)
-        return original(self, gaussians, groups, *args)
+        return original(gaussians, scene, views, groups, *args, **how)
 
-    monkeypatch.setattr(Measuring, "measure_groups", measure_groups)
+    monkeypatch.setattr(occlusion, "measure", measure)
     occlusion.score(cloud(1000), ring(11), threads=1)
 
-    assert [list(groups) for groups in asked] == [list(range(8))]
+    assert asked == [measuring.view_groups(11)]
 
 
 def test_a_round_orders_what_it_removes_and_the_next_one_the_rest_anew():

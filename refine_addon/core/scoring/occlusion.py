@@ -19,6 +19,7 @@ splats.
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ from ..splats import Splats, refuse_undrawable
 from ..views import ViewSet
 from ..views_between import views_between
 from ..visibility import projection
-from ..visibility.measuring import SECONDS, Measured, Measuring, Sampling
+from ..visibility.measuring import SECONDS, Measured, Sampling, measure, view_groups
 from ..visibility.ray_sample import RaySample
 from . import closed_form, coverage
 from .removal_rounds import RemovalRounds
@@ -169,11 +170,17 @@ def measure_part(
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.05), threads=threads
     )
-    measuring = Measuring(scene, views, sampling, threads)
-    groups = measuring.groups_of_part(turn, parts)
-    sums = measuring.measure(gaussians, groups, part(progress, 0.05, 1.0))
-    measured = Measured.sum(sums.values()).for_all(np.asarray(gaussians.index), len(splats))
-    return measured, measuring.weight_share(groups)
+    ordered = views.by_distance()
+    groups = view_groups(len(ordered))
+    parts = min(parts, len(groups))
+    groups = groups[turn % parts :: parts]
+    sums, _ = measure(
+        gaussians, scene, ordered, groups, sampling,
+        progress=part(progress, 0.05, 1.0), threads=threads,
+    )  # fmt: skip
+    measured = Measured.sum(sums).for_all(np.asarray(gaussians.index), len(splats))
+    weight = math.fsum(ordered[number][1] for group in groups for number in group)
+    return measured, weight / math.fsum(weight for _, weight in ordered)
 
 
 def _score(splats, views, rounds, settled, sampling, few_views, progress, threads):
@@ -196,19 +203,20 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
         splats, views, depth="distance", frustum=False, local=False,
         progress=closed, threads=threads,
     ).values  # fmt: skip
-    measuring = Measuring(scene, views, sampling, threads)
-    samples = [RaySample(measuring.views, gaussians, splats, few_views=few_views)]
+    ordered = views.by_distance()
+    samples = [RaySample(ordered, gaussians, splats, few_views=few_views)]
     if rounds > 1:
-        samples.append(RaySample(measuring.views, gaussians, splats, scoring=True))
+        samples.append(RaySample(ordered, gaussians, splats, scoring=True))
     sample = coverage.sample(gaussians)
-    sums, errors = measuring.measure_groups(
-        gaussians, range(measuring.count), sample, looking, samples
-    )
-    measured = Measured.sum(sums.values())
+    sums, errors = measure(
+        gaussians, scene, ordered, view_groups(len(ordered)), sampling,
+        sample=sample, ray_samples=samples, progress=looking, threads=threads,
+    )  # fmt: skip
+    measured = Measured.sum(sums)
     if not measured.contribution.any():
         raise RefineError(
             f"no camera sees the splats: none of {count} reaches into the image of any of "
-            f"{len(measuring.views)} views; check that cameras and splats share their frame and "
+            f"{len(ordered)} views; check that cameras and splats share their frame and "
             "unit"
         )
     index = np.asarray(gaussians.index)
@@ -230,7 +238,7 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
     values[~good] = 0.0
     everything = measured.for_all(index, count)
     scores = Scores(
-        values, everything.seen, len(measuring.views), int(np.count_nonzero(~good)),
+        values, everything.seen, len(ordered), int(np.count_nonzero(~good)),
         {"floor": weights}, method="occlusion", ray_sample=samples[0], between=between,
         settled=settled,
     )  # fmt: skip
@@ -244,9 +252,9 @@ def _folds(measured, sums, errors, sample, prior, progress):
     is of the sample.
     """
     whole = measured.take(sample)
-    for k in sums if len(sums) > 1 else ():
+    for group, of_views in zip(sums, errors, strict=True) if len(sums) > 1 else ():
         report(progress, 0.0, "scoring")
-        without = sums[k].take(sample)
+        without = group.take(sample)
         others = Measured(
             # Rounding can leave a negative difference.
             np.maximum(whole.contribution - without.contribution, 0.0),
@@ -254,7 +262,7 @@ def _folds(measured, sums, errors, sample, prior, progress):
             whole.seen - without.seen,
         )
         floors = coverage.floor(prior.astype(np.float64), others.seen, 1.0 + EXPONENT)
-        yield combined(others), floors, errors[k]
+        yield combined(others), floors, of_views
 
 
 def _order(index, prior, measured, rays, weights, kept, progress):

@@ -10,8 +10,7 @@ which REFINE's Hessian approximates.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -20,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, chunks, run, run_all
-from ..views import View, ViewSet
+from ..execute import Progress, chunks, run, run_all, silent
+from ..views import View
 from . import froxels, projection
 from .points import cell_size, scatter
 from .projection import Footprints, Gaussians
@@ -144,91 +143,71 @@ class ViewMeasurement(NamedTuple):
     error: NDArray[np.float64]
 
 
-class Measuring:
-    """The views of one scoring, ready to measure Gaussians.
+def view_groups(count: int) -> list[range]:
+    """Numbers of the views of each group: of eight groups, every eighth of so many views.
+
+    Examples
+    --------
+    >>> view_groups(9)[:2], len(view_groups(3))
+    ([range(0, 9, 8), range(1, 9, 8)], 3)
+    """
+    groups = min(VIEW_GROUPS, count)
+    return [range(k, count, groups) for k in range(groups)]
+
+
+def measure(
+    gaussians: Gaussians,
+    scene: Scene,
+    views: Sequence[tuple[View, float]],
+    groups: Sequence[range],
+    sampling: Sampling,
+    *,
+    sample: Sequence[int] | NDArray[np.int64] = (),
+    ray_samples: Sequence[RaySample] = (),
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> tuple[list[Measured], list[NDArray[np.float64]]]:
+    """Sums over each group of views, and the errors of a sample in each view.
 
     Parameters
     ----------
+    gaussians : Gaussians
     scene : Scene
-    views : ViewSet
+    views : sequence of (View, float)
+        Views and their weights, see `ViewSet.by_distance`.
+    groups : sequence of range
+        Those to measure, see `view_groups`.
     sampling : Sampling
+    sample : (m,) int64
+        Rows of the Gaussians.
+    ray_samples : sequence of RaySample
+        They are given those rays of these views that they lack.
+    progress : callable
     threads : int, optional
 
-    Attributes
-    ----------
-    views : list of (View, float)
-        Views and their weights, see `ViewSet.by_distance`.
-    groups : list of list of int
-        The numbers of the views of each group: of eight groups, every eighth view.
+    Returns
+    -------
+    list of Measured, list of (views, m) float64
+        Of each group.
     """
-
-    def __init__(
-        self, scene: Scene, views: ViewSet, sampling: Sampling, threads: int | None
-    ) -> None:
-        self.scene, self.sampling, self.threads = scene, sampling, threads
-        self.views = views.by_distance()
-        self.count = min(VIEW_GROUPS, len(self.views))
-        self.groups = [list(range(k, len(self.views), self.count)) for k in range(self.count)]
-
-    def groups_of_part(self, turn: int, parts: int) -> range:
-        """Every `parts`-th group, the first at `turn`; see `occlusion.measure_part`."""
-        parts = min(parts, self.count)
-        return range(turn % parts, self.count, parts)
-
-    def weight_share(self, groups: Sequence[int]) -> float:
-        """Sum of the weights of some groups over that of all views."""
-        chosen = (self.views[number][1] for k in groups for number in self.groups[k])
-        return math.fsum(chosen) / math.fsum(weight for _, weight in self.views)
-
-    def measure(
-        self, gaussians: Gaussians, groups: Sequence[int], progress: Progress
-    ) -> Mapping[int, Measured]:
-        """Sums over some groups of views; see `measure_groups`."""
-        return self.measure_groups(gaussians, groups, np.empty(0, np.int64), progress)[0]
-
-    def measure_groups(
-        self,
-        gaussians: Gaussians,
-        groups: Sequence[int],
-        sample: NDArray[np.int64],
-        progress: Progress,
-        ray_samples: Sequence[RaySample] = (),
-    ) -> tuple[Mapping[int, Measured], dict[int, NDArray[np.float64]]]:
-        """Sums over each group of views, and the errors of a sample in each view.
-
-        Parameters
-        ----------
-        gaussians : Gaussians
-        groups : sequence of int
-            Those to measure.
-        sample : (m,) int64
-            Rows of the Gaussians.
-        progress : callable
-        ray_samples : sequence of RaySample
-            They are given those rays of these views that they lack.
-
-        Returns
-        -------
-        dict of int to Measured, dict of int to (views, m) float64
-            Of each of these groups.
-        """
-        chosen = [(k, number) for k in groups for number in self.groups[k]]
-        lacking = {n: [rays for rays in ray_samples if rays.wants(n)] for _, n in chosen}
-        measured = run(
-            partial(_measure_and_cast, gaussians, self.scene, self.views, self.sampling),
-            [(number, [rays.scoring for rays in lacking[number]]) for _, number in chosen],
-            cost=SECONDS * len(gaussians) * len(chosen),
-            progress=progress, what="scoring", threads=self.threads,
-        )  # fmt: skip
-        sums = {k: Measured.zero(len(gaussians)) for k in groups}
-        errors: dict[int, list[NDArray[np.float64]]] = {k: [] for k in groups}
-        for (measurement, cast), (k, number) in zip(measured, chosen, strict=True):
-            before = sums[k].error[sample]  # (m,)
-            sums[k].add_view(measurement, self.views[number][1], self.threads)
-            errors[k].append(sums[k].error[sample] - before)
-            for ray_sample, rays in zip(lacking[number], cast, strict=True):
-                ray_sample.rays[number] = rays
-        return sums, {k: np.array(of_views) for k, of_views in errors.items()}
+    rows, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
+    lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]
+    measured = run(
+        partial(_measure_and_cast, gaussians, scene, views, sampling),
+        [(n, [rays.scoring for rays in some]) for n, some in zip(numbers, lacking, strict=True)],
+        cost=SECONDS * len(gaussians) * len(numbers),
+        progress=progress, what="scoring", threads=threads,
+    )  # fmt: skip
+    sums = [Measured.zero(len(gaussians)) for _ in groups]
+    errors: list[list[NDArray[np.float64]]] = [[] for _ in groups]
+    place = [k for k, group in enumerate(groups) for _ in group]
+    for (measurement, cast), k, number, some in zip(measured, place, numbers, lacking, strict=True):
+        before = sums[k].error[rows]  # (m,)
+        sums[k].add_view(measurement, views[number][1], threads)
+        errors[k].append(sums[k].error[rows] - before)
+        for ray_sample, rays in zip(some, cast, strict=True):
+            ray_sample.rays[number] = rays
+    return sums, [np.array(of_views) for of_views in errors]
 
 
 def _measure_and_cast(gaussians, scene, views, sampling, number_and_kinds):
