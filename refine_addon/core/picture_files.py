@@ -12,8 +12,8 @@ from typing import Any
 
 from .errors import RefineError
 from .execute import Progress, silent
+from .images import png
 from .pictures import AMPLIFIED, CAMERAS, compare
-from .png import png
 from .splats import Splats
 from .views import ViewSet
 from .whole_file import new_folder, refuse_existing, whole_file

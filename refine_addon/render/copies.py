@@ -40,7 +40,7 @@ def remove_all() -> None:
 
 
 def write_exr(scene: bpy.types.Scene, path: Path) -> None:
-    """Have renders of a copy write images with all passes, which `core.exr` reads."""
+    """Have renders of a copy write images with all passes, which `core.images` reads."""
     render, settings = scene.render, scene.render.image_settings
     _set_format(settings, "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER")
     settings.color_depth, settings.exr_codec = "32", "NONE"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.drawing import Layers, in_order
-from ..core.exr import read_exr
+from ..core.images import read_exr
 
 _ROUNDS = 2
 """Pixels by which known depths are spread to pixels at edges without one."""

@@ -28,9 +28,9 @@ from refine_addon.core import (
     score,
 )
 from refine_addon.core.formats import ply
+from refine_addon.core.images import png
 from refine_addon.core.picture_files import PictureFiles, chosen
 from refine_addon.core.pictures import compare
-from refine_addon.core.png import png
 from refine_addon.core.scoring import closed_form
 from refine_addon.version import VERSION
 from tests.strategies import plain_header, plain_ply, splat_names

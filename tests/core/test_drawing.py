@@ -10,7 +10,7 @@ import pytest
 
 from refine_addon.core import RefineError
 from refine_addon.core.drawing import draw, in_order, seen_from
-from refine_addon.core.exr import read_exr
+from refine_addon.core.images import read_exr
 
 from .test_pictures import crowd, splats_of, view_of
 

@@ -13,9 +13,9 @@ import pytest
 
 from refine_addon.core import Budget, RefineError, Splats, prune
 from refine_addon.core.execute import Cancelled
+from refine_addon.core.images import png
 from refine_addon.core.picture_files import KINDS, PictureFiles, chosen, in_words
 from refine_addon.core.pictures import AMPLIFIED, Comparison, compare, fitted
-from refine_addon.core.png import png
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import cast

@@ -184,19 +184,16 @@ class _Binary:
 def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, str, CameraPlace]]:
     """Yield the file at each of its rows, of at least so many bytes; its name; and its place."""
     # Memory-mapped, since images.bin is mostly observations, which are skipped.
-    with (
-        opened(file) as (stream, _),
-        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as all_,
-    ):
-        data = _Binary(file, all_)
+    with opened(file) as (stream, _):
+        data = _Binary(file, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
         (count,) = data.take("Q", f"number of {thing}s")
-        if count * least > len(all_) - data.offset:
+        if count * least > len(data.data) - data.offset:
             announced = f"{count} of at least {least} bytes each are announced"
             data.truncated(f"number of {thing}s: {announced}")
         for index in range(count):
             row = f"{thing} row {index}"
             yield data, row, file.at(f"{row} at byte {data.offset}")
-        if left := len(all_) - data.offset:
+        if left := len(data.data) - data.offset:
             file.at(f"byte {data.offset}").fail(
                 f"expected the end of the file after {counted(count, thing)}, got {left} more bytes"
             )

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..images import image_size
 from ..views import ORTHONORMAL, ViewSet
-from .image_size import image_size
 from .lenses import FISHEYE624, MODELS_BY_NAME, PANORAMAS, Model, counted, lens_note
 from .place import CameraPlace, is_file, is_folder, read_json
 

@@ -17,11 +17,8 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, part, run_all
-from ..views import View
 from ..visibility import projection
 from ..visibility.measuring import VIEW_GROUPS
-from ..visibility.projection import Gaussians
-from ..visibility.scene import Scene
 from .clusters import small_clusters
 from .support import Evidence, Hits, evidence_of, hits_of_view, own_support, share
 
@@ -91,11 +88,9 @@ class Found(NamedTuple):
 
 
 class Search:
-    """The search of one `clean` among M Gaussians, by all views that decide."""
+    """The search of one `clean` among M Gaussians, by the list of all views that decide."""
 
-    def __init__(
-        self, gaussians: Gaussians, scene: Scene, views: list[View], threads: int | None
-    ) -> None:
+    def __init__(self, gaussians, scene, views, threads):
         self.gaussians, self.scene, self.views, self.threads = gaussians, scene, views, threads
         self.shown = np.zeros(len(gaussians), np.bool_)
         self.huge = gaussians.largest >= HUGE

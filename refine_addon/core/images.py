@@ -1,0 +1,163 @@
+"""Image files: PNG written, OpenEXR read, the size of a PNG or JPEG read from its header.
+
+PNG is written with 8 bits a channel (ISO/IEC 15948). OpenEXR is read as Blender writes it
+for us, in one part without compression (Academy Software Foundation, "OpenEXR File Layout"): a
+header of named attributes, a table of offsets, and then for each line its number, its size and its
+channels one after another, in the order of their names.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import RefineError
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_TRUECOLOR = 2
+_UP = 2  # the filter that stores each row's difference to the one above
+
+_EXR = 20000630
+_MULTI_PART = 0x1000  # flag of the version
+_LINE_HEAD = 8  # bytes: number and size of a line
+_TYPES = {1: "<f2", 2: "<f4"}  # of numbers in a channel
+
+_JPEG_START = b"\xff\xd8"
+
+_MOST_SEGMENTS = 4096
+"""Most segments and fill bytes that are skipped; no camera writes more."""
+
+_FILL = 0xFF
+_START_OF_SCAN = 0xDA
+_END_OF_IMAGE = 0xD9
+_STANDALONE = {0x01, *range(0xD0, 0xD9)}
+"""JPEG markers that no segment follows."""
+_FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""JPEG start-of-frame markers: a segment with precision (1 byte), height, width (2 bytes each)."""
+
+
+def png(pixels: NDArray[np.uint8]) -> bytes:
+    r"""PNG image of pixels (H, W, 3), the top row first.
+
+    Examples
+    --------
+    >>> png(np.zeros((1, 1, 3), np.uint8))[:4]
+    b'\x89PNG'
+    """
+    height, width = pixels.shape[:2]
+    rows = pixels.reshape(height, -1)
+    filtered = np.full((height, 1 + rows.shape[1]), _UP, np.uint8)
+    filtered[:, 1:] = np.diff(rows, axis=0, prepend=np.zeros((1, rows.shape[1]), np.uint8))
+    header = struct.pack(">IIBBBBB", width, height, 8, _TRUECOLOR, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes())), (b"IEND", b""))
+    return _PNG + b"".join(  # of each chunk: length, kind, data, checksum of kind and data
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+
+
+def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
+    """Channels of an image by their names.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    mapping of str to (H, W) float32
+        The top row first.
+
+    Raises
+    ------
+    RefineError
+        If the file cannot be read, or is packed, has several parts, or channels of integers.
+    """
+    try:
+        return _channels(path.read_bytes())
+    except OSError as error:
+        raise RefineError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, KeyError, IndexError, struct.error) as error:
+        raise RefineError(
+            f"{path}: expected an OpenEXR image in one part, without compression; {error}"
+        ) from error
+
+
+def _channels(data):
+    magic, version = struct.unpack_from("<II", data)
+    if magic != _EXR or version & _MULTI_PART:
+        raise ValueError(f"it begins with {magic}, version {version:#x}")
+    header, at = {}, 8
+    while data[at]:
+        name, at = _text(data, at)
+        _, at = _text(data, at)  # its type
+        (size,) = struct.unpack_from("<i", data, at)
+        header[name] = data[at + 4 : at + 4 + size]
+        at += 4 + size
+    if header["compression"] != b"\0":
+        raise ValueError(f"its compression is number {header['compression'][0]}")
+    left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
+    width, height = right - left + 1, bottom - top + 1
+    parts: list[Any] = [("head", f"V{_LINE_HEAD}")]
+    listed, place = header["channels"], 0
+    while listed[place]:  # in the order in which lines hold them
+        name, place = _text(listed, place)
+        (kind,) = struct.unpack_from("<i", listed, place)
+        parts.append((name, _TYPES[kind], (width,)))
+        place += 16
+    lines = np.frombuffer(data, np.dtype(parts), height, at + 1 + 8 * height)
+    return {name: lines[name].astype(np.float32) for name, *_ in parts[1:]}
+
+
+def _text(data: bytes, start: int) -> tuple[str, int]:
+    """Text that begins here, and where it is over."""
+    end = data.index(b"\0", start)
+    return data[start:end].decode(errors="replace"), end + 1
+
+
+def image_size(path: Path) -> tuple[int, int] | None:
+    """Width and height as stored (before any EXIF rotation), pixels.
+
+    Parameters
+    ----------
+    path : Path
+        An image, or anything else.
+
+    Returns
+    -------
+    tuple of int or None
+        ``None`` if the file does not exist, is neither PNG nor JPEG, or is truncated.
+    """
+    try:
+        if not path.is_file():  # a pipe would be waited for
+            return None
+        with path.open("rb") as stream:
+            head = stream.read(24)
+            if head.startswith(_PNG) and head[12:16] == b"IHDR":
+                return struct.unpack(">II", head[16:24])
+            return _jpeg_size(stream) if head.startswith(_JPEG_START) else None
+    except (OSError, ValueError, struct.error):
+        return None
+
+
+def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
+    """Size in the first frame header; the segments before it are skipped."""
+    stream.seek(len(_JPEG_START))
+    for _ in range(_MOST_SEGMENTS):
+        start, marker = stream.read(2)
+        if start != _FILL or marker in (_START_OF_SCAN, _END_OF_IMAGE):
+            return None
+        if marker == _FILL:
+            stream.seek(-1, 1)
+        elif marker not in _STANDALONE:
+            (length,) = struct.unpack(">H", stream.read(2))
+            if marker in _FRAME_MARKERS:
+                height, width = struct.unpack(">xHH", stream.read(5))
+                return width, height
+            stream.seek(max(length - 2, 0), 1)
+    return None
