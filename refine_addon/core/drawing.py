@@ -20,7 +20,7 @@ from .splats import SH_C0, Splats
 from .views import View, ViewSet
 from .visibility import projection
 from .visibility.cast import hits
-from .visibility.projection import Footprints
+from .visibility.projection import Gaussians
 from .visibility.ray_sample import colors_from
 from .visibility.rays import LOG_OPAQUE, in_front
 from .visibility.scene import Scene
@@ -118,13 +118,8 @@ def draw(
     gaussians, scene, _ = projection.prepare(
         splats, ViewSet((view,)), scene, progress=part(progress, 0.0, 0.1), threads=threads
     )
-    with np.errstate(under="ignore"):
-        footprints = projection.project(gaussians, scene, view)
-        colors = colors_from(splats, gaussians.index[footprints.index], view)
-        depths = scene.size * projection.depths(gaussians, scene, view)[footprints.index]
-    among = None if layers is None else (layers, depths)
     rest = part(progress, 0.1, 1.0)
-    return picture(footprints, colors, view, among, progress=rest, threads=threads)
+    return drawn(splats, gaussians, scene, view, layers, progress=rest, threads=threads)
 
 
 def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
@@ -146,32 +141,25 @@ def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
     return replace(splats.up_to_degree(0), sh_dc=(colors - 0.5) / SH_C0)
 
 
-def picture(
-    footprints: Footprints,
-    colors: NDArray[np.float64],
+def drawn(
+    splats: Splats,
+    gaussians: Gaussians,
+    scene: Scene,
     view: View,
-    among: tuple[Layers, NDArray[Any]] | None = None,
+    layers: Layers | None = None,
     *,
     progress: Progress,
     threads: int | None,
 ) -> NDArray[np.float64]:
-    """What `draw` returns, of footprints.
-
-    Parameters
-    ----------
-    footprints : Footprints
-    colors : (3, n) float64
-        Of the footprints.
-    view : View
-    among : (Layers, (n,) floating), optional
-        Layers, and the depths of the footprints in world units.
-    progress, threads
-        See `draw`.
-    """
+    """What `draw` returns, of splats that are prepared: see `projection.prepare`."""
+    with np.errstate(under="ignore"):
+        footprints = projection.project(gaussians, scene, view)
+        colors = colors_from(splats, gaussians.index[footprints.index], view)
+        depths = scene.size * projection.depths(gaussians, scene, view)[footprints.index]
 
     def work(piece: slice) -> NDArray[np.float64]:
         rows = np.arange(piece.start, piece.stop)
-        cut = None if among is None else _Cut(*among, piece)
+        cut = None if layers is None else _Cut(layers, depths, piece)
         with np.errstate(under="ignore"):
             strip = _strip(footprints, colors, np.arange(view.width), rows, cut)
         return strip.reshape(4, len(rows), view.width)

@@ -10,14 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .drawing import picture
+from .drawing import drawn
 from .execute import Progress, part, silent
 from .quality.psnr import psnr_of
 from .rendering import NEAR_RELATIVE
 from .splats import Splats
 from .views import View, ViewSet
 from .visibility import frustum, projection
-from .visibility.ray_sample import colors_from
 
 LONGEST = 960
 """Pixels along the longer side of a picture, at most: views of more are drawn smaller."""
@@ -85,18 +84,24 @@ def compare(
     Cancelled
         If `progress` answers ``False``.
     """
-    gaussians, scene, _ = projection.prepare(
-        before, views, progress=part(progress, 0.0, 0.1), threads=threads
-    )
-    drawn = ViewSet(tuple(_drawn(view, scene) for view in views))
-    first = _pictures(before, gaussians, scene, drawn, part(progress, 0.1, 0.5), threads)
-    gaussians, scene, _ = projection.prepare(
-        after, drawn, progress=part(progress, 0.5, 0.6), threads=threads
-    )
-    second = _pictures(after, gaussians, scene, drawn, part(progress, 0.6, 1.0), threads)
+    pictures: list[list[NDArray[np.float64]]] = []
+    for splats, start in ((before, 0.0), (after, 0.5)):
+        gaussians, scene, _ = projection.prepare(
+            splats, views, progress=part(progress, start, start + 0.1), threads=threads
+        )
+        if not pictures:
+            views = ViewSet(tuple(_fitted(view, scene) for view in views))
+        rest, share = part(progress, start + 0.1, start + 0.5), 1.0 / len(views)
+        pictures.append([
+            drawn(
+                splats, gaussians, scene, view,
+                progress=part(rest, k * share, (k + 1) * share), threads=threads,
+            )[:3]
+            for k, view in enumerate(views)
+        ])  # fmt: skip
     return [
         Comparison(view, _rounded(one), _rounded(other), _psnr(other, one, view))
-        for view, one, other in zip(drawn, first, second, strict=True)
+        for view, one, other in zip(views, *pictures, strict=True)
     ]
 
 
@@ -121,26 +126,13 @@ def fitted(view: View) -> View:
     return replace(view, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
 
-def _drawn(view, scene):
+def _fitted(view, scene):
     """A view in the size of its picture, with the near plane that scoring gives it.
 
     Otherwise a scene of fewer splats, whose size is another, would begin elsewhere.
     """
     near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
     return replace(fitted(view), near=near if near < far else view.near)
-
-
-def _pictures(splats, gaussians, scene, views, progress, threads):
-    """Picture of each view, (3, H, W), 0..1."""
-    pictures = []
-    for number, view in enumerate(views):
-        of_view = part(progress, number / len(views), (number + 1) / len(views))
-        with np.errstate(under="ignore"):
-            footprints = projection.project(gaussians, scene, view)
-            colors = colors_from(splats, gaussians.index[footprints.index], view)
-        drawn = picture(footprints, colors, view, progress=of_view, threads=threads)
-        pictures.append(drawn[:3])
-    return pictures
 
 
 def _rounded(picture):
