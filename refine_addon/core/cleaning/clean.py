@@ -196,8 +196,7 @@ def clean(
         found = search.find(slender, part(progress, 0.05, 1.0))
         shows, faint, sure = judge(gaussians, found, threads)
         faint &= found.doubted & ~found.large
-        centers = scene.positions(np.array([view.center for view in deciding]))
-        haze = faint & (gaussians.alphas < FAINT) & _near_any(centers, gaussians.means, faint)
+        haze = faint & (gaussians.alphas < FAINT) & _near_any(gaussians, scene, deciding, faint)
         unused = [view for view in views if view not in deciding]
         masks = {
             "front": shows & found.doubted & ~found.large,
@@ -228,12 +227,12 @@ def clean(
     )  # fmt: skip
 
 
-def _near_any(centers, means, chosen):
-    """Gaussians among those chosen, (M,) bool, that are near a centre, (M,) bool."""
+def _near_any(gaussians, scene, views, chosen):
+    """Gaussians among those chosen, (M,) bool, that are near a camera, (M,) bool."""
     rows = np.flatnonzero(chosen)
     near = np.zeros(len(rows), np.bool_)
-    for center in centers:
-        step = means[:, rows].T.astype(np.float64) - center
+    for view in views:
+        step = gaussians.means[:, rows].T - scene.positions(view.center[None])
         near |= np.einsum("ij,ij->i", step, step) < NEAR * NEAR
     return np.bincount(rows[near], minlength=len(chosen)) > 0
 

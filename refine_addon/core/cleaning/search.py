@@ -119,8 +119,7 @@ class Search:
         for number, (start, end) in enumerate(ROUNDS):
             doubted = doubted | new
             joining = part(progress, start, start + 0.02)
-            solid = ~doubted & ~giant
-            small = small | small_clusters(self.gaussians, solid, joining, self.threads)
+            small = small | small_clusters(self.gaussians, ~doubted & ~giant, joining, self.threads)
             absent = doubted | giant | needle | small
             wanted = open_ & ~absent
             behind = None if number else absent | open_
@@ -138,7 +137,6 @@ class Search:
 
     def _first_look(self, progress: Progress) -> NDArray[np.float64]:
         """Light, supported light, views and width, (4, M), with all present but wide giants."""
-        everyone = np.ones(len(self.shown), np.bool_)
 
         def of_group(numbers: range) -> NDArray[np.float64]:
             *_, views, width = sums = np.zeros((4, len(self.shown)))
@@ -153,7 +151,7 @@ class Search:
                 absent[index] = wide & self.huge[index]
                 hits = hits_of_view(self.gaussians, footprints, self.scene, (view, number), absent)
                 if hits is not None:
-                    sums[:2, hits.hit] += own_support(hits.without(absent), everyone)
+                    sums[:2, hits.hit] += own_support(hits.without(absent), ~absent)
                     width[hits.hit] = np.maximum(width[hits.hit], hits.width)
             return sums
 
@@ -163,8 +161,7 @@ class Search:
         if len(self.shown) and not total[3].any():
             raise RefineError(
                 f"no camera sees the splats: none of {len(self.shown)} that show is hit by a ray "
-                f"of any of {len(self.views)} views; check that cameras and splats share "
-                "their frame and unit"
+                f"of any of {len(self.views)} views; check that they share their frame and unit"
             )
         return total
 

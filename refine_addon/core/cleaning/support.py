@@ -94,15 +94,13 @@ class Light(NamedTuple):
         """
         key, window, ray = self.key[rows], self.window[rows], np.floor(self.key[rows])
         end = ray + (1.0 + _FRACTION) / 2.0
-        return (
-            np.searchsorted(self.key, np.maximum(key - window, ray)),
-            np.searchsorted(self.key, np.minimum(key + window, end), side="right"),
-            np.searchsorted(self.key, end),
-        )
+        first = np.searchsorted(self.key, np.maximum(key - window, ray))
+        last = np.searchsorted(self.key, np.minimum(key + window, end), side="right")
+        return first, last, np.searchsorted(self.key, end)
 
-    def sums(self, rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum of values, (r,), of some hits for each of `hit`, (u,)."""
-        return np.asarray(np.bincount(self.owner[rows], values, len(self.hit)), np.float64)
+    def sums(self, rows: NDArray[np.int64], *values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sums of k values, (r,), of some hits for each of `hit`, (k, u)."""
+        return np.stack([np.bincount(self.owner[rows], each, len(self.hit)) for each in values])
 
 
 class Hits(NamedTuple):
@@ -233,10 +231,8 @@ def _depths(gaussians, footprints, scene, view, rays, reached):
 
     `gaussians` and `footprints` are the u that are hit; `reached`, (h,), says which hits count.
     """
-    means, covariances = (
-        values.astype(np.float64) for values in projection.in_camera(gaussians, scene, view)
-    )
-    x, y, z = means
+    in_camera = projection.in_camera(gaussians, scene, view)
+    (x, y, z), covariances = (values.astype(np.float64) for values in in_camera)
     with_depth = (  # (u,) each: covariance of column and row with the depth
         view.fx / z * (covariances[2] - x / z * covariances[5]),
         view.fy / z * (covariances[4] - y / z * covariances[5]),
@@ -273,7 +269,7 @@ def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
     support = near / np.maximum(near + behind, _TINY)
     support = np.where(behind > NOTHING * light.transmittance[rows], support, 1.0)
     weight = light.weight[rows]
-    return np.stack([light.sums(rows, weight), light.sums(rows, weight * support)])
+    return light.sums(rows, weight, weight * support)
 
 
 def evidence_of(
@@ -294,9 +290,8 @@ def evidence_of(
         squared += (own[rows] - (before[end] - before[last]) / np.maximum(behind, _TINY)) ** 2
     contrast = np.where(behind > NOTHING, np.sqrt(squared / 3.0), 0.0)  # root mean square
     alpha = light.alpha[rows]
-    mass, stops, passes, differs = (
-        light.sums(rows, values)
-        for values in (alpha, alpha * near, alpha * behind, alpha * behind * contrast)
+    mass, stops, passes, differs = light.sums(
+        rows, alpha, alpha * near, alpha * behind, alpha * behind * contrast
     )
     sees = (stops + passes > SEEN * mass) & (mass > 0.0)
     past = sees & (stops < PAST * (stops + passes))
