@@ -306,10 +306,11 @@ def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
         (("sh0", "mins", [0, 0, 0]), "sh0 mins: expected a list of 4 numbers"),
         (("shN", "mins", [0]), "shN mins: expected a number, got a list of 1"),
         (("shN", "files", ["l", "n"]), "shN: a palette 1 pixels wide, expected 192, 512, 960"),
+        (("quats", "files", [[]]), "quats files [0]: expected a string, got a list of 0"),
         (("quats", "files", ["no"]), '"no" is not there'),
         (("quats", "files", ["folder"]), '"folder" is not there'),
     ],
-    ids=range(7),
+    ids=range(8),
 )
 def test_what_is_wrong_with_images_beside_a_meta_json_is_named(tmp_path, change, expected):
     """With the file and the place."""

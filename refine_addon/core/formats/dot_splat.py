@@ -31,10 +31,8 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     size = _ROW.itemsize
     count, beyond = divmod(len(data), size)
     if beyond:
-        raise RefineError(
-            f"{path}: truncated: splat {count} at byte {count * size} has {beyond} bytes, "
-            f"expected {size}"
-        )
+        where = f"splat {count} at byte {count * size}"
+        raise RefineError(f"{path}: truncated: {where} has {beyond} bytes, expected {size}")
     stored = data.view(_ROW)
     file, splats = new_file(path, Origin(NAME, len(data)), count, 0)
     # Scales that are 0 or no sizes at all become logarithms that are not finite, as in a PLY.

@@ -97,12 +97,12 @@ class _Document(NamedTuple):
         stride = whole("byteStride", 0) or size
         end = offset + stride * (count - 1) + size if count else 0
         if stride < size or end > length or start + length > len(self.binary):
-            place.fail(
-                f"{count} values of {size} bytes from byte {offset} of a view of {length} bytes "
-                f"at byte {start} of {len(self.binary)}, expected that they fit"
-            )
+            around = f"of a view of {length} bytes at byte {start} of {len(self.binary)}"
+            got = f"{count} values of {size} bytes from byte {offset}"
+            place.fail(f"{got} {around}, expected that they fit")
+        steps = stride, dtype.itemsize
         values: NDArray[Any] = np.ndarray(
-            (count, width), dtype, self.binary.data, start + offset, (stride, dtype.itemsize)
+            (count, width), dtype, self.binary.data, start + offset, steps
         )
         shares = dtype.kind != "f" and held.get("normalized", False)
         return values, float(np.iinfo(dtype).max) if shares else 1.0
@@ -123,11 +123,8 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     meshes: dict[int, list[_Part]] = {}
     shown: list[tuple[_Part, NDArray[np.float64], Place]] = []
     every: list[_Part] = []
-    left: list[tuple[Any, Place, NDArray[np.float64]]] = []
-    visited: set[int] = set()
-    count = 0
+    left, visited, count, place = [], set(), 0, document.place.at("scene")
     if "scenes" in document.content:
-        place = document.place.at("scene")
         scene, place = document.item("scenes", document.content.get("scene", 0), place)
         left = [(index, place, np.eye(4)) for index in _listed(scene, "nodes", place)[::-1]]
     while left:
@@ -143,24 +140,19 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
             continue
         mesh, where = document.item("meshes", node["mesh"], place)
         if node["mesh"] not in meshes:
-            found = _parts(document, mesh, where)
-            every += found
+            every += (found := _parts(document, mesh, where))
             meshes[node["mesh"]] = [part for part in found if part.splats]
         parts = meshes[node["mesh"]]
         shown += [(part, matrix, place) for part in parts]
         count += sum(part.splats for part in parts)
         if count > len(data):  # many nodes may show one mesh
-            document.place.fail(
-                f"its nodes show {count} splats or more, expected at most {len(data)}, the bytes "
-                "of the file"
-            )
+            wanted = f"expected at most {len(data)}, the bytes of the file"
+            document.place.fail(f"its nodes show {count} splats or more, {wanted}")
     if not every:
-        raise RefineError(
-            f"{path}: no splats: no node of its scene shows a primitive with {EXTENSION}"
-        )
-    degree = max(part.degree for part in every)
+        said = f"no node of its scene shows a primitive with {EXTENSION}"
+        document.place.fail(f"no splats: {said}")
     origin = Origin(f"{NAME} with {EXTENSION}", len(data))
-    file, splats = new_file(path, origin, count, degree)
+    file, splats = new_file(path, origin, count, max(part.degree for part in every))
     start = 0
     with np.errstate(all="ignore"):  # any number may stand in a file
         for part, matrix, place in shown:
@@ -182,7 +174,7 @@ def _opened(path: Path, data: NDArray[np.uint8]) -> _Document:
     refuse_short(path, _HEADER.size + _CHUNK.size, len(data), "the first bytes of a GLB file")
     _, version, length = _HEADER.unpack(data[: _HEADER.size].tobytes())
     if version != _VERSION:
-        raise RefineError(f"{path}: glTF version {version}, expected {_VERSION}")
+        Place(path).fail(f"glTF version {version}, expected {_VERSION}")
     refuse_short(path, length, len(data), "all chunks")
     chunks: dict[bytes, NDArray[np.uint8]] = {}
     at = _HEADER.size
@@ -348,9 +340,8 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
         text, body = _json(attributes, len(splats), *ends)
         total = _HEADER.size + 2 * _CHUNK.size + len(text) + body
         if total > _LONGEST:
-            raise RefineError(
-                f"{len(splats)} splats are {total} bytes as {NAME}, which holds {_LONGEST}"
-            )
+            what = f"{len(splats)} splats are {total} bytes"
+            raise RefineError(f"{what} as {NAME}, which holds {_LONGEST}")
         stream.write(_HEADER.pack(_MAGIC, _VERSION, total) + _CHUNK.pack(len(text), _JSON) + text)
         stream.write(_CHUNK.pack(body, _BINARY))
         for _, kind, _, values in attributes:

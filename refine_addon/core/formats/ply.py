@@ -264,10 +264,11 @@ class SplatFile:
                 declared.append(f"property {kind} {name}".encode())
         if declared:
             lines = _lines(header)
-            index = last = _vertex_line(lines)
-            while (words := lines[index + 1].split()[:1]) not in ([b"element"], [b"end_header"]):
+            words = [line.split()[:2] for line in lines]
+            index = last = words.index([b"element", b"vertex"])
+            while words[index + 1][:1] not in ([b"element"], [b"end_header"]):
                 index += 1
-                last = index if words == [b"property"] else last
+                last = index if words[index][:1] == [b"property"] else last
             lines[last + 1 : last + 1] = declared
             header = _line_end(header).join(lines)
         return header, _grown(self.rows.dtype, columns)
@@ -604,13 +605,10 @@ def vertex_header(raw: bytes) -> bytes:
 
 def with_count(raw: bytes, count: int) -> bytes:
     """Header with this number of vertices; nothing else in it changes."""
-    lines = _lines(raw)
-    index = _vertex_line(lines)
-    announced = re.match(rb"(\s*element\s+vertex\s+)(\d+)", lines[index])
-    if not announced or int(announced[2]) == count:
+    announced = re.search(_line_end(raw) + rb"[ \t]*element[ \t]+vertex[ \t]+(\d+)", raw)
+    if not announced or int(announced[1]) == count:
         return raw
-    lines[index] = b"%s%d%s" % (announced[1], count, lines[index][announced.end() :])
-    return _line_end(raw).join(lines)
+    return b"%s%d%s" % (raw[: announced.start(1)], count, raw[announced.end(1) :])
 
 
 def model_of(raw: bytes) -> Model | None:
@@ -658,12 +656,6 @@ def _line_end(raw: bytes) -> bytes:
 
 def _lines(raw: bytes) -> list[bytes]:
     return raw.split(_line_end(raw))
-
-
-def _vertex_line(lines: Sequence[bytes]) -> int:
-    return next(
-        index for index, line in enumerate(lines) if line.split()[:2] == [b"element", b"vertex"]
-    )
 
 
 # Writing.

@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,9 @@ _BROKEN = (*_DAMAGED, RuntimeError, KeyError, OSError)
 
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How files of an archive may be compressed: the other ways take any memory, raise anything."""
+
+
+_Read = TypeVar("_Read")
 
 
 class Bundle:
@@ -112,8 +115,7 @@ class Bundle:
         if word not in MODELS:
             wanted = ", ".join(MODELS)
             self.place.at("model").fail(f"expected one of {wanted}, got {described(word)}")
-        model: Model = word
-        return model
+        return word
 
     @property
     def degree(self) -> int:
@@ -123,7 +125,7 @@ class Bundle:
         section, place = self.section("shN")
         if self.version == VERSION:
             return place.at("bands").whole(section.get("bands"), 1, _DEGREES)
-        _, across, _ = self._image("shN", 0)
+        across, _ = self._tried(self._codec.size, "shN", 0)
         degrees = {_ACROSS * above_constant(degree): degree for degree in range(1, _DEGREES + 1)}
         if across not in degrees:
             place.fail(f"a palette {across} pixels wide, expected {', '.join(map(str, degrees))}")
@@ -153,26 +155,22 @@ class Bundle:
 
         Another width than `width` is refused, unless that is 0.
         """
-        data, across, down = self._image(name, index)
+        across, down = self._tried(self._codec.size, name, index)
         if not least <= across * down <= most:
             self._fail(name, index, f"{across} x {down} pixels, expected {least}")
         if width and across != width:
             self._fail(name, index, f"{across} pixels wide, expected {width}")
-        try:
-            return self._codec.decode(data)
-        except ValueError as error:
-            self._fail(name, index, f"cannot be read ({str(error)[:100]})")
+        return self._tried(self._codec.decode, name, index)
 
     def rows(self, name: str, index: int, count: int) -> NDArray[np.uint8]:
         """Pixels of `count` splats, (count, 4), of an image; far more pixels are refused."""
         image = self.pixels(name, index, count, 4 * count + _SPARE_PIXELS)
         return image.reshape(-1, 4)[:count]
 
-    def _image(self, name: str, index: int) -> tuple[bytes, int, int]:
-        """File of an image, its width and its height."""
-        data = self._opened(self._file(name, index), 4 * self.size)
+    def _tried(self, read: Callable[[bytes], _Read], name: str, index: int) -> _Read:
+        """What a codec reads of an image."""
         try:
-            return data, *self._codec.size(data)
+            return read(self._opened(self._file(name, index), 4 * self.size))
         except ValueError as error:
             self._fail(name, index, f"cannot be read ({str(error)[:100]})")
 
@@ -254,8 +252,9 @@ def bundle_beside(path: Path) -> Bundle:
 
     def files(meta: dict[str, Any]) -> dict[Any, int]:
         named = [part.get("files") for part in meta.values() if isinstance(part, dict)]
-        names = {name for group in named if isinstance(group, list) for name in group}
-        paths = [path, *(beside(place, name) for name in names if isinstance(name, str))]
+        every = [name for group in named if isinstance(group, list) for name in group]
+        names = {name for name in every if isinstance(name, str)}
+        paths = [path, *(beside(place, name) for name in names)]
         return {there.resolve(): there.stat().st_size for there in paths}
 
     text = held(path, _META_LIMIT)
