@@ -93,8 +93,8 @@ def _check_settings(options: argparse.Namespace) -> None:
         levels(options)
         check_goal(options.distance_psnr)
     scoring = settings(options)
-    if scoring.refit.rounds is not None and options.survivors != "refit":
-        raise RefineError(f"rounds is {scoring.refit.rounds}, expected only with --survivors refit")
+    if scoring.rounds is not None and options.survivors != "refit":
+        raise RefineError(f"rounds is {scoring.rounds}, expected only with --survivors refit")
     if options.command == "prune":
         budget(options)
 

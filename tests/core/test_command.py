@@ -378,6 +378,21 @@ def test_views_between_decide_besides_those_of_the_file(capsys):
 
 
 @pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--survivors", "refit", "--rounds", "1000000"], "rounds is 1000000, expected 1 to 100"),
+        (["--rounds", "3"], "rounds is 3, expected only with --survivors refit"),
+        (["--views-between", "1000000"], "views in between are 1,000,000, expected 0 to 1,000"),
+    ],
+)
+def test_rounds_and_views_between_out_of_range_are_refused(capsys, options, words):
+    """With what was got and what was expected; nothing is written."""
+    assert command.main([*PRUNE, "-o", "out.ply", "--overwrite", *options]) != 0
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("folder")
 def test_the_summary_says_how_close_the_pictures_stay(capsys):
     """As the report does, in whole decibels; and why not what absorbing would reach."""
     for options, pattern in (

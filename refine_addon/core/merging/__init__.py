@@ -1,1 +1,1 @@
-"""Absorbing: survivors take over the splats that go."""
+"""Merging: kept splats take over what goes."""

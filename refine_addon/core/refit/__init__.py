@@ -1,1 +1,1 @@
-"""Survivors learn what the unpruned splats look like, from rays."""
+"""Kept splats learn what the unpruned splats look like, from rays."""

@@ -1,4 +1,4 @@
-"""The rays of all rounds of refitting: what the unpruned splats look like on them, and survivors.
+"""The rays of all rounds of refitting: what unpruned and kept splats look like on them.
 
 Each round learns from rays through other pixels, of views that stand a little beside the given ones
 (`SHIFT`): what the given ones alone tell does not hold between them. So do validation rays, which
@@ -30,7 +30,7 @@ from ..visibility.scene import Scene
 from .linear import LEAST_WEIGHT, LinearRays, Seen, Shapes, linear_view
 
 RAYS_OF_SPLAT = 7.0
-"""Rays of a round for each survivor: with fewer, survivors learn them by heart, and two rounds of
+"""Rays of a round for each kept splat: with fewer, they are learned by heart, and two rounds of
 half as many bring less than one."""
 
 MIN_RAYS = 1 << 17
@@ -38,10 +38,10 @@ MIN_RAYS = 1 << 17
 
 HITS_OF_SPLAT, MIN_HITS = 112, 3 << 21
 """About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`), for each
-survivor, and where that would be fewer. Each takes 14 bytes of a file (`stored`)."""
+kept splat, and where that would be fewer. Each takes 14 bytes of a file (`stored`)."""
 
 MANY_HITS, FEWER_HITS = 1 << 24, 64
-"""Rounds of more hits have no more than so many for each survivor, to bound that file."""
+"""Rounds of more hits have no more than so many for each kept splat, to bound that file."""
 
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """About how far a view is moved in a round: so many times as far as the view next to it is, at most
@@ -239,7 +239,7 @@ class RoundRays:
             The unpruned splats, in the frame of the views.
         views : ViewSet
         count : int
-            For how many survivors there are to be rays, see `limits`.
+            For how many kept splats there are to be rays, see `limits`.
         progress : callable
         threads : int, optional
         """
