@@ -156,9 +156,7 @@ def _packed(shares: NDArray[Any], fields: tuple[tuple[int, int], ...]) -> NDArra
     return packed
 
 
-def _between(
-    shares: NDArray[np.float64], chunks: NDArray[Any], names: tuple[str, ...]
-) -> NDArray[np.float64]:
+def _between(shares: NDArray[Any], chunks: NDArray[Any], names: tuple[str, ...]):
     """Vectors (n, 3) of shares of the ranges of their chunks."""
     for axis, share in enumerate(shares.T):
         ends = (chunks[name].astype(np.float64) for name in (names[axis], names[axis + 3]))

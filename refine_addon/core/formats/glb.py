@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TypeAlias
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,10 +100,8 @@ class _Document(NamedTuple):
             around = f"of a view of {length} bytes at byte {start} of {len(self.binary)}"
             got = f"{count} values of {size} bytes from byte {offset}"
             place.fail(f"{got} {around}, expected that they fit")
-        steps = stride, dtype.itemsize
-        values: NDArray[Any] = np.ndarray(
-            (count, width), dtype, self.binary.data, start + offset, steps
-        )
+        layout = self.binary.data, start + offset, (stride, dtype.itemsize)
+        values: NDArray[Any] = np.ndarray((count, width), dtype, *layout)
         shares = dtype.kind != "f" and held.get("normalized", False)
         return values, float(np.iinfo(dtype).max) if shares else 1.0
 
@@ -305,12 +303,11 @@ def _harmonics(degree: int) -> list[str]:
     return [_harmonic(band, n) for band in range(degree + 1) for n in range(2 * band + 1)]
 
 
-_Attribute: TypeAlias = tuple[str, int, int, Callable[[Splats], NDArray[Any]]]
-"""Name, component type, numbers of one splat, and these, (n, width), in the frame of glTF."""
+def _attributes(degree: int) -> list[tuple[str, int, int, Callable[[Splats], NDArray[Any]]]]:
+    """What is written, in the order of the binary chunk.
 
-
-def _attributes(degree: int) -> list[_Attribute]:
-    """What is written, in the order of the binary chunk."""
+    Name, component type, numbers of one splat, and these, (n, width), in the frame of glTF.
+    """
 
     def color(splats: Splats) -> NDArray[Any]:
         return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
@@ -350,9 +347,7 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
                 stream.write(np.ascontiguousarray(written, _KINDS[kind]).data)
 
 
-def _json(
-    attributes: list[_Attribute], count: int, low: list[float], high: list[float]
-) -> tuple[bytes, int]:
+def _json(attributes: list, count: int, low: list[float], high: list[float]):
     """JSON of a file, padded with spaces to a multiple of 4 bytes, and the bytes behind it."""
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []

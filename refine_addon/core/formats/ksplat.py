@@ -116,13 +116,7 @@ def _sections(path: Path, data: NDArray[np.uint8], count: int, level: int) -> It
         yield section
 
 
-def _fill(
-    splats: Splats,
-    level: int,
-    limits: tuple[np.float32, np.float32],
-    section: _Section,
-    data: NDArray[np.uint8],
-) -> None:
+def _fill(splats: Splats, level: int, limits: tuple, section: _Section, data: NDArray[Any]):
     """Set the splats of a section; `limits` are those of its harmonics in level 2."""
     dtype = _row(level, section.degree)
     stored = data[section.rows : section.rows + section.splats * dtype.itemsize].view(dtype)
@@ -150,9 +144,7 @@ def _fill(
             at += width
 
 
-def _buckets(
-    section: _Section, data: NDArray[np.uint8]
-) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+def _buckets(section: _Section, data: NDArray[np.uint8]):
     """Centres of the buckets (B, 3), and in which bucket each splat lies.
 
     Full buckets come first; the lengths of the others stand before the centres.

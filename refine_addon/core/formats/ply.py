@@ -238,9 +238,7 @@ class SplatFile:
             write_rows(stream, self.rows, keep, columns, threads=threads)
             stream.write(self.after.data)
 
-    def _layout(
-        self, keep: NDArray[np.bool_] | None, columns: Mapping[str, NDArray[Any]]
-    ) -> tuple[bytes, np.dtype[Any]]:
+    def _layout(self, keep: NDArray[np.bool_] | None, columns: Mapping[str, NDArray[Any]]):
         """Header and row of a file of the kept rows with these columns; refuse what none can be."""
         header = with_count(self.header, len(self) if keep is None else int(np.count_nonzero(keep)))
         names = self.rows.dtype.names or ()
@@ -705,9 +703,7 @@ def _grown(dtype: np.dtype[Any], columns: Mapping[str, NDArray[Any]]) -> np.dtyp
     return np.dtype([*((name, dtype[name]) for name in dtype.names or ()), *more])
 
 
-def _with_cells(
-    chunk: NDArray[Any], dtype: np.dtype[Any], cells: Mapping[str, NDArray[Any]]
-) -> NDArray[Any]:
+def _with_cells(chunk: NDArray[Any], dtype: np.dtype[Any], cells: Mapping):
     """n rows of bytes, (n,) void of `dtype`, with some properties set and others appended."""
     grown = np.empty(len(chunk), _grown(dtype, cells))
     as_bytes = grown.view(np.uint8).reshape(len(chunk), grown.dtype.itemsize)

@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, NoReturn, TypeVar
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +61,6 @@ _BROKEN = (*_DAMAGED, RuntimeError, KeyError, OSError)
 
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How files of an archive may be compressed: the other ways take any memory, raise anything."""
-
-
-_Read = TypeVar("_Read")
 
 
 class Bundle:
@@ -167,7 +164,7 @@ class Bundle:
         image = self.pixels(name, index, count, 4 * count + _SPARE_PIXELS)
         return image.reshape(-1, 4)[:count]
 
-    def _tried(self, read: Callable[[bytes], _Read], name: str, index: int) -> _Read:
+    def _tried(self, read: Callable[[bytes], Any], name: str, index: int) -> Any:
         """What a codec reads of an image."""
         try:
             return read(self._opened(self._file(name, index), 4 * self.size))
@@ -459,9 +456,7 @@ def _grouped(rows: NDArray[Any]) -> NDArray[np.int64]:
     return labels
 
 
-def _widest(
-    columns: NDArray[np.float32], labels: NDArray[np.int64]
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _widest(columns: NDArray[np.float32], labels: NDArray[np.int64]):
     """In which of D columns (D, N) each group varies most, and its mean there, (G,) each."""
     sizes = np.bincount(labels)
     groups = len(sizes)
@@ -477,9 +472,7 @@ def _widest(
     return axis, middle
 
 
-def _centroids(
-    sh_rest: NDArray[Any], labels: NDArray[np.int64], entries: int
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def _centroids(sh_rest: NDArray[Any], labels: NDArray[np.int64], entries: int):
     """Table and the image of a palette: the mean harmonics of each group."""
     coefficients, sizes = sh_rest.shape[1], np.bincount(labels, minlength=entries)
     means = np.empty((entries, coefficients, 3))

@@ -12,7 +12,7 @@ import math
 import struct
 import zlib
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TypeAlias
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,10 +70,6 @@ _PIECE = 1 << 20  # bytes that a zstd stream is unpacked to at a time
 
 _STEP = 1 << 12
 """Bytes of a gzip stream that are unpacked at a time where what they hold is not used."""
-
-
-_Blocks: TypeAlias = dict[str, NDArray[np.uint8]]
-"""Bytes of each attribute, (splats, bytes of one), by its name."""
 
 
 class _Header(NamedTuple):
@@ -151,7 +147,7 @@ def _parsed(path: Path, head: bytes, size: int) -> _Header:
     return header
 
 
-def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, _Blocks]:
+def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict]:
     """Header and attributes of a gzip stream."""
     engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
@@ -190,8 +186,8 @@ def _damaged_at(data: NDArray[np.uint8]) -> int:
     return at
 
 
-def _split(path: Path, header: _Header, body: NDArray[np.uint8]) -> _Blocks:
-    """Attributes that follow each other in `body`."""
+def _split(path: Path, header: _Header, body: NDArray[np.uint8]) -> dict:
+    """Attributes that follow each other in `body`, by name: (splats, bytes of one) each."""
     lengths = header.blocks()
     ends = np.cumsum([*lengths.values()])
     refuse_short(path, int(ends[-1]), len(body), f"{header.splats} splats (unpacked)")
@@ -203,7 +199,7 @@ def _table(block: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
     return block.reshape(count, len(block) // count if count else 0)
 
 
-def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> _Blocks:
+def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict:
     """Attributes of version 4."""
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
@@ -230,8 +226,6 @@ def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> _Blocks:
 
 def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
     """What is in a zstd stream; refuse it if that has another length."""
-    reader: Any
-    failure: type[Exception]
     try:
         try:
             module: Any = importlib.import_module("compression.zstd")  # Python 3.14 and later
