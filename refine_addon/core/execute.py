@@ -224,8 +224,22 @@ def on(cluster: Any) -> Iterator[None]:
         _own.cluster = before
 
 
+def alone(work: Callable[[Item], Outcome], items: Iterable[Item]) -> list[Outcome]:
+    """Do the same as `run_all` in this thread alone, and whatever the work runs, too."""
+    _own.alone = True
+    try:
+        return run_all(work, items, threads=1)
+    finally:
+        _own.alone = False
+
+
 def default_threads() -> int:
-    """How many threads to use: the cores that this process may run on, at most 8."""
+    """How many threads to use: the cores that this process may run on, at most 8.
+
+    In a thread whose work is one of several pieces that a cluster does it is one.
+    """
+    if getattr(_own, "alone", False):
+        return 1
     if hasattr(os, "sched_getaffinity"):
         return min(len(os.sched_getaffinity(0)), 8)
     return min(os.cpu_count() or 1, 8)

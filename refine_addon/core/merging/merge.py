@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, part, report, return_freed, run_all, seconds, silent, stages
-from ..splats import ARRAYS, Splats, drawable
+from ..execute import Progress, report, return_freed, seconds, silent, stages
+from ..regions import in_regions
+from ..splats import Splats, drawable
 from ..views import ViewSet
-from ..visibility.scene import Scene, scene_of, spatial_order, splat_fingerprint
-from .field import Array, Index, measured_field
-from .graph import MergeGraph
-from .pairs import as_splats, blend, groups
+from ..visibility.scene import scene_of
+from .field import Array
+from .regions import stage_by_regions
+from .stage import Stage, copied, reduced_at_once
 
 Measure = Callable[[Splats, Array, Progress], Array]
 """``measure(splats, expected, progress)`` returns the sums of the splats left, (2, n).
@@ -41,16 +41,15 @@ FINER = 0.8
 """By how many stages more the way is divided than if each left `STAGE`: with three instead of two
 70 % of a park lose 1.4 dB less, with five instead of four 90 % gain nothing."""
 
-ALONE = 0.55
+ALONE, ALONE_BY_REGIONS = 0.55, 0.6
 """Least share that a stage leaves where one is enough; at least a half, as `STAGE`.
 
-Just below 5/9, so that one stage removes half of all splats of which a tenth was deleted before.
+Just below 5/9, so that one stage removes half of all splats of which a tenth was deleted before. By
+regions half goes in two stages: four regions in one stage lost 0.5 dB.
 """
 
 PENALTY = 2.0
 """Factor on the cost of merging if half of the splats go; see `merge_penalty`."""
-
-_CHUNK = 1 << 14  # splats copied at a time: some MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,35 +161,33 @@ def merge(
     spared = np.zeros(total, np.bool_) if protected is None else protected
     rows = np.flatnonzero(members)
     goal = max(keep_count, int(np.count_nonzero(spared[rows])), 0)
-    counts = stage_counts(len(rows), goal)
+    regions = in_regions(splats, len(rows))
+    counts = stage_counts(len(rows), goal, ALONE_BY_REGIONS if regions else ALONE)
     penalty = merge_penalty(1.0 - goal / max(began or len(rows), 1))
     return_freed()  # what scoring took: twice as much as is left of it
-    drawn = drawable(splats, threads=threads)[rows]
-    scene = scene_of(splats.means[rows], drawn, views, threads=threads)
+    drawn = drawable(splats, threads=threads)
+    # By regions those that were deleted count for the frame, too.
+    counting = np.arange(total) if regions else rows
+    scene = scene_of(splats.means[counting], drawn[counting], views, threads=threads)
+    del rows, drawn, counting
     expected: list[float] = []
     for entering in [total, *counts][: len(counts)]:
         again = seconds("measure", entering, len(views) / 2) if expected else 0.0
         expected += [again, seconds("merge", entering)]
     steps = iter(stages(progress, *expected))
-    for count in counts:
+    for number, count in enumerate(counts):
         measuring, merging = next(steps), next(steps)
         if left is not splats:
             sums = measure(left.up_to_degree(0), sums, measuring)
-        sums, fixed = np.asarray(sums, np.float64), spared[origin]
-        rows = mergeable(left, scene, fixed | (members == 0), threads=threads)
-        report(merging, 0.0, "merging")
-        measured = measured_field(
-            left, rows, views, scene, sums, progress=part(merging, 0.0, 0.3), threads=threads
-        )
-        field = measured.with_bias(measured.seen_and_whole())
-        graph = MergeGraph(field, scene, penalty, threads=threads)
-        del measured, field
-        left, keep, members, sums = reduced(
-            left, members, sums, rows, graph, count,
-            protected=fixed, progress=part(merging, 0.3, 1.0),
+        stage = Stage(
+            left, members, np.asarray(sums, np.float64), spared[origin], views, scene, penalty,
+            number, threads,
         )  # fmt: skip
+        many = in_regions(left, int(np.count_nonzero(members)))
+        reduced = stage_by_regions if many else reduced_at_once
+        left, keep, members, sums = reduced(stage, count, merging)
         origin = origin[keep]
-        del graph
+        del stage
         return_freed()  # views are measured next, by processes that need memory of their own
     if left is splats:
         origin = np.flatnonzero(members)
@@ -218,96 +215,3 @@ def stage_counts(count: int, goal: int, alone: float = ALONE) -> list[int]:
     number = 1 if share >= alone else math.ceil(math.log(share) / math.log(STAGE) + FINER)
     shares = [(goal / count) ** ((stage + 1) / number) for stage in range(number)]
     return [max(round(count * share), goal) for share in shares]
-
-
-def mergeable(
-    splats: Splats, scene: Scene, excluded: NDArray[np.bool_], *, threads: int | None = 1
-) -> Index:
-    """Rows of the splats that may merge, (M,) int64, by their place in the scene.
-
-    So ties do not depend on the order of the file.
-    """
-    rows = np.flatnonzero(drawable(splats, threads=threads) & ~excluded)
-    place = scene.positions(splats.means, rows, threads=threads)
-    return rows[
-        spatial_order(place, lambda tied: splat_fingerprint(splats, rows[tied]), threads=threads)
-    ]
-
-
-def reduced(
-    splats: Splats,
-    members: NDArray[np.int64],
-    sums: Array,
-    rows: Index,
-    graph: MergeGraph,
-    keep_count: int,
-    *,
-    protected: NDArray[np.bool_],
-    progress: Progress = silent,
-) -> tuple[Splats, NDArray[np.bool_], NDArray[np.int64], Array]:
-    """Reduce splats by a graph: undrawable ones go first, then the graph's cheapest operations.
-
-    Parameters
-    ----------
-    splats, sums, keep_count, protected, progress
-        See `merge`.
-    members : (N,) int64
-        For how many of the first splats each stands; 0 if it was deleted.
-    rows : (M,) int64
-        Rows of the splats that the graph holds, see `mergeable`.
-    graph : MergeGraph
-        Its field is dropped.
-
-    Returns
-    -------
-    splats : Splats
-        The K kept splats, see `Merged`.
-    keep : (N,) bool
-    members : (K,) int64
-    sums : (2, K) float64
-        Predicted from the sums before and the merges' own errors.
-    """
-    keep, threads = members > 0, graph.threads
-    excess = max(int(np.count_nonzero(keep)) - keep_count, 0)
-    others = keep & ~protected
-    others[rows] = False
-    undrawable = np.flatnonzero(others)[:excess]
-    keep[undrawable] = False
-    graph.reduce(max(len(rows) - (excess - len(undrawable)), 0), part(progress, 0.0, 0.95))
-    keep[rows[~graph.alive]] = False
-    owner, share = groups(graph.merges, len(rows))
-    changed = graph.alive & (np.bincount(owner, minlength=len(rows)) > 1)
-    # Drop the rest of the field before the kept splats are copied, to save memory.
-    field = graph.field = graph.field.take(np.flatnonzero(changed))
-    kept = np.flatnonzero(keep)
-    left, target = copied(splats, kept, threads), np.searchsorted(kept, rows[changed])
-    shapes = as_splats(field, part(progress, 0.95, 0.97), threads)
-    for name, values in zip(ARRAYS, (field.means, *shapes), strict=False):
-        getattr(left, name)[target] = values
-    inside = np.flatnonzero(changed[owner])
-    order = inside[np.argsort(owner[inside], kind="stable")]
-    into = np.searchsorted(kept, rows[owner[order]])
-    for before, after in ((splats.sh_dc[:, None], left.sh_dc[:, None]),
-                          (splats.sh_rest, left.sh_rest)):  # fmt: skip
-        blend(before, rows[order], share[order], after, into, part(progress, 0.97, 1.0), threads)
-    members = members.copy()
-    members[rows] = np.bincount(owner, members[rows], len(rows))
-    expected = sums[:, keep]
-    expected[:, target] = field.contribution, field.error
-    return left, keep, members[keep], expected
-
-
-def copied(splats: Splats, rows: Index, threads: int | None = None) -> Splats:
-    """Copies of some splats as `Merged` has them: merged ones merge again, in float64."""
-    columns: dict[str, Any] = {}
-    for name in ARRAYS:
-        values = getattr(splats, name)
-        kind = values.dtype if name == "sh_rest" else np.float64
-        columns[name] = np.empty((len(rows), *values.shape[1:]), kind)
-
-    def copy(piece: slice) -> None:
-        for name, column in columns.items():
-            column[piece] = getattr(splats, name)[rows[piece]]
-
-    run_all(copy, chunks(len(rows), _CHUNK), threads=threads)
-    return replace(splats, **columns)

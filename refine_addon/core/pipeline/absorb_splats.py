@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from .. import costs
 from ..costs import Plan
 from ..execute import Progress, part, silent
-from ..merging.merge import Merged, copied, merge, stage_counts
+from ..merging.merge import Merged, merge, stage_counts
+from ..merging.stage import copied
 from ..pace import phases
 from ..quality.curve import left_to_lose
 from ..quality.psnr import psnr_against

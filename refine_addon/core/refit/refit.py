@@ -33,9 +33,11 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, part, silent
+from ..regions import in_regions
 from ..splats import Splats, rotation_matrices, unit_quaternions
 from ..views import ViewSet
 from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, LinearRays
+from .regions import refit_by_regions
 from .round_rays import LARGEST, RoundRays, limits
 
 STEPS = 8
@@ -193,6 +195,12 @@ def refit_rounds(
     lie in a temporary file.
     """
     check_rounds(rounds)
+    if in_regions(original, len(original)) and in_regions(original, 2 * len(splats)):
+        for outcome in refit_by_regions(
+            refit_on, splats, original, views, rounds, progress=progress, threads=threads
+        ):
+            yield Refitted(*outcome)
+        return
     rays = RoundRays.of(original, views, len(splats), part(progress, 0.0, 0.03), threads)
     later = part(progress, 0.03, 1.0)
     yield from refit_on(rays, splats, rounds, protected=protected, progress=later, threads=threads)

@@ -212,12 +212,12 @@ class RoundRays:
     windows : sequence of Window
         Of the views that rays are cast from; also an attribute.
     original : Target
-        The unpruned splats.
+        The unpruned splats; also an attribute.
     threads : int, optional
     """
 
     def __init__(self, windows: Sequence[Window], original: Target, threads: int | None) -> None:
-        self.windows, self._original, self._threads = windows, original, threads
+        self.windows, self.original, self._threads = windows, original, threads
         step = -(-len(windows) // VALIDATION_VIEWS)
         self._validating = [window.moved(0) for window in windows[::step]] if step else []
         self._validation: list[Truth] = []
@@ -272,7 +272,7 @@ class RoundRays:
         windows = [window.moved(number) for window in self.windows]
         told = [truth.shown for truth in self._validation]
         shown = float(np.mean(told)) if told else None
-        truth = partial(cast_truth, self._original, windows, number, shown)
+        truth = partial(cast_truth, self.original, windows, number, shown)
         work = partial(_linearized, truth, windows, target, shapes)
         seen = self._each(work, windows, splats, part(progress, 0.05, 1.0))
         result = LinearRays.of(shapes, seen)
@@ -283,7 +283,7 @@ class RoundRays:
         """Mean PSNR of kept splats on validation rays, weighted as the views are, dB."""
         windows = self._validating
         if not self._validation:
-            cast = partial(cast_truth, self._original, windows, 0, None)
+            cast = partial(cast_truth, self.original, windows, 0, None)
             self._validation = [*self._each(cast, windows, splats, part(progress, 0.0, 0.5))]
         target = self.target(splats, part(progress, 0.5, 0.6))
         work = partial(_psnr, target, windows, self._validation)
@@ -293,7 +293,7 @@ class RoundRays:
 
     def target(self, splats: Splats, progress: Progress) -> Target:
         """What rays are cast into: kept splats, the first of all that are hit."""
-        views, scene = ViewSet(tuple(window.view for window in self.windows)), self._original.scene
+        views, scene = ViewSet(tuple(window.view for window in self.windows)), self.original.scene
         prepared = projection.prepare(
             splats, views, scene, progress=progress, threads=self._threads
         )
@@ -304,7 +304,7 @@ class RoundRays:
     ) -> Iterator[Any]:
         """Yield what is found on the rays of each of some windows."""
         numbers = range(len(windows))
-        cost = seconds("refit", len(self._original.splats) + len(splats), len(windows))
+        cost = seconds("refit", len(self.original.splats) + len(splats), len(windows))
         yield from run(
             work, numbers, cost=cost, progress=told, what="refitting", threads=self._threads
         )

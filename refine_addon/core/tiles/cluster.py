@@ -23,7 +23,7 @@ from typing import Any
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..execute import Progress, report, run_all
+from ..execute import Progress, alone, report
 from ..mapped import Interrupted
 from .source import Tile, bytes_of
 from .writing import waiting_in
@@ -222,7 +222,7 @@ class Cluster:
 
 def _run(packed: bytes, items: Sequence[Any]) -> list[Any]:
     """Do work with some items, in a worker."""
-    return run_all(_unpacked(packed), items, threads=1)
+    return alone(_unpacked(packed), items)
 
 
 @functools.lru_cache(maxsize=2)
