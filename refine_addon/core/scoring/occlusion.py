@@ -174,11 +174,11 @@ def measure_part(
     groups = view_groups(len(ordered))
     parts = min(parts, len(groups))
     groups = groups[turn % parts :: parts]
-    sums, _ = measure(
+    measured, *_ = measure(
         gaussians, scene, ordered, groups, sampling,
         progress=part(progress, 0.05, 1.0), threads=threads,
     )  # fmt: skip
-    measured = Measured.sum(sums).for_all(np.asarray(gaussians.index), len(splats))
+    measured = measured.for_all(np.asarray(gaussians.index), len(splats))
     weight = math.fsum(ordered[number][1] for group in groups for number in group)
     return measured, weight / math.fsum(weight for _, weight in ordered)
 
@@ -208,11 +208,10 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
     if rounds > 1:
         samples.append(RaySample(ordered, gaussians, splats, scoring=True))
     sample = coverage.sample(gaussians)
-    sums, errors = measure(
+    measured, of_groups, errors = measure(
         gaussians, scene, ordered, view_groups(len(ordered)), sampling,
         sample=sample, ray_samples=samples, progress=looking, threads=threads,
     )  # fmt: skip
-    measured = Measured.sum(sums)
     if not measured.contribution.any():
         raise RefineError(
             f"no camera sees the splats: none of {count} reaches into the image of any of "
@@ -221,9 +220,8 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
         )
     index = np.asarray(gaussians.index)
     weights = coverage.floor_weights(
-        _folds(measured, sums, errors, sample, prior[index[sample]], weighing)
+        _folds(measured.take(sample), of_groups, errors, prior[index[sample]], weighing)
     )
-    del sums
     between = None
     if halfway := views_between(views, BETWEEN):
         between = RaySample(ViewSet(tuple(halfway)).by_distance(), gaussians, splats)
@@ -245,16 +243,14 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
     return scores, everything
 
 
-def _folds(measured, sums, errors, sample, prior, progress):
+def _folds(whole, of_groups, errors, prior, progress):
     """What `coverage.floor_weights` takes, with each group of views left out once.
 
-    `measured` has the sums of all groups, `errors` those of the `sample`, (m,), by views, `prior`
-    is of the sample.
+    Of a sample: `whole` has the sums over all views, `of_groups` those over each group, `errors`
+    are by views.
     """
-    whole = measured.take(sample)
-    for group, of_views in zip(sums, errors, strict=True) if len(sums) > 1 else ():
+    for without, of_views in zip(of_groups, errors, strict=True) if len(errors) > 1 else ():
         report(progress, 0.0, "scoring")
-        without = group.take(sample)
         others = Measured(
             # Rounding can leave a negative difference.
             np.maximum(whole.contribution - without.contribution, 0.0),

@@ -10,7 +10,7 @@ which REFINE's Hessian approximates.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -81,16 +81,6 @@ class Measured:
     def zero(cls, count: int) -> Measured:
         """Sums of no views."""
         return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
-
-    @classmethod
-    def sum(cls, parts: Iterable[Measured]) -> Measured:
-        """Sums of all parts, one at least."""
-        total: Measured | None = None
-        for other in parts:
-            total = total or cls.zero(len(other.seen))
-            total.add(other)
-        assert total is not None
-        return total
 
     def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
         """Sums of `count` splats: these ones at `index`, 0 for all others."""
@@ -166,8 +156,8 @@ def measure(
     ray_samples: Sequence[RaySample] = (),
     progress: Progress = silent,
     threads: int | None = None,
-) -> tuple[list[Measured], list[NDArray[np.float64]]]:
-    """Sums over each group of views, and the errors of a sample in each view.
+) -> tuple[Measured, list[Measured], list[NDArray[np.float64]]]:
+    """Sums over views, and of a sample those over each group and the errors in each view.
 
     Parameters
     ----------
@@ -187,8 +177,10 @@ def measure(
 
     Returns
     -------
+    Measured
+        Added group by group.
     list of Measured, list of (views, m) float64
-        Of each group.
+        Of each group, for the sample.
     """
     rows, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
     lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]
@@ -198,16 +190,21 @@ def measure(
         cost=SECONDS * len(gaussians) * len(numbers),
         progress=progress, what="scoring", threads=threads,
     )  # fmt: skip
-    sums = [Measured.zero(len(gaussians)) for _ in groups]
-    errors: list[list[NDArray[np.float64]]] = [[] for _ in groups]
-    place = [k for k, group in enumerate(groups) for _ in group]
-    for (measurement, cast), k, number, some in zip(measured, place, numbers, lacking, strict=True):
-        before = sums[k].error[rows]  # (m,)
-        sums[k].add_view(measurement, views[number][1], threads)
-        errors[k].append(sums[k].error[rows] - before)
-        for ray_sample, rays in zip(some, cast, strict=True):
-            ray_sample.rays[number] = rays
-    return sums, [np.array(of_views) for of_views in errors]
+    total, of_groups, errors = Measured.zero(len(gaussians)), [], []
+    each = zip(measured, lacking, strict=True)
+    for group in groups:
+        sums, of_views = Measured.zero(len(gaussians)), []
+        for number, ((measurement, cast), some) in zip(group, each, strict=False):
+            before = sums.error[rows]  # (m,)
+            sums.add_view(measurement, views[number][1], threads)
+            of_views.append(sums.error[rows] - before)
+            for ray_sample, rays in zip(some, cast, strict=True):
+                ray_sample.rays[number] = rays
+        total.add(sums)
+        of_groups.append(sums.take(rows))
+        errors.append(np.array(of_views))
+    next(each, None)  # lets it end
+    return total, of_groups, errors
 
 
 def _measure_and_cast(gaussians, scene, views, sampling, number_and_kinds):
