@@ -49,6 +49,7 @@ from refine_addon.core.merging import merge
 from refine_addon.core.picture_files import PictureFiles
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.refit import round_rays
+from refine_addon.core.scoring import occlusion
 from refine_addon.core.selection import select
 from refine_addon.core.splats import joined, on_disk, with_model
 from refine_addon.core.tiles import cluster, source, storage, writing
@@ -760,6 +761,26 @@ def test_a_job_that_was_interrupted_goes_on_behind_the_last_stage(
     prune_tiles(tiles, tmp_path / "out", asked(views))
 
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "once")
+
+
+@pytest.mark.parametrize(("way", "stop"), [("unchanged", "selecting"), ("absorb", "merging")])
+def test_scores_by_occlusion_are_a_stage(tmp_path, tiles, views, monkeypatch, way, stop):
+    """What views saw is kept with the rays, which tell the estimates."""
+    request = asked(views, HALF, OCCLUSION, way)
+    once_told = prune_tiles(tiles, tmp_path / "once", request)
+
+    def progress(_fraction, what):
+        if what == stop:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prune_tiles(tiles, tmp_path / "out", request, progress=progress)
+    monkeypatch.setattr(occlusion, "_score_now", None)
+    told = prune_tiles(tiles, tmp_path / "out", request)
+
+    assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "once")
+    for key in ("estimated_psnr", "estimated_psnr_between", "quality", "views", "weights"):
+        assert told[key] == once_told[key]
 
 
 def renaming_stops(monkeypatch, name, error):

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from .. import execute
 from ..errors import RefineError
 from ..execute import Progress, part, report, seconds, silent, stages
+from ..mapped import once
 from ..scores import Scores, shares_gone
-from ..splats import Splats, refuse_undrawable
+from ..splats import Splats, folder_of, refuse_undrawable
 from ..views import ViewSet
 from ..views_between import views_between
 from ..visibility import projection
@@ -183,8 +184,19 @@ def measure_part(
     return measured, weight / math.fsum(weight for _, weight in ordered)
 
 
-def _score(splats, views, rounds, settled, sampling, few_views, progress, threads):
-    """Scores, and what was measured of all N; see `score` and `score_once`."""
+def _score(splats, views, rounds, settled, *how):
+    """Scores, and what was measured of all N; see `score` and `score_once`.
+
+    Of splats in files they are a stage of the job.
+    """
+    return once(
+        folder_of(splats), f"scores-{rounds}-{settled}",
+        lambda: _score_now(splats, views, rounds, settled, *how),
+    )  # fmt: skip
+
+
+def _score_now(splats, views, rounds, settled, sampling, few_views, progress, threads):
+    """What `_score` returns."""
     count = len(splats)
     if not count:
         raise RefineError("there are no splats to score")
