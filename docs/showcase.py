@@ -25,7 +25,7 @@ from collections.abc import Callable
 from numpy.typing import NDArray
 
 from benchmarks.tables.million import write_cameras, write_ply
-from refine_addon.core import Budget, Settings, Splats, View, ViewSet, prune
+from refine_addon.core import Budget, Merge, Splats, View, ViewSet, prune
 from refine_addon.core.pictures import compare
 from refine_addon.core.splats import SH_C0, joined, opacity_logits
 
@@ -377,8 +377,8 @@ def main() -> None:
         Image.fromarray(picture.before).save(out / "showcase.png")
         print(len(full))
         return
-    result = prune(full, cameras, Budget(ratio=SHARE), Settings(views=40), survivors="absorb")
-    (pictures,) = compare(full, result.survivors(full), held_out)
+    result = prune(full, cameras, Budget(ratio=SHARE), Merge(40))
+    (pictures,) = compare(full, result.splats, held_out)
     for name in ("before", "after"):
         Image.fromarray(getattr(pictures, name)).save(PROJECT / f"docs/{name}.jpg", quality=88)
     print(f"{len(full):,} splats, {int(result.keep.sum()):,} left: {pictures.psnr:.1f} dB held out")

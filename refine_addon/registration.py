@@ -14,7 +14,6 @@ from .ui import (
     panel_cache,
     plans,
     price,
-    properties,
     render_notice,
     render_operators,
     running,
@@ -148,7 +147,6 @@ def register() -> None:
     render_notice.register()
     camera_list.register()
     panel_cache.register()
-    properties.register()
     demand_changes.register()
     price.register()
     plans.register()
@@ -171,7 +169,6 @@ def unregister() -> None:
     plans.unregister()
     price.unregister()
     demand_changes.unregister()
-    properties.unregister()
     panel_cache.unregister()
     camera_list.unregister()
     render_notice.unregister()

@@ -39,9 +39,8 @@ sys.path.insert(0, str(ROOT))
 
 from refine_addon.command.info import describe
 from refine_addon.core import (
-    Occlusion,
+    ClosedForm,
     RefineError,
-    Settings,
     read_cameras,
     read_ply,
     read_splats,
@@ -50,6 +49,8 @@ from refine_addon.core import (
 )
 from refine_addon.core.formats.ply_columns import empty_rows, splats_from_columns
 from refine_addon.core.formats.registry import FORMATS, SUFFIXES
+from refine_addon.core.scoring import occlusion
+from refine_addon.core.visibility.measuring import Sampling
 
 MEMORY = 40_000_000
 """Bytes that any of these small inputs may cost; NumPy and JSON need some of their own."""
@@ -479,10 +480,14 @@ def use_cameras(folder: Path) -> None:
     views = read_cameras(files[0])
     values = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32)
     columns = dict(zip(REQUIRED.split(), values.T, strict=True))
-    for settings in (Settings("closed-form"), Settings(occlusion=Occlusion(16.0, 1.0, 1))):
+    coarse = Sampling(16.0, 1.0)
+    # In this thread: NumPy's flags are raised in it alone.
+    for scored in (
+        lambda splats: score(splats, views, ClosedForm(), threads=1),
+        lambda splats: occlusion.score_once(splats, views, sampling=coarse, threads=1)[0],
+    ):
         try:
-            # In this thread: NumPy's flags are raised in it alone.
-            scores = score(splats_from_columns(columns), views, settings, threads=1)
+            scores = scored(splats_from_columns(columns))
         except RefineError as error:
             if "no camera sees the splats" in str(error):
                 continue

@@ -1,10 +1,10 @@
 """How long a prune takes from file to file, and what memory it needs.
 
     python -m benchmarks.speed.file_to_file [--splats 3000000] [--runs 5]
-    python -m benchmarks.speed.file_to_file --survivors absorb --splats 1900000 --runs 3
-    python -m benchmarks.speed.file_to_file --survivors absorb refit --splats 160000 --runs 1
+    python -m benchmarks.speed.file_to_file --method merge --splats 1900000 --runs 3
+    python -m benchmarks.speed.file_to_file --method merge refit --splats 160000 --runs 1
 
-The first is against copying the file; the others, with survivors that change, against
+The first deletes by the closed form, against copying the file; the others are against
 splat-transform's decimation to the same number of splats, where that is installed.
 
 The input is the committed room's rows, repeated, each copy a little elsewhere and so much smaller
@@ -34,7 +34,7 @@ from pathlib import Path
 
 import numpy as np
 
-from refine_addon.core import SURVIVORS, Budget, read_ply
+from refine_addon.core import Budget, read_ply
 from refine_addon.core.formats.ply import with_count
 
 from ..baselines import splat_transform
@@ -94,12 +94,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--ratio", default="0.5")
     parser.add_argument(
-        "--survivors", nargs="+", choices=SURVIVORS[1:], default=[],
-        help="what they may become, one prune each: against a decimation by merging",
+        "--method", nargs="+", choices=("merge", "refit"), default=[],
+        help="one prune each, against a decimation by merging",
     )  # fmt: skip
     parser.add_argument("--folder", type=Path, help="on the disk to measure; default the system's")
     options = parser.parse_args(arguments)
-    other = "decimate" if options.survivors else "copy"
+    other = "decimate" if options.method else "copy"
     with tempfile.TemporaryDirectory(dir=options.folder) as made:
         source, output, report = (
             Path(made) / name for name in ("in.ply", "out.ply", "report.json")
@@ -109,9 +109,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prune = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output, "--ratio"]
         prune += [options.ratio, "--cameras", ROOM / "cameras.json", "--report", report]
         commands = {"start": [sys.executable, "-m", "refine_addon", "--version"]}
-        commands |= {name: [*prune, "--survivors", name] for name in options.survivors}
-        if not options.survivors:
-            commands["prune"] = [*prune, "--survivors", "unchanged", "--method", "closed-form"]
+        methods = options.method or ["closed-form"]
+        commands |= {name: [*prune, "--method", name] for name in methods}
+        if not options.method:
             commands["copy"] = ["cp", source, output]
         elif splat_transform.find():
             left = options.splats - Budget(ratio=float(options.ratio)).removals(options.splats)
@@ -122,8 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seconds: dict[str, list[float]] = {name: [] for name in commands}
         busy: dict[str, list[float]] = {name: [] for name in commands}
         peaks: dict[str, float] = dict.fromkeys(commands, 0.0)
-        pruning = options.survivors or ["prune"]
-        parts: dict[str, list[dict[str, float]]] = {name: [] for name in pruning}
+        parts: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
         for turn in range(options.runs + 1):
             for name, command in commands.items():
                 took, worked, peak = run(command)
@@ -139,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, values in seconds.items():
         every = " ".join(f"{value:.2f}" for value in values)
         print(
-            f"{name:8} {medians[name]:6.2f} s ({every}), {statistics.median(busy[name]):.2f} s of "
+            f"{name:11} {medians[name]:6.2f} s ({every}), {statistics.median(busy[name]):.2f} s of "
             f"the processor, peak {peaks[name]:.0f} MB of its own"
         )
     for name, of_runs in parts.items():
@@ -162,7 +161,7 @@ def tell(
         Of both; None if the other was not run.
     """
     for step in runs[0]:
-        print(f"    {name:8} {step:9} {statistics.median(run[step] for run in runs):6.2f}")
+        print(f"    {name:11} {step:9} {statistics.median(run[step] for run in runs):6.2f}")
     if others is not None:
         print(f"{name} / {other}: {seconds / others:.2f}, target at most {TARGET_RATIO[other]:g}")
 

@@ -1,6 +1,6 @@
 """How prunes would scale with cores, by what they do one after the other.
 
-    python -m benchmarks.speed.scaling SCENE_DIR [--ways absorb refit ...] [--ratio 0.9]
+    python -m benchmarks.speed.scaling SCENE_DIR [--methods merge refit ...] [--ratio 0.9]
 
 One thread does everything; counted are seconds of the processor, so that other work on the machine
 does not matter. Every piece of work that several cores could do at once (`execute.run`) is
@@ -22,24 +22,12 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
-from refine_addon.core import Budget, execute, prune_file, read_cameras
+from refine_addon.core import METHODS, Budget, Method, execute, prune_file, read_cameras
 from refine_addon.core.execute import Progress
-from refine_addon.core.operation.requests import PruneRequest
-from refine_addon.core.survivor_choice import SurvivorChoice
-from refine_addon.core.task import Settings
 
 CORES = (2, 4, 8, 16)
-WAYS: dict[str, tuple[str, SurvivorChoice]] = {
-    "closed-form": ("closed-form", "unchanged"),
-    "occlusion": ("occlusion", "unchanged"),
-    "absorb": ("occlusion", "absorb"),
-    "refit": ("occlusion", "refit"),
-}
-"""Name -> method, and what survivors may become."""
-
-Result = TypeVar("Result")
 
 
 class Division:
@@ -63,29 +51,25 @@ class Division:
         in_turn = execute._in_turn
 
         def timed(
-            whole: Callable[[slice], Result],
-            pieces: list[slice],
-            step: int,
-            progress: Progress,
-            what: str,
-        ) -> Iterator[Result]:
+            work: Callable[[Any], Any], items: list[Any], progress: Progress, what: str
+        ) -> Iterator[Any]:
             if self._inside:
-                return in_turn(whole, pieces, step, progress, what)
+                return in_turn(work, items, progress, what)
             seconds: list[float] = []
-            self.calls.append((whole.__qualname__, seconds))
+            self.calls.append((getattr(work, "__qualname__", type(work).__name__), seconds))
 
-            def of_piece(piece: slice) -> Result:
+            def of_piece(item: Any) -> Any:
                 self._inside = True
                 self.serial.disable()
                 start = time.process_time()
                 try:
-                    return whole(piece)
+                    return work(item)
                 finally:
                     seconds.append(time.process_time() - start)
                     self._inside = False
                     self.serial.enable()
 
-            return in_turn(of_piece, pieces, step, progress, what)
+            return in_turn(of_piece, items, progress, what)
 
         execute._in_turn = timed
 
@@ -104,60 +88,62 @@ def spread(seconds: Sequence[float], cores: int) -> float:
     return max(free)
 
 
-def modelled(scene: Path, request: PruneRequest) -> tuple[Division, float]:
-    """Return how a prune is divided, done by one thread, and seconds of the processor."""
+def pruned(scene: Path, ratio: float, method: Method, threads: int) -> None:
+    """Prune a scene from file to file."""
+    source, views = scene / "point_cloud.ply", read_cameras(scene / "cameras.json")
+    with tempfile.TemporaryDirectory() as made:
+        output = Path(made) / "out.ply"
+        prune_file(source, output, views, Budget(ratio=ratio), method, threads=threads)
+
+
+def modelled(scene: Path, ratio: float, method: Method) -> tuple[Division, float]:
+    """How a prune is divided, done by one thread, and seconds of the processor."""
     division = Division()
     in_turn = execute._in_turn
     division.watch()
     try:
-        with tempfile.TemporaryDirectory() as made:
-            start = time.process_time()
-            division.serial.enable()
-            prune_file(scene / "point_cloud.ply", Path(made) / "out.ply", request, threads=1)
-            division.serial.disable()
-            return division, time.process_time() - start
+        start = time.process_time()
+        division.serial.enable()
+        pruned(scene, ratio, method, 1)
+        division.serial.disable()
+        return division, time.process_time() - start
     finally:
         execute._in_turn = in_turn
 
 
-def clocked(scene: Path, request: PruneRequest, threads: int) -> float:
-    """Return how long a prune takes, seconds of the clock."""
-    with tempfile.TemporaryDirectory() as made:
-        start = time.perf_counter()
-        prune_file(scene / "point_cloud.ply", Path(made) / "out.ply", request, threads=threads)
-        return time.perf_counter() - start
+def clocked(scene: Path, ratio: float, method: Method, threads: int) -> float:
+    """How long a prune takes, seconds of the clock."""
+    start = time.perf_counter()
+    pruned(scene, ratio, method, threads)
+    return time.perf_counter() - start
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run each way once, and print the model."""
+    """Run each method once, and print the model."""
     parser = argparse.ArgumentParser(description="Model how prunes scale with cores.")
     parser.add_argument("scene", type=Path, help="folder of point_cloud.ply and cameras.json")
-    parser.add_argument("--ways", choices=[*WAYS], nargs="+", default=[*WAYS])
+    parser.add_argument("--methods", choices=METHODS, nargs="+", default=[*METHODS])
     parser.add_argument("--ratio", type=float, default=0.5)
     parser.add_argument("--functions", type=int, default=0, help="serial ones to tell")
     parser.add_argument("--two", action="store_true", help="also measure one core and two")
     options = parser.parse_args(arguments)
-    views = read_cameras(options.scene / "cameras.json")
     print("| | 1 core | serial | " + " | ".join(f"{cores} cores" for cores in CORES) + " |")
     print("|---|" + "---:|" * (len(CORES) + 2))
-    for way in options.ways:
-        method, survivors = WAYS[way]
-        request = PruneRequest(
-            views, Budget(ratio=options.ratio), Settings(method=method), survivors=survivors
-        )
-        division, total = modelled(options.scene, request)
+    for name in options.methods:
+        asked = options.scene, options.ratio, METHODS[name]()
+        division, total = modelled(*asked)
         serial = total - sum(sum(seconds) for _, seconds in division.calls)
         faster = [
             total / (serial + sum(spread(seconds, cores) for _, seconds in division.calls))
             for cores in CORES
         ]
         told = " | ".join(f"{factor:.2f} x" for factor in faster)
-        print(f"| {way} | {total:.1f} s | {serial / total:.1%} | {told} |", flush=True)
+        print(f"| {name} | {total:.1f} s | {serial / total:.1%} | {told} |", flush=True)
         if options.functions:
             _tell(division, options.functions)
         if options.two:
-            one, two = (clocked(options.scene, request, threads) for threads in (1, 2))
-            print(f"{way}: {one:.1f} s by one, {two:.1f} s by two: {one / two:.2f} x", flush=True)
+            one, two = (clocked(*asked, threads) for threads in (1, 2))
+            print(f"{name}: {one:.1f} s by one, {two:.1f} s by two: {one / two:.2f} x", flush=True)
 
 
 def _tell(division: Division, count: int) -> None:

@@ -20,16 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from refine_addon.core import (
-    Occlusion,
-    Settings,
-    Splats,
-    ViewSet,
-    read_cameras,
-    read_ply,
-    score,
-)
+from refine_addon.core import ClosedForm, Splats, ViewSet, read_cameras, read_ply, score
 from refine_addon.core.execute import default_threads
+from refine_addon.core.scoring import occlusion
 
 from ..baselines import splat_transform
 
@@ -78,23 +71,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     counts = [count for count in (100_000, 1_000_000, 3_000_000, 10_000_000) if count <= largest]
     for count in counts:
         splats = repeated(replace(room, sh_rest=room.sh_rest[:, :0]), count)
-        settings = Settings("closed-form")
-        seconds = median_seconds(lambda s=splats, t=settings: score(s, views, t), runs)
+        seconds = median_seconds(lambda s=splats: score(s, views, ClosedForm()), runs)
         print(f"  {count:>11,} splats  {seconds:7.3f} s  {seconds / count / 64 * 1e9:6.2f} ns")
 
     print("\nclosed form, 1 M splats: seconds by number of views")
     splats = repeated(replace(room, sh_rest=room.sh_rest[:, :0]), 1_000_000)
     for number in (8, 16, 32, 64, 128, 256):
         many = views.take(np.arange(number) % 64)
-        settings = Settings("closed-form", views=0)
-        seconds = median_seconds(lambda v=many, t=settings: score(splats, v, t), runs)
+        seconds = median_seconds(lambda v=many: score(splats, v, ClosedForm(views=0)), runs)
         print(f"  {number:4} views  {seconds:7.3f} s")
 
     print("\nocclusion, 64 views, one pass: seconds, and million splat-views a second")
-    once = Settings("occlusion", occlusion=Occlusion(rounds=1))
     for count in (40_000, 400_000, 1_900_000):
         splats = repeated(replace(room, sh_rest=room.sh_rest[:, :0]), min(count, largest))
-        seconds = median_seconds(lambda s=splats: score(s, views, once), 1 if options.quick else 3)
+        repeats = 1 if options.quick else 3
+        seconds = median_seconds(lambda s=splats: occlusion.score_once(s, views), repeats)
         rate = len(splats) * 64 / seconds / 1e6
         print(f"  {len(splats):>11,} splats  {seconds:7.2f} s  {rate:6.1f} M/s")
 

@@ -1,7 +1,7 @@
 """How long tiles take that are pruned together, and what memory the process needs.
 
     python -m benchmarks.speed.tiles [--splats 10000000] [--tiles 10] [--workers 0 1 2]
-    python -m benchmarks.speed.tiles --method occlusion [--absorb]
+    python -m benchmarks.speed.tiles --method merge
 
 The tiles are the committed room's rows without harmonics above the constant one, 56 bytes each, a
 room beside the other along a street. The room's cameras stand in all rooms, in each as many, so a
@@ -32,10 +32,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from refine_addon.core import read_ply
+from refine_addon.core import METHODS, read_ply
 from refine_addon.core.formats.ply import new_header
 from refine_addon.core.formats.ply_columns import REQUIRED
-from refine_addon.core.task import METHODS
 
 from ..baselines import splat_transform
 
@@ -157,7 +156,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--workers", type=int, nargs="*", default=[0], help="0: none of Dask's; any again"
     )
     parser.add_argument("--method", choices=METHODS, default="closed-form")
-    parser.add_argument("--absorb", action="store_true")
     parser.add_argument("--one-room", action="store_true", help="all cameras in the middle room")
     parser.add_argument("--folder", type=Path, help="on the disk to measure; default the system's")
     options = parser.parse_args(arguments)
@@ -172,7 +170,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         copy = ["sh", "-c", 'cat "$@" > "$0"', folder / "copy", *paths]
         prune = [sys.executable, "-m", "refine_addon", "prune", *paths, "--together", "--ratio"]
         prune += ["0.5", "--cameras", cameras, "--method", options.method]
-        prune += ["--absorb"] if options.absorb else []
         output = folder / "out"
         commands = [("copy", copy)]
         for workers in options.workers:

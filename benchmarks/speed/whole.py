@@ -4,7 +4,7 @@
 
 160,000, 1 million and 2.2 million splats of degree 3 (`capture`); with ``--quick`` the first alone,
 a minute of the processor. Each command is a process of its own and runs once, from file to file,
-one after the other: every method, absorbing half and nine tenths, and splat-transform to the same
+one after the other: every method, merging to half and a tenth, and splat-transform to the same
 numbers; refitting where it takes minutes, not tens of them. Told are seconds of the processor and
 the most memory (RssAnon) of the whole tree of processes, both over splat-transform's, and by how
 much they differ from the committed figures, `figures.json`, which ``--write`` replaces. Seconds of
@@ -47,19 +47,19 @@ def commands(folder: Path, count: int) -> Mapping[str, Sequence[str | Path]]:
     source, output = folder / "in.ply", folder / "out.ply"
     ours: list[str | Path] = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output]
     ours += ["--cameras", folder / "cameras.json", "--quiet", "--overwrite"]
-    deleted = [*ours, "--ratio", "0.5", "--survivors", "unchanged", "--method"]
+    half = [*ours, "--ratio", "0.5", "--method"]
     found: dict[str, Sequence[str | Path]] = {"copy": ["cp", source, output]}
-    found |= {name: [*deleted, name] for name in ("closed-form", "occlusion")}
+    found |= {name: [*half, name] for name in ("closed-form", "occlusion")}
     for ratio in (0.5, 0.9):
-        name = f"absorb {ratio:.0%}"
-        found[name] = [*ours, "--ratio", str(ratio), "--survivors", "absorb"]
+        name = f"merge {ratio:.0%}"
+        found[name] = [*ours, "--ratio", str(ratio), "--method", "merge"]
         if splat_transform.find() is not None:
             left = count - round(ratio * count)
             flag = splat_transform.FLAGS[0]
             name = f"splat-transform {ratio:.0%}"
             found[name] = splat_transform.command(source, output, flag, left)
     if count <= REFITTED:
-        found["refit 50%"] = [*ours, "--ratio", "0.5", "--survivors", "refit"]
+        found["refit 50%"] = [*half, "refit"]
     return found
 
 

@@ -4,9 +4,9 @@
 
     python -m benchmarks.tables.estimate SCENE_DIR ... --ratios .3 .5 .7 .9 --psnr 40 --views 64
 
-For a scene's folder see `evaluate`. The splats are deleted by occlusion's order, and absorbed; the
+For a scene's folder see `evaluate`. The splats are deleted by occlusion's order, and merged; the
 estimates are those of the reports. Every view that scores is rendered. "Expected" is what a result
-without absorbing says of absorbing. With `--psnr` the pictures are those of that budget. The last
+of deleting says of merging. With `--psnr` the pictures are those of that budget. The last
 columns are of single views: by how much their estimates are off on average and at most, and which
 place the view that is expected to change most has among those that do (1: it does).
 
@@ -26,19 +26,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from refine_addon.core import Settings, prune
+from refine_addon.core import Merge, Method, Occlusion, Refit, prune
 from refine_addon.core.errors import RefineError
-from refine_addon.core.pipeline.score_splats import with_quality
+from refine_addon.core.prune import with_quality
+from refine_addon.core.quality.curve import Way
 from refine_addon.core.report import little_seen
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
-from refine_addon.core.survivor_choice import Became
 from refine_addon.core.views import ViewSet
 
 from .evaluate import Evaluator, read_scene
 
-DELETE, ABSORB, REFIT = "delete", "absorb", "refit"
-BECOMING: dict[str, Became] = {DELETE: "unchanged", ABSORB: "absorb", REFIT: "refit"}
+METHODS: dict[Way, type[Method]] = {"delete": Occlusion, "merge": Merge, "refit": Refit}
+WAYS: tuple[Way, ...] = ("delete", "merge")
 HEADING = (
     f"{'scene':12}{'':10}{'budget':>12}{'removed':>9}{'estimate':>10}{'truth':>8}{'off by':>8}"
     f"{'expected':>10}{'seconds':>9}"
@@ -57,14 +57,14 @@ class Estimated:
 
     Attributes
     ----------
-    way : {"delete", "absorb", "refit"}
+    way : {"delete", "merge", "refit"}
     budget : Budget
     removed : float
         Share of the splats.
     estimate, truth : float
         PSNR, dB; the truth is the mean over all views that score.
     expected : float or None
-        What a result without absorbing says of absorbing, dB.
+        What a result of deleting says of merging, dB.
     seconds : float
         Of the prune.
     single : (V,) float64
@@ -73,7 +73,7 @@ class Estimated:
         Place of the view of the lowest estimate among the views by their truth, from 1.
     """
 
-    way: str
+    way: Way
     budget: Budget
     removed: float
     estimate: float
@@ -93,7 +93,7 @@ def measure(
     splats: Splats,
     views: ViewSet,
     budgets: Sequence[Budget],
-    ways: Sequence[str] = (DELETE, ABSORB),
+    ways: Sequence[Way] = WAYS,
 ) -> Iterator[Estimated]:
     """Yield estimate and truth of every way and budget, by `views`, all of which score.
 
@@ -103,21 +103,21 @@ def measure(
         If there is no estimate, since the views see too little.
     """
     evaluator = Evaluator(splats, views, metrics=("psnr",))
-    settings = Settings("occlusion", views=0)
     for way in ways:
         for budget in budgets:
             start = time.perf_counter()
-            result = prune(splats, views, budget, settings, survivors=BECOMING[way])
+            result = prune(splats, views, budget, METHODS[way](views=0))
             seconds = time.perf_counter() - start
-            left = result.absorbed.splats if result.absorbed else splats.take(result.keep)
             estimate = result.report["estimated_psnr"]
             if estimate is None:
                 raise RefineError(result.report["estimated_psnr_note"])
-            renders, gone = evaluator.evaluate(left).renders, 1.0 - float(result.keep.mean())
-            truth, curve = renders.values["psnr"], with_quality(result.scores).quality
+            renders = evaluator.evaluate(result.splats).renders
+            truth, gone = renders.values["psnr"], 1.0 - float(result.keep.mean())
+            assert result.scores is not None
+            curve = with_quality(result.scores).quality
             assert curve is not None
-            of_views = curve.of_views(gone, BECOMING[way])
-            # Absorbed results are compared in validation views only.
+            of_views = curve.of_views(gone, way)
+            # Merged results are compared in validation views only.
             told = [place for place, name in enumerate(renders.names) if name in of_views]
             guess = np.array([of_views[renders.names[place]] for place in told])  # (V,)
             truth = np.asarray(truth)[told]
@@ -127,7 +127,7 @@ def measure(
                 gone,
                 estimate,
                 renders.mean["psnr"],
-                result.report["survivors"]["psnr"]["absorb"] if way == DELETE else None,
+                result.report["method"]["psnr"]["merge"] if way == "delete" else None,
                 seconds,
                 guess - truth,
                 1 + int(np.count_nonzero(truth < truth[np.argmin(guess)])),
@@ -140,7 +140,7 @@ class Between:
 
     Attributes
     ----------
-    way : {"delete", "absorb", "refit"}
+    way : {"delete", "merge", "refit"}
     ratio : float
     estimate : float
         Of the views between, dB.
@@ -150,7 +150,7 @@ class Between:
         Whether the report says that views from elsewhere may lose more.
     """
 
-    way: str
+    way: Way
     ratio: float
     estimate: float
     held: NDArray[np.float64]
@@ -171,7 +171,7 @@ def measure_between(
     views: ViewSet,
     held: ViewSet,
     ratios: Sequence[float],
-    ways: Sequence[str] = (DELETE, ABSORB),
+    ways: Sequence[Way] = WAYS,
 ) -> Iterator[Between]:
     """Yield, by `views`, the estimate of those between them beside the held-out views.
 
@@ -183,15 +183,14 @@ def measure_between(
     evaluator = Evaluator(splats, held, metrics=("psnr",))
     for way in ways:
         for ratio in ratios:
-            result = prune(
-                splats, views, Budget(ratio=ratio), Settings("occlusion"), survivors=BECOMING[way]
-            )
+            result = prune(splats, views, Budget(ratio=ratio), METHODS[way]())
             estimate = result.report["estimated_psnr_between"]
             if estimate is None:
                 raise RefineError(
                     f"of {len(views)} views nothing is told of what lies between them"
                 )
-            renders = evaluator.evaluate(result.survivors(splats)).renders
+            renders = evaluator.evaluate(result.splats).renders
+            assert result.scores is not None
             warned = bool(little_seen(result.scores.seen))
             yield Between(way, ratio, estimate, np.asarray(renders.values["psnr"]), warned)
 
@@ -201,7 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parse(arguments)
     budgets = [Budget(ratio=ratio) for ratio in options.ratios]
     budgets += [Budget(psnr=psnr) for psnr in options.psnr]
-    ways = [options.only] if options.only else [DELETE, ABSORB]
+    ways = [options.only] if options.only else WAYS
     print(BETWEEN_HEADING if options.between else HEADING)
     errors: list[float] = []
     for folder in options.scenes:
@@ -243,7 +242,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--ratios", type=float, nargs="*", default=[0.3, 0.5, 0.7, 0.9])
     parser.add_argument("--psnr", type=float, nargs="*", default=[40.0])
     parser.add_argument("--views", type=int, default=64, help="that score, at most")
-    parser.add_argument("--only", choices=BECOMING, help="one of the ways")
+    parser.add_argument("--only", choices=METHODS, help="one of the ways")
     parser.add_argument(
         "--between", action="store_true", help="the views between, beside the held-out views"
     )

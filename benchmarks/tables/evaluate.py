@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from skimage.metrics import structural_similarity
 
-from refine_addon.core import Settings, score
+from refine_addon.core import METHODS, score
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
 from refine_addon.core.formats.ply import read_ply
@@ -54,6 +54,8 @@ METRICS = ("psnr", "ssim", "flip")
 HELD_OUT = 8
 """Without a split, every 8th view is held out, the first among them."""
 PICTURE_TYPES = (".png", ".jpg", ".jpeg", ".JPG")
+SCORING = [name for name, method in METHODS.items() if not method.changes]
+"""The methods of the core that delete by scores."""
 FLIP_MISSING = "FLIP needs the package flip-evaluator: pip install flip-evaluator"
 
 
@@ -284,14 +286,16 @@ def scores_of(
     Raises
     ------
     RefineError
-        If there is no such method.
+        If there is no such score.
     """
     if method in BASELINES:
         values = BASELINES[method](scene.splats, scene.train, statistics)
     elif method == "rap" and weights is not None:
         values = rap.score(scene.splats, weights)
+    elif method in SCORING:
+        return score(scene.splats, scene.train, METHODS[method]())
     else:
-        return score(scene.splats, scene.train, Settings(method=method))
+        raise RefineError(f"expected one of {', '.join((*SCORING, *BASELINES))}, got {method!r}")
     return Scores(values, np.zeros(len(values), np.int32), len(scene.train), 0)
 
 
@@ -321,7 +325,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--method",
         nargs="+",
-        default=[Settings().method],
+        default=["occlusion"],
         help=f"of the core, or {', '.join(BASELINES)}; default: %(default)s",
     )
     parser.add_argument("--rap", type=Path, metavar="FILE", help="trained weights: measure RAP too")

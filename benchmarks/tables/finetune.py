@@ -28,7 +28,7 @@ from .evaluate import Evaluator
 
 ITERATIONS = 500
 RATIOS = (0.7, 0.9)
-METHODS = ("refine-distance", "occlusion", "occlusion+absorb", "occlusion+refit")
+METHODS = ("refine-distance", "occlusion", "merge", "refit")
 """Whose results are trained, by their names in `methods`."""
 RATES = {"mean": 1.6e-6, "scale": 5e-3, "turn": 2e-3, "logit": 0.05, "dc": 2.5e-3, "rest": 1.25e-4}
 """Learning rates; that of the means in parts of the scene's extent. A quaternion's .001 is a turn

@@ -1,4 +1,4 @@
-"""Levels of detail side by side: ours from one another, in one go, nested; and splat-transform's.
+"""Levels of detail side by side: ours merged, in one go, deleted; and splat-transform's.
 
 ::
 
@@ -19,7 +19,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from refine_addon.core import Levels, lod, prune, read_ply
+from refine_addon.core import Levels, Merge, Method, Occlusion, lod, prune, read_ply
+from refine_addon.core.methods import DEFAULT
 from refine_addon.core.splats import Splats
 
 from ..baselines import splat_transform
@@ -28,25 +29,23 @@ from .evaluate import Evaluator, Scene, read_scene
 SHARES = (0.5, 0.25, 0.12, 0.06)
 
 
-def from_one_another(scene: Scene) -> Iterator[tuple[Splats, str]]:
+def from_one_another(scene: Scene, method: Method = DEFAULT) -> Iterator[tuple[Splats, str]]:
     """Yield the levels of `lod`, and the PSNR that it estimates."""
-    for level in lod(scene.splats, scene.train, Levels(SHARES)):
-        yield level.splats, f" [{level.psnr:.1f}]"
+    for level in lod(scene.splats, scene.train, Levels(SHARES), method):
+        yield level.result.splats, f" [{level.psnr:.1f}]"
 
 
-def nested(scene: Scene) -> Iterator[tuple[Splats, str]]:
-    """Yield the levels of `lod` by deletion, and the PSNR that it estimates."""
-    for level in lod(scene.splats, scene.train, Levels(SHARES, survivors="unchanged")):
-        yield level.splats, f" [{level.psnr:.1f}]"
+def deleted(scene: Scene) -> Iterator[tuple[Splats, str]]:
+    """Yield the levels by deletion."""
+    return from_one_another(scene, Occlusion())
 
 
 def in_one_go(scene: Scene) -> Iterator[tuple[Splats, str]]:
-    """Yield what absorbing makes of the original for each level by itself."""
+    """Yield what merging makes of the original for each level by itself."""
     for budget in Levels(SHARES).budgets(len(scene.splats)):
         start = time.process_time()
-        made = prune(scene.splats, scene.train, budget, survivors="absorb").absorbed
-        assert made is not None
-        yield made.splats, f" ({time.process_time() - start:.0f} s)"
+        left = prune(scene.splats, scene.train, budget, Merge()).splats
+        yield left, f" ({time.process_time() - start:.0f} s)"
 
 
 def decimated(source: Path, flag: str, count: int) -> Iterator[tuple[Splats, str]]:
@@ -72,7 +71,7 @@ def main() -> int:
         ways = {
             "each from the one before": from_one_another(scene),
             "each from the original": in_one_go(scene),
-            "nested": nested(scene),
+            "deleted": deleted(scene),
         }
         if splat_transform.find() is not None:
             for flag in splat_transform.FLAGS:

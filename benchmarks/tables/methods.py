@@ -1,7 +1,7 @@
 """Everything that the trade measures, under one name each: from splats and views to fewer splats.
 
 A method either scores, once for all budgets, or reduces to one budget at a time. What the core
-offers is asked of its `Settings`, so that a method that is added there is measured here.
+offers is asked of its `METHODS`, so that a method that is added there is measured here.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import numpy as np
 
 from refine_addon import core
-from refine_addon.core import Settings
+from refine_addon.core import METHODS, Occlusion
 from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.refit.refit import refit
 from refine_addon.core.scores import Scores
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import ARRAYS, Splats
@@ -184,45 +185,37 @@ def _published() -> list[Method]:
 CORE_ABOUT = {
     "closed-form": "closed form with frustum test, free of units: the instant answer",
     "occlusion": "froxels: transmittance and contrast without rendering, in rounds",
+    "merge": "what goes is merged into what stays, by what the views see of each",
+    "refit": "then what stays is fitted, on rays, to what the unpruned splats look like",
 }
 
 
 def _core() -> list[Method]:
-    """Return every method of `Settings`, and absorbing, which is the same for all of them."""
+    """Return every method of the core, and deleting with refitting."""
     methods = []
-    for name in get_args(get_type_hints(Settings)["method"]):
-        about = CORE_ABOUT.get(name, f"method '{name}'")
-        methods.append(_scoring(name, OURS, about, Settings(views=0, method=name)))
-    about = "`--survivors absorb`: survivors absorb what goes, by what the views see of each"
-    methods.append(Method("occlusion+absorb", OURS, about, reduce=partial(_made, "absorb")))
-    about = "`--survivors refit`: then they learn on rays what the unpruned splats look like"
-    methods.append(Method("occlusion+refit", OURS, about, reduce=partial(_made, "refit")))
-    about = "occlusion deletes, and the rest is refitted: `core.refit`"
+    for name, settings in METHODS.items():
+        one, about = settings(views=0), CORE_ABOUT.get(name, f"method '{name}'")
+        if one.changes:
+            methods.append(Method(name, OURS, about, reduce=partial(_pruned, one)))
+        else:
+            methods.append(Method(name, OURS, about, score=partial(_scored, one)))
+    about = "occlusion deletes, and the rest is refitted: `core/refit`"
     return [*methods, Method("deleted+refit", OURS, about, reduce=_deleted_and_refitted)]
 
 
-def _made(survivors: str, task: Task, keep_count: int, ratio: float) -> Splats:
+def _pruned(method: core.Method, task: Task, keep_count: int, ratio: float) -> Splats:
     del ratio
-    budget = Budget(keep=keep_count)
-    settings = Settings(views=0, method="occlusion")
-    result = core.prune(task.splats, task.views, budget, settings, survivors=survivors)
-    return result.survivors(task.splats)
+    return core.prune(task.splats, task.views, Budget(keep=keep_count), method).splats
 
 
 def _deleted_and_refitted(task: Task, keep_count: int, ratio: float) -> Splats:
-    del ratio
-    result = core.prune(
-        task.splats, task.views, Budget(keep=keep_count), Settings(views=0), survivors="unchanged"
-    )
-    return core.refit(task.splats.take(result.keep), task.splats, task.views).splats
+    left = _pruned(Occlusion(0), task, keep_count, ratio)
+    return refit(left, task.splats, task.views).splats
 
 
-def _scoring(name: str, group: str, about: str, settings: Settings) -> Method:
-    def score(task: Task, statistics: Statistics | None) -> Scores:
-        del statistics
-        return core.score(task.splats, task.views, settings)
-
-    return Method(name, group, about, score=score)
+def _scored(method: core.Method, task: Task, statistics: Statistics | None) -> Scores:
+    del statistics
+    return core.score(task.splats, task.views, method)
 
 
 def as_scores(values: np.ndarray[Any, np.dtype[np.float64]], views: int) -> Scores:

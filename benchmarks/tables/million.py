@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
+from refine_addon.core import METHODS
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.splats import SH_C0, Splats, drawable, joined, opacity, rotation_matrices
-from refine_addon.core.task import METHODS
 from refine_addon.core.views import ViewSet
 
 from ..baselines import splat_transform
@@ -176,9 +176,6 @@ def commands(folder: Path, left: int) -> Mapping[str, Sequence[str | Path]]:
     ours: list[str | Path] = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output]
     ours += ["--keep", str(left), "--cameras", folder / "cameras.json", "--views", "0"]
     found: dict[str, Any] = {name: [*ours, "--method", name] for name in METHODS}
-    for survivors in ("absorb", "refit"):
-        made = ["--method", "occlusion", "--survivors", survivors]
-        found[f"occlusion+{survivors}"] = [*ours, *made]
     if splat_transform.find() is not None:
         for flag in splat_transform.FLAGS:
             name = f"splat-transform{flag.removeprefix('--decimate')}"

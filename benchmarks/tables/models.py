@@ -19,17 +19,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from refine_addon.core import prune
+from refine_addon.core import METHODS, prune
 from refine_addon.core.affine import quaternion
 from refine_addon.core.rendering import MODELS, Model
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats, rotation_matrices, with_model
-from refine_addon.core.survivor_choice import SurvivorChoice
 from refine_addon.core.views import ViewSet
 
 from .evaluate import Evaluator, read_scene
 
-WAYS: tuple[SurvivorChoice, ...] = ("unchanged", "absorb", "refit")
+CHOSEN = ("occlusion", "merge", "refit")
 
 
 def version(splats: Splats, model: Model) -> Splats:
@@ -57,13 +56,13 @@ def measure(
     views: ViewSet,
     evaluators: Sequence[Evaluator],
     ratio: float,
-    ways: Sequence[SurvivorChoice],
+    methods: Sequence[str],
 ) -> list[str]:
-    """Return for each way: PSNR in the views of both evaluators, and the estimate, dB."""
+    """Return for each method: PSNR in the views of both evaluators, and the estimate, dB."""
     cells = []
-    for way in ways:
-        result = prune(decided, views, Budget(ratio=ratio), survivors=way)
-        left = result.survivors(decided)
+    for name in methods:
+        result = prune(decided, views, Budget(ratio=ratio), METHODS[name]())
+        left = result.splats
         drawn = left if left.model == splats.model else version(left, splats.model)
         scoring, held = (each.evaluate(drawn).renders.mean["psnr"] for each in evaluators)
         cells.append(f"{held:.2f} ({result.report['estimated_psnr']:.2f} for {scoring:.2f})")
@@ -76,12 +75,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder")
     parser.add_argument("--ratios", type=float, nargs="+", default=[0.5, 0.7])
     parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS)
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=CHOSEN)
     parser.add_argument("--decided-as", nargs="+", choices=MODELS, help="default: both")
     options = parser.parse_args(arguments)
     scene = read_scene(options.folder)
-    print("| model | decided as | removed |", " | ".join(options.ways), "|")
-    print("|---|---|---|" + "---|" * len(options.ways))
+    print("| model | decided as | removed |", " | ".join(options.methods), "|")
+    print("|---|---|---|" + "---|" * len(options.methods))
     for model in options.models:
         splats = version(scene.splats, model)
         evaluators = [
@@ -90,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for asked in options.decided_as or dict.fromkeys((model, MODELS[0])):
             decided = replace(splats, model=asked)
             for ratio in options.ratios:
-                cells = measure(splats, decided, scene.train, evaluators, ratio, options.ways)
+                cells = measure(splats, decided, scene.train, evaluators, ratio, options.methods)
                 print(f"| {model} | {asked} | {100 * ratio:.0f} % |", " | ".join(cells), "|")
                 sys.stdout.flush()
     return 0

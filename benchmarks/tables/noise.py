@@ -4,7 +4,7 @@
 
     python -m benchmarks.tables.noise SCENE_DIR ... --ratios .5 .7 .9 --turns 4
 
-For a scene's folder see `evaluate`. Splats are absorbed by the views that score; each turn takes
+For a scene's folder see `evaluate`. Splats are merged by the views that score; each turn takes
 other pixels for the rays, and cells of the image that are up to 3 % larger, neither of which makes
 results better. PSNR is by 65,536 rays of the held-out views, always the same ones: what is left is
 how much the result itself varies. "Other rays" is what other rays of the held-out views say of the
@@ -23,11 +23,11 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from refine_addon.core import Settings
 from refine_addon.core.execute import silent
-from refine_addon.core.pipeline.absorb_splats import absorb_removed
-from refine_addon.core.pipeline.score_splats import score_once
+from refine_addon.core.methods import DEFAULT
+from refine_addon.core.prune import merge_down
 from refine_addon.core.quality.psnr import psnr_against
+from refine_addon.core.scoring import occlusion
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import cast, points, projection, ray_sample
@@ -76,19 +76,16 @@ def held_out(splats: Splats, views: ViewSet, turn: int) -> RaySample:
 def measure(folder: Path, ratios: Sequence[float], turns: int) -> None:
     """Print the PSNR of each ratio and turn of a scene, mean and standard deviation."""
     scene = read_scene(folder)
-    settings = Settings()
-    used = scene.train.spread(settings.views)
+    used = scene.train.spread(DEFAULT.views)
     samples = [held_out(scene.splats, scene.test, turn) for turn in range(2)]
     found = np.zeros((turns, len(ratios)))
     others = np.zeros(len(ratios))
     for turn in range(turns):
         with other_pixels(turn), other_cells(turn):
-            known = score_once(scene.splats, used, settings, silent, 1)
+            known = occlusion.score_once(scene.splats, used, threads=1)
             for place, ratio in enumerate(ratios):
                 left = len(scene.splats) - int(ratio * len(scene.splats))
-                made = absorb_removed(
-                    scene.splats, used, left, settings, known=known, threads=1
-                ).splats
+                made = merge_down(scene.splats, used, left, known=known, threads=1).splats
                 found[turn, place] = psnr_against(samples[0], made, scene.test)
                 if turn == 0:
                     others[place] = psnr_against(samples[1], made, scene.test)

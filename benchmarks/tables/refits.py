@@ -6,7 +6,7 @@
     python -m benchmarks.tables.refits 160000 1000000 --ways "as it is"
     python -m benchmarks.tables.refits SCENE_DIR --views 8 --near --compared 16
 
-Run as a command, it says how long refitting takes, over what absorbing took in the same run (all
+Run as a command, it says how long refitting takes, over what merging took in the same run (all
 views score, one thread, seconds of the processor), and what it gained, on rays that nothing was
 learned from. For a scene's folder see `evaluate`; a number makes one of `speed.capture` of so many
 splats. With ``--views`` so many views score, spread out, or by ``--near`` those nearest to the
@@ -26,25 +26,24 @@ from typing import NamedTuple
 import numpy as np
 
 from refine_addon import core
-from refine_addon.core import Settings
+from refine_addon.core import ClosedForm, Merge, Method, Occlusion
 from refine_addon.core.execute import silent
 from refine_addon.core.refit.refit import Refitted, refit_on
 from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
-from refine_addon.core.survivor_choice import Became
 from refine_addon.core.views import ViewSet
 
 from ..speed import capture
 from .evaluate import Evaluator, read_scene
 from .methods import Task
 
-STARTS: dict[str, tuple[str, Became]] = {
-    "absorbed": ("occlusion", "absorb"),
-    "deleted by occlusion": ("occlusion", "unchanged"),
-    "deleted by the closed form": ("closed-form", "unchanged"),
+STARTS: dict[str, Method] = {
+    "merged": Merge(views=0),
+    "deleted by occlusion": Occlusion(views=0),
+    "deleted by the closed form": ClosedForm(views=0),
 }
-"""What refitting begins with: method and what survivors become before."""
+"""What refitting begins with."""
 
 
 class Cheaper(NamedTuple):
@@ -81,7 +80,7 @@ class Curve:
     Attributes
     ----------
     name : str
-        One of `STARTS` or of `CHEAPER`, which begin with "absorbed".
+        One of `STARTS` or of `CHEAPER`, which begin with "merged".
     ratio : float
         Share removed.
     start : float
@@ -98,12 +97,12 @@ class Curve:
 
 
 def measure(task: Task, evaluator: Evaluator, ratios: Sequence[float]) -> list[Curve]:
-    """Refit what each start leaves, and what absorbing leaves by each cheaper way."""
+    """Refit what each start leaves, and what merging leaves by each cheaper way."""
     curves = []
     for ratio in ratios:
-        for name, (method, survivors) in STARTS.items():
-            left, start = _left(task.splats, task.views, ratio, method, survivors)
-            ways = CHEAPER if survivors == "absorb" else {name: Cheaper()}
+        for name, method in STARTS.items():
+            left, start = _left(task.splats, task.views, ratio, method)
+            ways = CHEAPER if method.changes else {name: Cheaper()}
             for label, way in ways.items():
                 label = name if way == Cheaper() else label
                 rounds = [
@@ -115,13 +114,11 @@ def measure(task: Task, evaluator: Evaluator, ratios: Sequence[float]) -> list[C
     return curves
 
 
-def _left(
-    splats: Splats, views: ViewSet, ratio: float, method: str, survivors: Became
-) -> tuple[Splats, float]:
+def _left(splats: Splats, views: ViewSet, ratio: float, method: Method) -> tuple[Splats, float]:
     """Return what refitting begins with, made by one thread, and seconds, all that it took."""
-    settings, budget, began = Settings(method, views=0), Budget(ratio=ratio), time.process_time()
-    result = core.prune(splats, views, budget, settings, survivors=survivors, threads=1)
-    return result.survivors(splats), time.process_time() - began
+    began = time.process_time()
+    result = core.prune(splats, views, Budget(ratio=ratio), method, threads=1)
+    return result.splats, time.process_time() - began
 
 
 def _timed(
@@ -141,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print a line for each scene and way; return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.tables.refits",
-        description="How long refitting takes over absorbing, and what it gains.",
+        description="How long refitting takes over merging, and what it gains.",
     )
     parser.add_argument("scenes", nargs="+", metavar="SCENE_DIR | SPLATS")
     parser.add_argument("--ratio", type=float, default=0.5)
@@ -153,8 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in options.scenes:
         splats, views, evaluator = _scene(name, options.compared)
         views = _scoring(views, options.views, near=options.near)
-        left, seconds = _left(splats, views, options.ratio, "occlusion", "absorb")
-        told = f"{name}, {options.ratio:.0%}, {len(views)} views: absorbed in {seconds:.1f} s"
+        left, seconds = _left(splats, views, options.ratio, STARTS["merged"])
+        told = f"{name}, {options.ratio:.0%}, {len(views)} views: merged in {seconds:.1f} s"
         print(told + _held_out(evaluator, left), flush=True)
         for way in options.ways:
             for taken, refitted in _timed(left, splats, views, CHEAPER[way]):

@@ -88,8 +88,8 @@ def _refit_tables(scene: Measured, ratios: Sequence[float]) -> list[str]:
             rounds.append(["seconds", *(" ".join(f"{curve.start + seconds:.1f}"
                                                  for seconds, _ in curve.rounds)
                                         for curve in curves)])  # fmt: skip
-        if name == "absorbed" or name not in refits.STARTS:
-            label = "as it is" if name == "absorbed" else name
+        if name == "merged" or name not in refits.STARTS:
+            label = "as it is" if name == "merged" else name
             ways.append([label, *(f"{curve.rounds[-1][1]:.1f} ({curve.rounds[-1][0]:.1f})"
                                   for curve in curves)])  # fmt: skip
     how = ("PSNR on held-out views against renders of the unpruned splats, dB. Seconds are the "
@@ -98,7 +98,7 @@ def _refit_tables(scene: Measured, ratios: Sequence[float]) -> list[str]:
             f"{how}, and count from the scores. The first number is before any round.", "",
             *table(["refitted", *heads], rounds), "",
             f"### {scene.name}: refitting made cheaper", "",
-            f"After absorbing. {how}, and of refitting alone.", "",
+            f"After merging. {how}, and of refitting alone.", "",
             *table(["refitting", *heads], ways)]  # fmt: skip
 
 
@@ -157,7 +157,7 @@ def _cheaper_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
     ]
     return ["", f"### {scene.name}: speed for accuracy within occlusion", "",
             ("PSNR on held-out views against renders of the unpruned splats. Views are `--views`; "
-            "cells, density and rounds are settings of the core (`Occlusion`)."), "",
+            "cells, density and rounds are arguments of `core/scoring/occlusion.py`."), "",
             *table(["occlusion", *(f"{r:.0%}" for r in ratios), "seconds"], body)]  # fmt: skip
 
 

@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from refine_addon import core
-from refine_addon.core import Occlusion, Scores, Settings
+from refine_addon.core import ClosedForm, Scores
+from refine_addon.core.scoring import occlusion
+from refine_addon.core.visibility.measuring import Sampling
 
 from ..baselines.refine import refine
 from .evaluate import Evaluator
@@ -16,12 +18,10 @@ from .methods import Task, as_scores
 Score = Callable[[Task], Scores]
 
 
-def _by(settings: Settings) -> Score:
-    return lambda task: core.score(task.splats, task.views, settings)
-
-
-def _occlusion(views: int = 0, **changes: float) -> Score:
-    return _by(Settings("occlusion", views=views, occlusion=Occlusion(**changes)))
+def _occlusion(views: int = 0, rounds: int = 8, **sampling: float) -> Score:
+    return lambda task: occlusion.score(
+        task.splats, task.views.spread(views), rounds=rounds, sampling=Sampling(**sampling)
+    )
 
 
 def _published(depth: str, **changes: bool) -> Score:
@@ -54,7 +54,7 @@ ABLATION = {
     f"published, {depth}: {part}": _published(depth, **changes)
     for depth in ("z", "distance")
     for part, changes in _PARTS.items()
-} | {"default: whole": _by(Settings("closed-form", views=0))}
+} | {"default: whole": lambda task: core.score(task.splats, task.views, ClosedForm(views=0))}
 """The closed form as published, and without its parts as the paper takes it apart; and ours."""
 
 

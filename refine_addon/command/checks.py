@@ -10,10 +10,10 @@ from pathlib import Path
 
 from ..core import RefineError
 from ..core.formats.registry import SUFFIXES, format_named, without_suffix
-from ..core.levels.files import check_goal, is_streamed, level_paths
+from ..core.lod import is_streamed, level_paths
 from ..core.urls import Url, refuse_url
 from . import zones
-from .options import DEFAULT_LEVELS, arrangement, budget, cleaning, levels, settings
+from .options import DEFAULT_LEVELS, arrangement, budget, cleaning, levels, method
 from .report import is_report
 from .zones import ROLES
 
@@ -91,10 +91,7 @@ def _check_settings(options: argparse.Namespace) -> None:
         return
     if options.command == "lod":
         levels(options)
-        check_goal(options.distance_psnr)
-    scoring = settings(options)
-    if scoring.rounds is not None and options.survivors != "refit":
-        raise RefineError(f"rounds is {scoring.rounds}, expected only with --survivors refit")
+    method(options)
     if options.command == "prune":
         budget(options)
 

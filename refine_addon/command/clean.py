@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..core import CleanRequest, ViewSet, file_to_file
+from ..core import ViewSet, clean_file
 from . import zones
 from .options import cleaning
 from .run import Run
@@ -19,10 +19,10 @@ def clean(run: Run) -> None:
 
 def _clean(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
     options = run.options
-    request = CleanRequest(
-        views, cleaning(options), zones.of_files(options), options.overwrite, options.model
-    )
-    done = file_to_file(source, output, request, progress=run.progress(source.name)).report
+    done = clean_file(
+        source, output, views, cleaning(options), zones=zones.of_files(options),
+        model=options.model, overwrite=options.overwrite, progress=run.progress(source.name),
+    ).report  # fmt: skip
     run.terminal.clear()
     splats, to = done["splats"], f" -> {output}" if output else "; nothing is written without -o"
     run.terminal.say(

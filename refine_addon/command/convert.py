@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..core import ConvertRequest, convert_files
+from ..core import convert_files
 from .options import arrangement
 from .run import Run
 from .words import sizes, written
@@ -21,8 +21,10 @@ def convert(run: Run) -> None:
 
 def _convert(run: Run, sources: Sequence[Path], source: str) -> dict[str, Any]:
     output = run.options.output
-    request = ConvertRequest(run.options.overwrite, run.options.model)
-    done = convert_files(sources, output, request, arrangement(run.options)).report
+    done = convert_files(
+        sources, output, **arrangement(run.options),
+        model=run.options.model, overwrite=run.options.overwrite,
+    ).report  # fmt: skip
     splats, files = done["splats"], done["files"]
     size = sizes(files["input_bytes"], files["output_bytes"])
     run.terminal.say(f"{source}: {splats['before']:,} splats{written(splats)}, {size} -> {output}")

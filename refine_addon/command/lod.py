@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..core import ViewSet
+from ..core import ViewSet, lod_file
 from ..core.formats.registry import SUFFIXES
-from ..core.levels.files import LevelsRequest, lod_file
 from ..core.quality.curve import in_words
 from ..core.report import size_in_words
-from .options import levels, settings
+from .options import levels, method
 from .run import Run
 from .words import by
 from .zones import of_files
@@ -24,17 +23,11 @@ def lod(run: Run) -> None:
 
 def _make_levels(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options, terminal = run.options, run.terminal
-    request = LevelsRequest(
-        views,
-        levels(options),
-        settings(options),
-        zones=of_files(options),
-        suffix=options.format or SUFFIXES[0],
-        goal=options.distance_psnr,
-        overwrite=options.overwrite,
-        model=options.model,
-    )
-    done = lod_file(source, options.output_dir, request, progress=run.progress(source.name))
+    done = lod_file(
+        source, options.output_dir, views, levels(options), method(options),
+        zones=of_files(options), suffix=options.format or SUFFIXES[0], model=options.model,
+        overwrite=options.overwrite, progress=run.progress(source.name),
+    )  # fmt: skip
     terminal.clear()
     count, number = done["splats"]["before"], len(done["levels"])
     terminal.say(
@@ -43,17 +36,14 @@ def _make_levels(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
     )
     run.say_what_decided(done)
     for entry in done["levels"]:
-        terminal.say(f"  {_in_words(entry, done['goal_psnr'])}")
+        terminal.say(f"  {_in_words(entry)}")
     terminal.notes(done["notes"])
     return done
 
 
-def _in_words(entry: dict[str, Any], goal: float) -> str:
+def _in_words(entry: dict[str, Any]) -> str:
     """Return what there is to know of a level, on one line."""
     parts = [f"{entry['splats']:,} splats", size_in_words(entry["bytes"])]
     if entry["psnr"] is not None:
         parts.append(in_words(entry["psnr"]))
-    far = entry["distance_psnr"]
-    if far is not None:
-        parts.append(f"{goal:g} dB at a distance of {far:.3g} or more")
     return f"{entry['file']}: {', '.join(parts)}"

@@ -9,31 +9,27 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core import (
-    CHOICES,
     METHODS,
     REASONS,
-    SURVIVORS,
-    Arrangement,
     Budget,
     Cleaning,
     Levels,
+    Merge,
+    Method,
     Move,
     RefineError,
-    Settings,
+    Refit,
 )
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
-from ..core.levels.files import GOAL
+from ..core.lod import SHARES as DEFAULT_LEVELS
 from ..core.rendering import MODELS
-from ..core.survivor_choice import SurvivorChoice
 from ..core.urls import Url, is_url, refuse_url
 from ..core.whole_file import expanded
 from ..version import VERSION
 from . import zones
 
 DEFAULT_RATIO = 0.5
-
-DEFAULT_LEVELS = (0.5, 0.25, 0.12, 0.06)
 
 FORMATS = ", ".join(SUFFIXES)
 
@@ -49,7 +45,7 @@ EXAMPLES = {
     "prune": (
         "refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply",
         "refine prune *.ply --cameras cameras.json --psnr 40 --output-dir pruned",
-        "refine prune in.ply --cameras sparse/0 --max-mb 5 --survivors refit -o out.ply",
+        "refine prune in.ply --cameras sparse/0 --max-mb 5 --method refit -o out.ply",
         "refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply",
         f"{BLENDER}refine prune --object Splats --protect Statue --remove-inside Sky -o out.ply",
         "refine prune *.ply --together --cameras sparse/0 --ratio 0.6 --output-dir out",
@@ -162,25 +158,6 @@ def _add_prune(commands: Any) -> None:
         "is hard to tell apart, 30 is seen",
     )
     _add_scoring(prune)
-    becoming = prune.add_mutually_exclusive_group()
-    becoming.add_argument(
-        "--survivors",
-        choices=CHOICES,
-        help="what those that stay may become: unchanged; absorb: they take over what is removed, "
-        "by what the cameras see of it, far better when much is removed (--method then only "
-        "matters with --threshold and --min-seen); refit: they absorb and are then fitted to what "
-        "all splats look like, some dB better still, in several times the time; auto, the "
-        "default: absorb, but unchanged where that is as good, and with --method, --threshold or "
-        "--min-seen",
-    )
-    _add_rounds(prune)
-    becoming.add_argument(
-        "--absorb",
-        dest="survivors",
-        action="store_const",
-        const="absorb",
-        help="short for --survivors absorb",
-    )
     prune.add_argument(
         "--clean",
         action="store_true",
@@ -278,37 +255,12 @@ def _add_lod(commands: Any) -> None:
         metavar="DB,DB,...",
         help="or how close each stays to the original in these views, in dB",
     )
-    becoming = making.add_mutually_exclusive_group()
-    becoming.add_argument(
-        "--survivors",
-        choices=SURVIVORS,
-        default=Levels.survivors,
-        help="what those that stay may become, see prune (default absorb; no auto: either each "
-        "level is made from the one before, or all are parts of one another); --method only "
-        "matters where they stay unchanged",
-    )
-    _add_rounds(making)
-    becoming.add_argument(
-        "--nested",
-        dest="survivors",
-        action="store_const",
-        const="unchanged",
-        help="short for --survivors unchanged: each level is some of the splats of the one before",
-    )
     making.add_argument(
         "--format",
         type=str.lower,
         choices=SUFFIXES,
         metavar="SUFFIX",
         help=f"of the files: {FORMATS} (default {SUFFIXES[0]})",
-    )
-    making.add_argument(
-        "--distance-psnr",
-        type=float,
-        default=GOAL,
-        metavar="DB",
-        help="also say from how far away each level stays this close to the original (default "
-        f"{GOAL:g})",
     )
     _add_scoring(making)
     zones.add(making)
@@ -430,9 +382,9 @@ def _add_views(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--views",
         type=int,
-        default=Settings.views,
+        default=Merge.views,
         metavar="N",
-        help=f"use at most N views, spread out evenly; 0 uses all (default {Settings.views})",
+        help=f"use at most N views, spread out evenly; 0 uses all (default {Merge.views})",
     )
     parser.add_argument(
         "--views-between",
@@ -449,20 +401,20 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=METHODS,
-        help="how splats are scored: occlusion, the default, knows what hides what; closed-form "
-        "takes nothing as hidden: far faster, worse",
+        default=Merge.name,
+        help="from instant to best: closed-form takes nothing as hidden, occlusion knows what "
+        "hides what; both delete, and the other rows stay as they were. merge (the default) merges "
+        "what goes into what stays, or deletes where that is as good; refit then fits what stays "
+        "to what all splats look like, some dB better in several times the time",
     )
-    _add_views(parser)
-
-
-def _add_rounds(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rounds",
         type=int,
         metavar="N",
-        help="with --survivors refit: fit them up to N times, each time to other rays (default: 2 "
-        "to 4 times, fewer of more splats; more rounds bring up to 1 dB, and take longer)",
+        help="with --method refit: fit up to N times, each time to other rays (default: 2 to 4 "
+        "times, fewer of more splats; more rounds bring up to 1 dB, and take longer)",
     )
+    _add_views(parser)
 
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
@@ -575,10 +527,14 @@ def _path(text: str) -> Path:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def settings(options: argparse.Namespace) -> Settings:
-    """Return how to score and to refit, or raise `RefineError` where a value cannot be."""
-    method, rounds = options.method or Settings.method, getattr(options, "rounds", None)
-    return Settings(method, most_views(options), rounds=rounds)
+def method(options: argparse.Namespace) -> Method:
+    """The method with its settings; raises `RefineError` where a value cannot be."""
+    kind, rounds = METHODS[options.method], options.rounds
+    if kind is Refit:
+        return Refit(most_views(options), rounds)
+    if rounds is not None:
+        raise RefineError(f"rounds is {rounds}, expected only with --method refit")
+    return kind(most_views(options))
 
 
 def most_views(options: argparse.Namespace) -> int:
@@ -591,12 +547,6 @@ def most_views(options: argparse.Namespace) -> int:
     return options.views + options.views_between if options.views > 0 else options.views
 
 
-def survivors(options: argparse.Namespace) -> SurvivorChoice:
-    """Return what survivors may become; a method that is named says how to delete."""
-    chosen: SurvivorChoice | None = options.survivors
-    return chosen or ("unchanged" if options.method else CHOICES[0])
-
-
 def cleaning(options: argparse.Namespace) -> Cleaning:
     """Return what to clean away, or raise `RefineError` where a value cannot be."""
     return Cleaning(getattr(options, "reasons", Cleaning.reasons), most_views(options))
@@ -605,11 +555,11 @@ def cleaning(options: argparse.Namespace) -> Cleaning:
 def levels(options: argparse.Namespace) -> Levels:
     """Return which levels to make, or raise `RefineError` where a value cannot be."""
     shares = () if options.psnr else options.levels or DEFAULT_LEVELS
-    return Levels(shares, options.psnr, options.survivors)
+    return Levels(shares, options.psnr)
 
 
-def arrangement(options: argparse.Namespace) -> Arrangement:
-    """Return what becomes of splats besides their format; raise `RefineError` where none can."""
+def arrangement(options: argparse.Namespace) -> dict[str, Any]:
+    """What becomes of splats besides their format; raises `RefineError` where none can."""
     asked: list[dict[str, Any]] = [{} for _ in options.inputs]
     for name in ("translate", "rotate", "scale"):
         # Those of all inputs first, so that an input's own takes their place.
@@ -620,7 +570,9 @@ def arrangement(options: argparse.Namespace) -> Arrangement:
                 move[name] = values if len(values) > 1 else values[0]
     moves = tuple(Move(**move) for move in asked)
     moved = moves if any(move != Move() for move in moves) else ()
-    return Arrangement(moved, options.degree, options.morton, options.level)
+    return {
+        "moves": moved, "degree": options.degree, "morton": options.morton, "level": options.level
+    }  # fmt: skip
 
 
 def budget(options: argparse.Namespace) -> Budget:

@@ -7,16 +7,16 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-from ..core import PruneRequest, ViewSet, picture_files, prune_file, prune_tiles
+from ..core import ViewSet, picture_files, prune_file, prune_tiles
 from ..core.formats.registry import without_suffix
 from ..core.picture_files import PictureFiles
 from ..core.quality.curve import UNSEEN, in_views, in_words
 from ..core.tiles.cluster import Cluster, cluster
 from ..core.tiles.storage import located
 from . import zones
-from .options import budget, cleaning, settings, survivors
+from .options import budget, cleaning, method
 from .run import Run
-from .words import by, by_survivors, sizes, written
+from .words import by, by_method, sizes, written
 
 
 def prune(run: Run) -> None:
@@ -31,41 +31,41 @@ def prune(run: Run) -> None:
         run.each(_prune_one)
 
 
-def _request(options: argparse.Namespace, views: ViewSet, name: str) -> PruneRequest:
-    """Return what is asked of a prune; `name` is the first part of the names of its pictures."""
+def _how(options: argparse.Namespace, name: str) -> dict[str, Any]:
+    """What files and objects are pruned by; `name` begins the names of the pictures."""
     pictures = None
     if options.pictures is not None:
         pictures = PictureFiles(options.pictures, name, options.overwrite)
-    return PruneRequest(
-        views,
-        budget(options),
-        settings(options),
-        zones=() if options.object else zones.of_files(options),
-        survivors=survivors(options),
-        cleaning=cleaning(options) if options.clean else None,
-        pictures=pictures,
-        overwrite=options.overwrite,
-        dry_run=options.dry_run,
-        model=options.model,
-    )
+    return {
+        "budget": budget(options),
+        "method": method(options),
+        "pictures": pictures,
+        "overwrite": options.overwrite,
+        "dry_run": options.dry_run,
+    }
 
 
 def _prune_one(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
-    request = _request(run.options, views, without_suffix(source.name))
-    result = prune_file(source, output, request, progress=run.progress(source.name))
+    options = run.options
+    done = prune_file(
+        source, output, views, **_how(options, without_suffix(source.name)),
+        zones=zones.of_files(options), cleaning=cleaning(options) if options.clean else None,
+        model=options.model, progress=run.progress(source.name),
+    ).report  # fmt: skip
     run.terminal.clear()
-    _say_result(run, str(source), result.report)
-    return result.report
+    _say_result(run, str(source), done)
+    return done
 
 
 def _prune_together(run: Run, label: str, views: ViewSet) -> dict[str, Any]:
-    options = run.options
-    request, progress = _request(options, views, ""), run.progress(label)
+    options, progress = run.options, run.progress(label)
     try:
         with _workers(options) as workers:
             done = prune_tiles(
-                options.inputs, options.output_dir, request, progress=progress, workers=workers
-            )
+                options.inputs, options.output_dir, views, budget(options), method(options),
+                overwrite=options.overwrite, dry_run=options.dry_run, model=options.model,
+                progress=progress, workers=workers,
+            )  # fmt: skip
     except KeyboardInterrupt:
         run.terminal.clear()
         if not options.dry_run:
@@ -83,7 +83,7 @@ def _prune_together(run: Run, label: str, views: ViewSet) -> dict[str, Any]:
 
 
 def _workers(options: argparse.Namespace) -> contextlib.AbstractContextManager[Cluster | None]:
-    """Return who works on tiles; None for this process alone."""
+    """Who works on tiles; None for this process alone."""
     if options.workers is None and not options.scheduler:
         return contextlib.nullcontext()
     return cluster(options.workers, options.scheduler)
@@ -93,9 +93,8 @@ def _prune_object(run: Run) -> dict[str, Any]:
     from ..objects.operation import prune_object
 
     options, name = run.options, run.options.object
-    request, demanded = _request(options, run.views(), name), zones.of_object(options)
     done = prune_object(
-        name, request, demanded,
+        name, run.views(), **_how(options, name), demands=zones.of_object(options),
         output=options.output, save=options.save, progress=run.progress(name),
     )  # fmt: skip
     run.terminal.clear()
@@ -130,8 +129,8 @@ def _say_result(run: Run, label: str, done: dict[str, Any]) -> None:
 
 
 def _quality(done: dict[str, Any]) -> str:
-    """Return what is estimated of the pictures, in words; "" where nothing is."""
-    psnr, survivors = done["estimated_psnr"], done["survivors"]
+    """What is estimated of the pictures, in words; "" where nothing is."""
+    psnr, method = done["estimated_psnr"], done["method"]
     if psnr is None:
         return ""
     words = in_views(psnr, done["estimated_psnr_between"])
@@ -139,7 +138,7 @@ def _quality(done: dict[str, Any]) -> str:
         words += f", {in_words(done['written_psnr'])} as written"
     if psnr > UNSEEN:
         return words
-    if survivors["note"]:
-        return f"{words}; {survivors['note']}"
-    others = by_survivors(survivors, survivors["became"])
-    return f"{words} (--survivors {others})" if others else words
+    if method["note"]:
+        return f"{words}; {method['note']}"
+    others = by_method(method, method["done"])
+    return f"{words} (--method {others})" if others else words

@@ -11,8 +11,7 @@ from typing import Any
 
 from ..core import RefineError, ViewSet, read_cameras, with_views_between
 from ..core.errors import printable
-from ..core.execute import Progress
-from ..core.pace import Pace
+from ..core.execute import Progress, TimeLeft, in_time
 from ..core.report import MANY_UNSEEN
 from ..core.urls import Url
 from ..core.whole_file import new_folder
@@ -46,7 +45,9 @@ class Run:
         self._started = time.perf_counter()
         each = [_size(path) for path in options.inputs]
         together = getattr(options, "together", False)
-        self._pace = Pace([sum(each)] if together else each or [0])
+        self._sizes = [max(size, 1) for size in ([sum(each)] if together else each or [0])]
+        self._begun = 0
+        self._left = TimeLeft()
         self._cameras: dict[str, Any] = {}
 
     def views(self) -> ViewSet:
@@ -63,12 +64,20 @@ class Run:
         return with_views_between(views.spread(self.options.views), more) if more else views
 
     def named(self, name: str) -> str:
-        """Return what to call the file under way; see `Pace.named`."""
-        return self._pace.named(name)
+        """The name of the file under way, with its place among several."""
+        count = len(self._sizes)
+        return name if count == 1 else f"file {self._begun} of {count}, {name}"
 
     def progress(self, name: str) -> Progress:
         """Return what draws how much of the file under way is done, and the time left."""
-        return self.terminal.progress(self.named(name), self._pace.left)
+        before, current = sum(self._sizes[: self._begun - 1]), self._sizes[self._begun - 1]
+        total, several = sum(self._sizes), " in all" if len(self._sizes) > 1 else ""
+
+        def left(fraction: float) -> str:
+            seconds = self._left.seconds((before + fraction * current) / total)
+            return "" if seconds is None else f"about {in_time(seconds)} left{several}"
+
+        return self.terminal.progress(self.named(name), left)
 
     def say_what_decided(self, done: dict[str, Any], cleaned: int = 0) -> None:
         """Say what the report of an input tells of what decided.
@@ -82,7 +91,7 @@ class Run:
             self.terminal.say(f"  {demanded}")
         splats = done["splats"]
         if splats["unseen"]:
-            scored = splats["before"] - splats["forced"] - cleaned
+            scored = splats["before"] - splats["removed_by_user"] - cleaned
             self.terminal.say(f"  {splats['unseen']:,} of {scored:,} splats lie in no view")
             if splats.get("unseen_removed", 0) and splats["unseen"] >= MANY_UNSEEN * scored:
                 share = splats["unseen_removed"] / splats["unseen"]
@@ -104,7 +113,9 @@ class Run:
 
     def attempt(self, label: str, work: Callable[[], dict[str, Any]]) -> None:
         """Do one input's work; note its error, so that the others go on."""
-        self._pace.next()
+        if not self._begun:
+            self._left = TimeLeft()
+        self._begun += 1
         try:
             self.entries.append({"status": "done", **work(), **self._cameras})
         except (RefineError, OSError, MemoryError) as error:

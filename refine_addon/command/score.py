@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..core import ScoreRequest, ViewSet, file_to_file
+from ..core import ViewSet, score_file
 from . import zones
-from .options import settings
+from .options import method
 from .run import Run
-from .words import by_survivors
+from .words import by_method
 
 
 def score(run: Run) -> None:
@@ -24,11 +24,10 @@ def score(run: Run) -> None:
 
 def _score_file(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
-    request = ScoreRequest(
-        views, settings(options), zones.of_files(options), options.overwrite, options.model
-    )
-    progress = run.progress(source.name)
-    done = file_to_file(source, options.output, request, progress=progress).report
+    done = score_file(
+        source, options.output, views, method(options), zones=zones.of_files(options),
+        model=options.model, overwrite=options.overwrite, progress=run.progress(source.name),
+    ).report  # fmt: skip
     return _said(run, str(source), done)
 
 
@@ -36,9 +35,10 @@ def _score_object(run: Run) -> dict[str, Any]:
     from ..objects.operation import score_object
 
     options, name = run.options, run.options.object
-    request = ScoreRequest(run.views(), settings(options), overwrite=options.overwrite)
-    demands, progress = zones.of_object(options), run.progress(name)
-    done = score_object(name, request, demands, output=options.output, progress=progress)
+    done = score_object(
+        name, run.views(), method(options), zones.of_object(options),
+        output=options.output, overwrite=options.overwrite, progress=run.progress(name),
+    )  # fmt: skip
     return _said(run, name, done)
 
 
@@ -52,7 +52,7 @@ def _said(run: Run, label: str, done: dict[str, Any]) -> dict[str, Any]:
     )
     run.say_what_decided(done)
     for price in done["prices"]:
-        ways = by_survivors(price)
+        ways = by_method(price)
         run.terminal.say(f"  {price['removed']:.0%} removed: {ways}")
     run.terminal.notes(done["notes"])
     return done

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..core.pace import in_time
+from ..core.execute import in_time
 from ..core.quality.curve import in_words
 from ..core.report import size_in_words, sizes_in_words
 
@@ -39,29 +39,31 @@ def sizes(before: int, after: int | None) -> str:
     return sizes_in_words(before, "->", after)
 
 
-def by_survivors(told: Mapping[str, Any], without: str = "") -> str:
-    """Return which quality and time what survivors may become is expected to come to.
+def by_method(predicted: Mapping[str, Any], without: str = "") -> str:
+    """Which quality and time the methods are expected to come to.
 
     Parameters
     ----------
-    told : mapping
-        ``psnr`` and ``seconds`` of a report's ``survivors`` or ``prices``.
+    predicted : mapping
+        ``psnr`` and ``seconds`` of a report's ``method`` or ``prices``.
     without : str
-        What of them is left out.
+        The method that is left out.
 
     Examples
     --------
-    >>> psnr = {"unchanged": 38.0, "absorb": 46.0, "refit": None}
-    >>> by_survivors({"psnr": psnr, "seconds": {"unchanged": 1.2, "absorb": 2.1, "refit": 8.0}})
-    'unchanged about 38 dB in 2 s, absorb about 46 dB in 3 s'
-    >>> by_survivors({"psnr": psnr}, "absorb")  # one round of scoring tells less than all
-    'unchanged about 38 dB or more'
+    >>> psnr = {"delete": 38.0, "merge": 46.0, "refit": None}
+    >>> by_method({"psnr": psnr, "seconds": {"delete": 1.2, "merge": 2.1, "refit": 8.0}})
+    'occlusion about 38 dB in 2 s, merge about 46 dB in 3 s'
+    >>> by_method({"psnr": psnr}, "merge")  # one round of scoring tells less than all
+    'occlusion about 38 dB or more'
     """
-    seconds = told.get("seconds") or {}
+    seconds = predicted.get("seconds") or {}
     return ", ".join(
-        f"{way} {in_words(psnr)}"
-        + (" or more" if way == "unchanged" and without else "")
+        f"{name} {in_words(psnr)}"
+        + (" or more" if way == "delete" and without else "")
         + (f" in {in_time(seconds[way])}" if seconds else "")
-        for way, psnr in told["psnr"].items()
-        if psnr is not None and way != without
+        for way, psnr in predicted["psnr"].items()
+        if psnr is not None
+        and without != (name := "occlusion" if way == "delete" else way)
+        and not (way == "delete" and without == "closed-form")
     )

@@ -130,8 +130,8 @@ def words(done: dict[str, Any]) -> str:
     splats, parts = done["splats"], []
     if splats.get("protected"):
         parts.append(f"{splats['protected']:,} protected")
-    if splats.get("forced"):
-        parts.append(f"{splats['forced']:,} forced out")
+    if splats.get("removed_by_user"):
+        parts.append(f"{splats['removed_by_user']:,} removed by you")
     volumes = [
         f"{volume['role']} {volume['name'].removeprefix('object ')}: {volume['splats']:,}"
         for volume in done.get("volumes", ())

@@ -2,10 +2,9 @@
 
 In short::
 
-    file = read_splats("scene.ply")
-    result = prune(file.splats(), read_cameras("cameras.json"), Budget(ratio=0.5))
-    columns = survivor_columns(file.rows, result.absorbed)  # what survivors became
-    file.write("pruned.ply", result.keep, columns=columns)
+    splats = read_splats("scene.ply")
+    result = prune(splats, read_cameras("cameras.json"), Budget(ratio=0.5), method=Merge())
+    result.write("pruned.spz")
 """
 
 from .cameras.read import read_cameras
@@ -14,51 +13,40 @@ from .errors import RefineError
 from .execute import Cancelled
 from .formats.ply import SplatFile, read_ply
 from .formats.registry import read_splats, write_splats
-from .levels.files import LevelsRequest, lod_file
-from .levels.lod import Level, Levels, lod
-from .operation.arranged import Arrangement, Move, convert_files
-from .operation.files import file_to_file, prune_file
-from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, ScoreRequest
-from .pipeline import prune, score
-from .refit.refit import Refitted, refit, refit_rounds
+from .lod import Level, Levels, lod, lod_file
+from .methods import METHODS, ClosedForm, Merge, Method, Occlusion, Refit
+from .operations import Move, clean_file, convert_files, prune_file, score_file
+from .prune import prune, score
+from .result import Result
 from .scores import Scores
 from .selection import Budget, rank, select
 from .solid import Solid
 from .splats import Splats
-from .survivor_choice import CHOICES, SURVIVORS
-from .survivors import survivor_columns
-from .task import METHODS, Occlusion, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
 from .views_between import with_views_between
 from .volumes import Box, MovedVolume, Sphere, Zone, forced
 
 __all__ = [
-    "CHOICES",
     "METHODS",
     "REASONS",
-    "SURVIVORS",
-    "Arrangement",
     "Box",
     "Budget",
     "Cancelled",
-    "CleanRequest",
     "Cleaned",
     "Cleaning",
-    "ConvertRequest",
+    "ClosedForm",
     "Level",
     "Levels",
-    "LevelsRequest",
+    "Merge",
+    "Method",
     "Move",
     "MovedVolume",
     "Occlusion",
-    "PruneRequest",
     "RefineError",
-    "Refitted",
+    "Refit",
     "Result",
-    "ScoreRequest",
     "Scores",
-    "Settings",
     "Solid",
     "Sphere",
     "SplatFile",
@@ -67,8 +55,8 @@ __all__ = [
     "ViewSet",
     "Zone",
     "clean",
+    "clean_file",
     "convert_files",
-    "file_to_file",
     "forced",
     "lod",
     "lod_file",
@@ -79,11 +67,9 @@ __all__ = [
     "read_cameras",
     "read_ply",
     "read_splats",
-    "refit",
-    "refit_rounds",
     "score",
+    "score_file",
     "select",
-    "survivor_columns",
     "with_views_between",
     "write_splats",
 ]

@@ -1,30 +1,24 @@
-"""The report of a prune: counts, sizes, timings and notes; the same for panel, command and API."""
+"""The report of what was done: one dictionary of plain JSON values; see docs/report.md."""
 
 from __future__ import annotations
 
 import platform
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .formats.format import Format
-from .formats.ply import SplatFile
-from .formats.registry import left_out
-from .merging.merge import Merged
-from .quality.cost import expected_seconds
-from .quality.curve import FEWEST, expected, in_words, out_of_reach, parted
+from .methods import ClosedForm, Method
+from .quality.curve import FEWEST, Way, expected, expected_seconds, in_words, out_of_reach, parted
 from .scores import Scores
 from .selection import Budget
-from .survivor_choice import Became
 
 SEES_TOO_LITTLE = "the views see too little for an estimate of the pictures' quality"
 NOT_ESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is the budget"
-NOT_FORETOLD = (
-    f"what absorbing and refitting reach is not foretold for fewer than {FEWEST:,} splats"
+NOT_PREDICTED = (
+    f"what merging and refitting reach is not predicted for fewer than {FEWEST:,} splats"
 )
 """Why there is no estimate: notes of the report."""
 
@@ -33,15 +27,15 @@ MANY_UNSEEN = 0.05
 
 LITTLE_SEEN = 0.19
 """Share of the splats that lie in one view or none from which on it is said that other views may
-lose more than is told. On five scenes 8 views have .197 to .341 and 16 neighbours more, 12 and more
-that are spread out at most .180."""
+lose more than is told. On five scenes 8 views have 0.197 to 0.341 and 16 neighbours more, 12 and
+more that are spread out at most 0.180."""
 
-MEASURES = "absorbing measures by occlusion: closed-form was not used"
-"""A note of the report."""
+PRICED = (0.3, 0.5, 0.7, 0.9)
+"""Shares removed of which a scoring says what they would cost."""
 
 
 class Clock:
-    """A clock for the steps of one prune.
+    """Times of the steps of a run.
 
     Attributes
     ----------
@@ -63,15 +57,8 @@ class Clock:
         self.timings["total_s"] = time.perf_counter() - self._start
 
 
-def files_facts(
-    source: str, output: str | None, before: int, after: int | None
-) -> dict[str, str | int | None]:
-    """Return what a report says of files: their names, and bytes; see docs/report.md."""
-    return {"input": source, "output": output, "input_bytes": before, "output_bytes": after}
-
-
 def size_in_words(count: int) -> str:
-    """Return a number of bytes, in kB below .1 MB.
+    """Write a number of bytes, in kB below 0.1 MB.
 
     >>> size_in_words(4_940_000), size_in_words(32_000)
     ('4.9 MB', '32.0 kB')
@@ -80,7 +67,7 @@ def size_in_words(count: int) -> str:
 
 
 def sizes_in_words(first: int, between: str, second: int) -> str:
-    """Return two numbers of bytes, with one unit where they have the same.
+    """Write two numbers of bytes, with one unit where they have the same.
 
     >>> sizes_in_words(9_860_000, "->", 4_940_000), sizes_in_words(9_860_000, "->", 32_000)
     ('9.9 -> 4.9 MB', '9.9 MB -> 32.0 kB')
@@ -90,17 +77,17 @@ def sizes_in_words(first: int, between: str, second: int) -> str:
 
 
 def scoring_notes(scores: Scores) -> list[str]:
-    """Return what the user should know about a scoring, in sentences."""
+    """What the user should know about a scoring, in sentences."""
     notes = [*scores.notes, *(scores.alignment.notes() if scores.alignment else ())]
     if scores.undrawable:
         notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
     return notes
 
 
-def what_was_seen(
+def seen_by(
     seen: NDArray[np.int32], undrawable: int, given: int, used: int
 ) -> dict[str, dict[str, int]]:
-    """Return what every report says of the splats and the views, as plain JSON values.
+    """Counts of splats and views that every report has.
 
     Parameters
     ----------
@@ -118,45 +105,33 @@ def what_was_seen(
     }
 
 
-def seen_by(scores: Scores) -> dict[str, dict[str, int]]:
-    """Return `what_was_seen` of a scoring."""
-    return what_was_seen(scores.seen, scores.undrawable, scores.views_given, scores.views_used)
+def scored(scores: Scores) -> dict[str, dict[str, int]]:
+    """The same of a scoring."""
+    return seen_by(scores.seen, scores.undrawable, scores.views_given, scores.views_used)
 
 
 def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
-    """Return how many splats stay and go."""
+    """How many splats stay and go."""
     kept = int(np.count_nonzero(keep))
     return {"kept": kept, "removed": len(keep) - kept}
 
 
-def held(
-    file: SplatFile, form: Format | None, keep: NDArray[np.bool_], *, written: bool = True
-) -> dict[str, int | None]:
-    """Return how many splats a file of the kept rows holds, and how many its format leaves out.
-
-    Parameters
-    ----------
-    file : SplatFile
-        What is written.
-    form : Format or None
-        How; None is plain PLY.
-    keep : (N,) bool
-    written : bool
-        Whether there is a file; without one, ``written`` is None.
-    """
-    missing = left_out(file, form, keep)
-    count = int(np.count_nonzero(keep)) - missing
-    return {"written": count if written else None, "left_out": missing}
-
-
-def make_report(
+def of_prune(
     scores: Scores,
     keep: NDArray[np.bool_],
     budget: Budget,
-    settings: Any,
+    method: Method,
+    sizes: tuple[float, int],
     clock: Clock,
+    *,
+    psnr: float | None,
+    between: float | None,
+    measured: Mapping[Way, float | None],
+    timed: bool,
+    made: Any = None,
+    tried: Any = None,
 ) -> dict[str, Any]:
-    """Return the report of a prune, as plain JSON values.
+    """The report of a prune.
 
     Parameters
     ----------
@@ -164,91 +139,124 @@ def make_report(
         Those that decided.
     keep : (N,) bool
         Which splats stay.
-    budget, settings
-        Those of the prune.
-    clock : Clock
-        The report shares its timings, so it also gets those of later laps.
+    budget, method, sizes, clock
+        Those of the prune; the report shares the clock's times, and gets later laps too.
+    psnr, between : float or None
+        The estimate in the views that decided, and in views between these, dB.
+    measured : mapping of {"delete", "merge", "refit"} to (float or None)
+        The estimates that were measured, dB.
+    timed : bool
+        Whether the clock tells how long scoring took, so that other methods' times are predicted.
+    made : prune.Made, optional
+        What merging made; without it splats were deleted.
+    tried : prune.Made, optional
+        What merging had made where splats were deleted instead.
     """
-    facts = seen_by(scores)
+    count, notes = len(keep), scoring_notes(scores)
+    facts: dict[str, Any] = {**scored(scores)}
     facts["splats"] |= kept_and_removed(keep)
-    return {
-        **facts,
+    facts["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
+    removed = facts["splats"]["removed"]
+    share, curve = removed / count, scores.quality
+    note = None
+    if psnr is None:
+        note = NOT_ESTIMATED if scores.ray_sample is None else SEES_TOO_LITTLE
+        notes += [SEES_TOO_LITTLE] if scores.ray_sample is not None else []
+    if why := _remark(budget, removed, count, psnr, sizes):
+        notes.append(why)
+    if made is not None:
+        notes.append(made.merged.note())
+    if between is not None and parted(psnr, between):
+        notes.append(
+            f"views between these lose more, {in_words(between)}: have views in between decide "
+            "too, or remove less"
+        )
+    if between is not None and (few := little_seen(scores.seen)):
+        notes.append(few)
+    told = dict(measured)
+    if tried is not None and budget.psnr is None:  # of as many kept splats
+        told = {**tried.psnr, **told}
+    if made is not None:
+        notes += _refit_notes(made)
+        plain = measured.get("delete")
+        if made.done == "merge" and plain is not None and plain > (psnr or plain):
+            notes.append(f"plain deletion reaches more: {in_words(plain)}")
+    deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
+    seconds = None
+    if timed and not isinstance(method, ClosedForm):
+        took = expected_seconds(clock.timings["score_s"], share, once=made is not None)
+        seconds = {way: round(value, 1) for way, value in took.items()}
+    facts |= {
         "budget": {budget.kind: getattr(budget, budget.kind)},
-        "settings": asdict(settings),
+        "settings": method.facts(),
         "weights": scores.facts,
         "timings": clock.timings,
-        "notes": scoring_notes(scores),
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
+        "estimated_psnr": None if psnr is None else round(psnr, 2),
+        "estimated_psnr_note": note,
+        "estimated_psnr_between": None if between is None else round(between, 2),
+        "method": {
+            "asked": method.name,
+            "done": deletes if made is None or made.done == "delete" else made.done,
+            **predicted(scores, share, told),
+            "seconds": seconds,
+        },
+        "quality": None if curve is None else curve.facts(),
+        "budget_remark": why,
+        "notes": notes,
     }
+    if made is not None:
+        facts["merged"] = made.merged.facts()
+        if made.refitted is not None:
+            facts["refitted"] = {
+                "began": "merge" if made.merged.merged else deletes,
+                **made.refitted.facts(made.seconds),
+            }
+    return facts
 
 
-def remark(budget: Budget, gone: int, total: int, psnr: float | None, size: int) -> str:
-    """Return why a budget is out of reach or removes nothing, or "".
-
-    Parameters
-    ----------
-    budget : Budget
-    gone, total : int
-        How many splats go, of how many.
-    psnr : float or None
-        The estimate for the result, dB.
-    size : int
-        Bytes of the file before.
-    """
+def _remark(
+    budget: Budget, gone: int, total: int, psnr: float | None, sizes: tuple[float, int]
+) -> str:
+    """Why a budget is out of reach or removes nothing, or ""."""
     if budget.psnr is not None:
         return out_of_reach(budget.psnr, gone, total, psnr)
     if budget.max_mb is not None and not gone:
+        size = int(sizes[0] * total + sizes[1])
         return f"already {size_in_words(size)}: the budget removes nothing"
     return ""
 
 
-def conclude(
-    facts: dict[str, Any],
-    scores: Scores,
-    keep: NDArray[np.bool_],
-    psnr: float | None,
-    absorbed: Merged | None,
-    why: str,
-) -> None:
-    """Add to a report what it says about the quality of the pictures and about absorbing.
+def _refit_notes(made: Any) -> list[str]:
+    """What there is to say of refitting, in sentences."""
+    notes, done = [], made.refitted
+    if done is not None:
+        notes.append(done.note(made.seconds))
+    if {"delete", "merge"} <= made.psnr.keys() and not made.merged.merged:
+        plain, merge = (in_words(made.psnr[way]) for way in ("delete", "merge"))
+        notes.append(f"refitting began with plain deletion: {plain}, merging {merge}")
+    return [*notes, *getattr(made.stopped, "__notes__", ())]
+
+
+def deleted_note(plain: float | None, tried: float | None) -> str:
+    """Why splats are deleted where merging was asked for.
 
     Parameters
     ----------
-    facts : dict
-        The report; changed.
-    scores : Scores
-    keep : (N,) bool
-    psnr : float or None
-        The estimate for the result, dB.
-    absorbed : Merged or None
-        What was merged, if anything was.
-    why : str
-        See `remark`.
+    plain, tried : float or None
+        The estimates of deletion and of merging, dB; None where it was not tried.
     """
-    curve = scores.quality
-    gone = 0.0 if curve is None else 1.0 - float(np.mean(keep))
-    note = None
-    if psnr is None:
-        note = NOT_ESTIMATED if scores.ray_sample is None else SEES_TOO_LITTLE
-    became: Became = "unchanged" if absorbed is None else "absorb"
-    facts |= {
-        "estimated_psnr": None if psnr is None else round(psnr, 2),
-        "estimated_psnr_note": note,
-        "survivors": {"became": became, **expected_psnr(scores, gone, {became: psnr})},
-        "quality": None if curve is None else curve.facts(),
-    }
-    if psnr is None and scores.ray_sample is not None:
-        facts["notes"].append(SEES_TOO_LITTLE)
-    facts["budget_remark"] = why
-    if why:
-        facts["notes"].append(why)
-    if absorbed is not None:
-        facts["absorbed"] = absorbed.facts()
-        facts["notes"].append(absorbed.note())
+    why = "the views see too little to tell what merging would gain"
+    if tried is not None:
+        more = "no more" if plain is not None and tried <= plain else "hardly more"
+        why = f"merging reaches {in_words(tried)}, {more}"
+    elif plain is not None:
+        why = "nobody would see what merging gains"
+    return f"rows stay as they were, the others are deleted: {why}"
 
 
 def little_seen(seen: NDArray[np.int32]) -> str:
-    """Return what few views cannot know of others, for the user; "" where they are enough.
+    """What few views cannot know of others, for the user; "" where they are enough.
 
     The share of what exactly one of some views holds is about that which the next one adds to all
     of them (Good 1953, "The population frequencies of species").
@@ -274,83 +282,48 @@ def little_seen(seen: NDArray[np.int32]) -> str:
     )
 
 
-def conclude_between(
-    facts: dict[str, Any], between: float | None, seen: NDArray[np.int32] | None = None
-) -> None:
-    """Add to a report what views between those that decided will see.
-
-    Parameters
-    ----------
-    facts : dict
-        The report; changed. It has the estimate in the views that decided.
-    between : float or None
-        The estimate between them, dB.
-    seen : (N,) int32, optional
-        See `little_seen`, which is told where there are views between.
-    """
-    facts["estimated_psnr_between"] = None if between is None else round(between, 2)
-    if between is not None and parted(facts["estimated_psnr"], between):
-        facts["notes"].append(
-            f"views between these lose more, {in_words(between)}: have views in between decide "
-            "too, or remove less"
-        )
-    if between is not None and seen is not None and (few := little_seen(seen)):
-        facts["notes"].append(few)
-
-
-PRICED = (0.3, 0.5, 0.7, 0.9)
-"""Shares removed of which a scoring says what they would cost."""
-
-
-def prices(scores: Scores, scored: float) -> list[dict[str, Any]]:
-    """Return what pruning by some scores would cost, by the share removed and by survivors.
+def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
+    """What pruning by scores of occlusion would cost, by the share removed and by what is done.
 
     Parameters
     ----------
     scores : Scores
-        By *occlusion*.
-    scored : float
+    took : float
         How long scoring took, seconds.
     """
     curve = scores.quality
-    if curve is None:
+    if curve is None or scores.method == "closed-form":
         return []
     return [
         {
             "removed": share,
-            **expected_psnr(scores, share, {"unchanged": curve.at(share)}),
-            "seconds": in_tenths(expected_seconds(scored, share, once=False)),
+            **predicted(scores, share, {"delete": curve.at(share)}),
+            "seconds": {
+                way: round(value, 1)
+                for way, value in expected_seconds(took, share, once=False).items()
+            },
         }
         for share in PRICED
     ]
 
 
-def in_tenths(seconds: Mapping[Became, float]) -> dict[Became, float]:
-    """Return times as a report has them."""
-    return {way: round(value, 1) for way, value in seconds.items()}
-
-
-def expected_psnr(
-    scores: Scores, gone: float, measured: Mapping[Became, float | None]
-) -> dict[str, Any]:
-    """Return what a report says of how close the pictures stay by what survivors become.
+def predicted(scores: Scores, share: float, measured: Mapping[Way, float | None]) -> dict[str, Any]:
+    """How close the pictures stay by what is done: ``psnr`` in dB, and why it is not predicted.
 
     Parameters
     ----------
     scores : Scores
         Their curve and their rays tell what was not measured.
-    gone : float
-        Share of the splats that goes.
-    measured : mapping of str to (float or None)
-        The estimates that were measured on rays, dB, by what survivors became.
+    share : float
+        Of the splats that goes.
+    measured : mapping of {"delete", "merge", "refit"} to (float or None)
+        The estimates that were measured on rays, dB.
     """
     rays, many = scores.ray_sample, len(scores.values) >= FEWEST
-    told = expected(
-        scores.quality, gone, measured, rays.hits_of_ray() if rays is not None and many else None
-    )
-    some = [psnr for psnr in measured.values() if psnr is not None]
-    foretold = told["absorb"] is not None or not some
+    hits = rays.hits_of_ray() if rays is not None and many else None
+    psnr = expected(scores.quality, share, measured, hits)
+    some = any(value is not None for value in measured.values())
     return {
-        "psnr": {way: None if psnr is None else round(psnr, 2) for way, psnr in told.items()},
-        "note": None if foretold else NOT_FORETOLD,
+        "psnr": {way: None if value is None else round(value, 2) for way, value in psnr.items()},
+        "note": None if psnr["merge"] is not None or not some else NOT_PREDICTED,
     }

@@ -38,9 +38,6 @@ class Scores:
         What the user should know about how the scores were computed.
     method : str
         Name of the method asked for, as in `Settings.method`; "" where it is not known.
-    frustum : bool
-        True if `seen` counts only the views in whose image the centre lies; False if every view
-        counts for every splat.
     views_given : int
         How many views were given; those used were chosen from them.
     ray_sample : RaySample, optional
@@ -65,7 +62,6 @@ class Scores:
     facts: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     method: str = ""
-    frustum: bool = True
     views_given: int = 0
     ray_sample: RaySample | None = None
     between: RaySample | None = None

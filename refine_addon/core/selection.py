@@ -14,8 +14,6 @@ from .errors import RefineError
 from .quality.curve import PSNR_CAP, Quality
 from .scores import Scores
 
-RowBytes = float | NDArray[np.int64]
-
 
 @dataclass(frozen=True)
 class Budget:
@@ -80,13 +78,6 @@ class Budget:
         """Whether the number of splats that are removed depends on the scores of a method."""
         return self.threshold is not None or self.min_seen is not None
 
-    def refuse_meaningless(self, *, frustum: bool) -> None:
-        """Raise `RefineError` if this budget has no meaning; for `frustum` see `Scores`."""
-        if self.min_seen is not None and not frustum:
-            raise RefineError(
-                "without the frustum test every view sees every splat: min_seen would remove none"
-            )
-
     def after(self, gone: int, count: int) -> Budget:
         """Return the budget for what is left of `count` splats when `gone` went before.
 
@@ -101,15 +92,15 @@ class Budget:
             return self
         return Budget(keep=count - max(self.removals(count) or 0, gone))
 
-    def removals(self, count: int, row_bytes: RowBytes = 0.0, fixed_bytes: int = 0) -> int | None:
+    def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
         """Return how many of `count` splats are removed, or None if that depends on the scores.
 
         Parameters
         ----------
         count : int
             Number of splats.
-        row_bytes : float or (N,) int64
-            Size of a splat in the file, or of each of them; for `max_mb`.
+        row_bytes : float
+            Size of a splat in the file; for `max_mb`.
         fixed_bytes : int
             Size of everything else in the file.
 
@@ -124,28 +115,15 @@ class Budget:
         if self.keep is not None:
             return max(count - int(self.keep), 0)
         if self.max_mb is not None:
-            room = self.room(fixed_bytes)
-            if isinstance(row_bytes, np.ndarray):
-                if not count or row_bytes.sum() <= room:
-                    return 0
-                shortest: float = row_bytes.min()
-            else:
-                shortest = row_bytes
-            if not shortest:
+            room = math.floor(Fraction(repr(float(self.max_mb))) * 10**6) - fixed_bytes
+            if not row_bytes:
                 raise RefineError("max_mb needs to know how many bytes a splat takes in the file")
-            if room < shortest:
+            if room < row_bytes:
                 raise RefineError(
-                    f"max_mb is {self.max_mb}, too small for one splat of {shortest:.0f} bytes"
+                    f"max_mb is {self.max_mb}, too small for one splat of {row_bytes:.0f} bytes"
                 )
-            if isinstance(row_bytes, np.ndarray):
-                return None
             return max(count - math.floor(room / Fraction(row_bytes)), 0)
         return None
-
-    def room(self, fixed_bytes: int) -> int:
-        """Return how many bytes `max_mb` leaves for rows; `fixed_bytes` are taken."""
-        size = Fraction(repr(float(self.max_mb or 0))) * 10**6  # the decimal, as in `removals`
-        return math.floor(size) - fixed_bytes
 
 
 def select(
@@ -153,14 +131,13 @@ def select(
     budget: Budget,
     *,
     protected: NDArray[np.bool_] | None = None,
-    row_bytes: RowBytes = 0.0,
+    row_bytes: float = 0.0,
     fixed_bytes: int = 0,
 ) -> NDArray[np.bool_]:
     """Return which splats stay.
 
     The splats with the lowest scores are removed; of equal scores, the first in the file. Protected
-    splats always stay, and others are removed instead, as far as there are any. Where rows of text
-    differ in length, splats are removed in that order until the others fit in `Budget.max_mb`.
+    splats always stay, and others are removed instead, as far as there are any.
 
     Parameters
     ----------
@@ -178,11 +155,9 @@ def select(
     Raises
     ------
     RefineError
-        If the budget has no meaning for these scores (`Budget.refuse_meaningless`), if it is a PSNR
-        and the scores have no estimate of it, if it removes more than the scores were computed for
-        (`Scores.settled`), or if no splat would be left.
+        If the budget is a PSNR and the scores have no estimate of it, if it removes more than the
+        scores were computed for (`Scores.settled`), or if no splat would be left.
     """
-    budget.refuse_meaningless(frustum=scores.frustum)
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
@@ -193,10 +168,6 @@ def select(
         keep[free & (scores.seen < least_seen(budget.min_seen, scores.views_used))] = False
     elif removals:
         _remove_lowest(keep, values, free, removals)
-    elif removals is None:
-        lengths = np.asarray(row_bytes, np.int64)
-        excess = int(lengths.sum()) - budget.room(fixed_bytes)
-        _remove_lowest(keep, values, free, excess, lengths)
     left = int(np.count_nonzero(keep))
     refuse_none_left(budget, len(values), left)
     if scores.settled is not None and budget.min_seen is None:
@@ -256,7 +227,7 @@ class Tally:
         ----------
         budget : Budget
         row_bytes, fixed_bytes
-            See `Budget.removals`; all rows are equally long.
+            See `Budget.removals`.
 
         Raises
         ------
@@ -264,7 +235,6 @@ class Tally:
             See `select`.
         """
         scores = self.scores
-        budget.refuse_meaningless(frustum=scores.frustum)
         count = _removals(scores, budget, row_bytes, fixed_bytes)
         if budget.threshold is not None:
             count = int(np.searchsorted(self._values, single(budget.threshold)))
@@ -282,10 +252,10 @@ def single(threshold: float) -> np.float32:
         return np.float32(threshold)
 
 
-def _removals(scores: Scores, budget: Budget, row_bytes: RowBytes, fixed_bytes: int) -> int | None:
+def _removals(scores: Scores, budget: Budget, row_bytes: float, fixed_bytes: int) -> int | None:
     """Return how many splats a budget removes, of those with the lowest scores.
 
-    None where each splat's score, number of views or length of row tells whether it goes.
+    None where each splat's score or number of views tells whether it goes.
     """
     if budget.psnr is not None:
         return math.floor(quality_of(scores).share(budget.psnr) * len(scores.values))
@@ -337,20 +307,15 @@ def quality_of(scores: Scores) -> Quality:
     return scores.quality
 
 
-def _remove_lowest(keep, values, free, amount, weights=None):
-    """Set `keep` to False for the lowest `free` values; of equal ones, for the first.
-
-    As many of them as have the weight `amount` together, or more; by default each weighs 1.
-    """
+def _remove_lowest(
+    keep: NDArray[np.bool_], values: NDArray[np.float32], free: NDArray[np.bool_], amount: int
+) -> None:
+    """Set `keep` to False for the lowest `amount` of `free` values; of equal, for the first."""
     rows = np.flatnonzero(free)
-    chosen = np.where(np.isnan(values[rows]), np.float32(np.inf), values[rows])
-    if weights is not None:
-        order = rows[np.argsort(chosen, kind="stable")]
-        each = weights[order]
-        keep[order[np.cumsum(each) - each < amount]] = False
-    elif amount := min(amount, len(rows)):
-        edge = np.partition(chosen, amount - 1)[amount - 1]
-        gone, ties = chosen < edge, np.flatnonzero(chosen == edge)
+    some = np.where(np.isnan(values[rows]), np.float32(np.inf), values[rows])
+    if amount := min(amount, len(rows)):
+        edge = np.partition(some, amount - 1)[amount - 1]
+        gone, ties = some < edge, np.flatnonzero(some == edge)
         gone[ties[: amount - np.count_nonzero(gone)]] = True
         keep[rows[gone]] = False
 

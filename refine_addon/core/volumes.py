@@ -187,8 +187,8 @@ class Forced:
     facts: tuple[dict[str, Any], ...] = ()
 
     def counts(self) -> dict[str, int]:
-        """How many splats are ``protected`` and how many ``forced`` out."""
-        masks = (("protected", self.protected), ("forced", self.out))
+        """Return how many splats are ``protected`` and how many were ``removed_by_user``."""
+        masks = (("protected", self.protected), ("removed_by_user", self.out))
         return {n: 0 if mask is None else int(np.count_nonzero(mask)) for n, mask in masks}
 
     def of(self, rows: NDArray[np.bool_]) -> Forced:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import bpy
@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import RefineError
+from ..core.methods import Method
 from ..core.quality.curve import Quality
 from ..core.scores import Scores
 from ..core.selection import rank
-from ..core.task import Settings
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from . import heat_map
@@ -57,7 +57,7 @@ class Provenance:
 
     Attributes
     ----------
-    settings : Settings
+    method : Method
         What they were made with.
     origin : dict, optional
         See `staleness.origin`.
@@ -65,19 +65,16 @@ class Provenance:
         Name of each view given, and how many splats lie in it.
     protected : (N,) bool, optional
         Which splats the curve takes to stay.
-    asked : Settings, optional
-        What the scores are to be refined by, if that is still to come.
     together : Together, optional
         Where other objects were scored with them; the curve is that of all then.
     seconds : float, optional
         How long scoring took.
     """
 
-    settings: Settings
+    method: Method
     origin: dict[str, Any] | None = None
     cameras: list[tuple[str, int]] | None = None
     protected: NDArray[np.bool_] | None = None
-    asked: Settings | None = None
     together: Together | None = None
     seconds: float | None = None
 
@@ -97,14 +94,13 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
             f"object '{checked.obj.name}': has {len(checked)} splats, was scored with "
             f"{len(scores.values)}; score it again"
         )
-    together, asked = provenance.together, provenance.asked
+    together = provenance.together
     ranks = together.ranks if together else rank(scores.values)
     new_record = json.dumps(
         {
             "splats": len(scores.values),
-            "settings": asdict(provenance.settings),
+            "settings": provenance.method.facts(),
             "method": scores.method,
-            "frustum": scores.frustum,
             "views_given": scores.views_given,
             "views_used": scores.views_used,
             "undrawable": scores.undrawable,
@@ -115,7 +111,6 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
             "origin": provenance.origin,
             "cameras": provenance.cameras,
             "protected": digest(provenance.protected),
-            "asked": asdict(asked) if asked else None,
             "seconds": provenance.seconds,
             "together": together and {"id": together.id, "splats": together.splats},
         }
@@ -177,11 +172,6 @@ def move_origin(
         mesh[RECORD] = json.dumps({**recorded, "origin": origin})
 
 
-def unrefined(record: dict[str, Any]) -> bool:
-    """Tell whether a record is of a first version of the scores that were asked for."""
-    return bool(record.get("asked"))
-
-
 def stored_scores(checked: SplatObject, forced_out: NDArray[np.bool_] | None = None) -> Scores:
     """Return the scores that an object's mesh holds.
 
@@ -220,7 +210,6 @@ def stored_scores(checked: SplatObject, forced_out: NDArray[np.bool_] | None = N
         facts=recorded.get("weights", {}),
         notes=tuple(recorded.get("notes", ())),
         method=recorded.get("method", ""),
-        frustum=recorded.get("frustum", True),
         views_given=recorded["views_given"],
         quality=Quality.from_facts(recorded.get("quality")) if whole else None,
         scored=None if scored.all() else scored,

@@ -219,8 +219,8 @@ def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``protected`` and ``forced``, how many; ``volumes``, how many each holds by its label; or
-        ``error``, why that is not known.
+        ``protected`` and ``removed_by_user``, how many; ``volumes``, how many each holds by its
+        label; or ``error``, why that is not known.
     """
     try:
         recorded = parsed(mesh[FACTS])
@@ -228,7 +228,7 @@ def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
             return {}
         if "error" in recorded:
             return {"error": str(recorded["error"])}
-        counts = {name: int(recorded[name]) for name in ("protected", "forced")}
+        counts = {name: int(recorded[name]) for name in ("protected", "removed_by_user")}
         return {**counts, "volumes": dict(recorded["volumes"])}
     except (KeyError, TypeError, ValueError):
         return {}

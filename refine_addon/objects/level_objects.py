@@ -8,8 +8,7 @@ from contextlib import contextmanager
 import bpy
 
 from ..core.errors import RefineError
-from ..core.levels.files import GOAL
-from ..core.levels.lod import Level
+from ..core.lod import Level
 from ..mesh.layout import SplatObject, check
 from . import splat_object
 
@@ -20,7 +19,9 @@ LEVEL_OF = "refine_level_of"
 """Custom property of the object of a level: the object that it was made of."""
 
 
-def add_levels(checked: SplatObject, levels: Sequence[Level]) -> bpy.types.Collection:
+def add_levels(
+    checked: SplatObject, levels: Sequence[Level], distance: float
+) -> bpy.types.Collection:
     """Make an object of each level, in a new collection of the scene; the original stays.
 
     The objects are copies of the original in all but the splats. They are named after it with
@@ -32,6 +33,8 @@ def add_levels(checked: SplatObject, levels: Sequence[Level]) -> bpy.types.Colle
         The original.
     levels : sequence of Level
         Of its splats as they stand in the world.
+    distance : float
+        How far the views are from what they see, world units; see `viewing_distance`.
 
     Raises
     ------
@@ -48,8 +51,8 @@ def add_levels(checked: SplatObject, levels: Sequence[Level]) -> bpy.types.Colle
             copy.data = checked.obj.data.copy()
             copy.name = copy.data.name = f"{name}_lod{level.number}"
             bpy.context.view_layer.update()  # its place in the world
-            splat_object.apply_object(check(copy), level)
-            facts = {**level.facts(GOAL), "distance": _distance(level)}
+            splat_object.apply_object(check(copy), level.result)
+            facts = {**level.facts(), "distance": distance}
             copy[LEVEL_OF] = checked.obj
             copy[FACTS] = {key: value for key, value in facts.items() if value is not None}
             copy.select_set(False)
@@ -57,11 +60,6 @@ def add_levels(checked: SplatObject, levels: Sequence[Level]) -> bpy.types.Colle
             obj.hide_set(True)
             obj.hide_render = True
     return collection
-
-
-def _distance(level: Level) -> float | None:
-    """Return how far the views are from what they see, world units; None if they see too little."""
-    return level.reach.psnr[0][0] if level.reach.psnr else None
 
 
 def has_levels(obj: bpy.types.Object | None) -> bool:

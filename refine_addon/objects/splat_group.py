@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..core.merging.merge import Merged
+from ..core.methods import Method
 from ..core.quality.curve import Quality
+from ..core.result import Result
 from ..core.scores import Scores
 from ..core.selection import Budget, rank
 from ..core.splats import Splats, joined
-from ..core.survivor_choice import SurvivorChoice
-from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.views import ViewSet
 from ..core.volumes import Forced
 from ..mesh import edit as mesh_edit
@@ -207,20 +207,18 @@ def _scores_of_rows(scores: Scores, rows: slice) -> Scores:
     )
 
 
-def stored_task(
+def stored_arguments(
     group: Members,
     budget: Budget,
     forced: Sequence[Forced],
-    *,
-    settings: Settings = DEFAULTS,
+    method: Method,
     views: ViewSet | None = None,
-    survivors: SurvivorChoice = "unchanged",
-) -> Task:
-    """Return what Apply has to decide of all objects; see `splat_object.stored_task`.
+) -> dict[str, Any]:
+    """The arguments of `prune` for Apply to all objects; see `splat_object.stored_arguments`.
 
     Parameters
     ----------
-    group, budget, settings, views, survivors
+    group, budget, method, views
         See there.
     forced : sequence of Forced
         What must stay and what must go of each object.
@@ -232,29 +230,29 @@ def stored_task(
     """
     if len(group) > 1:
         _check_scored_together(group)
-    tasks = [
-        splat_object.stored_task(
-            member, budget, each, settings=settings, views=views, survivors=survivors
-        )
+    parts = [
+        splat_object.stored_arguments(member, budget, each, method, views)
         for member, each in zip(group, forced, strict=True)
     ]
-    if len(tasks) == 1:
-        return tasks[0]
+    if len(parts) == 1:
+        return parts[0]
     counts = [len(member) for member in group]
     masks: dict[str, Any] = {
-        name: _joined_masks([getattr(task, name) for task in tasks], counts)
-        for name in ("protected", "forced_out")
-        if any(getattr(task, name) is not None for task in tasks)
+        name: _joined_masks([part[name] for part in parts], counts)
+        for name in ("protected", "removed")
+        if any(part[name] is not None for part in parts)
     }
-    return replace(
-        tasks[0],
-        splats=None if views is None else joined([task.splats for task in tasks if task.splats]),
-        scores=_scores(group, [task.scores for task in tasks if task.scores], masks),
+    return {
+        **parts[0],
+        "splats": None if views is None else joined([part["splats"] for part in parts]),
+        "scores": _scores(group, [part["scores"] for part in parts], masks),
         # Of rows of several lengths the longest counts: a size is never exceeded.
-        row_bytes=max(float(task.row_bytes) for task in tasks),
-        fixed_bytes=sum(task.fixed_bytes for task in tasks),
+        "sizes": (
+            max(part["sizes"][0] for part in parts),
+            sum(part["sizes"][1] for part in parts),
+        ),
         **masks,
-    )
+    }
 
 
 def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
@@ -281,11 +279,9 @@ def changes(frames: Sequence[Frame], counts: Sequence[int], result: Result) -> l
         What was decided of all of them.
     """
     if len(frames) == 1:
-        return [splat_object.changed(frames[0], result.keep, result.absorbed)]
+        return [splat_object.changed(frames[0], result.keep, result.merged)]
     return [
-        splat_object.changed(
-            frame, result.keep[rows], result.absorbed and _part(result.absorbed, rows)
-        )
+        splat_object.changed(frame, result.keep[rows], result.merged and _part(result.merged, rows))
         for frame, rows in zip(frames, _runs(counts), strict=True)
     ]
 
@@ -356,7 +352,7 @@ def _check_scored_together(group: Members) -> None:
 
 def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:
     """Return the scores of all objects as one; their curve, if all that were scored are there."""
-    record, forced_out = mesh_scores.record(group[0].mesh) or {}, masks.get("forced_out")
+    record, forced_out = mesh_scores.record(group[0].mesh) or {}, masks.get("removed")
     values = np.concatenate([part.values for part in parts])
     scored = ~_joined_masks(
         [None if part.scored is None else ~part.scored for part in parts],

@@ -23,15 +23,14 @@ from ..core.errors import RefineError
 from ..core.execute import chunks, run_all
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
-from ..core.levels.lod import Level
 from ..core.merging.merge import Merged
+from ..core.methods import Merge, Method, Occlusion
 from ..core.moves import Move
+from ..core.result import Result
 from ..core.selection import Budget
 from ..core.splats import Splats
-from ..core.survivor_choice import SurvivorChoice
-from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.views import ViewSet
-from ..core.volumes import FREE, Forced
+from ..core.volumes import Forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -107,18 +106,11 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
         raise RefineError(f"object '{checked.obj.name}': {error}") from None
 
 
-def can_become(group: Sequence[SplatObject], survivors: SurvivorChoice) -> SurvivorChoice:
-    """Return what survivors may become: by default unchanged where the scale of any is uneven.
-
-    Parameters
-    ----------
-    group : sequence of SplatObject
-    survivors : {"auto", "unchanged", "absorb", "refit"}
-        What is asked.
-    """
+def possible(group: Sequence[SplatObject], method: Method) -> Method:
+    """The method for some objects: where the scale of one is uneven, merging only deletes."""
     graph = bpy.context.evaluated_depsgraph_get()
     even = all(is_uniform(world_matrix(member.obj, graph)) for member in group)
-    return survivors if even or survivors != "auto" else "unchanged"
+    return method if even or not isinstance(method, Merge) else Occlusion(method.views)
 
 
 def modifier_notes(obj: bpy.types.Object) -> list[str]:
@@ -143,16 +135,10 @@ def drift_notes(checked: SplatObject) -> list[str]:
     return [f"object '{checked.obj.name}': {told}{remedy}" for told in drift.sentences()]
 
 
-def stored_task(
-    checked: SplatObject,
-    budget: Budget,
-    forced: Forced = FREE,
-    *,
-    settings: Settings = DEFAULTS,
-    views: ViewSet | None = None,
-    survivors: SurvivorChoice = "unchanged",
-) -> Task:
-    """Return what Apply has to decide: by the scores that the object holds, which splats stay.
+def stored_arguments(
+    checked: SplatObject, budget: Budget, forced: Forced, method: Method, views: ViewSet | None
+) -> dict[str, Any]:
+    """The arguments of `prune` for Apply, which goes by the scores that the object holds.
 
     Parameters
     ----------
@@ -160,17 +146,9 @@ def stored_task(
     budget : Budget
     forced : Forced
         What must stay and what must go; see `Demands.forced`.
-    settings : Settings, optional
-        For absorbing.
-    views : ViewSet, optional
-        What absorbing and refitting go by.
-    survivors : {"unchanged", "absorb", "refit"}
-        What they may become.
-
-    Returns
-    -------
-    Task
-        For `refine_addon.core.pipeline.decide`.
+    method : Method
+    views : ViewSet or None
+        What merging and refitting go by; None where splats are deleted.
 
     Raises
     ------
@@ -178,19 +156,16 @@ def stored_task(
         If the object was not scored, or some of it needs scores now that had to go then; also see
         `gather`.
     """
-    row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
-    return Task(
-        budget=budget,
-        settings=settings,
-        splats=None if views is None else gather(checked, whole=True),
-        views=views,
-        scores=stored_scores(checked, forced.out),
-        protected=forced.protected,
-        forced_out=forced.out,
-        survivors=survivors,
-        row_bytes=row_bytes,
-        fixed_bytes=fixed_bytes,
-    )
+    return {
+        "splats": None if views is None else gather(checked, whole=True),
+        "views": views,
+        "budget": budget,
+        "method": method,
+        "scores": stored_scores(checked, forced.out),
+        "protected": forced.protected,
+        "removed": forced.out,
+        "sizes": mesh_attributes.file_size(checked),
+    }
 
 
 class Frame(NamedTuple):
@@ -252,9 +227,9 @@ def changed(frame: Frame, keep: NDArray[np.bool_], absorbed: Merged | None) -> C
     return Change(keep, rows, columns)
 
 
-def apply_object(checked: SplatObject, result: Result | Level) -> Outcome:
+def apply_object(checked: SplatObject, result: Result) -> Outcome:
     """Do what `apply` does, with what was decided of an object's splats."""
-    change = changed(frame_of(checked), result.keep, result.absorbed)
+    change = changed(frame_of(checked), result.keep, result.merged)
     (outcome,) = apply([(checked, change)])
     return outcome
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.quality.curve import UNSEEN, Quality
-from ..core.survivor_choice import SURVIVORS, Became
+from ..core.quality.curve import UNSEEN, WAYS, Quality, Way
 from . import pixel_font
 
 Color = tuple[float, float, float]
@@ -56,7 +55,7 @@ class Look:
             blue, orange, green, red, grey = 0x56B4E9, 0xE69F00, 0x2FBF8F, 0xE8603C, 0x8C8C8C
         else:
             blue, orange, green, red, grey = 0x005A9C, 0xA85400, 0x00704F, 0xB5300F, 0x6A6A6A
-        named = {"unchanged": blue, "absorb": orange, "refit": green, "goes": red, "stays": grey}
+        named = {"delete": blue, "merge": orange, "refit": green, "goes": red, "stays": grey}
         named |= {"in range": blue, "others": grey}
         return {name: _rgb(value) for name, value in named.items()}
 
@@ -98,12 +97,12 @@ class Place:
     ----------
     share : float
         Of the splats that go, 0 to 1.
-    survivors : {"unchanged", "absorb", "refit"}
-        What survivors may become.
+    way : {"delete", "merge", "refit"}
+        What is done.
     """
 
     share: float
-    survivors: Became = "unchanged"
+    way: Way = "delete"
 
 
 def by_score(values: NDArray[np.float32]) -> Histogram:
@@ -134,9 +133,9 @@ def by_views(seen: NDArray[np.int32], views: int) -> Histogram:
     return Histogram(bins, np.bincount(bins, minlength=count + 1), ticks, "views")
 
 
-def _ways(quality: Quality) -> tuple[Became, ...]:
+def _ways(quality: Quality) -> tuple[Way, ...]:
     """Return of what survivors may become curves are drawn."""
-    return SURVIVORS if quality.foretold else SURVIVORS[:1]
+    return WAYS if quality.foretold else WAYS[:1]
 
 
 class Chart:
@@ -258,7 +257,7 @@ class Chart:
         strip.box((x - half, top, x + half, bottom), self.look.ink, 0.8)
         for name in _ways(quality):
             y = self.at(place.share, quality.at(place.share, name))[1]
-            chosen = name == place.survivors
+            chosen = name == place.way
             if chosen:
                 strip.dot(x, y, 5.5 * self._scale, self.look.ink)
             strip.dot(x, y, (4.0 if chosen else 3.0) * self._scale, self.look.colors[name])

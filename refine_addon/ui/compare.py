@@ -12,13 +12,12 @@ import bpy
 import numpy as np
 
 from ..cameras.sets import CameraChoice
-from ..core import pipeline
 from ..core.execute import Progress, part
 from ..core.picture_files import KINDS
 from ..core.pictures import AMPLIFIED, Comparison, compare
+from ..core.prune import prune
 from ..core.quality.curve import in_words
 from ..core.splats import Splats
-from ..core.task import Task
 from ..core.views import ViewSet
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
@@ -28,7 +27,7 @@ from . import plans
 from .images import put
 from .on_thread import OnThread
 from .operator_bases import Answer, OnScored
-from .operators import apply_task
+from .operators import apply_arguments
 
 NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 """The pictures as images of the file, made anew by each comparison."""
@@ -41,7 +40,7 @@ MEASURED = "refine_measured"
 class _Comparing:
     """What is to be decided of which splats, and the view of them."""
 
-    task: Task
+    arguments: dict[str, Any]
     splats: Splats
     view: ViewSet
 
@@ -64,19 +63,18 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
         """Gather what Apply would decide by, the splats and the view of the active camera."""
         view = CameraChoice("ACTIVE").views(context, checked.obj)[0]
         group = splat_group.members(context.view_layer, checked)
-        task = apply_task(context, group, splat_group.forced_of_each(context.scene, group))
-        splats = task.splats or splat_group.gather(group, whole=None)
-        return _Comparing(task, splats, ViewSet((replace(view, weight=1.0),)))
+        forced = splat_group.forced_of_each(context.scene, group)
+        arguments = apply_arguments(context, group, forced)
+        splats = arguments["splats"] or splat_group.gather(group, whole=None)
+        return _Comparing(arguments, splats, ViewSet((replace(view, weight=1.0),)))
 
     @staticmethod
     def work(job: _Comparing, progress: Progress) -> tuple[Comparison, float | None]:
         """Decide which splats stay, draw both states; return them and the estimated PSNR, dB."""
-        decided = 0.6 if job.task.absorb else 0.1  # of the time, by then
-        result = pipeline.decide(job.task, progress=part(progress, 0.0, decided))
-        survivors = result.survivors(job.splats)
-        (comparison,) = compare(
-            job.splats, survivors, job.view, progress=part(progress, decided, 1.0)
-        )
+        decided = 0.6 if job.arguments["method"].changes else 0.1  # of the time, by then
+        result = prune(**job.arguments, partial=True, progress=part(progress, 0.0, decided))
+        kept = result.merged.splats if result.merged else job.splats.take(result.keep)
+        (comparison,) = compare(job.splats, kept, job.view, progress=part(progress, decided, 1.0))
         return comparison, result.report["estimated_psnr"]
 
     def finish(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import bpy
 
@@ -13,7 +12,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from . import running as at_work
 from .operator_bases import FAILURES, Answer, fail
-from .running import Running, Sketch
+from .running import Running
 from .target import Target
 from .worker import Worker
 
@@ -28,9 +27,6 @@ class OnThread:
     needed of it. `work` runs on the thread and touches the job's arrays alone. `finish` writes what
     came of it. The operator itself keeps neither.
 
-    Where `sketch` returns other, quicker work, that is done first. `show` writes its result while
-    `work` goes on; it stays if `work` is cancelled or fails.
-
     Meanwhile events go on to the rest of the window, but for undo and save. Before anything is
     written to an object, it is compared with what it was when it was read (`Target`).
     """
@@ -42,10 +38,6 @@ class OnThread:
     reads_object = True
     """Whether it needs the active object."""
     _running: Running | None = None
-
-    def sketch(self, _job: Any) -> Sketch | None:
-        """Return what is to be done and shown ahead of the work."""
-        return None
 
     def written(
         self, _context: bpy.types.Context, checked: SplatObject | None
@@ -76,17 +68,15 @@ class OnThread:
             targets = [Target.of(each) for each in self.written(context, checked)]
         except FAILURES as error:
             return fail(self, error)
-        manager, sketch = context.window_manager, self.sketch(job)
+        manager = context.window_manager
         self._running = Running(
             operator=type(self).bl_idname,
             doing=self.doing,
             escape="cancels",
             job=job,
             targets=targets,
-            worker=Worker(sketch.work if sketch else partial(self.work, job)),
+            worker=Worker(partial(self.work, job)),
             timer=manager.event_timer_add(_STEP, window=context.window),
-            sketch=sketch,
-            stage="sketch" if sketch else "work",
             offers=self.offers,
         )
         manager.modal_handler_add(self)
@@ -128,8 +118,6 @@ class OnThread:
         if not running.worker.running():
             waits = (target.waits() for target in running.targets)
             running.waits = next(filter(None, waits), "")
-            if running.stage == "sketch":
-                return self._sketched(context, running)
             if not running.waits:
                 return self._done(context, running)
             if running.worker.cancelled:
@@ -139,27 +127,6 @@ class OnThread:
 
     def _checked(self, context: bpy.types.Context) -> SplatObject | None:
         return mesh_layout.check(context.object) if self.reads_object else None
-
-    def _sketched(self, context: bpy.types.Context, running: Running) -> Answer:
-        """Go on to the main work, and show what the sketch came to."""
-        try:
-            result = running.worker.result()
-        except Cancelled:
-            return self._stopped(context, running)
-        except FAILURES:
-            result = None  # the main work fails too, and its message fits what was asked for
-        running.stage = "work"
-        running.next(Worker(partial(self.work, running.job)))
-        if result is not None and not running.waits:
-            try:
-                self.show(context, running.target(), running.job, result)
-            except FAILURES as error:
-                running.worker.cancel()
-                self._over(context, running)
-                return fail(self, error)
-            running.shows()
-        running.tell(context)
-        return {"PASS_THROUGH"}
 
     def _done(self, context: bpy.types.Context, running: Running) -> Answer:
         """Write what the main work came to."""
@@ -178,13 +145,10 @@ class OnThread:
     def _stopped(
         self, context: bpy.types.Context, running: Running, error: Exception | None = None
     ) -> Answer:
-        """Say why nothing more comes; a sketch that was shown is a step that can be undone."""
+        """Say why nothing more comes."""
         self._over(context, running)
         if error is not None:
             fail(self, error)
-        if running.sketch and running.stage == "shown":
-            self.report({"INFO"}, f"{running.doing} stopped; {running.sketch.left}")
-            return {"FINISHED"}
         if error is None:
             self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
         return {"CANCELLED"}

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import bpy
@@ -16,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.sets import CameraChoice
-from ..core import pipeline
 from ..core.execute import Progress, part
-from ..core.levels.lod import Level, Levels, lod
-from ..core.pipeline.refit_splats import DOING
+from ..core.lod import Level, Levels, lod, viewing_distance
+from ..core.methods import Method
+from ..core.prune import REFITTING, prune, score
 from ..core.quality.curve import in_words
 from ..core.report import scoring_notes, sizes_in_words
+from ..core.result import Result
 from ..core.scores import Scores
 from ..core.splats import Splats
-from ..core.task import Result, Settings, Task, may_absorb
 from ..core.views import ViewSet
 from ..core.visibility import frustum
 from ..core.volumes import Forced
@@ -37,7 +36,6 @@ from ..objects import level_objects, splat_group, splat_object
 from ..objects.demands import Demands
 from ..objects.splat_object import Change, Frame
 from . import plans, staleness
-from .adjust import Adjustable
 from .on_thread import OnThread
 from .operator_bases import (
     Answer,
@@ -45,7 +43,6 @@ from .operator_bases import (
     in_object_mode,
     scored,
 )
-from .running import Sketch
 from .wrapped import counted
 
 _SCORED = 0.97
@@ -57,19 +54,17 @@ def chosen_views(context: bpy.types.Context) -> ViewSet:
     return CameraChoice.of_scene(context.scene).views(context, context.object)
 
 
-def apply_task(
+def apply_arguments(
     context: bpy.types.Context, group: splat_group.Members, forced: list[Forced]
-) -> Task:
-    """Return what *Apply* has to decide of the selected objects by the settings of the panel.
+) -> dict[str, Any]:
+    """The arguments of `prune` for the selected objects, by the settings of the panel.
 
     `forced` is what must stay and what must go of each.
     """
-    settings, budget = context.scene.refine, context.scene.refine.to_budget()
-    how, survivors = settings.to_settings(), splat_object.can_become(group, settings.survivors)
-    views = chosen_views(context) if may_absorb(survivors, how, budget) else None
-    return splat_group.stored_task(
-        group, budget, forced, settings=how, views=views, survivors=survivors
-    )
+    settings = context.scene.refine
+    method = splat_object.possible(group, settings.to_method())
+    views = chosen_views(context) if method.changes else None
+    return splat_group.stored_arguments(group, settings.to_budget(), forced, method, views)
 
 
 def _of_objects(group: splat_group.Members) -> str:
@@ -84,7 +79,7 @@ class _Scoring:
     splats: Splats
     forced: Forced
     views: ViewSet
-    settings: Settings
+    method: Method
     quality: bool
     uids: tuple[int, ...]
     origins: list[dict[str, Any]]
@@ -108,48 +103,28 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
-        settings, views = context.scene.refine.to_settings(), chosen_views(context)
+        method, views = context.scene.refine.to_method(), chosen_views(context)
         group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_writable(member.obj)
-        quality = settings.estimates or context.scene.refine.budget == "psnr"
+        quality = method.name != "closed-form" or context.scene.refine.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
         origins = [staleness.origin(context, member.obj) for member in group]
         forced = splat_group.joined_forced(splat_group.forced_of_each(context.scene, group), group)
         uids = splat_group.uids_of(group)
-        return _Scoring(splats, forced, views, settings, quality, uids, origins)
+        return _Scoring(splats, forced, views, method, quality, uids, origins)
 
     def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
         """Return the objects that are scored, the active one first."""
         return splat_group.active_first(context.view_layer, checked)
 
-    def sketch(self, job: _Scoring) -> Sketch | None:
-        """Score by the closed form first, which takes a fraction of the time."""
-        if job.settings.method == "closed-form":
-            return None
-        work = partial(_sketch, job)
-        left = "the scores are the closed form's"
-        return Sketch(work, "Refining scores", "keeps the closed form's", left)
-
-    @staticmethod
-    def show(
-        context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
-    ) -> None:
-        """Store the closed form's scores, to be looked at until those asked for are there."""
-        group = splat_group.by_uids(job.uids, checked)
-        provenance = Provenance(
-            _by_closed_form(job), protected=job.forced.protected, asked=job.settings
-        )
-        splat_group.store(group, scores, provenance, job.origins)
-        plans.refresh(context)
-
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> _Scored:
         """Score, and count how many splats lie in each view."""
         forced_out, means, start = job.forced.out, job.splats.means, time.perf_counter()
-        scores = pipeline.score(
-            job.splats, job.views, job.settings,
-            protected=job.forced.protected, forced_out=forced_out,
+        scores = score(
+            job.splats, job.views, job.method,
+            protected=job.forced.protected, removed=forced_out,
             quality=job.quality, progress=part(progress, 0.0, _SCORED),
         )  # fmt: skip
         seconds = time.perf_counter() - start
@@ -170,11 +145,13 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         group = splat_group.by_uids(job.uids, checked)
         provenance = Provenance(
-            job.settings, cameras=cameras, protected=job.forced.protected, seconds=result.seconds
+            job.method, cameras=cameras, protected=job.forced.protected, seconds=result.seconds
         )
         splat_group.store(group, scores, provenance, job.origins)
         plans.refresh(context)
-        self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
+        self.report(
+            {"INFO"}, _scored_in_words(group, scores, job.forced.counts()["removed_by_user"])
+        )
         modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
         drifts = [note for each in group for note in splat_object.drift_notes(each)]
         for note in (*scoring_notes(scores), *modifiers, *drifts):
@@ -191,22 +168,11 @@ def _scored_in_words(group: splat_group.Members, scores: Scores, forced_out: int
     )
 
 
-def _by_closed_form(job: _Scoring) -> Settings:
-    """Return the settings of the sketch of the scores that a job asks for."""
-    return replace(job.settings, method="closed-form")
-
-
-def _sketch(job: _Scoring, progress: Progress) -> Scores:
-    return pipeline.score(
-        job.splats, job.views, _by_closed_form(job), forced_out=job.forced.out, progress=progress
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class _Applying:
     """What is to be decided, of which objects, and what must stay and go of each."""
 
-    task: Task
+    arguments: dict[str, Any]
     uids: tuple[int, ...]
     forced: list[Forced]
     frames: list[Frame]
@@ -233,32 +199,21 @@ def _scored_or_applied(context: bpy.types.Context) -> str:
     return "" if mesh_scores.RANK in context.object.data.attributes else scored(context)
 
 
-class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
+class REFINE_OT_apply(OnThread, OnSplats, bpy.types.Operator):
     """Delete the splats that the budget does not keep; the others make up for them, if they may"""
 
     bl_idname = "refine.apply"
     bl_label = "Apply"
     bl_options = {"REGISTER", "UNDO"}
     doing = "Pruning splats"
-    offers = DOING
+    offers = REFITTING
 
     needs = (*OnSplats.needs, _scored_or_applied)
 
-    def execute(self, context: bpy.types.Context) -> Answer:
-        """Do all of it at once; adjusted, by another budget than that of the panel."""
-        return self.adjusted(context, partial(super().execute, context))
-
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Delete at once; absorb and refit on a thread."""
-        start = super().invoke
-
-        def call() -> Answer:
-            """Go by what the panel says by now."""
-            settings = context.scene.refine
-            changing = may_absorb(settings.survivors, settings.to_settings(), settings.to_budget())
-            return start(context, event) if changing else self.execute(context)
-
-        return self.adjusted(context, call)
+        """Delete at once; merge and refit on a thread."""
+        changes = context.scene.refine.to_method().changes
+        return super().invoke(context, event) if changes else self.execute(context)
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Applying:
         """Gather the scores that decide; if survivors change, splats and views besides."""
@@ -266,9 +221,10 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         for member in group:
             mesh_edit.check_deletable(member.obj)
         forced = splat_group.forced_of_each(context.scene, group)
-        task, counts = apply_task(context, group, forced), [len(member) for member in group]
+        counts = [len(member) for member in group]
+        arguments = apply_arguments(context, group, forced)
         uids, frames = splat_group.uids_of(group), splat_group.frames_of(group)
-        return _Applying(task, uids, forced, frames, counts)
+        return _Applying(arguments, uids, forced, frames, counts)
 
     def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
         """Return the objects that lose splats, the active one first."""
@@ -277,7 +233,7 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     @staticmethod
     def work(job: _Applying, progress: Progress) -> _Applied:
         """Decide which splats stay, and what they become."""
-        result = pipeline.decide(job.task, progress=progress)
+        result = prune(**job.arguments, partial=True, progress=progress)
         return _Applied(result, splat_group.changes(job.frames, job.counts, result))
 
     def finish(
@@ -287,9 +243,9 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         result = applied.result
         context.view_layer.update()
         group = splat_group.by_uids(job.uids, checked)
-        if job.task.absorb:  # on a thread, while volumes can be moved
+        if job.arguments["method"].changes:  # on a thread, while volumes can be moved
             splat_group.check_forced(context.scene, group, job.forced)
-        decided = job.task.budget.needs_scores or not result.absorbed  # by the scores
+        decided = job.arguments["budget"].needs_scores or not result.merged  # by the scores
         changed = _changes_since_scoring(context, group, job) if decided else []
         drifts = [note for each in group for note in splat_object.drift_notes(each)]
         outcome = splat_group.apply(group, applied.changes)
@@ -322,7 +278,7 @@ def _changes_since_scoring(
     context: bpy.types.Context, group: splat_group.Members, job: _Applying
 ) -> list[str]:
     """Return what changed since the objects were scored, in a few words each."""
-    protected = splat_group.parts_of(job.task.protected, group)
+    protected = splat_group.parts_of(job.arguments["protected"], group)
     pairs = zip((member.obj for member in group), protected, strict=True)
     return staleness.changes_of(context, dict(pairs))
 
@@ -334,7 +290,7 @@ class _MakingLevels:
     splats: Splats
     views: ViewSet
     levels: Levels
-    settings: Settings
+    method: Method
     forced: Forced
 
 
@@ -353,19 +309,21 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         settings = context.scene.refine
         levels = settings.to_levels()
         return _MakingLevels(
-            splat_object.gather(checked, whole=True if levels.survivors != "unchanged" else None),
+            splat_object.gather(checked, whole=True if settings.to_method().changes else None),
             chosen_views(context),
             levels,
-            settings.to_settings(),
+            settings.to_method(),
             Demands.of_scene(context.scene).forced(checked),
         )
 
     @staticmethod
     def work(job: _MakingLevels, progress: Progress) -> list[Level]:
         """Make the levels."""
-        return lod(
-            job.splats, job.views, job.levels, job.settings,
-            protected=job.forced.protected, forced_out=job.forced.out, progress=progress,
+        return list(
+            lod(
+                job.splats, job.views, job.levels, job.method,
+                protected=job.forced.protected, removed=job.forced.out, progress=progress,
+            )
         )  # fmt: skip
 
     def finish(
@@ -376,9 +334,10 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         levels: list[Level],
     ) -> Answer:
         """Make the objects and say what each level costs."""
-        collection = level_objects.add_levels(checked, levels)
+        distance = viewing_distance(job.splats, job.views)
+        collection = level_objects.add_levels(checked, levels, distance)
         counts = [
-            f"{len(level.splats):,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
+            f"{level.facts()['splats']:,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
             for level in levels
         ]
         told = f"'{collection.name}', hidden: {', '.join(counts)} splats"

@@ -186,8 +186,8 @@ class REFINE_PT_volumes(_InSidebar, bpy.types.Panel):
             return
         if facts.get("protected"):
             layout.label(text=f"Stay: {facts['protected']:,}", icon="LOCKED")
-        if facts.get("forced"):
-            layout.label(text=f"Go: {facts['forced']:,}", icon="TRASH")
+        if facts.get("removed_by_user"):
+            layout.label(text=f"Go: {facts['removed_by_user']:,}", icon="TRASH")
             layout.operator("refine.crop", icon="TRASH")
 
 
@@ -216,6 +216,8 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         settings = context.scene.refine
         column = _named_column(layout)
         column.prop(settings, "method")
+        if settings.method == "refit":
+            column.prop(settings, "rounds")
         column.prop(settings, "views")
         layout.operator("refine.score", icon="CAMERA_DATA")
         obj = context.object
@@ -223,8 +225,6 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         if record:
             views = counted(record["views_given"], "view")
             layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
-            if mesh_scores.unrefined(record):
-                wrapped.label(layout, context, "By the closed form, not yet refined", icon="INFO")
             if changed := _changes(context, obj):
                 text = f"Score again: {', '.join(changed)}"
                 wrapped.label(layout, context, text, icon="ERROR")
@@ -259,9 +259,6 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column = _named_column(layout)
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
-        column.prop(settings, "survivors")
-        if settings.survivors == "refit":
-            column.prop(settings, "rounds")
         obj = context.object
         record = _record(obj)
         if record:
@@ -290,9 +287,6 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
             layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
         column = _named_column(layout)
         column.prop(settings, "levels")
-        column.prop(settings, "level_survivors")
-        if settings.level_survivors == "refit":
-            column.prop(settings, "rounds")
         column.operator("refine.levels", icon="MOD_DECIM")
         if level_objects.has_levels(obj):
             column.operator("refine.export_levels", icon="EXPORT")
@@ -381,9 +375,7 @@ def _draw_plan(
     if plan is None:
         return  # it is being made
     if "error" in plan:
-        waits = mesh_scores.unrefined(record) and settings.budget == "psnr"
-        text = plans.remark(plan, record) if waits else plan["error"]
-        wrapped.label(layout, context, text, icon="INFO" if waits else "ERROR")
+        wrapped.label(layout, context, plan["error"], icon="ERROR")
         return
     wrapped.label(layout, context, plans.sentence(plan))
     if remark := plans.remark(plan, record):

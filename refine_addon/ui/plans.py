@@ -18,17 +18,23 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ..core import pipeline
 from ..core.errors import RefineError
-from ..core.pace import in_time
+from ..core.execute import in_time
+from ..core.methods import Occlusion
+from ..core.prune import prune
 from ..core.quality.alignment import Alignment
-from ..core.quality.cost import expected_seconds
-from ..core.quality.curve import in_views, in_words, out_of_reach, parted
+from ..core.quality.curve import (
+    WAYS,
+    Way,
+    expected_seconds,
+    in_views,
+    in_words,
+    out_of_reach,
+    parted,
+)
 from ..core.report import MANY_UNSEEN, little_seen, sizes_in_words
 from ..core.scores import Scores
 from ..core.selection import Budget, Tally, quality_of
-from ..core.survivor_choice import SURVIVORS, Became, SurvivorChoice
-from ..core.task import Task, may_absorb
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.records import parsed
@@ -93,7 +99,7 @@ def unregister() -> None:
 def key(settings: Any) -> str:
     """Return what a plan depends on; a stored plan of another key is out of date."""
     budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {_demanded(settings)!r}"
-    return f"{budget} {settings.survivors} {settings.rounds} {settings.method}"
+    return f"{budget} {settings.rounds} {settings.method}"
 
 
 def changed(context: bpy.types.Context) -> None:
@@ -202,11 +208,11 @@ def sentence(plan: dict[str, Any]) -> str:
     Examples
     --------
     >>> plan = {"splats": 100, "kept": 50, "bytes_before": 5e6, "bytes_after": 2.5e6}
-    >>> plan |= {"psnr": 38.2, "psnr_absorbed": 45.9, "psnr_refitted": 48.9, "becomes": "absorb"}
+    >>> plan |= {"psnr": 38.2, "psnr_merged": 45.9, "psnr_refitted": 48.9, "becomes": "merge"}
     >>> sentence(plan).removeprefix("Keeps 50 of 100, 2.5 of 5.0 MB, ")
-    'about 46 dB in these views (Unchanged: about 38, Refit: about 49)'
+    'about 46 dB in these views (Occlusion: about 38, Refit: about 49)'
     >>> sentence(plan | {"psnr_between": 36.3}).removeprefix("Keeps 50 of 100, 2.5 of 5.0 MB, ")
-    'about 46 dB in these views, about 36 between them (Unchanged: about 38, Refit: about 49)'
+    'about 46 dB in these views, about 36 between them (Occlusion: about 38, Refit: about 49)'
     """
     text = (
         f"Keeps {'about ' if plan.get('about') else ''}{plan['kept']:,} of {plan['splats']:,}, "
@@ -214,18 +220,19 @@ def sentence(plan: dict[str, Any]) -> str:
     )
     if "psnr" not in plan:
         return text
-    if "psnr_absorbed" not in plan:  # not foretold
-        unless = " if survivors stay unchanged" if plan["becomes"] != "unchanged" else ""
+    if "psnr_merged" not in plan:  # not predicted
+        unless = " by deleting" if plan["becomes"] != "delete" else ""
         return f"{text}, {in_views(plan['psnr'], plan.get('psnr_between'))}{unless}"
-    ways = dict(zip(SURVIVORS, ("psnr", "psnr_absorbed", "psnr_refitted"), strict=True))
+    ways: dict[Way, str] = dict(zip(WAYS, ("psnr", "psnr_merged", "psnr_refitted"), strict=True))
     # Deleting is done at once.
-    taken = dict(plan.get("seconds", ()), unchanged=None)
-    times = {name: f" in {in_time(taken[name])}" if taken.get(name) else "" for name in SURVIVORS}
+    taken = dict(plan.get("seconds", ()), delete=None)
+    times = {name: f" in {in_time(taken[name])}" if taken.get(name) else "" for name in WAYS}
     way = plan["becomes"]
     here = in_views(plan[ways.pop(way)], plan.get("psnr_between")) + times[way]
+    names: dict[str, str] = {"delete": "Occlusion", "merge": "Merge", "refit": "Refit"}
     others = ", ".join(
-        f"{name.capitalize()}: {in_words(plan[told]).removesuffix(' dB')}{times[name]}"
-        for name, told in ways.items()
+        f"{names[name]}: {in_words(plan[key]).removesuffix(' dB')}{times[name]}"
+        for name, key in ways.items()
     )
     return f"{text}, {here} ({others})"
 
@@ -234,10 +241,8 @@ def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
     """Return what else there is to say of a plan and of the scoring, or ""."""
     if "psnr" in plan:
         return str(plan.get("remark", ""))
-    if mesh_scores.unrefined(record):
-        return "Refined scores tell dB"
     if record.get("method") == "closed-form":
-        return "Score with Auto, or with Quality as the budget, to see dB"
+        return "Score by another method, or with Quality as the budget, to see dB"
     return "The views see too little to tell dB"
 
 
@@ -348,12 +353,15 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     try:
         group = splat_group.members(bpy.context.view_layer, mesh_layout.check(obj))
         forced = splat_group.refresh(scene, group)
-        task = splat_group.stored_task(group, settings.to_budget(), forced)
-        known = _know(task, _state(objects, settings), _scored_s(mesh))
+        arguments = splat_group.stored_arguments(
+            group, settings.to_budget(), forced, Occlusion(settings.views)
+        )
+        known = _know(arguments, _state(objects, settings), _scored_s(mesh))
         plan = _noted(known, settings) | depends
-        keep = pipeline.decide(task).keep
+        keep = prune(**arguments).keep
         splat_group.mark_removed(group, keep)
-        keep = keep if task.forced_out is None else keep[~task.forced_out]
+        removed = arguments["removed"]
+        keep = keep if removed is None else keep[~removed]
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan), keep)
         _tell_cameras(known.tally.scores, plan)
@@ -380,23 +388,24 @@ def _scored_s(mesh: bpy.types.Mesh) -> float | None:
     return float(seconds) if isinstance(seconds, (int, float)) else None
 
 
-def _know(task: Task, state: tuple[Any, ...], scored_s: float | None) -> _Known:
+def _know(arguments: dict[str, Any], state: tuple[Any, ...], scored_s: float | None) -> _Known:
     """Return what holds for any budget; what was known before, where it still does."""
-    forced = task.forced()
-    gone = 0 if forced is None else int(np.count_nonzero(forced))
-    task = task if forced is None else task.without(forced)
-    scores = task.scores
-    assert scores is not None
+    scores, protected, removed = (arguments[name] for name in ("scores", "protected", "removed"))
+    gone = 0
+    if removed is not None:
+        rest = ~removed if protected is None else ~removed | protected
+        gone = int(np.count_nonzero(~rest))
+        scores = scores.of(rest)
+        protected = None if protected is None else protected[rest]
     old = _known[0] if _known else None
-    if old is not None and old.state == state and old.tally.is_of(scores, task.protected):
+    if old is not None and old.state == state and old.tally.is_of(scores, protected):
         return old
     kinds = price.histogram(scores)
-    tally, unseen = Tally(scores, task.protected), int(np.count_nonzero(scores.seen == 0))
+    tally, unseen = Tally(scores, protected), int(np.count_nonzero(scores.seen == 0))
     known = _Known(
         state,
         tally,
-        int(task.row_bytes),
-        task.fixed_bytes,
+        *map(int, arguments["sizes"]),
         kinds,
         unseen,
         little_seen(scores.seen),
@@ -437,7 +446,7 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:
     plan: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
     try:
         budget = settings.to_budget()
-        becomes = _may_become(settings, budget)
+        becomes = _way(settings)
         removed, about = _removed(known, budget, becomes)
     except RefineError as error:
         return plan | {"error": str(error)}
@@ -445,13 +454,13 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:
         plan["about"] = True
     outcome = Outcome.of(count, rest - removed, known.row_bytes, known.fixed_bytes)
     curve = known.tally.scores.quality
-    if settings.survivors == "auto" and (curve is None or curve.as_good(removed / rest)):
-        becomes = "unchanged"
+    if becomes == "merge" and (curve is None or curve.as_good(removed / rest)):
+        becomes = "delete"
     plan |= {**vars(outcome), "forced": known.forced, "becomes": becomes}
     if curve is None:
         return plan
     plan["psnr"] = curve.at(removed / rest)
-    told: Became = becomes if curve.foretold else "unchanged"
+    told: Way = becomes if curve.foretold else "delete"
     between = curve.at_between(removed / rest, told)
     if between is not None:
         plan["psnr_between"] = between
@@ -460,7 +469,7 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:
     if known.scored_s is not None:
         plan["seconds"] = expected_seconds(known.scored_s, removed / rest, once=False)
     if curve.foretold:
-        plan["psnr_absorbed"] = curve.at(removed / rest, "absorb")
+        plan["psnr_merged"] = curve.at(removed / rest, "merge")
         plan["psnr_refitted"] = curve.at(removed / rest, "refit")
     if budget.psnr is not None:
         psnr = curve.at(removed / rest, becomes)
@@ -468,21 +477,19 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:
     return plan
 
 
-def _may_become(settings: Any, budget: Budget) -> Became:
-    """Return what survivors may become, by the settings of the panel."""
-    asked: SurvivorChoice = settings.survivors
-    if asked != "auto":
-        return asked
-    return "absorb" if may_absorb(asked, settings.to_settings(), budget) else "unchanged"
+def _way(settings: Any) -> Way:
+    """What the method of the panel does."""
+    changing: dict[str, Way] = {"merge": "merge", "refit": "refit"}
+    return changing.get(settings.method, "delete")
 
 
-def _removed(known: _Known, budget: Budget, survivors: Became) -> tuple[int, bool]:
+def _removed(known: _Known, budget: Budget, way: Way) -> tuple[int, bool]:
     """Return how many splats a budget removes beside those forced out, and whether it is a guess.
 
     Raise `RefineError` if the budget means nothing to the scores.
     """
-    if budget.psnr is not None and survivors != "unchanged":
-        share = quality_of(known.tally.scores).share(budget.psnr, survivors)
+    if budget.psnr is not None and way != "delete":
+        share = quality_of(known.tally.scores).share(budget.psnr, way)
         rest = known.count - known.forced
         return min(math.floor(share * rest), known.tally.free), True
     left = budget.after(known.forced, known.count)
@@ -495,8 +502,8 @@ def _tell_cameras(scores: Scores, plan: dict[str, Any]) -> None:
     if curve is None or place is None:
         camera_list.tell({})
         return
-    survivors = place.survivors if curve.foretold else "unchanged"
-    camera_list.tell(curve.of_views(place.share, survivors))
+    way = place.way if curve.foretold else "delete"
+    camera_list.tell(curve.of_views(place.share, way))
 
 
 def _place(plan: dict[str, Any]) -> Place | None:

@@ -7,12 +7,12 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from .properties import AMOUNTS, METHODS, OLDER, UPRIGHT_TEXT, VIEWS, RefineSettings, take_over
+from .properties import AMOUNTS, UPRIGHT_TEXT, VIEWS, RefineSettings
 
 PACKAGE = __package__.rpartition(".")[0]
 """The name under which the extension is enabled, such as ``bl_ext.user_default.refine_addon``."""
 
-DEFAULTS = ("method", "views", "budget", "percent", "psnr", "survivors")
+DEFAULTS = ("method", "views", "budget", "percent", "psnr")
 """The preferences that are settings of a scene, by the same names."""
 
 
@@ -21,13 +21,11 @@ class RefinePreferences(bpy.types.AddonPreferences):
 
     bl_idname = PACKAGE
 
-    method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)
+    method: EnumProperty(**AMOUNTS["method"])
     views: IntProperty(**VIEWS)
     budget: EnumProperty(**AMOUNTS["budget"])
     percent: FloatProperty(**AMOUNTS["percent"])
     psnr: FloatProperty(**AMOUNTS["psnr"])
-    survivors: EnumProperty(**AMOUNTS["survivors"])
-    absorb: BoolProperty(name="Absorb", description=OLDER, options={"HIDDEN"})
     upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -67,5 +65,4 @@ def _chosen(context: bpy.types.Context) -> RefinePreferences | None:
     addon = context.preferences.addons.get(PACKAGE)
     if addon is None:
         return None
-    take_over(addon.preferences)
     return addon.preferences

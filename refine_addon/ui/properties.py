@@ -8,7 +8,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from bpy.app.handlers import persistent
 from bpy.props import (
     BoolProperty,
     CollectionProperty,
@@ -22,10 +21,11 @@ from bpy.props import (
 from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
-from ..core.levels.lod import Levels
+from ..core.lod import Levels
+from ..core.methods import METHODS as CORE_METHODS
+from ..core.methods import Merge, Method, Refit
 from ..core.rendering import MODELS
 from ..core.selection import Budget
-from ..core.task import Settings
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING
@@ -34,14 +34,25 @@ from .select_panel import SelectSettings
 from .volumes import RefineVolume
 
 METHODS = (
-    ("occlusion", "Occlusion", "Knows which splats hide others"),
     (
         "closed-form",
         "Closed Form",
-        "Ignores that splats hide others: far faster, and worse",
+        "REFINE's formula; takes nothing as hidden. Rows stay as they were",
+    ),
+    ("occlusion", "Occlusion", "Knows what hides what; deletes. Rows stay as they were"),
+    (
+        "merge",
+        "Merge",
+        "What goes is merged into what stays, by what the cameras see of it; deletes where that is "
+        "as good",
+    ),
+    (
+        "refit",
+        "Refit",
+        "Merges, then fits what stays to what all splats looked like: closest, and slowest",
     ),
 )
-"""Methods of scoring, by the names that core gives them."""
+"""The dial, from instant to best, by the names of core."""
 
 BUDGETS = (
     ("ratio", "Share", "Remove this share of the splats"),
@@ -53,37 +64,15 @@ BUDGETS = (
 )
 """Kinds of budget, by the names that core gives them."""
 
-SURVIVORS = (
-    (
-        "auto",
-        "Auto",
-        "Absorb, but unchanged where that is as good, or where Method is Closed Form",
-    ),
-    ("unchanged", "Unchanged", "They stay what they are, to the bit"),
-    (
-        "absorb",
-        "Absorb",
-        "They take over what goes, by what the cameras see of it: far better if much goes; slower",
-    ),
-    (
-        "refit",
-        "Refit",
-        "They absorb, then learn what all splats look like to the cameras: better yet, slower yet",
-    ),
-)
-"""What survivors may become, by the names that core gives it."""
-
 UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
     "z-up world of Blender"
 )
 
-OLDER = "What files and preferences of before say in place of Survivors"
-
 VIEWS: dict[str, Any] = {
     "name": "Views",
     "description": "Use at most this many views, spread out evenly; 0 uses all",
-    "default": Settings.views,
+    "default": Merge.views,
     "min": 0,
 }
 
@@ -136,10 +125,11 @@ AMOUNTS: dict[str, dict[str, Any]] = {
         "min": 1.0,
         "max": 99.0,
     },
-    "survivors": {
-        "name": "Survivors",
-        "description": "What the splats that stay may become",
-        "items": SURVIVORS,
+    "method": {
+        "name": "Method",
+        "description": "How splats are pruned, from instant to best",
+        "items": METHODS,
+        "default": Merge.name,
     },
     "rounds": {
         "name": "Rounds",
@@ -250,39 +240,10 @@ def decimal(value: float) -> float:
     return float(str(np.float32(value)))
 
 
-def take_over(settings: Any) -> None:
-    """Set what survivors may become by what was stored before there was that choice."""
-    for older, name, chosen in (
-        ("absorb", "survivors", ("unchanged", "absorb")),
-        ("nested", "level_survivors", ("absorb", "unchanged")),
-    ):
-        if older in settings.bl_rna.properties and settings.is_property_set(older):
-            if not settings.is_property_set(name):
-                setattr(settings, name, chosen[getattr(settings, older)])
-            settings.property_unset(older)
-
-
-@persistent
-def _loaded(_path: str) -> None:
-    for scene in bpy.data.scenes:
-        if not scene.library:
-            take_over(scene.refine)
-
-
-def register() -> None:
-    """Take over what files of before say, when they are loaded."""
-    bpy.app.handlers.load_post.append(_loaded)
-
-
-def unregister() -> None:
-    """Undo `register`."""
-    bpy.app.handlers.load_post.remove(_loaded)
-
-
 class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
-    method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)
+    method: EnumProperty(**AMOUNTS["method"], update=_plan_again)
     model: EnumProperty(
         name="Drawn As",
         description="How the splats of the active object are drawn, in all of the panel and in the "
@@ -326,10 +287,7 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     threshold: FloatProperty(**AMOUNTS["threshold"], update=_plan_again)
     min_seen: FloatProperty(**AMOUNTS["min_seen"], update=_plan_again)
     psnr: FloatProperty(**AMOUNTS["psnr"], update=_plan_again)
-    survivors: EnumProperty(**AMOUNTS["survivors"], update=_plan_again)
     rounds: IntProperty(**AMOUNTS["rounds"], update=_plan_again)
-    absorb: BoolProperty(name="Absorb", description=OLDER, options={"HIDDEN"})
-    nested: BoolProperty(name="Nested", description=OLDER, options={"HIDDEN"})
     protect: StringProperty(
         name="Protect",
         description="Vertex group, or boolean or float point attribute: the splats in it stay",
@@ -346,22 +304,12 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         description="Shares of the splats that stay in the levels of detail, the finest first",
         default="0.5, 0.25, 0.12, 0.06",
     )
-    level_survivors: EnumProperty(
-        name="Survivors",
-        description="What the splats that stay in a level may become",
-        items=SURVIVORS[1:],
-        default=Levels.survivors,
-    )
 
-    def to_settings(self) -> Settings:
-        """Return the settings of core.
-
-        Raises
-        ------
-        RefineError
-            If they cannot be.
-        """
-        return Settings(self.method, self.views, rounds=self.rounds or None)
+    def to_method(self) -> Method:
+        """The method of core; raises `RefineError` where a value cannot be."""
+        if self.method == Refit.name:
+            return Refit(self.views, self.rounds or None)
+        return CORE_METHODS[self.method](self.views)
 
     def to_budget(self) -> Budget:
         """Return the budget of core.
@@ -389,7 +337,7 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
             raise RefineError(
                 f"Levels is {self.levels!r}, expected numbers with commas between them"
             ) from error
-        return Levels(shares, survivors=self.level_survivors)
+        return Levels(shares)
 
     def to_frames(self, scene: bpy.types.Scene) -> range:
         """Return the frames whose views count."""

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import bpy
 from bpy.app.handlers import persistent
 
-from ..core.execute import Progress
-from ..core.pace import Pace
+from ..core.execute import TimeLeft, in_time
 from ..mesh.layout import SplatObject
 from .target import Target
 from .worker import Worker
@@ -25,32 +23,6 @@ _WAIT = {
     "wm.save_as_mainfile": _SAVE,
 }
 """What waits until the work is over, by the names of Blender's operators."""
-
-
-def _begun() -> Pace:
-    pace = Pace([1])
-    pace.next()
-    return pace
-
-
-@dataclass(frozen=True)
-class Sketch:
-    """Quick work whose result is shown while the main work goes on.
-
-    Attributes
-    ----------
-    work : callable
-        ``work(progress)``.
-    doing, escape : str
-        Those of `Running` once the result is shown.
-    left : str
-        A sentence on what the user has if the main work is cancelled or fails.
-    """
-
-    work: Callable[[Progress], Any]
-    doing: str
-    escape: str
-    left: str
 
 
 _LONG = 5.0
@@ -77,10 +49,6 @@ class Running:
         The objects that are to be written to.
     worker : Worker
     timer : bpy.types.Timer
-    sketch : Sketch or None
-        What is done first.
-    stage : {"sketch", "work", "shown"}
-        What is being done; "shown" is the main work with the sketch's result written.
     waits : str
         What has to happen before the result can be written, "" if nothing.
     offers : str
@@ -94,12 +62,10 @@ class Running:
     targets: list[Target]
     worker: Worker[Any]
     timer: bpy.types.Timer
-    sketch: Sketch | None = None
-    stage: Literal["sketch", "work", "shown"] = "work"
     waits: str = ""
     offers: str = ""
     _said: tuple[str, float] = ("", 0.0)
-    _pace: Pace = field(default_factory=_begun)
+    _left: TimeLeft = field(default_factory=TimeLeft)
     _told: str = ""
 
     def target(self) -> SplatObject | None:
@@ -111,15 +77,6 @@ class Running:
             If one is no longer as it was read; see `Target.unchanged`.
         """
         return next(iter([target.unchanged() for target in self.targets]), None)
-
-    def next(self, worker: Worker[Any]) -> None:
-        """Go on with other work, at a pace of its own."""
-        self.worker, self._pace = worker, _begun()
-
-    def shows(self) -> None:
-        """Note that the sketch is shown."""
-        if self.sketch is not None:
-            self.stage, self.doing, self.escape = "shown", self.sketch.doing, self.sketch.escape
 
     @property
     def at_escape(self) -> str:
@@ -138,8 +95,8 @@ class Running:
         """How much is done and how long the rest takes, as short as a bar wants it."""
         if self.waits:
             return "done"
-        left = self._pace.left(self.factor)
-        return f"{self.factor:.0%}, {left}" if left else f"{self.factor:.0%}"
+        left = self._left.seconds(self.factor)
+        return f"{self.factor:.0%}" + ("" if left is None else f", about {in_time(left)} left")
 
     @property
     def sentence(self) -> str:

@@ -7,7 +7,6 @@ the settings. What was done to the splats themselves is not looked for.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import bpy
@@ -60,14 +59,14 @@ def changes(
     """
     record = mesh_scores.record(obj.data) or {}
     try:
-        then, settings = record["origin"], record.get("asked") or record["settings"]
+        then, settings = record["origin"], record["settings"]
         changed = {
             "object moved": _moved(then, context.scene, obj),
             "cameras changed": _other_cameras(then, _cameras(context)),
             "volumes changed": _other_volumes(then, context.scene),
             "what must go changed": then.get("must_go", _NONE) != _must_go(obj),
             "settings changed": _deciding(settings)
-            != _deciding(asdict(context.scene.refine.to_settings())),
+            != _deciding(context.scene.refine.to_method().facts()),
             "what is protected changed": bool(record.get("quality"))
             and record.get("protected", _NONE) != _protected(obj, protected),
         }
@@ -149,8 +148,8 @@ def _moved(then: dict[str, Any], scene: bpy.types.Scene, obj: bpy.types.Object) 
 
 
 def _deciding(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return those settings of core that a method looks at, as far as the panel has them."""
-    return {name: settings[name] for name in ("method", "views")}
+    """What scores depend on: all methods but the closed form score by occlusion."""
+    return {"by": settings["method"] == "closed-form", "views": settings["views"]}
 
 
 def _cameras(context: bpy.types.Context) -> dict[str, Any]:

@@ -67,9 +67,16 @@ def keep_mask(addon, obj, budget, protect=""):
     """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
     checked = addon.mesh.layout.check(obj)
     found = addon.objects.demands.Demands((protect,) if protect else ()).forced(checked)
-    return addon.core.pipeline.decide(
-        addon.objects.splat_object.stored_task(checked, budget, found)
-    ).keep
+    return deleted(addon, checked, budget, found).keep
+
+
+def deleted(addon, checked, budget, found=None):
+    """What *Apply* decides by the scores of an object where splats are deleted."""
+    found = found or addon.core.volumes.FREE
+    arguments = addon.objects.splat_object.stored_arguments(
+        checked, budget, found, addon.core.Occlusion(), None
+    )
+    return addon.core.prune(**arguments)
 
 
 @pytest.fixture(autouse=True)
@@ -132,13 +139,9 @@ def score(addon):
     """Return a function that scores an object by the views it is given, as the button does."""
 
     def score(obj, views):
-        settings = addon.core.Settings("closed-form")
-        scores = addon.core.score(
-            addon.objects.splat_object.gather(addon.mesh.layout.check(obj)), views, settings
-        )
-        addon.mesh.scores.store(
-            addon.mesh.layout.check(obj), scores, addon.mesh.scores.Provenance(settings)
-        )
+        method, checked = addon.core.ClosedForm(), addon.mesh.layout.check(obj)
+        scores = addon.core.score(addon.objects.splat_object.gather(checked), views, method)
+        addon.mesh.scores.store(checked, scores, addon.mesh.scores.Provenance(method))
 
     return score
 

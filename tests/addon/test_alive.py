@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from types import SimpleNamespace
@@ -36,18 +35,18 @@ def start(addon, few):
 
 @pytest.fixture
 def gate(addon, monkeypatch):
-    """Hold back the scoring that was asked for, not its sketch, until `open`; or let it fail."""
-    gate, score = SimpleNamespace(open=threading.Event(), error=None), addon.core.pipeline.score
+    """Hold back scoring on the thread until `open`; or let it fail."""
+    gate, score = SimpleNamespace(open=threading.Event(), error=None), addon.core.score
 
-    def held(splats, views, settings, *, progress, **options):
-        if threading.current_thread().name == "refine" and settings.method != "closed-form":
+    def held(splats, views, method, *, progress, **options):
+        if threading.current_thread().name == "refine":
             while not gate.open.wait(0.01):
                 addon.core.execute.report(progress, 0.4, "looking")
             if gate.error:
                 raise gate.error
-        return score(splats, views, settings, progress=progress, **options)
+        return score(splats, views, method, progress=progress, **options)
 
-    monkeypatch.setattr(addon.core.pipeline, "score", held)
+    monkeypatch.setattr(addon.ui.operators, "score", held)
     return gate
 
 
@@ -154,11 +153,11 @@ def test_what_stays_and_goes_is_not_changed_while_a_thread_works(start, gate):
 
 
 @pytest.mark.parametrize("change", ["marks", "volume"])
-def test_an_absorption_is_refused_when_other_splats_must_stay_since(addon, few, start, change):
+def test_a_merge_is_refused_when_other_splats_must_stay_since(addon, few, start, change):
     """By a mark from a script or a volume that moved: each deletes or keeps what it must not."""
     bpy.ops.refine.score()
     settings = bpy.context.scene.refine
-    settings.survivors, settings.percent = "absorb", 80.0
+    settings.method, settings.percent = "merge", 80.0
     volume = bpy.data.objects.new("volume", None)
     volume.empty_display_type, volume.location = "CUBE", (1000.0, 0.0, 0.0)
     bpy.context.scene.collection.objects.link(volume)
@@ -179,17 +178,10 @@ def test_an_absorption_is_refused_when_other_splats_must_stay_since(addon, few, 
     assert noted(addon, few) is not None
 
 
-@pytest.mark.parametrize("stage", ["sketch", "work"])
-def test_a_fault_on_the_thread_is_raised_and_locks_nothing(addon, start, gate, monkeypatch, stage):
+def test_a_fault_on_the_thread_is_raised_and_locks_nothing(start, gate):
     """Blender prints what is raised; the buttons come back and the timer ends."""
     gate.error = ValueError("a fault")
     gate.open.set()
-    if stage == "sketch":
-
-        def fault(*_arguments, **_options):
-            raise gate.error
-
-        monkeypatch.setattr(addon.core.pipeline, "score", fault)
     operator, context, _ = start()
 
     with pytest.raises(ValueError, match="a fault"):
@@ -208,7 +200,7 @@ def test_only_sidebars_are_drawn_again(start, gate):
     until_over(operator, context)
 
     assert set(context.drawn) == {"VIEW_3D UI"}
-    assert "Refining scores (looking); Esc keeps the closed form's: 39%" in context.said
+    assert "Scoring splats (looking); Esc cancels: 39%" in context.said
     assert context.timers == 0
 
 
@@ -242,20 +234,17 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("stage", ["sketch", "work"])
-def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, few, change, stage):
+def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, few, change):
     """Whatever was done to the object; nothing is written to what it is now."""
     operator, context, said = start()
-    if stage == "work":
-        until(operator, context, lambda: addon.ui.running.now().stage == "shown")
     change(few)
     gate.open.set()
     answer = until_over(operator, context)
 
     assert said[0] == CHANGES[change]
-    assert answer == ({"FINISHED"} if stage == "work" else {"CANCELLED"})
+    assert answer == {"CANCELLED"}
     if change is not _delete:
-        assert (noted(addon, few) is None) == (stage == "sketch")
+        assert noted(addon, few) is None
     assert context.timers == 0
     assert addon.ui.running.now() is None
 
@@ -289,7 +278,7 @@ def test_a_renamed_object_gets_its_result(start, gate, addon, few):
 
 
 def test_a_result_waits_until_edit_mode_is_left(start, gate, addon, few):
-    """Attributes cannot be written there; the sketch is left out."""
+    """Attributes cannot be written there."""
     operator, context, _ = start()
     bpy.ops.object.mode_set(mode="EDIT")
     gate.open.set()
@@ -302,95 +291,27 @@ def test_a_result_waits_until_edit_mode_is_left(start, gate, addon, few):
     assert noted(addon, few)["method"] == "occlusion"
 
 
-def test_the_closed_form_is_shown_first_and_refined_in_place(start, gate, addon, few):
-    """What is there in the end is what scoring at once writes, to the bit; it is one step."""
-    expected = {name: scored_by(few, name) for name in ("closed-form", "occlusion")}
-    plain = noted(addon, few)
+def test_scoring_on_the_thread_writes_what_scoring_at_once_writes(start, addon, few):
+    """To the bit; it is one step."""
+    expected, plain = scored_by(few, "occlusion"), noted(addon, few)
     del few.data[addon.mesh.scores.RECORD]
     operator, context, _ = start()
-    until(operator, context, lambda: addon.ui.running.now().stage == "shown")
-    first, note = values(few).copy(), noted(addon, few)
-    ranks = values(few, "refine_rank").copy()
-    gate.open.set()
-    answer = until_over(operator, context)
 
-    assert np.array_equal(first, expected["closed-form"])
-    assert np.array_equal(ranks, addon.core.selection.rank(first).astype(np.float32))
-    assert (note["method"], note["asked"]["method"]) == ("closed-form", "occlusion")
-    assert addon.ui.staleness.changes(bpy.context, few) == []
-    assert answer == {"FINISHED"}
-    assert np.array_equal(values(few), expected["occlusion"])
+    assert until_over(operator, context) == {"FINISHED"}
+    assert np.array_equal(values(few), expected)
     assert noted(addon, few) | {"seconds": plain["seconds"]} == plain
 
 
-@pytest.mark.parametrize("how", ["escape", "fails"])
-def test_what_stops_the_refinement_leaves_the_closed_form(start, gate, addon, few, how):
-    """Named as such, with a step to undo; *Apply* goes by it."""
-    expected = scored_by(few, "closed-form")
-    scored_by(few, "occlusion")
-    operator, context, said = start()
-    until(operator, context, lambda: addon.ui.running.now().stage == "shown")
-    waits = bpy.ops.refine.apply.poll()
-    if how == "fails":
-        gate.error = MemoryError("Unable to allocate 9 GiB")
-        gate.open.set()
-    else:
-        operator.modal(context, event("ESC"))
-    answer = until_over(operator, context)
-
-    assert not waits
-    assert answer == {"FINISHED"}
-    assert said[-1] == "Refining scores stopped; the scores are the closed form's"
-    assert said[:-1] == (["not enough memory (Unable to allocate 9 GiB)"] if how == "fails" else [])
-    assert np.array_equal(values(few), expected)
-    assert addon.mesh.scores.unrefined(noted(addon, few))
-    assert bpy.ops.refine.apply() == {"FINISHED"}
-
-
-def test_esc_before_anything_is_shown_leaves_the_old_scores(start, addon, few, monkeypatch):
+def test_esc_leaves_the_old_scores(start, gate, addon, few):
     """To the bit, with their note."""
     expected, note = scored_by(few, "occlusion"), noted(addon, few)
-    module, tell = addon.ui.operators, threading.Event()
-
-    def slow(_job, progress):
-        tell.set()
-        while progress(0.1, "reading"):
-            time.sleep(0.01)
-        raise addon.core.Cancelled
-
-    monkeypatch.setattr(module, "_sketch", slow)
     operator, context, said = start()
-    assert tell.wait(60.0)
     operator.modal(context, event("ESC"))
 
     assert until_over(operator, context) == {"CANCELLED"}
     assert said == ["Scoring splats cancelled; nothing was changed"]
     assert np.array_equal(values(few), expected)
     assert noted(addon, few) == note
-
-
-def test_the_closed_form_itself_has_no_sketch(start, addon, few):
-    """It would be done twice."""
-    bpy.context.scene.refine.method = "closed-form"
-    operator, context, _ = start()
-
-    assert addon.ui.running.now().stage == "work"
-    assert until_over(operator, context) == {"FINISHED"}
-    assert noted(addon, few)["asked"] is None
-
-
-def test_while_unrefined_the_panel_promises_no_decibels(start, gate, addon, few):
-    """A PSNR as budget has to wait, which is no error of the user's."""
-    bpy.context.scene.refine.budget = "psnr"
-    operator, context, _ = start()
-    until(operator, context, lambda: addon.ui.running.now().stage == "shown")
-    plan = json.loads(few.data[addon.ui.plans.PLAN])
-
-    assert "error" in plan
-    assert addon.ui.plans.remark(plan, noted(addon, few)) == "Refined scores tell dB"
-    gate.open.set()
-    until_over(operator, context)
-    assert "psnr" in json.loads(few.data[addon.ui.plans.PLAN])
 
 
 def threads():
@@ -402,7 +323,6 @@ def threads():
 def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):
     """Another file is loaded, or the extension is switched off: nothing runs on or is left."""
     operator, context, _ = start()
-    until(operator, context, lambda: addon.ui.running.now().stage == "shown")
     assert threads()
     if how == "another file":
         bpy.ops.wm.read_homefile(use_empty=True)
@@ -420,7 +340,7 @@ def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):
 def test_work_that_listens_to_nobody_is_left_behind(start, addon, few, monkeypatch):
     """It still waits when the operator is over; what it comes to later is dropped."""
     free, expected = threading.Event(), scored_by(few, "occlusion")
-    monkeypatch.setattr(addon.ui.operators, "_sketch", lambda _job, _progress: free.wait(600.0))
+    monkeypatch.setattr(addon.ui.operators, "score", lambda *_, **__: free.wait(600.0))
     operator, context, _ = start()
     operator.modal(context, event("ESC"))
     answer = until_over(operator, context)

@@ -370,7 +370,7 @@ def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, 
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         room_views,
         core.Budget(ratio=0.5),
-        core.Settings("closed-form"),
+        addon.core.ClosedForm(),
     ).keep
     for camera in room_cameras.objects:
         del camera["refine_view"]
@@ -379,7 +379,7 @@ def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, 
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,
         core.Budget(ratio=0.5),
-        core.Settings("closed-form"),
+        addon.core.ClosedForm(),
     ).keep
 
     assert np.count_nonzero(got != expected) == 0

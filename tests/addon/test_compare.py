@@ -18,12 +18,12 @@ def pixels(name):
     return np.rint(values.reshape(height, width, 4)[::-1, :, :3] * 255.0).astype(np.uint8)
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", pytest.param("absorb", marks=pytest.mark.slow)])
-def test_the_pictures_are_those_of_what_apply_leaves(addon, quarter, room_cameras, survivors):
+@pytest.mark.parametrize("method", ["closed-form", pytest.param("merge", marks=pytest.mark.slow)])
+def test_the_pictures_are_those_of_what_apply_leaves(addon, quarter, room_cameras, method):
     """Before: the splats as they are; after: once *Apply* was clicked; by the same camera."""
     scene = bpy.context.scene
     scene.camera = room_cameras.objects[24]
-    scene.refine.ratio, scene.refine.survivors, scene.refine.views = 0.7, survivors, 16
+    scene.refine.ratio, scene.refine.method, scene.refine.views = 0.7, method, 16
     bpy.ops.refine.score()
     gather, check = addon.objects.splat_object.gather, addon.mesh.layout.check
     before = gather(check(quarter), whole=True)
@@ -39,7 +39,7 @@ def test_the_pictures_are_those_of_what_apply_leaves(addon, quarter, room_camera
     assert (expected.view.width, expected.view.height) == (240, 160)
     for name, wanted in zip(NAMES, ("before", "after", "difference"), strict=True):
         apart = np.abs(pixels(name).astype(int) - getattr(expected, wanted))
-        assert apart.max() <= (8 if wanted == "difference" else 1)  # what absorbs is float32 then
+        assert apart.max() <= (8 if wanted == "difference" else 1)  # what is merged is float32 then
 
 
 def test_a_second_comparison_replaces_the_first(room, room_cameras):

@@ -240,8 +240,7 @@ def test_what_compare_measured_stays_in_the_panel_while_the_plan_is_the_same(
 
 def test_levels_do_not_stand_on_top_of_each_other(quarter, room_cameras):
     """They are hidden, in renders too; the original is shown, and stays active."""
-    settings = bpy.context.scene.refine
-    settings.levels, settings.survivors = "0.5, 0.25", "unchanged"
+    bpy.context.scene.refine.levels = "0.5, 0.25"
 
     bpy.ops.refine.levels()
 

@@ -121,13 +121,12 @@ def test_an_object_is_pruned_to_a_size_in_another_format(addon, small, tmp_path)
     core, views = addon.core, addon.core.read_cameras(ROOM / "cameras.json")
     prune, name = addon.objects.operation.prune_object, bpy.context.object.name
 
-    small_enough = core.PruneRequest(views, core.Budget(max_mb=0.0032))
-    report = prune(name, small_enough, output=tmp_path / "a.splat")
+    report = prune(name, views, core.Budget(max_mb=0.0032), output=tmp_path / "a.splat")
 
     assert len(core.read_splats(tmp_path / "a.splat")) == report["splats"]["kept"] == 100
     assert report["files"]["output_bytes"] == 3200
     with pytest.raises(core.RefineError, match=r"a size cannot be kept to in \.spz"):
-        prune(name, core.PruneRequest(views, core.Budget(max_mb=1.0)), output=tmp_path / "a.spz")
+        prune(name, views, core.Budget(max_mb=1.0), output=tmp_path / "a.spz")
 
 
 def test_the_images_of_blender_are_those_of_pillow(addon):

@@ -17,54 +17,29 @@ def preferred(addon):
     """Return the extension's preferences; unset again afterwards."""
     preferences = bpy.context.preferences.addons[addon.__name__].preferences
     yield preferences
-    for name in (*addon.ui.preferences.DEFAULTS, "upright", "absorb"):
+    for name in (*addon.ui.preferences.DEFAULTS, "upright"):
         preferences.property_unset(name)
 
 
 def test_preferences_are_the_defaults_of_what_a_scene_has_not_set(addon, preferred):
-    """The scene has chosen its method; share and Absorb it takes over, the rest stays."""
+    """The scene has chosen its number of views; share and method it takes over."""
     settings = bpy.context.scene.refine
-    preferred.method, preferred.percent, preferred.survivors = "closed-form", 70.0, "absorb"
-    settings.method = "occlusion"
+    preferred.method, preferred.percent, preferred.views = "closed-form", 70.0, 16
+    settings.views = 32
 
     addon.ui.preferences.fill(settings, preferred)
 
-    assert (settings.method, settings.survivors, settings.budget) == (
-        "occlusion",
-        "absorb",
-        "ratio",
-    )
+    assert (settings.method, settings.budget, settings.views) == ("closed-form", "ratio", 32)
     assert settings.ratio == pytest.approx(0.7)
-    assert settings.views == 64
-
-
-@pytest.mark.parametrize(("absorb", "becomes"), [(True, "absorb"), (False, "unchanged")])
-def test_what_was_stored_before_there_was_a_choice_holds(
-    addon, preferred, tmp_path, absorb, becomes
-):
-    """*Absorb* and *Nested* of a file, and *Absorb* of the preferences, are taken over once."""
-    settings, preferred.absorb = bpy.context.scene.refine, absorb
-    addon.ui.preferences.fill(settings, addon.ui.preferences._chosen(bpy.context))
-    by_preferences = settings.survivors
-    settings.property_unset("survivors")
-    settings.absorb, settings.nested = absorb, True
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "older.blend"))
-
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "older.blend"))
-
-    settings = bpy.context.scene.refine
-    assert by_preferences == becomes
-    assert (settings.survivors, settings.level_survivors) == (becomes, "unchanged")
-    assert not settings.is_property_set("absorb")
 
 
 def test_scripts_get_what_they_ask_for(preferred):
     """In the background preferences change nothing."""
-    preferred.survivors, preferred.upright = "absorb", True
+    preferred.method, preferred.upright = "refit", True
 
     bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"))
 
-    assert not bpy.context.scene.refine.is_property_set("survivors")
+    assert not bpy.context.scene.refine.is_property_set("method")
     assert bpy.context.object.matrix_world.is_identity
 
 

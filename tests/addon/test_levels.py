@@ -16,7 +16,7 @@ def few(addon, room, room_cameras):
     remove = np.arange(len(room.data.vertices)) % 10 != 0
     addon.mesh.edit.delete_vertices(room, remove)
     settings = bpy.context.scene.refine
-    settings.levels, settings.level_survivors = "0.5, 0.1", "unchanged"
+    settings.levels = "0.5, 0.1"
     return room
 
 
@@ -31,8 +31,8 @@ def test_levels_are_objects_beside_the_original(addon, few, room_views):
     wanted = core.lod(
         addon.objects.splat_object.gather(addon.mesh.layout.check(few), whole=True),
         room_views,
-        core.Levels((0.5, 0.1), survivors="unchanged"),
-        core.Settings("closed-form"),
+        core.Levels((0.5, 0.1)),
+        addon.core.ClosedForm(),
     )
     before, matrix = splats_of(addon, few), few.matrix_world.copy()
 
@@ -43,20 +43,20 @@ def test_levels_are_objects_beside_the_original(addon, few, room_views):
     assert len(few.data.vertices) == 3976
     for number, level in enumerate(wanted, start=1):
         obj = collection.objects[f"room_lod{number}"]
-        np.testing.assert_array_equal(splats_of(addon, obj).means, before.means[level.keep])
+        np.testing.assert_array_equal(splats_of(addon, obj).means, before.means[level.result.keep])
         assert obj.matrix_world == matrix
         assert obj["refine_lod"]["splats"] == len(obj.data.vertices)
     assert len(collection.objects["room_lod2"].data.vertices) == 398
     assert bpy.context.object == few
 
 
-def test_absorbed_levels_stand_where_the_original_does(addon, few):
-    """The object and its cameras moved: survivors are stored in its frame."""
+def test_merged_levels_stand_where_the_original_does(addon, few):
+    """The object and its cameras moved: splats are stored in its frame."""
     few.matrix_world = Matrix.Translation((1.0, 2.0, 3.0))
     for camera in (obj for obj in bpy.data.objects if obj.type == "CAMERA"):
         camera.matrix_world = Matrix.Translation((1.0, 2.0, 3.0)) @ camera.matrix_world
     settings = bpy.context.scene.refine
-    settings.level_survivors, settings.levels, settings.views = "absorb", "0.3", 8
+    settings.method, settings.levels, settings.views = "merge", "0.3", 8
     bpy.context.view_layer.update()
     low, high = (f(splats_of(addon, few).means, axis=0) for f in (np.min, np.max))
 

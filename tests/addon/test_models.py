@@ -60,7 +60,7 @@ def test_discs_go_through_an_object_as_they_are(addon, discs, tmp_path):
 
 
 def test_discs_are_turned_and_merged(addon, discs, tmp_path, room_views):
-    """A turn of the object, baked into the file, and absorbing leave discs."""
+    """A turn of the object, baked into the file, and merging leave discs."""
     obj, _ = discs
     obj.rotation_euler = (0.3, 0.2, 0.1)
     bpy.context.view_layer.update()
@@ -72,8 +72,9 @@ def test_discs_are_turned_and_merged(addon, discs, tmp_path, room_views):
     assert turned.model == "2dgs"
 
     result = addon.core.prune(
-        expected, room_views, addon.core.Budget(ratio=0.5), survivors="absorb"
+        expected, room_views, addon.core.Budget(ratio=0.5), addon.core.Refit(rounds=1)
     )
+    assert result.merged is not None
     addon.objects.splat_object.apply_object(checked, result)
 
     left = addon.mesh.layout.check(obj)

@@ -169,7 +169,7 @@ def test_a_point_cloud_is_scored_like_the_file_it_exports(addon, core, cloud, ro
     """Logarithms and logits are rounded to float32 before scoring, as they are in the file."""
     export(addon, addon.mesh.layout.check(cloud), tmp_path / "out.ply")
     expected = core.score(
-        core.read_ply(tmp_path / "out.ply").splats(), room_views, core.Settings("closed-form")
+        core.read_ply(tmp_path / "out.ply").splats(), room_views, addon.core.ClosedForm()
     )
     bpy.ops.refine.score()
     got = addon.mesh.scores.stored_scores(addon.mesh.layout.check(cloud))
@@ -218,11 +218,11 @@ def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_camer
         keep_mask(addon, cloud, budget, "number")
 
 
-def test_absorbing_changes_survivors_alone(addon, cloud, room_cameras):
-    """What absorbed nothing is equal to the bit, though logarithms are taken and undone."""
+def test_merging_changes_what_others_are_merged_into(addon, cloud, room_cameras):
+    """The rest is equal to the bit, though logarithms are taken and undone."""
     addon.mesh.edit.delete_vertices(cloud, np.arange(len(cloud.data.points)) % 10 != 0)
     settings = bpy.context.scene.refine
-    settings.survivors, settings.ratio, settings.views = "absorb", 0.6, 4
+    settings.method, settings.ratio, settings.views = "merge", 0.6, 4
     store(cloud, "number", "INT", np.arange(len(cloud.data.points), dtype=np.int32))
     bpy.ops.refine.score()
     read = addon.mesh.attributes.read_attribute
@@ -282,7 +282,7 @@ def test_the_command_prunes_a_point_cloud(addon, cloud, room_cameras, tmp_path):
     export(addon, addon.mesh.layout.check(cloud), tmp_path / "all.ply")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     words = ["prune", "--object", "room", "-o", str(tmp_path / "out.ply"), "--save", "--quiet"]
-    words += ["--survivors", "unchanged"]
+    words += ["--method", "occlusion"]
 
     assert addon.command.main(words, scene=True) == 0
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
@@ -558,12 +558,12 @@ def test_blenders_own_import_is_what_these_tests_build(addon, core, file, tmp_pa
     assert bpy.context.object.data.type == "GAUSSIAN_SPLAT"
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb", "refit"])
-def test_levels_of_detail_of_native_splats_are_native(addon, cloud, room_cameras, survivors):
+@pytest.mark.parametrize("method", ["closed-form", "merge", "refit"])
+def test_levels_of_detail_of_native_splats_are_native(addon, cloud, room_cameras, method):
     """Copies reduced by the same apply: points of .1 and .05 of 9,939, rounded up."""
     addon.mesh.edit.delete_vertices(cloud, np.arange(39755) % 4 != 0)
     settings = bpy.context.scene.refine
-    settings.levels, settings.level_survivors, settings.views = "0.1, 0.05", survivors, 6
+    settings.levels, settings.method, settings.views = "0.1, 0.05", method, 6
 
     assert bpy.ops.refine.levels() == {"FINISHED"}
 

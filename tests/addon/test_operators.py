@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
-from .conftest import export, keep_mask
+from .conftest import deleted, export, keep_mask
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
@@ -23,7 +22,7 @@ def _bytes(path):
 def test_import_score_apply_export_writes_the_file_that_core_writes(addon, room_cameras, tmp_path):
     """The panel's path from file to file, against `prune_file` with the camera file: 50 % off."""
     settings = bpy.context.scene.refine
-    settings.method, settings.ratio = "auto", 0.5
+    settings.method, settings.ratio = "merge", 0.5
     bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"))
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
@@ -33,18 +32,17 @@ def test_import_score_apply_export_writes_the_file_that_core_writes(addon, room_
     core.prune_file(
         ROOM / "point_cloud.ply",
         tmp_path / "core.ply",
-        core.PruneRequest(views, core.Budget(ratio=0.5)),
+        views,
+        core.Budget(ratio=0.5),
     )
 
     assert len(room_cameras.objects) == len(views) == 72
     assert _bytes(tmp_path / "panel.ply") == _bytes(tmp_path / "core.ply")
 
 
-@pytest.mark.parametrize(
-    ("method", "survivors"), [("occlusion", "unchanged"), ("closed-form", "absorb")]
-)
+@pytest.mark.parametrize("method", ["occlusion", "merge"])
 def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
-    addon, quarter_file, method, survivors
+    addon, quarter_file, method
 ):
     """A quarter turn of splats and cameras: the command without Blender never sees it."""
     bpy.ops.refine.import_ply(filepath=str(quarter_file), upright=True)
@@ -53,7 +51,7 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
     obj.data.attributes["row"].data.foreach_set("value", np.arange(9939))
     bpy.ops.refine.import_cameras(filepath=str(ROOM / "cameras.json"), upright=True)
     settings = bpy.context.scene.refine
-    settings.method, settings.survivors, settings.views, settings.ratio = method, survivors, 24, 0.9
+    settings.method, settings.views, settings.ratio = method, 24, 0.9
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     core = addon.core
@@ -62,8 +60,7 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
         splats,
         core.read_cameras(ROOM / "cameras.json"),
         core.Budget(ratio=0.9),
-        core.Settings(method, views=24),
-        survivors=survivors,
+        core.METHODS[method](24),
     ).keep
 
     found = addon.mesh.attributes.read_attribute(obj.data, "row")
@@ -86,12 +83,10 @@ def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, 
     core = addon.core
     file = core.read_ply(ROOM / "point_cloud.ply")
     expected = core.prune(
-        file.splats(),
+        file,
         core.read_cameras(ROOM / "cameras.json"),
         core.Budget(**{kind: value}),
-        core.Settings("closed-form"),
-        row_bytes=file.row_bytes,
-        fixed_bytes=file.fixed_bytes,
+        addon.core.ClosedForm(),
     ).keep
 
     assert np.array_equal(got, expected)
@@ -101,11 +96,13 @@ def test_settings_reach_core_as_they_were_typed(addon):
     """The defaults of the panel are those of core; each change arrives."""
     core = addon.core
     settings = bpy.context.scene.refine
-    assert settings.to_settings() == core.Settings()
+    assert settings.to_method() == core.Merge()
     assert settings.to_budget() == core.Budget(ratio=0.5)
 
-    settings.method, settings.views, settings.rounds = "closed-form", 7, 3
-    assert settings.to_settings() == core.Settings("closed-form", views=7, rounds=3)
+    settings.views, settings.rounds = 7, 3
+    for name, kind in core.METHODS.items():
+        settings.method = name
+        assert settings.to_method() == (core.Refit(7, 3) if name == "refit" else kind(7))
 
 
 def test_scoring_writes_scores_ranks_views_and_colours(addon, room, room_cameras):
@@ -151,7 +148,7 @@ def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):
 
 
 def test_apply_asks_for_new_scores_before_it_removes_more(room, room_cameras):
-    """Pressed twice, it must not halve twice; only adjusted, which Blender undoes first."""
+    """Pressed twice, it must not halve twice."""
     assert not bpy.ops.refine.apply.poll()
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
@@ -261,28 +258,11 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
     unchanged()
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_a_budget_that_means_nothing_to_the_scores_is_refused(
-    addon,
-    room,
-    room_cameras,
-    room_views,
-    unchanged,
-    survivors,
-):
-    """As the command refuses it, by what made the scores, not by the panel's method now.
-
-    Without a frustum test, as a script can ask for it, every view sees every splat.
-    """
-    method, kind, reason = "closed-form", "min_seen", "min_seen would remove none"
-    settings, core = bpy.context.scene.refine, addon.core
-    settings.views, settings.survivors = 4, survivors
-    checked = addon.mesh.layout.check(room)
-    asked = core.Settings(method, 4)
-    scores = core.score(addon.objects.splat_object.gather(checked), room_views, asked)
-    scores = replace(scores, frustum=False)
-    addon.mesh.scores.store(checked, scores, addon.mesh.scores.Provenance(asked))
-    settings.budget = kind
+def test_a_budget_that_means_nothing_to_the_scores_is_refused(addon, room, room_cameras, unchanged):
+    """As the command refuses it: the closed form told nothing of the pictures."""
+    settings, reason = bpy.context.scene.refine, "score again with a PSNR as budget"
+    bpy.ops.refine.score()
+    settings.budget = "psnr"
     addon.ui.plans.refresh(bpy.context)
     unchanged.start()
 
@@ -504,7 +484,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,
         addon.core.Budget(ratio=0.5),
-        addon.core.Settings("closed-form"),
+        addon.core.ClosedForm(),
     ).keep
     if how == "hide_set":
         room.hide_set(True)
@@ -518,10 +498,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
         bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
     score(room, views)
     keep = keep_mask(addon, room, addon.core.Budget(ratio=0.5))
-    task = addon.objects.splat_object.stored_task(
-        addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5)
-    )
-    result = addon.core.pipeline.decide(task)
+    result = deleted(addon, addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5))
     addon.objects.splat_object.apply_object(addon.mesh.layout.check(room), result)
 
     assert np.array_equal(keep, expected)
@@ -553,17 +530,15 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
     views = core.read_cameras(ROOM / "cameras.json")
     with pytest.raises(core.RefineError, match=r"^~nouser/x\.ply: cannot be found"):
         addon.objects.operation.prune_object(
-            "room",
-            addon.core.PruneRequest(views, core.Budget(ratio=0.5), core.Settings()),
-            output=Path("~nouser/x.ply"),
+            "room", views, core.Budget(ratio=0.5), output=Path("~nouser/x.ply")
         )
 
 
 @pytest.mark.parametrize(
     ("module", "function", "operator", "arguments"),
     [
-        ("core.pipeline", "score", "score", {}),
-        ("core.pipeline", "decide", "apply", {}),
+        ("ui.operators", "score", "score", {}),
+        ("ui.operators", "prune", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.camera_import", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
         ("ui.export_operators", "write_splats", "export_ply", {"filepath": "out.ply"}),
@@ -586,34 +561,3 @@ def test_too_little_memory_is_a_sentence(
     expected = "not enough memory" + (f" ({said})" if said else "")
     with pytest.raises(RuntimeError, match=f"^Error: {re.escape(expected)}\n$"):
         getattr(bpy.ops.refine, operator)(**arguments)
-
-
-def test_apply_takes_another_budget_and_leaves_it_in_the_panel(room, room_cameras):
-    """As when it is adjusted: 30 % of 39,755 are 11,926. Without a value the panel's counts."""
-    settings = bpy.context.scene.refine
-    settings.ratio = 0.9
-    bpy.ops.refine.score()
-
-    bpy.ops.refine.apply(percent=30.0)
-
-    assert len(room.data.vertices) == 39_755 - 11_926
-    assert settings.ratio == pytest.approx(0.3)
-    bpy.ops.refine.score()
-    bpy.ops.refine.apply(budget="keep", keep=1000)
-    assert len(room.data.vertices) == 1000
-    assert settings.budget == "keep"
-
-
-def test_an_apply_that_fails_leaves_the_budget_of_the_panel(room, room_cameras):
-    """Nothing of the name is there to protect: no splat goes, and the next click is as before."""
-    settings = bpy.context.scene.refine
-    settings.ratio = 0.9
-    bpy.ops.refine.score()
-    settings.protect = "none"
-
-    with pytest.raises(RuntimeError, match="nothing to protect is named 'none'"):
-        bpy.ops.refine.apply(budget="keep", keep=1000, percent=30.0)
-
-    assert len(room.data.vertices) == 39_755
-    assert settings.budget == "ratio"
-    assert settings.ratio == pytest.approx(0.9)

@@ -86,7 +86,7 @@ def draw(addon, monkeypatch):
         with monkeypatch.context() as patch:
             for name in ("stored_scores", "gather", "apply"):
                 patch.setattr(addon.objects.splat_object, name, never)
-            for name in ("members", "stored_task", "mark_removed", "gather", "apply"):
+            for name in ("members", "stored_arguments", "mark_removed", "gather", "apply"):
                 patch.setattr(addon.objects.splat_group, name, never)
             patch.setattr(addon.mesh.attributes, "read_attribute", never)
             patch.setattr(addon.mesh.attributes, "write_attribute", never)
@@ -325,12 +325,11 @@ def test_one_bar_is_drawn_in_the_box_of_the_button_that_was_clicked(draw, at_wor
     assert f"refine.{name}" in buttons <= set(drawn)
 
 
-@pytest.mark.parametrize("name", ["survivors", "level_survivors"])
-def test_rounds_are_drawn_where_survivors_are_refitted(draw, name):
-    """In the boxes of *Apply* and of levels."""
-    setattr(bpy.context.scene.refine, name, "absorb")
+def test_rounds_are_drawn_where_splats_are_refitted(draw):
+    """In the box of *Score*, where the method is chosen."""
+    bpy.context.scene.refine.method = "merge"
     without = draw().count("rounds")
-    setattr(bpy.context.scene.refine, name, "refit")
+    bpy.context.scene.refine.method = "refit"
 
     assert (without, draw().count("rounds")) == (0, 1)
 

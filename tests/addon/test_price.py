@@ -20,7 +20,7 @@ def chart(addon):
 
 @pytest.fixture
 def curve(addon):
-    """Give a straight curve: 50 dB with 20 % removed, 30 with 80 %; absorbing gains 6 dB."""
+    """Give a straight curve: 50 dB with 20 % removed, 30 with 80 %; merging gains 6 dB."""
     shares, psnr = np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0])
     return addon.core.quality.curve.Quality(shares, psnr, psnr + 6.0)
 
@@ -55,22 +55,22 @@ def test_the_curve_goes_where_the_estimate_is(chart, curve, size):
     look = chart.Look(size, INK)
     made = chart.Chart(look, curve, chart.by_views(np.zeros(4, np.int32), 4))
     picture = made.picture(None)
-    blue = np.array(look.colors["unchanged"]) * 255.0
+    blue = np.array(look.colors["delete"]) * 255.0
 
     for share, psnr in ((0.2, 50.0), (0.5, 40.0), (0.79, 30.3)):
         assert np.abs(pixel(picture, *made.at(share, psnr))[:3] - blue).max() < 8
 
 
 def test_the_budget_is_a_dot_on_the_curve_that_holds_and_a_line_through_both(chart, curve):
-    """A dot 4 pixels wide around the estimate: of deleting, or of absorbing where that is asked."""
+    """A dot 4 pixels wide around the estimate: of deleting, or of merging where that is asked."""
     look = chart.Look(212, INK)
     made = chart.Chart(look, curve, chart.by_views(np.zeros(4, np.int32), 4))
-    for survivors, name, psnr in (("unchanged", "unchanged", 40.0), ("absorb", "absorb", 46.0)):
-        picture = made.picture(chart.Place(0.5, survivors))
+    for way, psnr in (("delete", 40.0), ("merge", 46.0)):
+        picture = made.picture(chart.Place(0.5, way))
         x, y = made.at(0.5, psnr)
 
         for aside in (-3, 0, 2):
-            color = np.array(look.colors[name]) * 255.0
+            color = np.array(look.colors[way]) * 255.0
             assert np.abs(pixel(picture, x + aside, y)[:3] - color).max() < 8
         assert pixel(picture, x, made.at(0.5, 33.0)[1])[3] > 150
 
@@ -85,8 +85,8 @@ def test_moving_the_budget_draws_what_drawing_all_anew_does(chart, curve):
     anew = chart.Chart(chart.Look(300, INK), curve, kinds)
 
     assert np.array_equal(
-        moved.picture(chart.Place(0.7, survivors="absorb")),
-        anew.picture(chart.Place(0.7, survivors="absorb"), going),
+        moved.picture(chart.Place(0.7, "merge")),
+        anew.picture(chart.Place(0.7, "merge"), going),
     )
 
 
@@ -259,29 +259,29 @@ def test_the_sentence_tells_all_three_ways(addon):
     """The one that Apply would take first; estimates above 60 dB are all the same."""
     plan = {"splats": 39755, "kept": 19878, "bytes_before": 9.86e6, "bytes_after": 4.93e6}
     sentence = addon.ui.plans.sentence
-    known = plan | {"psnr": 37.8, "psnr_absorbed": 46.4, "psnr_refitted": 49.2}
-    seen = dict.fromkeys(("psnr", "psnr_absorbed", "psnr_refitted"), 70.0)
+    known = plan | {"psnr": 37.8, "psnr_merged": 46.4, "psnr_refitted": 49.2}
+    seen = dict.fromkeys(("psnr", "psnr_merged", "psnr_refitted"), 70.0)
     start = "Keeps 19,878 of 39,755, 4.9 of 9.9 MB"
 
-    assert sentence(plan | {"becomes": "absorb"}) == start
-    for survivors, words in (
-        ("unchanged", "about 38 dB in these views (Absorb: about 46, Refit: about 49)"),
-        ("absorb", "about 46 dB in these views (Unchanged: about 38, Refit: about 49)"),
-        ("refit", "about 49 dB in these views (Unchanged: about 38, Absorb: about 46)"),
+    assert sentence(plan | {"becomes": "merge"}) == start
+    for way, words in (
+        ("delete", "about 38 dB in these views (Merge: about 46, Refit: about 49)"),
+        ("merge", "about 46 dB in these views (Occlusion: about 38, Refit: about 49)"),
+        ("refit", "about 49 dB in these views (Occlusion: about 38, Merge: about 46)"),
     ):
-        assert sentence(known | {"becomes": survivors}) == f"{start}, {words}"
-    assert sentence(plan | seen | {"becomes": "unchanged"}).endswith(
-        "more than 60 dB in these views (Absorb: more than 60, Refit: more than 60)"
+        assert sentence(known | {"becomes": way}) == f"{start}, {words}"
+    assert sentence(plan | seen | {"becomes": "delete"}).endswith(
+        "more than 60 dB in these views (Merge: more than 60, Refit: more than 60)"
     )
 
 
-def test_what_absorbing_reaches_of_few_splats_is_neither_told_nor_drawn(addon, chart, curve):
+def test_what_merging_reaches_of_few_splats_is_neither_told_nor_drawn(addon, chart, curve):
     """There the estimate of it is far off; the curve and the sentence of deleting stay."""
     plan = {"splats": 900, "kept": 450, "bytes_before": 9.86e6, "bytes_after": 4.93e6, "psnr": 37.8}
     start, sentence = "Keeps 450 of 900, 4.9 of 9.9 MB", addon.ui.plans.sentence
     look, few = chart.Look(212, INK), replace(curve, foretold=False)
-    kinds, place = chart.by_views(np.zeros(4, np.int32), 4), chart.Place(0.5, survivors="unchanged")
-    orange = np.array(look.colors["absorb"]) * 255.0
+    kinds, place = chart.by_views(np.zeros(4, np.int32), 4), chart.Place(0.5, "delete")
+    orange = np.array(look.colors["merge"]) * 255.0
 
     drawn = [
         (
@@ -291,9 +291,9 @@ def test_what_absorbing_reaches_of_few_splats_is_neither_told_nor_drawn(addon, c
     ]
 
     assert drawn == [True, False]
-    assert sentence(plan | {"becomes": "unchanged"}) == f"{start}, about 38 dB in these views"
-    unless = "about 38 dB in these views if survivors stay unchanged"
-    assert sentence(plan | {"becomes": "absorb"}) == f"{start}, {unless}"
+    assert sentence(plan | {"becomes": "delete"}) == f"{start}, about 38 dB in these views"
+    by_deleting = "about 38 dB in these views by deleting"
+    assert sentence(plan | {"becomes": "merge"}) == f"{start}, {by_deleting}"
 
 
 def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):
@@ -315,18 +315,19 @@ def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):
     assert middle["psnr"] == pytest.approx(35.0, abs=0.01)
 
 
-def test_a_quality_with_absorb_counts_on_what_absorbing_reaches(addon, room, room_cameras):
-    """More goes than by deleting, and absorbing is expected to reach the quality asked for."""
+def test_a_quality_counts_on_what_merging_reaches(addon, room, room_cameras):
+    """More goes than by deleting, and merging is expected to reach the quality asked for."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     settings.budget, settings.psnr, settings.views = "psnr", 35.0, 8
+    settings.method = "occlusion"
     bpy.ops.refine.score()
     deleted = plans.stored(room, settings)
-    settings.survivors = "absorb"
-    absorbed = plans.stored(room, settings)
+    settings.method = "merge"
+    merged = plans.stored(room, settings)
 
-    assert absorbed["removed"] > 1.2 * deleted["removed"]
-    assert absorbed["psnr_absorbed"] == pytest.approx(35.0, abs=0.01)
-    assert plans.sentence(absorbed).startswith("Keeps about ")
+    assert merged["removed"] > 1.2 * deleted["removed"]
+    assert merged["psnr_merged"] == pytest.approx(35.0, abs=0.01)
+    assert plans.sentence(merged).startswith("Keeps about ")
 
 
 def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras):
@@ -336,7 +337,8 @@ def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras
     record = addon.mesh.scores.record(room.data)
     plan = plans.stored(room, settings)
 
-    assert plans.remark(plan, record) == "Score with Auto, or with Quality as the budget, to see dB"
+    remark = "Score by another method, or with Quality as the budget, to see dB"
+    assert plans.remark(plan, record) == remark
     assert "dB" not in plans.sentence(plan)
 
 
@@ -359,17 +361,17 @@ def test_what_the_cameras_do_not_know_is_said_beside_apply(addon, room, room_cam
     ]
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_success_is_no_warning(room, room_cameras, capfd, survivors):
+@pytest.mark.parametrize("method", ["closed-form", "merge"])
+def test_success_is_no_warning(room, room_cameras, capfd, method):
     """Blender prints what operators report, each with its kind in front."""
     settings = bpy.context.scene.refine
-    settings.views, settings.survivors = 4, survivors
+    settings.views, settings.method = 4, method
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     said = capfd.readouterr().out
 
     assert "Info: Kept 19,878 splats" in said
-    assert ("survivors absorbed" in said) == (survivors == "absorb")
+    assert ("splats were merged into" in said) == (method == "merge")
     assert "Warning" not in said
 
 
@@ -393,7 +395,7 @@ def test_a_sentence_is_broken_where_the_panel_ends(addon):
     """No line is wider, none could take the next word too, and no word is lost."""
     import blf
 
-    text = "Keeps 19,878 of 39,755, 4.9 of 9.9 MB, about 38 dB in these views (Absorb: about 46)"
+    text = "Keeps 19,878 of 39,755, 4.9 of 9.9 MB, about 38 dB in these views (Merge: about 46)"
     lines = addon.ui.wrapped.lines(text, 230, 11.0)
     blf.size(0, 11.0)
 

@@ -70,13 +70,13 @@ def test_the_list_tells_how_close_each_picture_stays(addon, room, room_cameras):
     assert manager.refine_changes_most == min(told, key=many.__getitem__)
 
 
-def test_absorbing_changes_less(room, room_cameras):
+def test_merging_changes_less(room, room_cameras):
     """Each picture gains what all of them gain on average: 39,755 splats are enough to foretell."""
     settings, manager = bpy.context.scene.refine, bpy.context.window_manager
     settings.method, settings.views, settings.percent = "occlusion", 4, 50.0
     bpy.ops.refine.score()
     deleted = {item.name: item.psnr for item in manager.refine_cameras}
-    settings.survivors = "absorb"
+    settings.method = "merge"
     gains = {i.name: i.psnr - deleted[i.name] for i in manager.refine_cameras if i.psnr >= 0.0}
 
     assert len(gains) == 4
@@ -126,10 +126,7 @@ def test_the_command_notes_what_the_panel_warns_of(addon, imported):
     obj = imported(splats=True, cameras=False)
     views = addon.cameras.sets.CameraChoice.of_scene(bpy.context.scene).views(bpy.context, obj)
     report = addon.objects.operation.prune_object(
-        obj.name,
-        addon.core.PruneRequest(
-            views, addon.core.Budget(ratio=0.5), addon.core.Settings("closed-form"), dry_run=True
-        ),
+        obj.name, views, addon.core.Budget(ratio=0.5), addon.core.ClosedForm(), dry_run=True
     )
 
     assert [note for note in report["notes"] if "do not share an up axis" in note]

@@ -224,7 +224,7 @@ def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
     chosen(room, best)
     bpy.ops.refine.protect(mode="ADD", mark="GO")
     assert "what must go changed" in addon.ui.staleness.changes(bpy.context, room)
-    assert addon.objects.demands.facts(room.data)["forced"] == 100
+    assert addon.objects.demands.facts(room.data)["removed_by_user"] == 100
     bpy.ops.refine.score()
     assert addon.ui.staleness.changes(bpy.context, room) == []
     going = addon.mesh.attributes.read_attribute(room.data, "refine_remove")
@@ -234,7 +234,7 @@ def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
     bpy.ops.refine.protect(mode="ADD", mark="STAY")
     facts = addon.objects.demands.facts(room.data)
 
-    assert (facts["protected"], facts["forced"]) == (40, 60)
+    assert (facts["protected"], facts["removed_by_user"]) == (40, 60)
     bpy.ops.refine.crop()
     assert addon.mesh.layout.splat_count(room.data) == COUNT - 60
 

@@ -47,24 +47,23 @@ def test_the_object_that_cannot_be_scored_is_named(halves):
 
 
 @pytest.mark.parametrize(
-    ("method", "survivors"),
+    "method",
     [
-        ("closed-form", "unchanged"),
-        pytest.param("occlusion", "unchanged", marks=pytest.mark.slow),
-        pytest.param("closed-form", "absorb", marks=pytest.mark.slow),
+        "closed-form",
+        pytest.param("occlusion", marks=pytest.mark.slow),
+        pytest.param("merge", marks=pytest.mark.slow),
     ],
 )
-def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, method, survivors):
+def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, method):
     """70 % of 39,755 are 27,828 by one order of removal; 11,927 stay, unevenly in both objects."""
     settings = bpy.context.scene.refine
-    settings.method, settings.survivors, settings.views, settings.ratio = method, survivors, 16, 0.7
+    settings.method, settings.views, settings.ratio = method, 16, 0.7
     core = addon.core
     expected = core.prune(
         core.read_ply(ROOM / "point_cloud.ply").splats(),
         room_views,
         core.Budget(ratio=0.7),
-        core.Settings(method, views=16),
-        survivors=survivors,
+        core.METHODS[method](16),
     )
 
     assert bpy.ops.refine.score() == {"FINISHED"}
@@ -75,7 +74,7 @@ def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, m
     np.testing.assert_array_equal(rows(addon, halves), np.flatnonzero(expected.keep))
     check, gather = addon.mesh.layout.check, addon.objects.splat_object.gather
     left = [gather(check(obj), whole=True) for obj in halves]
-    wanted = expected.survivors(core.read_ply(ROOM / "point_cloud.ply").splats())
+    wanted = expected.splats
     np.testing.assert_allclose(
         np.concatenate([part.means for part in left]), wanted.means, rtol=1e-6, atol=1e-6
     )
@@ -97,7 +96,7 @@ def test_a_mesh_and_a_point_cloud_share_a_budget(addon, halves, room_views):
         core.read_ply(ROOM / "point_cloud.ply").splats(),
         room_views,
         core.Budget(ratio=0.5),
-        core.Settings("closed-form"),
+        addon.core.ClosedForm(),
     ).keep
 
     assert [obj.type for obj in clouds] == ["MESH", "POINTCLOUD"]
@@ -135,9 +134,9 @@ def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):
     members = group.members(bpy.context.view_layer, addon.mesh.layout.check(halves[1]))
 
     found = group.forced_of_each(bpy.context.scene, members)
-    task = group.stored_task(members, settings.to_budget(), found)
+    arguments = group.stored_arguments(members, settings.to_budget(), found, settings.to_method())
 
-    assert task.scores.quality is not None
+    assert arguments["scores"].quality is not None
     assert all(scores.stored_scores(member).quality is None for member in members)
     ranks = [addon.mesh.attributes.read_attribute(obj.data, "refine_rank") for obj in halves]
     np.testing.assert_allclose(np.sort(np.concatenate(ranks)), np.linspace(0, 1, COUNT), atol=1e-6)

@@ -55,12 +55,10 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):
     unchanged.start()
     report = addon.objects.operation.prune_object(
         "room",
-        addon.core.PruneRequest(
-            addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context),
-            addon.core.Budget(keep=1000),
-            addon.core.Settings("closed-form"),
-            dry_run=True,
-        ),
+        addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context),
+        addon.core.Budget(keep=1000),
+        addon.core.ClosedForm(),
+        dry_run=True,
         output=tmp_path / "out.ply",
     )
 
@@ -76,9 +74,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
         addon.objects.operation.prune_object(
-            "rooom",
-            addon.core.PruneRequest(views, addon.core.Budget(ratio=0.5)),
-            **options,
+            "rooom", views, addon.core.Budget(ratio=0.5), **options
         )
 
 
@@ -86,11 +82,7 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
     """There is no file to save to."""
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
-        addon.objects.operation.prune_object(
-            "room",
-            addon.core.PruneRequest(views, addon.core.Budget(ratio=0.5), addon.core.Settings()),
-            save=True,
-        )
+        addon.objects.operation.prune_object("room", views, addon.core.Budget(ratio=0.5), save=True)
     assert len(room.data.vertices) == 39755
 
 
@@ -188,7 +180,7 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):
     scores = addon.core.score(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,
-        addon.core.Settings("closed-form"),
+        addon.core.ClosedForm(),
     )
     keep = np.ones(39755, np.bool_)
     keep[7] = False
@@ -198,7 +190,7 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):
         addon.mesh.scores.store(
             addon.mesh.layout.check(room),
             scores,
-            addon.mesh.scores.Provenance(addon.core.Settings()),
+            addon.mesh.scores.Provenance(addon.core.ClosedForm()),
         )
 
 

@@ -509,10 +509,10 @@ def test_who_turns_sizes_and_rotations_as_well_is_left_alone(addon, imported):
     assert told_of(addon, imported) == []
 
 
-def test_absorbing_and_conversion_are_no_drift(addon, imported, room_cameras):
-    """Survivors move and grow; a point cloud holds other numbers. A drift from before stays one."""
+def test_merging_and_conversion_are_no_drift(addon, imported, room_cameras):
+    """Splats move and grow; a point cloud holds other numbers. A drift from before stays one."""
     select(imported)
-    bpy.context.scene.refine.survivors = "absorb"
+    bpy.context.scene.refine.method = "merge"
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     assert addon.mesh.drift.found(imported.data) is None
@@ -552,9 +552,9 @@ def test_score_apply_and_export_say_what_was_done(
         said = capfd.readouterr()
         assert "splats were transformed without" in said.out + said.err
     core = addon.core
-    budget, settings = core.Budget(ratio=0.5), core.Settings("closed-form")
-    request = core.PruneRequest(room_views, budget, settings, dry_run=True)
-    report = addon.objects.operation.prune_object(imported.name, request)
+    report = addon.objects.operation.prune_object(
+        imported.name, room_views, core.Budget(ratio=0.5), core.ClosedForm(), dry_run=True
+    )
 
     assert "Mend Splats in the panel" in " ".join(report["notes"])
 

@@ -121,7 +121,7 @@ def test_the_panel_removes_what_volumes_say_and_keeps_what_they_protect(addon, r
     assert len(room.data.vertices) == 39_755 - 31_804
 
 
-def test_more_forced_out_than_the_budget_takes_goes_all_the_same(addon, room, crop):
+def test_more_that_must_go_than_the_budget_takes_goes_all_the_same(addon, room, crop):
     """And nothing beside it."""
     _, removed = crop
     bpy.context.scene.refine.ratio = 0.01
@@ -135,26 +135,25 @@ def opacities(path, core):
     return core.read_ply(path).splats().opacity_logits
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"], ids=["delete", "absorb"])
-def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp_path, survivors):
+@pytest.mark.parametrize("method", ["closed-form", "merge"])
+def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp_path, method):
     """By the saved scene, by options that name its objects, and by masks: the same file."""
     protected, removed = crop
     settings = bpy.context.scene.refine
-    settings.ratio, settings.survivors = 0.8, survivors
+    settings.ratio, settings.method = 0.8, method
     settings.views = 8
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     views = addon.ui.operators.chosen_views(bpy.context)
     by_api = core.prune(
         addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True), views,
-        core.Budget(ratio=0.8), core.Settings("closed-form", 8),
-        protected=protected, forced_out=removed, survivors=survivors,
+        core.Budget(ratio=0.8), core.METHODS[method](8),
+        protected=protected, removed=removed,
     )  # fmt: skip
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     bpy.ops.refine.export_ply(filepath=str(tmp_path / "panel.ply"))
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    words = ["prune", "--object", "room", "--ratio", ".8", "--views", "8", *CLOSED]
-    words += ["--absorb"] if survivors == "absorb" else []
+    words = ["prune", "--object", "room", "--ratio", ".8", "--views", "8", "--method", method]
     told = tmp_path / "report.json"
     saved = [*words, "-o", str(tmp_path / "saved.ply"), "--report", str(told)]
     assert command(addon, saved) == 0
@@ -166,13 +165,13 @@ def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp
     assert files["panel"] == files["saved"] == files["named"]
     entry = json.loads(told.read_text())["results"][0]
     assert entry["splats"]["protected"] == protected.sum()
-    assert entry["splats"]["forced"] == removed.sum()
+    assert entry["splats"]["removed_by_user"] == removed.sum()
     assert [v["name"] for v in entry["volumes"]] == [
         f"object '{n}'" for n in ("Outer", "Inner", "Core")
     ]
     kept = opacities(tmp_path / "saved.ply", core)
     assert len(kept) == by_api.keep.sum() == 9_939 - 7_951  # floor(.8 * 9939)
-    if survivors == "unchanged":
+    if method == "closed-form":
         room = bpy.data.objects["room"]
         assert np.array_equal(kept, mask(addon, room, "opacity")[by_api.keep])
 
@@ -437,12 +436,12 @@ def test_what_is_protected_otherwise_asks_for_new_scores(addon, room, guarded):
     assert unmarked == ["what is protected changed"]
 
 
-def test_a_plan_to_absorb_keeps_no_fewer_than_are_protected(addon, room, guarded):
+def test_a_plan_to_merge_keeps_no_fewer_than_are_protected(addon, room, guarded):
     """At 1 dB 95% could go by the curve, and less than that is free."""
     guarded.scale = [2.0 * x for x in guarded.scale]
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
-    settings.survivors, settings.psnr = "absorb", 1.0
+    settings.method, settings.psnr = "merge", 1.0
     addon.ui.plans.refresh(bpy.context)
     plan = addon.ui.plans.stored(room, settings)
     protected = (mask(addon, room, "refine_force") == 1).sum()
@@ -500,7 +499,7 @@ def test_what_must_go_is_deleted_at_once_without_scores(addon, room, crop):
 
     assert np.array_equal(mask(addon, room, "opacity"), opacity[~removed])
     assert facts(addon, room)["protected"] == protected.sum()
-    assert facts(addon, room)["forced"] == 0
+    assert facts(addon, room)["removed_by_user"] == 0
     with pytest.raises(RuntimeError, match="no volume says of any splat that it must go"):
         bpy.ops.refine.crop()
     bpy.ops.refine.score()
@@ -511,7 +510,7 @@ def test_levels_and_floaters_leave_out_what_must_go(addon, core, room, quarter, 
     """No level has any of it, and it is evidence of nothing."""
     protected, removed = crop
     settings = bpy.context.scene.refine
-    settings.levels, settings.level_survivors, settings.views = "0.2", "unchanged", 8
+    settings.levels, settings.views = "0.2", 8
     expected = core.clean(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         addon.ui.operators.chosen_views(bpy.context), core.Cleaning(views=8),
@@ -656,7 +655,7 @@ def test_names_that_there_are_not_are_refused(addon, room, room_cameras, capsys)
     assert second.endswith("in the open .blend (objects that are volumes: Cube)")
 
 
-def test_all_forced_out_is_refused(addon, room, room_cameras):
+def test_a_volume_that_leaves_nothing_is_refused(addon, room, room_cameras):
     """A volume far away keeps nothing."""
     volume(empty((1000, 0, 0), (1, 1, 1)), "KEEP")
 
@@ -676,7 +675,14 @@ def test_a_group_named_by_the_command_protects(addon, room, room_cameras, capsys
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", '{"splats": 39755}', '{"splats": 39755, "protected": "x", "forced": 1}']
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        '{"splats": 39755}',
+        '{"splats": 39755, "protected": "x", "removed_by_user": 1}',
+    ],
 )
 def test_a_damaged_note_counts_as_none(addon, room, text):
     """A .blend may come from anywhere."""

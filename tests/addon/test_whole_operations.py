@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import shutil
 import threading
 import time
@@ -17,10 +18,10 @@ from tests.windows import event, started_in_a_window, until_over
 
 @pytest.fixture
 def few(addon, room, room_cameras):
-    """Every tenth splat of the room, to be absorbed to two fifths by four views."""
+    """Every tenth splat of the room, to be merged to two fifths by four views."""
     addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 10 != 0)
     settings = bpy.context.scene.refine
-    settings.survivors, settings.ratio, settings.views = "absorb", 0.6, 4
+    settings.method, settings.ratio, settings.views = "merge", 0.6, 4
     return room
 
 
@@ -65,7 +66,7 @@ def fail_at(addon, monkeypatch):
 
 @pytest.mark.parametrize("stage", ["deleting", "after deleting", "writing"])
 def test_an_apply_that_fails_leaves_the_mesh_as_it_was(few, fail_at, stage):
-    """With Absorb, wherever it fails: attributes, groups, plan and scores are equal to the bit."""
+    """With Merge, wherever it fails: attributes, groups, plan and scores are equal to the bit."""
     few.vertex_groups.new(name="some").add(range(0, 3000, 7), 0.5, "REPLACE")
     few.data.use_fake_user = True
     bpy.ops.refine.score()
@@ -81,20 +82,20 @@ def test_an_apply_that_fails_leaves_the_mesh_as_it_was(few, fail_at, stage):
     assert bpy.ops.refine.apply.poll()
 
 
-def pruned(addon, room_views, tmp_path, **options):
+def pruned(addon, room_views, tmp_path, method="merge"):
     """Prune the object as the command does, to a file and in the .blend."""
     return addon.objects.operation.prune_object(
         "room",
-        addon.core.PruneRequest(
-            room_views, addon.core.Budget(ratio=0.6), addon.core.Settings(views=4), **options
-        ),
+        room_views,
+        addon.core.Budget(ratio=0.6),
+        addon.core.METHODS[method](4),
         output=tmp_path / "out.ply",
         save=True,
     )
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_a_blend_that_cannot_be_saved_keeps_its_splats(addon, few, room_views, tmp_path, survivors):
+@pytest.mark.parametrize("method", ["occlusion", "merge"])
+def test_a_blend_that_cannot_be_saved_keeps_its_splats(addon, few, room_views, tmp_path, method):
     """Its folder is gone: what was exported stays and is named, the object is as it was."""
     (tmp_path / "blend").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "blend" / "scene.blend"))
@@ -104,7 +105,7 @@ def test_a_blend_that_cannot_be_saved_keeps_its_splats(addon, few, room_views, t
     with pytest.raises(
         addon.core.RefineError, match=r"nothing was removed, .*out\.ply was written"
     ):
-        pruned(addon, room_views, tmp_path, survivors=survivors)
+        pruned(addon, room_views, tmp_path, method)
 
     assert bits(few) == before
     assert len(addon.core.read_ply(tmp_path / "out.ply")) == len(few.data.vertices) * 2 // 5 + 1
@@ -151,7 +152,7 @@ def test_each_operation_reads_the_layout_of_its_object_once(
         lambda: addon.ui.plans.refresh(bpy.context),
         lambda: bpy.ops.refine.export_ply(filepath=str(tmp_path / "exported.ply")),
         bpy.ops.refine.apply,
-        lambda: pruned(addon, room_views, tmp_path, survivors="absorb"),
+        lambda: pruned(addon, room_views, tmp_path),
     ):
         counts.append(0)
         operation()
@@ -175,8 +176,8 @@ def noted(addon, monkeypatch):
         monkeypatch.setattr(module, name, noting)
 
     note(addon.objects.splat_object, "gather")
-    note(addon.core.pipeline, "score")
-    note(addon.core.pipeline.absorb_splats, "absorb_removed")
+    note(addon.ui.operators, "score")
+    note(importlib.import_module(f"{addon.__name__}.core.prune"), "merge_down")
     return references
 
 
@@ -188,7 +189,7 @@ def left(references):
 
 @pytest.mark.parametrize("name", ["score", "apply"])
 def test_the_history_of_operators_holds_no_splats(few, noted, name):
-    """Blender keeps the operator that ran, to show it in *Adjust Last Operation*."""
+    """Blender keeps the operator that ran."""
     bpy.ops.refine.score()
     noted.clear()
     getattr(bpy.ops.refine, name)("EXEC_DEFAULT", True)  # with undo, as a click
@@ -215,11 +216,8 @@ def work(addon, monkeypatch):
                 time.sleep(0.01)
             raise addon.core.Cancelled if how == "wait" else addon.core.RefineError("failed")
 
-        core = addon.core
-        module, function = {
-            "score": (core.pipeline, "score"), "apply": (core.pipeline, "decide"),
-        }[name]  # fmt: skip
-        monkeypatch.setattr(module, function, instead)
+        function = {"score": "score", "apply": "prune"}[name]
+        monkeypatch.setattr(addon.ui.operators, function, instead)
 
     return work
 

@@ -21,9 +21,7 @@ def test_the_file_of_a_moved_object_is_compared_where_the_object_stands(
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context).take(range(0, 72, 6))
 
     report = addon.objects.operation.prune_object(
-        "room",
-        addon.core.PruneRequest(views, core.Budget(ratio=0.3), core.Settings("occlusion")),
-        output=tmp_path / "a.glb",
+        "room", views, core.Budget(ratio=0.3), core.Occlusion(), output=tmp_path / "a.glb"
     )
 
     assert report["written_psnr"] == pytest.approx(report["estimated_psnr"], abs=0.05)
@@ -40,12 +38,10 @@ def test_the_report_of_an_object_counts_what_the_file_holds(
 
     report = addon.objects.operation.prune_object(
         "room",
-        addon.core.PruneRequest(
-            room_views.take(range(4)),
-            core.Budget(ratio=0.0),
-            core.Settings("closed-form"),
-            dry_run=dry_run,
-        ),
+        room_views.take(range(4)),
+        core.Budget(ratio=0.0),
+        core.ClosedForm(),
+        dry_run=dry_run,
         output=out,
     )
 

@@ -34,18 +34,18 @@ def test_cameras_of_a_capture_see_most_of_it_and_hide_some():
 
 
 def test_the_table_says_what_is_over_splat_transform_and_what_has_changed():
-    """Absorbing nine tenths: 3 s over 2 s and 200 MB over 100; a tenth more is not marked."""
+    """Merging to a tenth: 3 s over 2 s and 200 MB over 100; a tenth more is not marked."""
     figures = {
-        "absorb 90%": Figure(3.0, 200.0),
+        "merge 90%": Figure(3.0, 200.0),
         "occlusion": Figure(2.2, 50.0),
         "splat-transform 90%": Figure(2.0, 100.0),
     }
-    before = {"absorb 90%": (2.0, 195.0), "occlusion": (2.1, 50.0)}
+    before = {"merge 90%": (2.0, 195.0), "occlusion": (2.1, 50.0)}
 
     lines = whole.table(figures, before)
 
     assert lines[2:] == [
-        "| absorb 90% | 3.0 s | 200 MB | 1.50 / 2.00 | busy +50% |",
+        "| merge 90% | 3.0 s | 200 MB | 1.50 / 2.00 | busy +50% |",
         "| occlusion | 2.2 s | 50 MB |  | as before |",
         "| splat-transform 90% | 2.0 s | 100 MB |  | new |",
     ]

@@ -204,7 +204,7 @@ def test_of_levels_that_the_command_writes_it_reads_each(tmp_path, level):
     source, path, back = room(tmp_path, 1), tmp_path / "web/lod-meta.json", tmp_path / "back.ply"
     cameras = [View(np.eye(3), np.array([x, 0.0, -6.0]), 60, 60, 40, 30, 80, 60) for x in (-1, 1)]
     write_cameras(tmp_path / "cameras.json", ViewSet(tuple(cameras)))
-    options = ["--levels", ".5,.1", "--nested", "--method", "closed-form"]
+    options = ["--levels", ".5,.1", "--method", "closed-form"]
     order = ["lod", source, "--cameras", tmp_path / "cameras.json", *options, "-o", path]
     assert main([str(word) for word in order]) == 0
 

@@ -12,7 +12,8 @@ import pytest
 from refine_addon.core import (
     Budget,
     Cancelled,
-    Settings,
+    ClosedForm,
+    Occlusion,
     ViewSet,
     prune,
     read_cameras,
@@ -80,8 +81,8 @@ def test_the_note_says_how_much_finer_and_reaches_the_report(room):
     wrong = turned(views, QUARTER).take(range(0, 72, 9))
     budget = Budget(ratio=0.5)
 
-    report = prune(splats, wrong, budget, Settings("occlusion")).report
-    plain = prune(splats, wrong, budget, Settings("closed-form")).report
+    report = prune(splats, wrong, budget, Occlusion()).report
+    plain = prune(splats, wrong, budget, ClosedForm()).report
 
     words = "cameras and splats do not seem to share an up axis: turned a quarter about X"
     assert [words in note for note in report["notes"]].count(True) == 1
@@ -94,7 +95,7 @@ def test_what_is_known_of_the_views_is_not_measured():
     """Views that know their turn say so, whatever the pictures look like."""
     for turn, sentences in ((0, 0), (1, 1), (-1, 1)):
         views = replace(ring(), turn=turn)
-        scores = score(cloud(), views, Settings("occlusion"))
+        scores = score(cloud(), views, Occlusion())
 
         assert scores.alignment is not None
         assert (scores.alignment.turn, scores.alignment.known) == (turn, True)

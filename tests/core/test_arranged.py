@@ -9,8 +9,6 @@ import pytest
 
 from refine_addon.command import main
 from refine_addon.core import (
-    Arrangement,
-    ConvertRequest,
     Move,
     RefineError,
     convert_files,
@@ -97,7 +95,7 @@ def test_what_is_moved_is_what_the_matrix_makes_of_it(files, suffix):
     """In any format, within its bounds."""
     move = Move((0.5, 0.0, 0.0), (10.0, 20.0, 30.0), 1.5)
 
-    convert_files([files / "a.ply"], files / f"out{suffix}", ConvertRequest(), Arrangement((move,)))
+    convert_files([files / "a.ply"], files / f"out{suffix}", moves=(move,))
 
     expected = transformed(read_splats(files / "a.ply").splats(), move.matrix)
     found = differences(read_splats(files / f"out{suffix}").splats(), expected)
@@ -142,10 +140,8 @@ def test_a_single_file_of_which_nothing_is_asked_stays_as_it_is(tmp_path):
     data = ply_of({**scene(1, 9), "mine": np.arange(9, dtype=np.float32)})
     (tmp_path / "in.ply").write_bytes(data)
 
-    kept = convert_files([tmp_path / "in.ply"], tmp_path / "same.ply", ConvertRequest())
-    less = convert_files(
-        [tmp_path / "in.ply"], tmp_path / "out.ply", ConvertRequest(), Arrangement(degree=0)
-    )
+    kept = convert_files([tmp_path / "in.ply"], tmp_path / "same.ply")
+    less = convert_files([tmp_path / "in.ply"], tmp_path / "out.ply", degree=0)
 
     assert (tmp_path / "same.ply").read_bytes() == data
     assert kept.report["notes"] == []
@@ -225,6 +221,4 @@ def test_wrong_usage_ends_before_any_work(files, capsys, options, word):
 def test_a_move_that_splats_cannot_follow_is_refused(files):
     """Beyond what float32 holds; the matrix says so."""
     with pytest.raises(RefineError, match="scale"):
-        convert_files(
-            [files / "a.ply"], files / "o.ply", ConvertRequest(), Arrangement((Move(scale=1e31),))
-        )
+        convert_files([files / "a.ply"], files / "o.ply", moves=(Move(scale=1e31),))

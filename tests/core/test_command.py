@@ -18,8 +18,8 @@ import pytest
 from refine_addon import command
 from refine_addon.core import (
     Budget,
-    PruneRequest,
-    Settings,
+    ClosedForm,
+    Occlusion,
     prune,
     prune_file,
     read_cameras,
@@ -82,21 +82,21 @@ def contents(folder: Path) -> dict[Path, bytes]:
 @pytest.mark.parametrize(
     ("options", "budget", "settings"),
     [
-        ([], Budget(ratio=0.5), Settings()),
-        (["--ratio", "0.29"], Budget(ratio=0.29), Settings()),
-        (["--keep", "7"], Budget(keep=7), Settings()),
-        (["--max-mb", ".004"], Budget(max_mb=0.004), Settings()),
+        ([], Budget(ratio=0.5), Occlusion()),
+        (["--ratio", "0.29"], Budget(ratio=0.29), Occlusion()),
+        (["--keep", "7"], Budget(keep=7), Occlusion()),
+        (["--max-mb", ".004"], Budget(max_mb=0.004), Occlusion()),
         (
             ["--method", "closed-form", "--threshold", "0.8"],
             Budget(threshold=0.8),
-            Settings("closed-form"),
+            ClosedForm(),
         ),
-        (["--min-seen", "70"], Budget(min_seen=70), Settings()),
-        (["--psnr", "30"], Budget(psnr=30), Settings()),
-        (["--views", "2"], Budget(ratio=0.5), Settings(views=2)),
-        (["--views", "0"], Budget(ratio=0.5), Settings(views=0)),
-        (["--method", "closed-form"], Budget(ratio=0.5), Settings("closed-form")),
-        (["--method", "occlusion"], Budget(ratio=0.5), Settings("occlusion")),
+        (["--min-seen", "70"], Budget(min_seen=70), Occlusion()),
+        (["--psnr", "30"], Budget(psnr=30), Occlusion()),
+        (["--views", "2"], Budget(ratio=0.5), Occlusion(2)),
+        (["--views", "0"], Budget(ratio=0.5), Occlusion(0)),
+        (["--method", "closed-form"], Budget(ratio=0.5), ClosedForm()),
+        (["--method", "occlusion"], Budget(ratio=0.5), Occlusion()),
     ],
 )
 def test_every_budget_and_setting_keeps_the_rows_that_the_interface_keeps(
@@ -105,16 +105,13 @@ def test_every_budget_and_setting_keeps_the_rows_that_the_interface_keeps(
     """The file is the input's bytes of exactly those rows."""
     file, views = read_ply("in.ply"), read_cameras("cameras.json")
     expected = prune(
-        file.splats(),
+        file,
         views,
         budget,
         settings,
-        survivors="unchanged",
-        row_bytes=file.row_bytes,
-        fixed_bytes=file.fixed_bytes,
     ).keep
 
-    assert command.main([*PRUNE, "--survivors", "unchanged", "-o", "out.ply", *options]) == 0
+    assert command.main([*PRUNE, "--method", "occlusion", "-o", "out.ply", *options]) == 0
 
     assert 0 < np.count_nonzero(expected) < COUNT
     assert file.rows[expected].tobytes() == read_ply("out.ply").rows.tobytes()
@@ -125,7 +122,7 @@ def test_every_budget_and_setting_keeps_the_rows_that_the_interface_keeps(
 def test_the_room_is_pruned_to_the_same_file_from_python_and_from_the_command(folder):
     """39,755 splats by the 64 most spread of 72 views, file to file."""
     source, cameras = ROOM / "point_cloud.ply", ROOM / "cameras.json"
-    prune_file(source, "api.ply", PruneRequest(read_cameras(cameras), Budget(ratio=0.3)))
+    prune_file(source, "api.ply", read_cameras(cameras), Budget(ratio=0.3))
 
     done = command.main(
         ["prune", str(source), "--cameras", str(cameras), "-o", "out.ply", "--ratio", ".3"]
@@ -140,7 +137,7 @@ def test_the_room_is_pruned_to_the_same_file_from_python_and_from_the_command(fo
 def test_scores_are_written_bit_for_bit():
     """The file is the input with one more property, and nothing else."""
     file = read_ply("in.ply")
-    expected = score(file.splats(), read_cameras("cameras.json"), Settings()).values
+    expected = score(file.splats(), read_cameras("cameras.json"), Occlusion()).values
 
     assert command.main([*SCORE, "-o", "out.ply"]) == 0
 
@@ -338,14 +335,14 @@ def test_the_report_of_a_prune_is_complete_and_plain(folder):
 @pytest.mark.slow
 def test_the_report_of_scores_is_plain_too(folder):
     """Counts, weights and the files' names; unseen is what no view counts as seen."""
-    seen = score(read_ply("in.ply").splats(), read_cameras("cameras.json"), Settings()).seen
+    seen = score(read_ply("in.ply").splats(), read_cameras("cameras.json"), Occlusion()).seen
     unseen = int(np.count_nonzero(seen == 0))
     assert command.main([*SCORE, "-o", "out.ply", "--report", "report.json"]) == 0
 
     (entry,) = json.loads((folder / "report.json").read_text())["results"]
     sizes = [(folder / name).stat().st_size for name in ("in.ply", "out.ply")]
     assert [*entry["files"].values()] == ["in.ply", "out.ply", *sizes]
-    counts = {"before": COUNT, "undrawable": 0, "unseen": unseen, "forced": 0}
+    counts = {"before": COUNT, "undrawable": 0, "unseen": unseen, "removed_by_user": 0}
     assert entry["splats"] == counts | {"written": COUNT, "left_out": 0}
     assert all(map(math.isfinite, numbers(entry)))
 
@@ -398,11 +395,11 @@ def test_the_summary_says_how_close_the_pictures_stay(capsys):
     for options, pattern in (
         (
             ["--method", "occlusion"],
-            r"  quality: about \d+ dB in these views, about \d+ between them; what absorbing ",
+            r"  quality: about \d+ dB in these views, about \d+ between them; what merging and ",
         ),
         (
-            ["--absorb"],
-            r"quality: about \d+ dB in these views, about \d+ between them \(--survivors unch",
+            ["--method", "merge"],
+            r"quality: about \d+ dB in these views, about \d+ between them \(--method occlus",
         ),
         (
             ["--method", "occlusion", "--ratio", "0"],
@@ -459,7 +456,7 @@ def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
-    [["--dry-run"], ["-o", "out.ply"], ["-o", "out.splat", "--absorb"]],
+    [["--dry-run"], ["-o", "out.ply"], ["-o", "out.splat", "--method", "merge"]],
     ids=["dry run", "written", "absorbed, rounded"],
 )
 def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
@@ -479,7 +476,7 @@ def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
     before = read_ply(folder / "in.ply").splats()
     made = folder / options[1] if "-o" in options else None
     decided = prune(before, read_cameras(folder / "cameras.json"), Budget(ratio=0.5))
-    after = read_splats(made).splats() if made else decided.survivors(before)
+    after = read_splats(made).splats() if made else decided.splats
     found = compare(before, after, chosen(read_cameras(folder / "cameras.json")))
     assert [view["psnr"] for view in drawn["views"]] == [round(one.psnr, 2) for one in found]
     for view, one in zip(drawn["views"], found, strict=True):
@@ -584,7 +581,7 @@ USAGE = {
     "seen by too many": [*PRUNE, "-o", "out.ply", "--min-seen", "101"],
     "views below 0": [*PRUNE, "-o", "out.ply", "--views", "-1"],
     "rounds of nothing": [*PRUNE, "-o", "out.ply", "--rounds", "2"],
-    "no rounds": [*PRUNE, "-o", "out.ply", "--survivors", "refit", "--rounds", "0"],
+    "no rounds": [*PRUNE, "-o", "out.ply", "--method", "refit", "--rounds", "0"],
     "unknown method": [*PRUNE, "-o", "out.ply", "--method", "guess"],
     "object without Blender": ["prune", "--object", "Splats", "-o", "out.ply", *PRUNE[2:]],
     "save without object": [*PRUNE, "-o", "out.ply", "--save"],

@@ -10,13 +10,14 @@ import pytest
 
 from refine_addon.command import main
 from refine_addon.core import read_splats
-from refine_addon.core.levels import files as levels_files
 
 from .test_command_clean import call, files  # noqa: F401 - a fixture
+from .test_levels import merges  # noqa: F401 - a fixture
 
 pytestmark = pytest.mark.slow
 
-QUICK = ["--nested", "--method", "closed-form", "--views", "2"]
+LOD = importlib.import_module("refine_addon.core.lod")
+QUICK = ["--method", "closed-form", "--views", "2"]
 
 
 def test_lod_writes_levels_and_says_what_each_costs(files, capsys):
@@ -38,7 +39,7 @@ def test_lod_writes_levels_and_says_what_each_costs(files, capsys):
 
 
 @pytest.mark.slow
-def test_by_default_survivors_absorb_and_four_levels_are_made(files):
+def test_by_default_splats_are_merged_and_four_levels_are_made(merges, files):
     """Halves of halves, about: 289, 145, 70 and 35 of 577, rounded up."""
     assert call(files, "lod", "-o", str(files / "out"), "--views", "2", "--quiet") == 0
     made = [len(read_splats(files / f"out/scene.lod{number}.ply")) for number in range(1, 5)]
@@ -56,7 +57,6 @@ def test_by_default_survivors_absorb_and_four_levels_are_made(files):
         (["--levels", "2"], "less than 1"),
         (["--psnr", "30,40"], "comes after"),
         (["--psnr", "40", "--levels", ".5"], "not allowed with"),
-        (["--distance-psnr", "200"], "less than 100"),
         (["--format", ".obj"], "invalid choice"),
     ],
 )
@@ -85,7 +85,8 @@ def test_files_that_exist_are_replaced_when_told_alone(files, capsys):
 
 def test_ctrl_c_leaves_nothing(files, monkeypatch, capsys):
     """Interrupted while the second level is made: 130, and the first level is gone again."""
-    made = levels_files.each_level
+    module = importlib.import_module("refine_addon.core.lod")
+    made = module.lod
 
     def interrupted(*given, **named):
         for level in made(*given, **named):
@@ -93,7 +94,7 @@ def test_ctrl_c_leaves_nothing(files, monkeypatch, capsys):
                 raise KeyboardInterrupt
             yield level
 
-    monkeypatch.setattr(levels_files, "each_level", interrupted)
+    monkeypatch.setattr(LOD, "lod", interrupted)
 
     assert call(files, "lod", "-o", str(files / "out"), *QUICK) == 130
     assert "nothing was left half-written" in capsys.readouterr().err
@@ -130,7 +131,7 @@ def test_levels_that_would_be_equal_are_made_once(files, capsys):
 
 def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):
     """Alone it is an error; beside another the note says so. 1 dB is out of reach."""
-    run = ["lod", "-o", str(files / "out"), "--nested", "--views", "2"]
+    run = ["lod", "-o", str(files / "out"), "--method", "occlusion", "--views", "2"]
 
     assert call(files, *run, "--psnr", "99.9") == 1
     assert "no level has fewer splats than the input, which has 577" in capsys.readouterr().err
@@ -174,7 +175,7 @@ def test_a_run_that_stops_before_its_first_level_leaves_the_run_before(files, mo
     def interrupted(*_given, **_named):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(levels_files, "each_level", interrupted)
+    monkeypatch.setattr(LOD, "lod", interrupted)
 
     assert call(files, "lod", "-o", str(out), "--overwrite", *QUICK) == 130
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
@@ -256,7 +257,8 @@ def test_what_must_go_is_in_no_level_of_a_streamed_sog(files, streamed):
 def test_a_streamed_sog_that_is_stopped_leaves_nothing(files, streamed, monkeypatch):
     """Neither of a new one, nor of one to be replaced, which stays as it was."""
     path, run = streamed
-    made, stops = levels_files.each_level, [True]
+    module = importlib.import_module("refine_addon.core.lod")
+    made, stops = module.lod, [True]
 
     def interrupted(*given, **named):
         for level in made(*given, **named):
@@ -264,7 +266,7 @@ def test_a_streamed_sog_that_is_stopped_leaves_nothing(files, streamed, monkeypa
                 raise KeyboardInterrupt
             yield level
 
-    monkeypatch.setattr(levels_files, "each_level", interrupted)
+    monkeypatch.setattr(LOD, "lod", interrupted)
     assert call(files, *run) == 130
     assert not path.parent.exists()
     stops.clear()
@@ -286,7 +288,7 @@ def test_a_library_that_is_missing_is_told_before_the_work(streamed, monkeypatch
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", missing)
-    monkeypatch.setattr(levels_files, "each_level", None)
+    monkeypatch.setattr(LOD, "lod", None)
 
     assert call(path.parents[1], *run) == 1
     assert "WebP images need a library" in capsys.readouterr().err

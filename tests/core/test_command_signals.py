@@ -110,7 +110,7 @@ def test_ctrl_c_while_refitting_writes_what_that_has_reached(folder):
 
     The signal comes in the first round: survivors have absorbed by then.
     """
-    words = [*PRUNE[:6], "--survivors", "refit", "--views", "8", "--keep", "100"]
+    words = [*PRUNE[:6], "--method", "refit", "--views", "8", "--keep", "100"]
 
     with start("-c", CALLED, "_solve", *words) as process:
         said = process.communicate(timeout=SECONDS)
@@ -123,7 +123,7 @@ def test_ctrl_c_while_refitting_writes_what_that_has_reached(folder):
 
 
 def test_ctrl_c_while_refitting_writes_nothing_in_a_dry_run(folder):
-    words = [*PRUNE[:4], "--survivors", "refit", "--views", "8", "--dry-run"]
+    words = [*PRUNE[:4], "--method", "refit", "--views", "8", "--dry-run"]
 
     with start("-c", CALLED, "_solve", *words) as process:
         said = process.communicate(timeout=SECONDS)

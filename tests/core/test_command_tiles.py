@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from refine_addon.command import main
-from refine_addon.core import Budget, Settings, prune, read_cameras, read_ply
+from refine_addon.core import Budget, ClosedForm, prune, read_cameras, read_ply
 from refine_addon.core.tiles import storage
 from tests.strategies import plain_header, plain_ply, splat_names
 
@@ -47,7 +47,7 @@ def test_one_budget_counts_over_all_files(folder, capsys):
     (folder / "whole.ply").write_bytes(plain_header(100, splat_names(0)) + rows.tobytes())
     whole = read_ply("whole.ply").splats()
     views = read_cameras("cameras.json")
-    keep = prune(whole, views, Budget(ratio=0.5), Settings(method="closed-form")).keep
+    keep = prune(whole, views, Budget(ratio=0.5), ClosedForm()).keep
     kept = [int(np.count_nonzero(part)) for part in np.split(keep, [60])]
     assert [len(read_ply(folder / "out" / name)) for name in COUNTS] == kept
     assert kept[1] < 20

@@ -50,12 +50,12 @@ def test_prune_removes_protects_and_says_how_many(scene, capsys):
     assert (read_ply(out).splats().means[:, 0] >= 0.0).sum() == (x >= 0.0).sum()
     entry = told(folder)
     assert entry["splats"]["protected"] == stays.sum() == SIDE
-    assert entry["splats"]["forced"] == goes.sum()
+    assert entry["splats"]["removed_by_user"] == goes.sum()
     assert entry["volumes"][1] == {
         "role": "remove", "name": f"'{HALF}'", "splats": int((x < 0.0).sum())
     }  # fmt: skip
-    line = f"\n  {SIDE} protected, {goes.sum()} forced out (protect 'box:-9,-9,3,-2.9,9,9': {SIDE}"
-    assert line in capsys.readouterr().out
+    line = f"\n  {SIDE} protected, {goes.sum()} removed by you (protect 'box:-9,-9,3,-2.9,9,9': "
+    assert f"{line}{SIDE}" in capsys.readouterr().out
 
 
 def test_volumes_of_a_kind_are_joined(scene):
@@ -80,7 +80,7 @@ def test_clean_leaves_out_what_must_go_and_spares_what_is_protected(scene):
 
     left = read_ply(out).splats().means
     assert len(left) == ((x >= 0.0) | (z < 3.0)).sum()
-    assert told(folder)["splats"]["forced"] == ((x < 0.0) & (z > 3.0)).sum()
+    assert told(folder)["splats"]["removed_by_user"] == ((x < 0.0) & (z > 3.0)).sum()
 
 
 def test_score_leaves_out_what_must_go(scene):
@@ -97,13 +97,22 @@ def test_score_leaves_out_what_must_go(scene):
 def test_levels_leave_out_what_must_go(scene):
     """Both levels lie in the right half; the report counts what went."""
     folder, x, _ = scene
-    options = ["--remove-inside", HALF, "--levels", ".4,.2", "-o", str(folder / "lod"), "--nested"]
+    options = [
+        "--remove-inside",
+        HALF,
+        "--levels",
+        ".4,.2",
+        "-o",
+        str(folder / "lod"),
+        "--method",
+        "occlusion",
+    ]
 
     assert call(folder, "lod", *options) == 0
     for entry in told(folder)["levels"]:
         level = read_ply(folder / "lod" / entry["file"])
         assert (level.splats().means[:, 0] >= 0.0).all()
-    assert told(folder)["splats"]["forced"] == (x < 0.0).sum()
+    assert told(folder)["splats"]["removed_by_user"] == (x < 0.0).sum()
     assert told(folder)["splats"]["before"] == WALL + 1
 
 

@@ -15,14 +15,12 @@ import numpy as np
 import pytest
 
 # Of modules, not of the package: a process that runs `row` imports these too, from the same places.
-from refine_addon.core import execute
+from refine_addon.core import Merge, Occlusion, execute, prune
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
 from refine_addon.core.execute import Cancelled, run
 from refine_addon.core.formats.ply import read_ply
-from refine_addon.core.pipeline import prune
 from refine_addon.core.selection import Budget
-from refine_addon.core.task import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -296,8 +294,8 @@ print(len(processes._idle))
     assert said.stdout.startswith(b"0")
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_processes_keep_the_same_splats_as_one_thread(survivors, monkeypatch):
+@pytest.mark.parametrize("method", [Occlusion(), Merge()])
+def test_processes_keep_the_same_splats_as_one_thread(method, monkeypatch):
     """To the bit, with every view measured in a process however little work it is."""
     monkeypatch.setattr(execute, "WORTH", 0.0)
     monkeypatch.setattr(execute, "WORTH_READY", 0.0)
@@ -305,8 +303,7 @@ def test_processes_keep_the_same_splats_as_one_thread(survivors, monkeypatch):
     views = read_cameras(ROOM / "cameras.json").spread(20)
 
     one, two = (
-        prune(splats, views, Budget(ratio=0.5), Settings(), survivors=survivors, threads=threads)
-        for threads in (1, 2)
+        prune(splats, views, Budget(ratio=0.5), method, threads=threads) for threads in (1, 2)
     )
 
     assert len(execute._idle) == 2

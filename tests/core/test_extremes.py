@@ -1,4 +1,4 @@
-"""Whatever survivors may become: scenes at the edge of what there is, with warnings as errors."""
+"""Whatever the method: scenes at the edge of what there is, with warnings as errors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import CHOICES, Budget, ViewSet, prune
+from refine_addon.core import METHODS, Budget, ViewSet, prune
 
 from .test_merging import around, cloud
 
@@ -66,22 +66,22 @@ SCENES = {
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("survivors", CHOICES)
+@pytest.mark.parametrize("method", METHODS.values())
 @pytest.mark.parametrize("name", SCENES)
-def test_survivors_of_a_scene_at_an_edge_are_as_many_as_asked_for_and_numbers(name, survivors):
+def test_kept_splats_of_a_scene_at_an_edge_are_as_many_as_asked_for_and_numbers(name, method):
     """Half stay; none is NaN that was a number; refitting ends no lower than it began."""
     splats, views = SCENES[name](cloud(COUNT), small())
 
-    result = prune(splats, views, Budget(keep=max(len(splats) // 2, 1)), survivors=survivors)
+    result = prune(splats, views, Budget(keep=max(len(splats) // 2, 1)), method())
 
-    left, told = result.survivors(splats), result.report
+    left, told = result.splats, result.report
     assert len(left) == max(len(splats) // 2, 1)
     for array in ("means", "log_scales", "quaternions", "sh_dc", "sh_rest"):
         assert np.isfinite(getattr(left, array)).all()
     assert not np.isnan(left.opacity_logits).any()
     refitted = told.get("refitted", {"psnr": 0.0, "psnr_before": 0.0})
     assert refitted["psnr"] >= refitted["psnr_before"]
-    reached = told["survivors"]["psnr"]
+    reached = told["method"]["psnr"]
     assert all(psnr is None or 0.0 < psnr <= 100.0 for psnr in reached.values())
     if name == "images of a pixel":  # too little is seen for a measurement
-        assert reached == {"unchanged": None, "absorb": None, "refit": None}
+        assert reached == {"delete": None, "merge": None, "refit": None}

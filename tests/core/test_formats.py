@@ -14,7 +14,6 @@ import pytest
 from refine_addon.command import main
 from refine_addon.core import (
     Budget,
-    PruneRequest,
     RefineError,
     Splats,
     prune_file,
@@ -206,7 +205,7 @@ def test_one_colour_beyond_all_others_is_no_file_that_is_refused(tmp_path, suffi
     (tmp_path / "in.ply").write_bytes(ply_of(columns))
     output = tmp_path / f"p{suffix}"
 
-    prune_file(tmp_path / "in.ply", output, PruneRequest(cameras, Budget(ratio=0.0)))
+    prune_file(tmp_path / "in.ply", output, cameras, Budget(ratio=0.0))
 
     splats = in_order(read_splats(output).splats())
     others = np.arange(COUNT) != 7
@@ -276,9 +275,7 @@ def test_a_size_is_kept_to(tmp_path, suffix, cameras):
     limit = (fixed + 300.5 * row) / 1e6
     path = tmp_path / f"out{suffix}"
 
-    report = prune_file(
-        tmp_path / "in.ply", path, PruneRequest(cameras, Budget(max_mb=limit))
-    ).report
+    report = prune_file(tmp_path / "in.ply", path, cameras, Budget(max_mb=limit)).report
 
     assert report["splats"]["kept"] == len(read_splats(path)) == 300
     assert 300 * row <= path.stat().st_size <= limit * 1e6
@@ -294,20 +291,18 @@ def test_a_size_is_refused_where_only_writing_tells_it(tmp_path, suffix, cameras
         prune_file(
             tmp_path / "in.ply",
             tmp_path / f"out{suffix}",
-            PruneRequest(cameras, Budget(max_mb=0.01)),
+            cameras,
+            Budget(max_mb=0.01),
         )
     assert not (tmp_path / f"out{suffix}").exists()
 
 
 @pytest.fixture(scope="module")
 def absorbed(tmp_path_factory, cameras):
-    """Return a folder with the test scene, what is asked of it, and 300 survivors that absorbed."""
-    folder, asked = (
-        tmp_path_factory.mktemp("a"),
-        PruneRequest(cameras, Budget(keep=300), survivors="absorb"),
-    )
+    """Return a folder with the test scene, what is asked of it, and 300 kept splats."""
+    folder, asked = tmp_path_factory.mktemp("a"), (cameras, Budget(keep=300))
     (folder / "in.ply").write_bytes(ply_of(scene()))
-    prune_file(folder / "in.ply", folder / "out.ply", asked)
+    prune_file(folder / "in.ply", folder / "out.ply", *asked)
     return folder, asked
 
 
@@ -315,7 +310,7 @@ def absorbed(tmp_path_factory, cameras):
 def test_survivors_that_absorbed_are_written_as_they_became(absorbed, suffix):
     """The same prune to a PLY and to the format: the same splats within the bounds."""
     folder, asked = absorbed
-    prune_file(folder / "in.ply", folder / f"out{suffix}", asked)
+    prune_file(folder / "in.ply", folder / f"out{suffix}", *asked)
 
     kept = read_splats(folder / f"out{suffix}").splats()
     plain = read_splats(folder / "out.ply").splats()
@@ -342,9 +337,10 @@ def test_a_file_that_may_not_be_read_is_replaced(cameras):
         report = prune_file(
             folder / "in.ply",
             output,
-            PruneRequest(
-                cameras, Budget(keep=300), overwrite=True, pictures=PictureFiles(folder, "a")
-            ),
+            cameras,
+            Budget(keep=300),
+            overwrite=True,
+            pictures=PictureFiles(folder, "a"),
             threads=1,
         ).report
 
@@ -420,7 +416,9 @@ def test_a_dry_run_counts_the_bytes_of_the_output(tmp_path, capsys, cameras):
         result = prune_file(
             tmp_path / "in.ply",
             tmp_path / f"a{suffix}",
-            PruneRequest(cameras, Budget(keep=500), dry_run=True),
+            cameras,
+            Budget(keep=500),
+            dry_run=True,
         )
         assert result.report["files"]["output_bytes"] == size
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from refine_addon.core import (
+    METHODS,
     Budget,
-    Settings,
+    Merge,
     Splats,
     View,
     ViewSet,
@@ -23,6 +24,8 @@ from refine_addon.core import (
 from refine_addon.core.affine import transformed
 
 pytestmark = pytest.mark.slow
+
+from .test_levels import merges  # noqa: F401 - a fixture
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 QUARTER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # about x, as *Upright* turns
@@ -60,25 +63,22 @@ def room():
     return splats, read_cameras(ROOM / "cameras.json")
 
 
-def kept(splats, views, ratio, *, survivors, method="occlusion", most=64):
-    if survivors == "absorb":
-        settings = Settings(views=most)
-        return prune(splats, views, Budget(ratio=ratio), settings, survivors="absorb").keep
-    scores = score(splats, views, Settings(method, views=most))
+def kept(splats, views, ratio, method, most=64):
+    if method == "merge":
+        return prune(splats, views, Budget(ratio=ratio), Merge(most)).keep
+    scores = score(splats, views, METHODS[method](most))
     return np.stack([select(scores, Budget(ratio=share)) for share in (0.5, 0.9)])
 
 
 @pytest.fixture(
-    scope="module", params=["closed-form", "occlusion", "absorb at 50 %", "absorb at 90 %"]
+    scope="module", params=["closed-form", "occlusion", "merge at 50 %", "merge at 90 %"]
 )
 def how(request, room):
     """Return what decides, and the kept set of the scene as it is."""
     words = {
         "ratio": 0.9 if "90" in request.param else 0.5,
-        "survivors": "absorb" if "absorb" in request.param else "unchanged",
+        "method": request.param.partition(" ")[0],
     }
-    if request.param == "closed-form":
-        words["method"] = "closed-form"
     return words, kept(*room, **words)
 
 
@@ -135,11 +135,11 @@ def scene_of_ties(kind):
 
 
 @pytest.mark.parametrize("kind", ["ring", "coincident", "lattice"])
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_ties_are_decided_by_what_does_not_move(kind, survivors):
+@pytest.mark.parametrize("method", ["occlusion", "merge"])
+def test_ties_are_decided_by_what_does_not_move(merges, kind, method):
     """Equal distances of views by their names, equal places of splats by opacity and colour."""
     splats, views = scene_of_ties(kind)
-    few = {"ratio": 0.9, "survivors": survivors, "most": 24}
+    few = {"ratio": 0.9, "method": method, "most": 24}
     expected = kept(splats, views, **few)
     order = np.random.default_rng(1).permutation(len(splats))
 

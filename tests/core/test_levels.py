@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +13,12 @@ import pytest
 from refine_addon.core import (
     Budget,
     Cancelled,
+    ClosedForm,
     Levels,
-    LevelsRequest,
+    Merge,
+    Occlusion,
     RefineError,
-    Settings,
     Splats,
-    View,
-    ViewSet,
     lod,
     lod_file,
     prune,
@@ -28,18 +28,23 @@ from refine_addon.core import (
     score,
 )
 from refine_addon.core.formats.ply import SplatFile
-from refine_addon.core.levels import distance
-from refine_addon.core.levels.distance import OriginalPictures
 from refine_addon.core.merging import merge as merging
-from refine_addon.core.pipeline import absorb_splats
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.splats import ARRAYS
 
 from .test_cleaning import cameras, wall
 
+PRUNE = importlib.import_module("refine_addon.core.prune")
 ROOM = Path(__file__).parents[1] / "data/room_small"
-DELETED = Levels((0.5, 0.25), survivors="unchanged")
-QUICK = Settings("closed-form")
+TWO = Levels((0.5, 0.25))
+QUICK = ClosedForm()
+
+
+@pytest.fixture
+def merges(monkeypatch):
+    """Let merging seem better: so few splats can be deleted as well."""
+    for name in ("_deletion_will_do", "_deletion_is_as_good"):
+        monkeypatch.setattr(PRUNE._Prune, name, lambda *_: False)
 
 
 def colourful():
@@ -76,52 +81,52 @@ def test_deleting_keeps_rows_of_the_level_before_as_they_were():
     """
     splats, views = colourful(), cameras()
 
-    levels = lod(splats, views, Levels((0.5, 0.3, 0.1), survivors="unchanged"))
+    levels = list(lod(splats, views, Levels((0.5, 0.3, 0.1)), Occlusion()))
 
-    assert [len(level.splats) for level in levels] == [288, 173, 58]
+    assert [len(level.result.splats) for level in levels] == [288, 173, 58]
     assert [level.number for level in levels] == [1, 2, 3]
     before = np.ones(576, np.bool_)
     for level, ratio in zip(levels, (0.5, 0.7, 0.9), strict=True):
-        assert level.absorbed is None
-        assert equal(level.splats, splats.take(level.keep))
-        assert not np.any(level.keep & ~before)
-        alone = prune(splats, views, Budget(ratio=ratio), survivors="unchanged")
-        np.testing.assert_array_equal(level.keep, alone.keep)
-        before = level.keep
+        assert level.result.merged is None
+        assert equal(level.result.splats, splats.take(level.result.keep))
+        assert not np.any(level.result.keep & ~before)
+        alone = prune(splats, views, Budget(ratio=ratio), Occlusion())
+        np.testing.assert_array_equal(level.result.keep, alone.keep)
+        before = level.result.keep
 
 
 @pytest.mark.slow
-def test_the_first_level_is_what_prune_absorbs():
+def test_the_first_level_is_what_prune_merges(merges):
     """It is made from the original, as prune's result is: equal to the bit."""
     splats, views = colourful(), cameras()
-    wanted = prune(splats, views, Budget(keep=288), survivors="absorb")
+    wanted = prune(splats, views, Budget(keep=288), Merge())
 
-    first = lod(splats, views, Levels((0.5, 0.25)))[0]
+    first = next(lod(splats, views, Levels((0.5, 0.25))))
 
-    np.testing.assert_array_equal(first.keep, wanted.keep)
-    assert equal(first.splats, wanted.absorbed.splats)
+    np.testing.assert_array_equal(first.result.keep, wanted.keep)
+    assert equal(first.result.splats, wanted.merged.splats)
     assert first.psnr == wanted.report["estimated_psnr"]
 
 
 @pytest.mark.slow
-def test_each_level_is_absorbed_from_the_one_before():
+def test_each_level_is_merged_from_the_one_before(merges):
     """Its rows are among those before; one that is unchanged there stayed the original's."""
     splats, views = colourful(), cameras()
 
-    levels = lod(splats, views, Levels((0.6, 0.3, 0.15)))
+    levels = list(lod(splats, views, Levels((0.6, 0.3, 0.15))))
 
     before = levels[0]
     for level in levels[1:]:
-        assert not np.any(level.keep & ~before.keep)
-        was = before.absorbed.changed[level.keep[before.keep]]
-        assert not np.any(was & ~level.absorbed.changed)
-        still = np.flatnonzero(~level.absorbed.changed)
-        rows = np.flatnonzero(level.keep)[still]
-        assert equal(level.splats.take(still), joined_in_double(splats.take(rows)))
-        told = level.absorbed
-        assert told.merged + told.deleted + len(level.splats) == 576
+        assert not np.any(level.result.keep & ~before.result.keep)
+        was = before.result.merged.changed[level.result.keep[before.result.keep]]
+        assert not np.any(was & ~level.result.merged.changed)
+        still = np.flatnonzero(~level.result.merged.changed)
+        rows = np.flatnonzero(level.result.keep)[still]
+        assert equal(level.result.splats.take(still), joined_in_double(splats.take(rows)))
+        told = level.result.merged
+        assert told.merged + told.deleted + len(level.result.splats) == 576
         before = level
-    assert levels[2].absorbed.changed.any()
+    assert levels[2].result.merged.changed.any()
 
 
 def joined_in_double(splats):
@@ -130,14 +135,14 @@ def joined_in_double(splats):
 
 
 @pytest.mark.slow
-def test_what_absorbed_before_is_not_thinned_by_a_tenth_again(monkeypatch):
+def test_what_was_merged_before_is_not_thinned_by_a_tenth_again(merges, monkeypatch):
     """Of 576, 57 are deleted before any merge; of the 288 left, none are, since 288 went already.
 
-    The merge penalty goes by what has gone of the 519: 1 - 288/519, then 1 - 144/519.
+    The penalty goes by what has gone of the 519: 1 - 288/519, then 1 - 144/519.
     """
     given, shares, whole, plain = [], [], merging.merge, merging.merge_penalty
     monkeypatch.setattr(
-        absorb_splats,
+        PRUNE,
         "merge",
         lambda *rest, **named: (
             given.append(len(rest[0]) - named["deleted"].sum()) or whole(*rest, **named)
@@ -147,32 +152,30 @@ def test_what_absorbed_before_is_not_thinned_by_a_tenth_again(monkeypatch):
         merging, "merge_penalty", lambda share: shares.append(share) or plain(share)
     )
 
-    lod(colourful(), cameras(), Levels((0.5, 0.25)))
+    list(lod(colourful(), cameras(), Levels((0.5, 0.25))))
 
     assert given == [519, 288]
     assert shares == [1.0 - 288 / 519, 1.0 - 144 / 519]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("survivors", ["absorb", "unchanged"])
-def test_protected_splats_are_in_all_levels_unchanged(survivors):
+@pytest.mark.parametrize("method", [Merge(), Occlusion()])
+def test_protected_splats_are_in_all_levels_unchanged(merges, method):
     """60 of 576 are protected; the last level keeps 115 (115.2 rounds up to 116)."""
     splats, protected = colourful(), np.arange(576) % 10 == 3
 
-    for level in lod(
-        splats, cameras(), Levels((0.5, 0.2), survivors=survivors), protected=protected
-    ):
-        assert level.keep[protected].all()
-        there = protected[level.keep]
+    for level in lod(splats, cameras(), Levels((0.5, 0.2)), method, protected=protected):
+        assert level.result.keep[protected].all()
+        there = protected[level.result.keep]
         wanted = splats.take(protected)
-        found = level.splats.take(there)
-        assert equal(found, joined_in_double(wanted) if survivors == "absorb" else wanted)
-    assert len(level.splats) == 116
+        found = level.result.splats.take(there)
+        assert equal(found, joined_in_double(wanted) if level.result.merged else wanted)
+    assert len(level.result.splats) == 116
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("survivors", ["absorb", "unchanged"])
-def test_levels_by_psnr_lie_near_it(survivors):
+@pytest.mark.parametrize("method", [Merge(), Occlusion()])
+def test_levels_by_psnr_lie_near_it(method):
     """Deleting keeps at least it by the curve; absorbing comes as near as prune does, .7 dB.
 
     Between the shares of the curve, straight lines are off by some tenths on so small a scene.
@@ -180,21 +183,23 @@ def test_levels_by_psnr_lie_near_it(survivors):
     splats, views = read_ply(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
     splats, views = splats.take(slice(0, None, 8)), views.take(range(0, 72, 6))
 
-    levels = lod(splats, views, Levels(psnr=(34.0, 28.0), survivors=survivors))
+    levels = list(lod(splats, views, Levels(psnr=(34.0, 28.0)), method))
 
     assert levels[0].psnr == pytest.approx(34.0, abs=1.0)
     assert levels[1].psnr == pytest.approx(28.0, abs=1.0)
-    assert len(levels[1].splats) < len(levels[0].splats) < len(splats)
+    assert len(levels[1].result.splats) < len(levels[0].result.splats) < len(splats)
 
 
 @pytest.mark.slow
-def test_the_psnr_of_a_level_is_against_the_original():
+def test_the_psnr_of_a_level_is_against_the_original(merges):
     """The estimate of the second level is that of its splats against all, not against the first."""
     splats, views = colourful(), cameras()
-    levels = lod(splats, views, Levels((0.5, 0.2)))
-    sample = score(splats, views, Settings("occlusion")).ray_sample
+    levels = list(lod(splats, views, Levels((0.5, 0.2))))
+    sample = score(splats, views, Occlusion()).ray_sample
 
-    assert levels[1].psnr == pytest.approx(psnr_against(sample, levels[1].splats, views), abs=0.01)
+    assert levels[1].psnr == pytest.approx(
+        psnr_against(sample, levels[1].result.splats, views), abs=0.01
+    )
 
 
 @pytest.mark.parametrize(
@@ -224,72 +229,17 @@ def test_one_splat_stays_at_least():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("survivors", ["absorb", "unchanged"])
-def test_progress_only_rises_and_can_cancel(survivors):
+@pytest.mark.parametrize("method", [Merge(), Occlusion()])
+def test_progress_only_rises_and_can_cancel(method):
     """From 0 to 1, whatever the level; False ends it."""
-    told, levels = [], Levels((0.5, 0.2), survivors=survivors)
-    lod(colourful(), cameras(), levels, progress=lambda f, _: told.append(f))
+    told, levels = [], Levels((0.5, 0.2))
+    list(lod(colourful(), cameras(), levels, method, progress=lambda f, _: told.append(f)))
 
     assert told == sorted(told)
     assert 0.0 <= told[0] < 0.05
-    assert 0.95 < told[-1] <= 1.0
+    assert 0.9 < told[-1] <= 1.0
     with pytest.raises(Cancelled):
-        lod(colourful(), cameras(), levels, progress=lambda f, _: f < 0.5)
-
-
-def pictures_of(splats, size=96, focal=400.0):
-    """Return the picture of one view straight at the wall, 4 away."""
-    half = size / 2
-    view = View(np.eye(3), np.zeros(3), focal, focal, half, half, size, size, name="a")
-    return OriginalPictures(splats, ViewSet((view,)))
-
-
-def test_the_distance_is_that_of_what_is_seen():
-    """The image of 96 px at f = 400 shows .96 of the wall at z = 4: 4 to 4.06 away."""
-    assert pictures_of(colourful()).distance == pytest.approx(4.03, abs=0.03)
-
-
-def test_an_even_change_is_seen_from_any_distance():
-    """All splats .1 darker: every pixel by .097 to .1, as the wall lets 3 % through at most.
-
-    That is 20 to 20.3 dB, however many pixels are averaged.
-    """
-    splats = wall()
-    darker = replace(splats, sh_dc=splats.sh_dc - np.float32(0.1 / 0.28209479))
-
-    reach = pictures_of(splats).reach(darker)
-
-    psnr = [value for _, value in reach.psnr]
-    assert psnr == pytest.approx([psnr[0]] * 5, abs=0.001)
-    assert 20.0 < psnr[0] < 20.3
-    far = [step for step, _ in reach.psnr]
-    assert far == pytest.approx([far[0] * k for k in (1, 2, 4, 8, 16)])
-
-
-def test_a_change_that_evens_out_fades_with_the_distance():
-    """Pixels alternately .1 up and down: 20 dB from near, nothing in squares of 2 and more."""
-    change = np.where(np.indices((32, 32)).sum(axis=0) % 2, 0.1, -0.1)[None] * np.ones((3, 1, 1))
-
-    found = [distance._psnr(change, size) for size in distance.FACTORS]
-
-    assert found == pytest.approx([20.0, 100.0, 100.0, 100.0, 100.0])
-
-
-def test_small_pictures_are_compared_whole():
-    """15 columns are fewer than one square of 16; 200 hold four, evenly spread."""
-    assert distance._patches(15).tolist() == list(range(15))
-    columns = distance._patches(200)
-    assert len(np.unique(columns)) == 64
-    assert columns[[0, 16, 32, 48]].tolist() == [17, 67, 117, 167]
-    assert columns[-1] == 182
-
-
-def test_where_the_views_see_too_little_no_distance_is_said():
-    """An image of 10 x 10 has 100 rays, fewer than the 256 that an estimate needs."""
-    reach = pictures_of(colourful(), size=10).reach(colourful())
-
-    assert reach.psnr == ()
-    assert reach.within(10.0) is None
+        list(lod(colourful(), cameras(), levels, method, progress=lambda f, _: f < 0.5))
 
 
 def test_files_of_levels_are_written(tmp_path):
@@ -297,7 +247,7 @@ def test_files_of_levels_are_written(tmp_path):
     source = file_of(colourful(), tmp_path / "a.ply")
     out = tmp_path / "out"
 
-    done = lod_file(source, out, LevelsRequest(cameras(2), DELETED, QUICK))
+    done = lod_file(source, out, cameras(2), TWO, QUICK)
 
     assert sorted(path.name for path in out.iterdir()) == ["a.lod1.ply", "a.lod2.ply"]
     assert done["nested"] is True
@@ -310,17 +260,17 @@ def test_files_of_levels_are_written(tmp_path):
 
 
 @pytest.mark.slow
-def test_files_of_absorbed_levels_hold_the_survivors(tmp_path):
+def test_files_of_merged_levels_hold_what_kept_splats_became(tmp_path, merges):
     """In float32, rounded once."""
     source = file_of(colourful(), tmp_path / "a.ply")
-    levels = lod(read_ply(source).splats(), cameras(), Levels((0.5, 0.25)))
+    levels = list(lod(read_ply(source).splats(), cameras(), TWO))
 
-    lod_file(source, tmp_path, LevelsRequest(cameras(), Levels((0.5, 0.25))))
+    lod_file(source, tmp_path, cameras(), Levels((0.5, 0.25)))
 
     written = read_ply(tmp_path / "a.lod2.ply").splats()
-    np.testing.assert_array_equal(written.means, levels[1].splats.means.astype(np.float32))
+    np.testing.assert_array_equal(written.means, levels[1].result.splats.means.astype(np.float32))
     np.testing.assert_array_equal(
-        written.opacity_logits, levels[1].splats.opacity_logits.astype(np.float32)
+        written.opacity_logits, levels[1].result.splats.opacity_logits.astype(np.float32)
     )
 
 
@@ -328,9 +278,9 @@ def test_files_of_absorbed_levels_hold_the_survivors(tmp_path):
 def test_levels_are_written_in_any_format(tmp_path, suffix):
     """As many splats, in a file that is read by its content, with what the format loses noted."""
     source = file_of(colourful(), tmp_path / "a.ply")
-    levels = Levels((0.5,), survivors="unchanged")
+    levels = Levels((0.5,))
 
-    done = lod_file(source, tmp_path, LevelsRequest(cameras(2), levels, QUICK, suffix=suffix))
+    done = lod_file(source, tmp_path, cameras(2), levels, QUICK, suffix=suffix)
 
     assert done["levels"][0]["file"] == f"a.lod1{suffix}"
     assert len(read_splats(tmp_path / f"a.lod1{suffix}")) == 288
@@ -344,10 +294,10 @@ def test_no_file_is_replaced_unless_told(tmp_path, name):
     (tmp_path / name).write_text("mine")
 
     with pytest.raises(RefineError, match="exists already"):
-        lod_file(source, tmp_path, LevelsRequest(cameras(), Levels((0.5, 0.25))))
+        lod_file(source, tmp_path, cameras(), Levels((0.5, 0.25)))
 
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["a.ply", name])
-    lod_file(source, tmp_path, LevelsRequest(cameras(2), DELETED, QUICK, overwrite=True))
+    lod_file(source, tmp_path, cameras(2), TWO, QUICK, overwrite=True)
     assert (tmp_path / name).read_bytes()[:4] != b"mine"
 
 
@@ -371,13 +321,6 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
     failing_second(monkeypatch, error)
 
     with pytest.raises(type(error)):
-        lod_file(source, tmp_path / "out", LevelsRequest(cameras(2), DELETED, QUICK))
+        lod_file(source, tmp_path / "out", cameras(2), TWO, QUICK)
 
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
-
-
-@pytest.mark.parametrize("goal", [0.0, 100.0, math.nan])
-def test_a_distance_for_no_psnr_is_refused(tmp_path, goal):
-    """Before anything is read: there is no such file."""
-    with pytest.raises(RefineError, match="PSNR for a distance"):
-        lod_file(tmp_path / "a.ply", tmp_path, LevelsRequest(cameras(), Levels((0.5,)), goal=goal))

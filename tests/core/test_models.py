@@ -7,18 +7,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, Splats, View, ViewSet, read_splats
+from refine_addon.core import (
+    Levels,
+    RefineError,
+    Splats,
+    View,
+    ViewSet,
+    convert_files,
+    lod_file,
+    read_splats,
+    score_file,
+)
 from refine_addon.core.formats import ply
 from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.formats.registry import FORMATS
-from refine_addon.core.levels.files import LevelsRequest, lod_file
-from refine_addon.core.levels.lod import Levels
 from refine_addon.core.merging import field as merge_field
 from refine_addon.core.merging import pairs as merging
 from refine_addon.core.merging.merge import merge
-from refine_addon.core.operation.arranged import convert_files
-from refine_addon.core.operation.files import file_to_file
-from refine_addon.core.operation.requests import ConvertRequest, ScoreRequest
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS, MODELS
 from refine_addon.core.splats import LOG_ZERO, joined, opacity, rotation_matrices, with_model
 from refine_addon.core.visibility import projection
@@ -75,7 +80,7 @@ def test_splats_without_a_third_scale_are_discs_and_stay_so(tmp_path):
     path = write(tmp_path / "in.ply", splats, [b"antialiased 1"])
     assert b"scale_2" not in path.read_bytes()
 
-    file_to_file(path, tmp_path / "out.ply", ConvertRequest())
+    convert_files([path], tmp_path / "out.ply")
 
     read = read_splats(tmp_path / "out.ply")
     assert read.model == "2dgs"
@@ -93,8 +98,8 @@ def test_a_format_tells_the_model_or_its_notes_do(tmp_path, form, model):
     source = write(tmp_path / "in.ply", cloud(40))
     between, back = tmp_path / f"between{form.suffix}", tmp_path / "back.ply"
 
-    report = file_to_file(source, between, ConvertRequest(model=model)).report
-    file_to_file(between, back, ConvertRequest())
+    report = convert_files([source], between, model=model).report
+    convert_files([between], back)
 
     held = model in form.models
     assert read_splats(back).model == (model if held else "default")
@@ -107,7 +112,7 @@ def test_discs_of_several_files_are_written_without_a_third_scale(tmp_path):
     one = write(tmp_path / "one.ply", cloud(3), [b"SplatRenderMode: 2dgs"])
     other = write(tmp_path / "other.ply", with_model(cloud(4), "2dgs"))
 
-    convert_files([one, other], tmp_path / "both.ply", ConvertRequest())
+    convert_files([one, other], tmp_path / "both.ply")
 
     both = read_splats(tmp_path / "both.ply")
     assert b"scale_2" not in both.header
@@ -232,7 +237,7 @@ def test_two_small_splats_merge_into_one_of_their_mass(model):
     splats = with_model(splats, model)
     views = ViewSet((VIEW,))
 
-    merged = merge(splats, views, seen_whole(splats), seen_whole, 1).splats
+    merged = merge(splats, views, seen_whole(range(2), None, None), seen_whole, 1).splats
 
     assert merged.model == model
     before, after = (
@@ -241,9 +246,9 @@ def test_two_small_splats_merge_into_one_of_their_mass(model):
     assert after == pytest.approx(before, rel=0.12)
 
 
-def seen_whole(left, _sums=None, _progress=None):
-    """Return the sums that merging asks for: all splats contribute alike."""
-    return np.outer([10.0, 1.0], np.ones(len(left)))
+def seen_whole(left, _expected, _progress):
+    """Return what merging asks of views: all splats contribute alike."""
+    return np.repeat([[10.0], [1.0]], len(left), axis=1)
 
 
 def test_splats_of_different_models_are_no_scene():
@@ -309,8 +314,9 @@ def test_of_discs_one_behind_the_other_comes_one_that_faces_the_camera():
         sh_dc=np.ones((2, 3)),
     )
 
-    discs = with_model(discs, "2dgs")
-    merged = merge(discs, ViewSet((VIEW,)), seen_whole(discs), seen_whole, 1).splats
+    merged = merge(
+        with_model(discs, "2dgs"), ViewSet((VIEW,)), seen_whole(range(2), None, None), seen_whole, 1
+    ).splats
 
     assert abs(rotation_matrices(merged.quaternions)[0, 2, 2]) > 0.99
     np.testing.assert_allclose(np.sort(np.exp(merged.log_scales[0, :2])), [0.01, 0.02], rtol=0.02)
@@ -321,10 +327,10 @@ def test_levels_and_scores_are_files_of_the_same_model(tmp_path, model):
     """Of splats that the file calls ordinary and `model=` does not; discs stay discs."""
     source = write(tmp_path / "in.ply", before_the_camera(60, -2.0, "default"))
     views = ViewSet((VIEW,))
-    levels = Levels((0.5,), survivors="absorb")
+    levels = Levels((0.5,))
 
-    lod_file(source, tmp_path / "levels", LevelsRequest(views, levels, model=model))
-    file_to_file(source, tmp_path / "scored.ply", ScoreRequest(views, model=model))
+    lod_file(source, tmp_path / "levels", views, levels, model=model)
+    score_file(source, tmp_path / "scored.ply", views, model=model)
 
     assert read_splats(tmp_path / "levels/in.lod1.ply").model == model
     assert read_splats(tmp_path / "scored.ply").model == model

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from refine_addon.core import (
     Budget,
+    ClosedForm,
     Occlusion,
     RefineError,
-    Settings,
     Splats,
     View,
     ViewSet,
@@ -26,7 +26,7 @@ from refine_addon.core import (
 )
 from refine_addon.core.merging import field as merge_field
 from refine_addon.core.merging import graph as merge_graph
-from refine_addon.core.pipeline import absorb_removed
+from refine_addon.core.prune import merge_down
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.scoring.closed_form import lambdas
 from refine_addon.core.splats import ARRAYS, drawable, opacity
@@ -38,10 +38,9 @@ FINITE = [
 ]
 EXTREME = [*FINITE, math.inf, -math.inf, math.nan]
 DOUBLES = [1e-320, -1e-310, 1e-200, 1e-100, 1e100, -1e200, 1e308]
-COARSE = Occlusion(cell=8.0, density=1.0, rounds=2)
 METHODS = {
-    "closed form": Settings("closed-form"),
-    "occlusion": Settings("occlusion", occlusion=COARSE),
+    "closed form": ClosedForm(),
+    "occlusion": Occlusion(),
 }
 READINGS: dict[str, dict[str, object]] = {
     "distance": {"depth": "distance"},
@@ -80,7 +79,7 @@ def view(center=(0.0, 0.0, 0.0), **changes) -> View:
 
 def scored(splats, views=None, settings=None):
     """Score in this thread: NumPy's flags are raised in it alone."""
-    settings = settings or Settings("closed-form")
+    settings = settings or ClosedForm()
     views = views or ViewSet((view(), view([0.1, 0, 0])))
     if isinstance(settings, dict):
         return closed_form.score(splats, views, **settings, threads=1)
@@ -289,7 +288,7 @@ def test_ten_thousand_views_are_one_mean():
     splats = cloud()
     many = ViewSet((view(),) * 10_000)
 
-    values = scored(splats, many, Settings("closed-form", views=0)).values
+    values = scored(splats, many, ClosedForm(0)).values
 
     np.testing.assert_allclose(values, scored(splats, ViewSet((view(),))).values, rtol=1e-6)
 
@@ -483,7 +482,7 @@ def test_any_values_at_once_absorb_each_other_and_stay_splats(data, count):
     )
 
     try:
-        result = absorb_removed(splats, drawn_views(data), count, METHODS["occlusion"], threads=1)
+        result = merge_down(splats, drawn_views(data), count, threads=1)
     except RefineError as error:
         if "no camera sees the splats" not in str(error):
             raise
@@ -499,7 +498,7 @@ def test_one_extreme_splat_among_good_ones_absorbs_and_is_absorbed(name):
     for value in EXTREME:
         splats = with_first(name, value)
 
-        result = absorb_removed(splats, views, 10, METHODS["occlusion"], threads=1)
+        result = merge_down(splats, views, 10, threads=1)
 
         check_absorbed(splats, result, 10)
 
@@ -553,9 +552,9 @@ def test_detail_of_a_millimetre_survives_a_million_metres_from_the_origin(settin
 def test_the_size_of_the_pieces_of_work_changes_nothing_with_occlusion(monkeypatch):
     """Splats and points a few at a time, on one thread or on three: whole columns, so no sum."""
     splats, views = cloud(300), ViewSet(tuple(view([x, 0, 0]) for x in (-0.2, 0.0, 0.1, 0.3)))
-    settings = Settings("occlusion", occlusion=Occlusion(rounds=1))
+    settings = Occlusion()
     expected = score(splats, views, settings, threads=1)
-    survivors = absorb_removed(splats, views, 100, settings, threads=1)
+    survivors = merge_down(splats, views, 100, threads=1)
     for module, name, size in (
         (points, "_BLOCK", 50),
         (projection, "_CHUNK", 7),
@@ -566,7 +565,7 @@ def test_the_size_of_the_pieces_of_work_changes_nothing_with_occlusion(monkeypat
 
     for threads in (1, 3):
         scores = score(splats, views, settings, threads=threads)
-        again = absorb_removed(splats, views, 100, settings, threads=threads)
+        again = merge_down(splats, views, 100, threads=threads)
 
         np.testing.assert_allclose(scores.values, expected.values, atol=1.5 / 300)
         np.testing.assert_array_equal(scores.seen, expected.seen)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from refine_addon.core import Budget, RefineError, Splats, prune
+from refine_addon.core import Budget, Merge, Occlusion, RefineError, Splats, prune
 from refine_addon.core.execute import Cancelled
 from refine_addon.core.images import png
 from refine_addon.core.picture_files import KINDS, PictureFiles, chosen, in_words
@@ -262,11 +262,11 @@ def test_a_picture_that_exists_is_refused_before_the_work(tmp_path):
 
 
 def test_what_absorbs_is_drawn_as_it_became():
-    """With `absorb` the survivors are other splats than before."""
+    """After merging the kept splats are others than before."""
     splats, views = crowd(), ViewSet((view_of(60, 40),))
 
-    result = prune(splats, views, Budget(ratio=0.6), survivors="absorb")
+    result = prune(splats, views, Budget(ratio=0.6), Merge())
 
-    assert result.survivors(splats) is result.absorbed.splats
-    plain = prune(splats, views, Budget(ratio=0.6), survivors="unchanged")
-    assert np.array_equal(plain.survivors(splats).means, splats.means[plain.keep])
+    assert result.splats is result.merged.splats
+    plain = prune(splats, views, Budget(ratio=0.6), Occlusion())
+    assert np.array_equal(plain.splats.means, splats.means[plain.keep])

@@ -10,30 +10,32 @@ import numpy as np
 import pytest
 
 from refine_addon.core import (
+    METHODS,
     Budget,
     Cancelled,
+    ClosedForm,
+    Merge,
+    Occlusion,
     RefineError,
     Scores,
-    Settings,
     View,
     ViewSet,
     prune,
     score,
     select,
 )
-from refine_addon.core.pipeline import decide
 from refine_addon.core.quality.curve import PSNR_CAP, SHARES, Quality, absorbed_from
 from refine_addon.core.quality.psnr import psnr_against, psnr_kept, psnr_of, quality_curve
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.splats import opacity
-from refine_addon.core.task import Task
 from refine_addon.core.visibility import cast, projection, ray_sample
 from refine_addon.core.visibility.ray_sample import validation_rays
 from refine_addon.core.visibility.rays import Rays
 from tests.core.test_invariance import MOTIONS, moved
+from tests.core.test_levels import merges  # noqa: F401 - a fixture
 from tests.core.test_occlusion import cloud, look_along_z, ring, splats_of
 
-FAST = Settings("closed-form")
+FAST = ClosedForm()
 CURVE = Quality(*np.array([[0.2, 0.5, 0.8], [50.0, 40.0, 30.0], [52.0, 47.0, 38.0]]))
 CUT = 1.0 / 255.0
 
@@ -187,7 +189,7 @@ def test_where_too_few_rays_meet_a_splat_nothing_is_estimated():
 
     assert psnr_kept(validation_rays(splats, views), np.zeros(1, np.bool_)) is None
     result = prune(splats_of([[0, 0, 2.0]] * 4, scales=0.02), views, Budget(ratio=0.5),
-                   Settings("occlusion"))  # fmt: skip
+                   Occlusion())  # fmt: skip
     assert result.report["estimated_psnr"] is None
     assert any("too little" in note for note in result.report["notes"])
 
@@ -223,7 +225,7 @@ def gaussians_of(splats):
 def test_the_curve_is_what_each_share_reaches():
     """Each point is the estimate for the lowest scores removed, as `select` removes them."""
     splats, views = cloud(), ring()
-    scores = score(splats, views, Settings("occlusion"))
+    scores = score(splats, views, Occlusion())
 
     assert scores.quality is not None
     assert scores.ray_sample is not None
@@ -243,7 +245,7 @@ def test_the_curve_is_the_mean_of_those_of_single_views():
         replace(view, name=f"view {k}", weight=3.0 if k == 2 else 1.0)
         for k, view in enumerate(ring())
     ))  # fmt: skip
-    scores = score(cloud(), views, Settings("occlusion"))
+    scores = score(cloud(), views, Occlusion())
 
     assert scores.quality is not None
     single = scores.quality.views
@@ -283,8 +285,8 @@ def test_the_estimate_depends_on_nothing_but_the_scene(method):
     order = np.random.default_rng(1).permutation(len(splats))
     moved_splats, moved_views = moved(splats.take(order), named[1], *MOTIONS["a turn and a move"])
 
-    one = score(splats, named[0], Settings(method), quality=True, threads=1)
-    other = score(moved_splats, moved_views, Settings(method), quality=True, threads=3)
+    one = score(splats, named[0], METHODS[method](), quality=True, threads=1)
+    other = score(moved_splats, moved_views, METHODS[method](), quality=True, threads=3)
 
     assert one.quality is not None
     assert other.quality is not None
@@ -327,8 +329,8 @@ def test_where_the_curve_is_flat_as_much_goes_as_can():
 
 def test_the_curve_of_absorbing_is_read_in_the_same_way():
     """At the points what was put in."""
-    assert CURVE.at(0.5, survivors="absorb") == pytest.approx(47.0)
-    assert CURVE.share(38.0, survivors="absorb") == pytest.approx(0.8)
+    assert CURVE.at(0.5, way="merge") == pytest.approx(47.0)
+    assert CURVE.share(38.0, way="merge") == pytest.approx(0.8)
 
 
 def test_absorbing_is_expected_to_be_better_and_never_worse():
@@ -416,8 +418,8 @@ def test_scores_without_an_estimate_cannot_keep_a_psnr():
 @pytest.mark.parametrize("goal", [20.0, 35.0])
 def test_every_method_reaches_a_psnr(method, goal):
     """To half a dB by its own estimate, with one splat more it would be above."""
-    budget, settings = Budget(psnr=goal), Settings(method)
-    result = prune(cloud(), ring(), budget, settings, survivors="unchanged")
+    budget, settings = Budget(psnr=goal), METHODS[method]()
+    result = prune(cloud(), ring(), budget, settings)
 
     assert result.report["estimated_psnr"] == pytest.approx(goal, abs=0.6)
     assert result.report["budget"] == {"psnr": goal}
@@ -426,14 +428,14 @@ def test_every_method_reaches_a_psnr(method, goal):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [25.0, 40.0])
-def test_absorbing_reaches_a_psnr_with_fewer(goal):
+def test_merging_reaches_a_psnr_with_fewer(merges, goal):
     """By its own estimate, to `absorb_splats.CLOSE` or as near as three tries come."""
     splats, views = cloud(1500), ring()
-    plain = prune(splats, views, Budget(psnr=goal), Settings("occlusion"), survivors="unchanged")
-    merged = prune(splats, views, Budget(psnr=goal), survivors="absorb")
+    plain = prune(splats, views, Budget(psnr=goal), Occlusion())
+    merged = prune(splats, views, Budget(psnr=goal), Merge())
 
     assert merged.report["estimated_psnr"] == pytest.approx(goal, abs=1.5)
-    assert merged.report["survivors"]["psnr"]["absorb"] == merged.report["estimated_psnr"]
+    assert merged.report["method"]["psnr"]["merge"] == merged.report["estimated_psnr"]
     assert merged.keep.sum() <= plain.keep.sum()  # three tries need not tell them apart
 
 
@@ -441,13 +443,10 @@ def test_absorbing_reaches_a_psnr_with_fewer(goal):
 def test_protected_splats_stay_and_the_psnr_is_kept_all_the_same():
     """With the lowest half protected, others must go, and fewer of them."""
     splats, views = cloud(), ring()
-    scores = score(splats, views, Settings("occlusion"))
+    scores = score(splats, views, Occlusion())
     protected = scores.values <= np.median(scores.values)
 
-    result = prune(
-        splats, views, Budget(psnr=30.0), Settings("occlusion"),
-        protected=protected, survivors="unchanged",
-    )  # fmt: skip
+    result = prune(splats, views, Budget(psnr=30.0), Occlusion(), protected=protected)
 
     assert result.keep[protected].all()
     assert result.report["estimated_psnr"] == pytest.approx(30.0, abs=1.0)
@@ -455,39 +454,40 @@ def test_protected_splats_stay_and_the_psnr_is_kept_all_the_same():
 
 def test_the_report_has_the_estimate_and_the_curve():
     """Plain numbers: of the result, of absorbing instead, and of all shares."""
-    settings = Settings("occlusion")
-    done = prune(cloud(), ring(), Budget(ratio=0.5), settings, survivors="unchanged").report
+    done = prune(cloud(), ring(), Budget(ratio=0.5), Occlusion()).report
 
     at = done["quality"]["shares"].index(0.5)
     assert done["estimated_psnr"] == pytest.approx(done["quality"]["psnr"][at], abs=0.01)
-    assert done["survivors"]["psnr"] == {
-        "unchanged": done["estimated_psnr"],
-        "absorb": None,
+    assert done["method"]["psnr"] == {
+        "delete": done["estimated_psnr"],
+        "merge": None,
         "refit": None,
     }
     json.dumps(done, allow_nan=False)
 
 
 @pytest.mark.slow
-def test_what_absorbing_would_reach_is_told_of_many_splats_alone():
+def test_what_merging_would_reach_is_told_of_many_splats_alone(merges):
     """With few it was off by up to 7 dB. What it did reach is always told."""
-    settings = Settings("occlusion")
-    few = prune(cloud(), ring(), Budget(ratio=0.5), settings, survivors="unchanged")
+    few = prune(cloud(), ring(), Budget(ratio=0.5), Occlusion())
     curve = few.scores.quality
     assert curve is not None
     many = replace(few.scores, quality=replace(curve, foretold=True))
     splats, views = cloud(), ring()
 
-    told = [decide(Task(Budget(ratio=0.5), scores=scores)).report for scores in (few.scores, many)]
-    done = prune(splats, views, Budget(ratio=0.5), Settings("occlusion"), survivors="absorb").report
+    told = [
+        prune(None, None, Budget(ratio=0.5), Occlusion(), scores=scores).report
+        for scores in (few.scores, many)
+    ]
+    done = prune(splats, views, Budget(ratio=0.5), Merge()).report
 
-    few_told, many_told, reached = (each["survivors"] for each in (*told, done))
-    assert few_told["psnr"]["absorb"] is None
+    few_told, many_told, reached = (each["method"] for each in (*told, done))
+    assert few_told["psnr"]["merge"] is None
     assert "fewer than 20,000 splats" in few_told["note"]
-    assert many_told["psnr"]["unchanged"] < many_told["psnr"]["absorb"]
-    assert many_told["psnr"]["absorb"] < many_told["psnr"]["refit"]
+    assert many_told["psnr"]["delete"] < many_told["psnr"]["merge"]
+    assert many_told["psnr"]["merge"] < many_told["psnr"]["refit"]
     assert many_told["note"] is None
-    assert reached["psnr"]["absorb"] == done["estimated_psnr"]
+    assert reached["psnr"]["merge"] == done["estimated_psnr"]
     assert not Quality.from_facts(curve.facts()).foretold
     old = {name: value for name, value in curve.facts().items() if name != "foretold"}
     assert Quality.from_facts(old).foretold

@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 
 from refine_addon.core import (
-    SURVIVORS,
     Budget,
     Levels,
-    LevelsRequest,
-    PruneRequest,
-    RefineError,
-    Settings,
+    Merge,
+    Refit,
     ViewSet,
     lod,
     lod_file,
@@ -26,16 +23,14 @@ from refine_addon.core import (
     read_ply,
 )
 from refine_addon.core.execute import Cancelled
-from refine_addon.core.pipeline import decide
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.splats import ARRAYS
-from refine_addon.core.task import Task
 from refine_addon.core.visibility.ray_sample import validation_rays
 from tests.strategies import ply_of
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
-FEW = Settings(views=12)
+FEW, REFIT = Merge(12), Refit(12)
 HALF = Budget(ratio=0.5)
 
 pytestmark = pytest.mark.slow
@@ -61,37 +56,33 @@ def small(tmp_path_factory):
 def refitted(small, views, tmp_path_factory):
     """Return the file of the refitted half, and what was decided."""
     path = tmp_path_factory.mktemp("refitted") / "out.ply"
-    return path, prune_file(small, path, PruneRequest(views, HALF, FEW, survivors="refit"))
+    return path, prune_file(small, path, views, HALF, REFIT)
 
 
 def test_refitting_comes_closer_than_absorbing_and_says_by_how_much(small, views, refitted):
     """The same rows stay; rays that neither went by say that the pictures are closer."""
     splats = read_ply(small).splats()
-    absorbed = prune(splats, views, HALF, FEW, survivors="absorb")
+    absorbed = prune(splats, views, HALF, FEW)
     result, facts = refitted[1], refitted[1].report["refitted"]
     used = views.spread(FEW.views)
     rays = validation_rays(splats, used)
 
-    found = [psnr_against(rays, each.absorbed.splats, used) for each in (absorbed, result)]
+    found = [psnr_against(rays, each.splats, used) for each in (absorbed, result)]
 
     assert np.array_equal(result.keep, absorbed.keep)
     assert found[1] > found[0] + 1.0
     assert facts["psnr"] > facts["psnr_before"] + 1.0
     assert facts["rounds"] >= 1
-    assert 0 < facts["changed"] <= np.count_nonzero(result.absorbed.changed)
+    assert 0 < facts["changed"] <= np.count_nonzero(result.merged.changed)
     assert facts["seconds"] > 0.0
-    assert result.report["absorbed"] == absorbed.report["absorbed"]
+    assert result.report["merged"] == absorbed.report["merged"]
     assert any("survivors were refitted" in note for note in result.report["notes"])
 
 
 def test_rounds_are_as_many_as_asked_for_where_each_gains(small, views):
     """More rounds come closer on rays that none of them went by."""
     splats = read_ply(small).splats()
-    few = [replace(FEW, rounds=rounds) for rounds in (1, 3)]
-
-    told = [
-        prune(splats, views, HALF, asked, survivors="refit").report["refitted"] for asked in few
-    ]
+    told = [prune(splats, views, HALF, Refit(12, rounds)).report["refitted"] for rounds in (1, 3)]
 
     assert [facts["rounds"] for facts in told] == [1, 3]
     assert told[0]["psnr"] < told[1]["psnr"]
@@ -102,11 +93,11 @@ def test_the_file_holds_what_was_refitted_and_the_rest_bit_for_bit(small, refitt
     path, result = refitted
     before, after = read_ply(small), read_ply(path)
 
-    changed, kept = result.absorbed.changed, before.rows[result.keep]
+    changed, kept = result.merged.changed, before.rows[result.keep]
 
     assert after.rows[~changed].tobytes() == kept[~changed].tobytes()
     for item in ARRAYS:
-        wanted = getattr(result.absorbed.splats, item).astype(np.float32)
+        wanted = getattr(result.merged.splats, item).astype(np.float32)
         np.testing.assert_array_equal(getattr(after.splats(), item), wanted)
 
 
@@ -120,12 +111,11 @@ def test_doubles_stay_doubles_and_what_is_not_of_a_splat_stays(small, views, tmp
     shift = np.array([1e6, 0.0, 0.0])
     moved = ViewSet(tuple(replace(view, center=view.center + shift) for view in views))
 
-    request = PruneRequest(moved, HALF, FEW, survivors="refit")
-    result = prune_file(tmp_path / "in.ply", tmp_path / "out.ply", request)
+    result = prune_file(tmp_path / "in.ply", tmp_path / "out.ply", moved, HALF, REFIT)
 
     written = read_ply(tmp_path / "out.ply")
     np.testing.assert_array_equal(written.rows["mine"], np.flatnonzero(result.keep))
-    np.testing.assert_array_equal(written.splats().means, result.absorbed.splats.means)
+    np.testing.assert_array_equal(written.splats().means, result.merged.splats.means)
     assert written.splats().means.dtype == np.float64
     assert len(np.unique(written.rows["x"])) > 100
 
@@ -135,14 +125,14 @@ def test_protected_splats_keep_their_bits(small, views):
     splats = read_ply(small).splats()
     protected = np.arange(len(splats)) % 3 == 0
 
-    result = prune(splats, views, HALF, FEW, protected=protected, survivors="refit")
+    result = prune(splats, views, HALF, REFIT, protected=protected)
 
     spared = protected[result.keep]
     assert result.keep[protected].all()
-    assert not result.absorbed.changed[spared].any()
-    assert result.absorbed.changed[~spared].any()
+    assert not result.merged.changed[spared].any()
+    assert result.merged.changed[~spared].any()
     for item in ARRAYS:
-        found = getattr(result.absorbed.splats, item)[spared]
+        found = getattr(result.merged.splats, item)[spared]
         np.testing.assert_array_equal(found, getattr(splats, item)[protected])
 
 
@@ -150,9 +140,9 @@ def test_where_nothing_goes_nothing_is_refitted(small, views):
     """All rows are what they were."""
     splats = read_ply(small).splats()
 
-    result = prune(splats, views, Budget(ratio=0.0), FEW, survivors="refit")
+    result = prune(splats, views, Budget(ratio=0.0), REFIT)
 
-    assert not result.absorbed.changed.any()
+    assert not result.merged.changed.any()
     assert "refitted" not in result.report
 
 
@@ -161,8 +151,7 @@ def test_a_psnr_is_reached_with_fewer_splats_than_by_absorbing(small, views):
     splats = read_ply(small).splats()
 
     absorbed, refitted = (
-        prune(splats, views, Budget(psnr=38.0), FEW, survivors=survivors)
-        for survivors in ("absorb", "refit")
+        prune(splats, views, Budget(psnr=38.0), method) for method in (FEW, REFIT)
     )
 
     assert refitted.report["estimated_psnr"] == pytest.approx(38.0, abs=1.0)
@@ -174,13 +163,10 @@ def test_levels_are_refitted_to_the_original(small, views):
     """The second, too, though it is made from the first: it is closer than without refitting."""
     splats = read_ply(small).splats()
 
-    plain, better = (
-        lod(splats, views, Levels((0.5, 0.25), survivors=survivors), FEW)
-        for survivors in ("absorb", "refit")
-    )
+    plain, better = (lod(splats, views, Levels((0.5, 0.25)), method) for method in (FEW, REFIT))
 
     for one, other in zip(plain, better, strict=True):
-        assert len(one.splats) == len(other.splats)
+        assert len(one.result.splats) == len(other.result.splats)
         assert other.psnr > one.psnr + 0.5
 
 
@@ -193,7 +179,7 @@ def test_progress_rises_and_can_end_while_refitting(small, views):
         return what != "refitting"
 
     with pytest.raises(Cancelled):
-        prune(splats, views, HALF, FEW, survivors="refit", progress=listen)
+        prune(splats, views, HALF, REFIT, progress=listen)
 
     shares = [share for share, _ in told]
     assert shares == sorted(shares)
@@ -222,24 +208,23 @@ class Round:
         return not over
 
 
-@pytest.mark.parametrize(("rounds", "became"), [(1, "refit"), (-1, "absorb")])
+@pytest.mark.parametrize(("rounds", "became"), [(1, "refit"), (-1, "merge")])
 def test_what_was_reached_is_the_result_where_refitting_is_cancelled(
     small, views, monkeypatch, rounds, became
 ):
     """After a round what that reached, before it what absorbing left, each with its own PSNR."""
     splats = read_ply(small).splats()
     listen = Round(monkeypatch, rounds)
-    task = Task(HALF, FEW, splats, views, survivors="refit")
 
-    result = decide(task, progress=listen)
+    result = prune(splats, views, HALF, REFIT, partial=True, progress=listen)
 
-    whole = prune(splats, views, HALF, FEW, survivors="refit")
+    whole = prune(splats, views, HALF, REFIT)
     told = result.report
     assert isinstance(result.stopped, Cancelled)
     assert listen.told_after == 1
     np.testing.assert_array_equal(result.keep, whole.keep)
-    assert told["survivors"]["became"] == became
-    assert told["survivors"]["psnr"]["absorb"] == whole.report["survivors"]["psnr"]["absorb"]
+    assert told["method"]["done"] == became
+    assert told["method"]["psnr"]["merge"] == whole.report["method"]["psnr"]["merge"]
     assert (told.get("refitted", {}).get("rounds", 0) == 1) == (rounds == 1)
     assert told["estimated_psnr"] <= whole.report["estimated_psnr"] + 0.3
     assert any("refitting was stopped" in note for note in told["notes"])
@@ -250,12 +235,11 @@ def test_a_file_of_what_was_reached_is_written_where_refitting_is_cancelled(
 ):
     """As large as asked for, and named in what is raised; without an output nothing is."""
     listen = Round(monkeypatch, 1)
-    request = PruneRequest(views, HALF, FEW, survivors="refit")
 
     with pytest.raises(Cancelled) as stop:
-        prune_file(small, tmp_path / "out.ply", request, progress=listen)
+        prune_file(small, tmp_path / "out.ply", views, HALF, REFIT, progress=listen)
     with pytest.raises(Cancelled) as bare:
-        prune_file(small, None, request, progress=listen)
+        prune_file(small, None, views, HALF, REFIT, progress=listen)
 
     notes = stop.value.__notes__
     assert len(read_ply(tmp_path / "out.ply")) == 994
@@ -268,7 +252,7 @@ def test_a_psnr_that_is_cancelled_has_the_last_try_that_was_done(small, views, m
     """The first try comes close enough, or is the only one; a later one that is cut off is not."""
     splats, listen = read_ply(small).splats(), Round(monkeypatch, 1)
 
-    result = decide(Task(Budget(psnr=38.0), FEW, splats, views, survivors="refit"), progress=listen)
+    result = prune(splats, views, Budget(psnr=38.0), REFIT, partial=True, progress=listen)
 
     assert isinstance(result.stopped, Cancelled)
     assert 0 < np.count_nonzero(result.keep) < len(splats)
@@ -276,10 +260,10 @@ def test_a_psnr_that_is_cancelled_has_the_last_try_that_was_done(small, views, m
 
 def test_levels_that_are_cancelled_while_refitting_are_none(small, views, tmp_path, monkeypatch):
     """All of them or none, whatever the first had reached."""
-    request = LevelsRequest(views, Levels((0.5, 0.25), survivors="refit"), FEW)
+    levels, listen = Levels((0.5, 0.25)), Round(monkeypatch, 1)
 
     with pytest.raises(Cancelled):
-        lod_file(small, tmp_path / "out", request, progress=Round(monkeypatch, 1))
+        lod_file(small, tmp_path / "out", views, levels, REFIT, progress=listen)
 
     assert not (tmp_path / "out").exists()
 
@@ -288,29 +272,10 @@ def test_refitting_begins_with_deletion_where_that_is_better(small, views):
     """Two views see a third of the splats: half can be deleted with hardly a trace."""
     splats, two = read_ply(small).splats(), ViewSet(tuple(views)[:2])
 
-    absorbed, result = (
-        prune(splats, two, HALF, FEW, survivors=survivors) for survivors in ("absorb", "refit")
-    )
+    result = prune(splats, two, HALF, REFIT)
 
-    told = result.report["survivors"]["psnr"]
-    assert result.report["refitted"]["began"] == "unchanged"
-    assert result.report["absorbed"] == {"changed": 0, "merged": 0, "deleted": 994}
-    assert told["refit"] > told["unchanged"] > told["absorb"] + 10.0
+    told = result.report["method"]["psnr"]
+    assert result.report["refitted"]["began"] == "occlusion"
+    assert result.report["merged"] == {"changed": 0, "merged": 0, "deleted": 994}
+    assert told["refit"] > told["delete"] > told["merge"] + 10.0
     assert any("began with plain deletion" in note for note in result.report["notes"])
-    assert any("plain deletion reaches more" in note for note in absorbed.report["notes"])
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        lambda views: PruneRequest(views, HALF, survivors="merge"),
-        lambda views: Task(HALF, survivors="merge", views=views),
-        lambda _: Levels((0.5,), survivors="merge"),
-    ],
-)
-def test_what_survivors_cannot_become_is_refused(views, asked):
-    """With what was got and what was expected."""
-    words = f"survivors is 'merge', expected one of .*{', '.join(SURVIVORS)}"
-
-    with pytest.raises(RefineError, match=words):
-        asked(views)

@@ -16,19 +16,19 @@ pytestmark = pytest.mark.slow
 
 SECTIONS = (Path(__file__).parents[2] / "docs/report.md").read_text("utf-8").split("\n## ")
 CAMERAS = ["--cameras", "."]
-CHANGING = ["--survivors", "refit", "--clean", "--ratio", ".3"]
+CHANGING = ["--method", "refit", "--clean", "--ratio", ".3"]
 RUNS = {
     "prune": [
         ["-o", "a.splat", *CHANGING, *CAMERAS],
-        ["--dry-run", "--survivors", "unchanged", "--max-mb", "9", "--pictures", "shots", *CAMERAS],
+        ["--dry-run", "--method", "occlusion", "--max-mb", "9", "--pictures", "shots", *CAMERAS],
         ["--together", "--dry-run", "--method", "closed-form", *CAMERAS],
     ],
     "score": [["-o", "scored.ply", *CAMERAS]],
     "clean": [["--reasons", "front,isolated,giant,needle,transparent,haze,outside", *CAMERAS]],
     "convert": [["b.splat"]],
     "lod": [
-        ["-o", "levels", "--nested", *CAMERAS],
-        ["-o", "refitted", "--survivors", "refit", "--levels", ".5", *CAMERAS],
+        ["-o", "levels", "--method", "occlusion", *CAMERAS],
+        ["-o", "refitted", "--method", "refit", "--levels", ".5", *CAMERAS],
     ],
     "info": [[]],
 }

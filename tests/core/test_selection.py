@@ -108,40 +108,6 @@ def test_a_size_is_met_by_as_many_splats_as_fit(megabytes, row, fixed, count):
     assert kept == count or fixed + (kept + 1) * row > size
 
 
-@given(values=scores(), data=st.data())
-def test_rows_of_text_are_counted_one_by_one(values, data):
-    """As if one went after the other until the others fit; protected rows stay and are counted."""
-    count = len(values)
-    protected = np.array(data.draw(masks(count)))
-    lengths = np.array(data.draw(st.lists(st.integers(1, 99), min_size=count, max_size=count)))
-    fixed = data.draw(st.integers(0, 200))
-    size = data.draw(st.integers(fixed + 99, fixed + 99 * count + 1))
-    expected = [True] * count
-    for gone in range(count + 1):
-        expected = slow_keep(values, gone, protected)
-        if fixed + lengths[expected].sum() <= size:
-            break
-    budget = Budget(max_mb=size / 1e6)
-
-    if not any(expected):
-        with pytest.raises(RefineError, match="nothing was removed"):
-            select(scored(values), budget, row_bytes=lengths, fixed_bytes=fixed)
-        return
-    keep = select(scored(values), budget, protected=protected, row_bytes=lengths, fixed_bytes=fixed)
-
-    assert expected == keep.tolist()
-
-
-def test_a_limit_shorter_than_every_row_of_text_is_refused():
-    """10 bytes beside the rows and 7 of the shortest are 17: 16 are too few, 17 are enough."""
-    lengths = np.array([9, 7])
-
-    with pytest.raises(RefineError, match=r"max_mb is 1.6e-05, too small for one splat of 7 bytes"):
-        select(scored([1, 2]), Budget(max_mb=16e-6), row_bytes=lengths, fixed_bytes=10)
-    kept = select(scored([1, 2]), Budget(max_mb=17e-6), row_bytes=lengths, fixed_bytes=10)
-    assert kept.tolist() == [False, True]
-
-
 @pytest.mark.parametrize("megabytes", [1e303, 1.7e308])
 def test_a_size_beyond_all_files_keeps_every_splat(megabytes):
     """In bytes it is beyond what floating point holds."""
@@ -276,15 +242,6 @@ def test_only_a_threshold_and_a_number_of_views_need_scores_to_count_what_goes()
 
         assert budget.needs_scores == (kind in ("threshold", "min_seen"))
         assert budget.needs_scores == (budget.removals(10, 248) is None)
-
-
-def test_views_that_see_all_count_nothing():
-    """Without the frustum test `seen` is the number of views for every splat."""
-    scores = replace(scored([1, 2], [64, 64]), frustum=False)
-
-    with pytest.raises(RefineError, match="min_seen would remove none"):
-        select(scores, Budget(min_seen=50.0))
-    assert np.count_nonzero(select(scores, Budget(threshold=1.5))) == 1
 
 
 def test_whole_numbers_of_any_kind_are_taken():

@@ -27,13 +27,12 @@ from numpy.lib.recfunctions import drop_fields
 
 from refine_addon.command import main
 from refine_addon.core import (
-    Box,
     Budget,
-    Cleaning,
-    PruneRequest,
+    ClosedForm,
+    Merge,
+    Occlusion,
     RefineError,
-    Settings,
-    Zone,
+    Refit,
     mapped,
     prune,
     prune_file,
@@ -46,7 +45,6 @@ from refine_addon.core import (
 )
 from refine_addon.core.mapped import Interrupted, Mapped, note, noted, once
 from refine_addon.core.merging import merge
-from refine_addon.core.picture_files import PictureFiles
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.refit import round_rays
 from refine_addon.core.scoring import occlusion
@@ -63,8 +61,7 @@ from tests.strategies import plain_header, plain_ply, ply_of, splat_names
 from tests.tiles import COUNT, ROOM, cut, room_rows, rows_in, write
 
 HALF = Budget(ratio=0.5)
-CLOSED = Settings(method="closed-form", views=8)
-OCCLUSION = Settings(views=8)
+CLOSED, OCCLUSION, MERGE = ClosedForm(8), Occlusion(8), Merge(8)
 
 
 @pytest.fixture(autouse=True)
@@ -89,8 +86,8 @@ def tiles(tmp_path):
     return cut(tmp_path, room_rows())
 
 
-def asked(views, budget=HALF, settings=CLOSED, survivors="unchanged", **more):
-    return PruneRequest(views, budget, settings, survivors=survivors, **more)
+def asked(views, budget=HALF, method=CLOSED, **more):
+    return {"views": views, "budget": budget, "method": method, **more}
 
 
 # The law: tiles give the rows of one file.
@@ -106,33 +103,31 @@ BUDGETS = [
     Budget(psnr=36.0),
 ]
 WAYS = [
-    *((CLOSED, "unchanged", budget) for budget in BUDGETS),
-    (OCCLUSION, "unchanged", Budget(ratio=0.7)),
-    (OCCLUSION, "unchanged", Budget(min_seen=60)),
-    (OCCLUSION, "unchanged", Budget(psnr=36.0)),
-    (OCCLUSION, "auto", Budget(ratio=0.1)),
-    (OCCLUSION, "auto", Budget(psnr=36.0)),
-    (OCCLUSION, "absorb", Budget(ratio=0.8)),
-    (OCCLUSION, "refit", Budget(ratio=0.5)),
+    *((CLOSED, budget) for budget in BUDGETS),
+    (OCCLUSION, Budget(ratio=0.7)),
+    (OCCLUSION, Budget(min_seen=60)),
+    (OCCLUSION, Budget(psnr=36.0)),
+    (MERGE, Budget(ratio=0.1)),
+    (MERGE, Budget(psnr=36.0)),
+    (MERGE, Budget(ratio=0.8)),
+    (Refit(8), Budget(ratio=0.5)),
 ]
 
 
-@pytest.mark.parametrize(("settings", "survivors", "budget"), WAYS, ids=str)
-def test_of_tiles_the_same_rows_stay_as_of_one_file(
-    tmp_path, tiles, views, settings, survivors, budget
-):
+@pytest.mark.parametrize(("method", "budget"), WAYS, ids=str)
+def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, method, budget):
     """Every row to the byte, in the order of the files, and the report says the same of them.
 
     For a size, the four headers take bytes that one does not: here the rows left are compared with
     those of as many in one file.
     """
-    told = prune_tiles(tiles, tmp_path / "out", asked(views, budget, settings, survivors))
+    told = prune_tiles(tiles, tmp_path / "out", **asked(views, budget, method))
 
     if budget.max_mb:
         assert 0 <= 400_000 - told["files"]["output_bytes"] < 2 * 248
         budget = Budget(keep=told["splats"]["kept"])
     whole = prune_file(
-        tmp_path / "whole.ply", tmp_path / "pruned.ply", asked(views, budget, settings, survivors)
+        tmp_path / "whole.ply", tmp_path / "pruned.ply", **asked(views, budget, method)
     ).report
     assert (
         rows_in(tmp_path / "out", tiles).tobytes()
@@ -148,9 +143,9 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(
 @pytest.mark.parametrize("model", ["antialiased", "2dgs"])
 def test_tiles_of_every_model_are_pruned_as_one_file(tmp_path, tiles, views, model):
     """Merged to the byte, and written as the model that they are."""
-    request = asked(views, HALF, OCCLUSION, "absorb", model=model)
-    prune_tiles(tiles, tmp_path / "out", request)
-    prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", request)
+    request = asked(views, HALF, MERGE, model=model)
+    prune_tiles(tiles, tmp_path / "out", **request)
+    prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", **request)
 
     expected = read_ply(tmp_path / "pruned.ply").rows
     assert rows_in(tmp_path / "out", tiles).tobytes() == expected.tobytes()
@@ -161,7 +156,7 @@ def test_splats_at_the_threshold_stay(tmp_path, tiles, views):
     """401 splats are equal: those below them go, and none of them."""
     values = score(read_ply(tmp_path / "whole.ply").splats(), views, CLOSED).values
 
-    told = prune_tiles(tiles, None, asked(views, Budget(threshold=float(values[900]))))
+    told = prune_tiles(tiles, None, **asked(views, Budget(threshold=float(values[900]))))
 
     assert np.count_nonzero(values == values[900]) == 401
     assert told["splats"]["removed"] == np.count_nonzero(values < values[900])
@@ -173,10 +168,10 @@ def test_a_report_says_what_stays_of_each_tile(tmp_path, tiles, views):
     Without a folder the same sizes are told, and nothing is written.
     """
     before = sorted(tmp_path.rglob("*"))
-    dry = prune_tiles(tiles, None, asked(views))
+    dry = prune_tiles(tiles, None, **asked(views))
     assert sorted(tmp_path.rglob("*")) == before
 
-    report = prune_tiles(tiles, tmp_path / "out", asked(views))
+    report = prune_tiles(tiles, tmp_path / "out", **asked(views))
 
     each = report["tiles"]
     assert [tile["output_bytes"] for tile in dry["tiles"]] == [t["output_bytes"] for t in each]
@@ -193,13 +188,13 @@ def test_a_report_says_what_stays_of_each_tile(tmp_path, tiles, views):
 
 
 @pytest.mark.parametrize("megabytes", [0.1, 0.35, 10.0])
-def test_tiles_of_other_degrees_go_by_their_bytes(tmp_path, views, megabytes):
-    """As in memory, where rows have several lengths: the lowest go until the rest fits.
+def test_of_tiles_of_other_degrees_each_splat_counts_as_the_longest_row(tmp_path, views, megabytes):
+    """The lowest go until the rest fits, however the others are stored.
 
     The files have degree 3, 1 and 0; scores do not depend on the harmonics above the constant one.
     """
     rows = room_rows()
-    paths, lengths = [], []
+    paths, longest = [], 0
     for index, degree in enumerate((3, 1, 0)):
         file = tmp_path / f"{degree}.ply"
         file.write_bytes(plain_ply(400, degree))
@@ -210,14 +205,14 @@ def test_tiles_of_other_degrees_go_by_their_bytes(tmp_path, views, megabytes):
                 some[name] = rows[name][index * 400 : index * 400 + 400]
         file.write_bytes(data.header + some.tobytes())
         paths.append(file)
-        lengths.append(np.full(400, some.dtype.itemsize))
+        longest = max(longest, some.dtype.itemsize)
     write(tmp_path / "whole.ply", rows[:1200])
     scores = score(read_ply(tmp_path / "whole.ply").splats(), views, CLOSED)
     fixed = sum(read_ply(path).fixed_bytes for path in paths)
     budget = Budget(max_mb=megabytes)
-    keep = select(scores, budget, row_bytes=np.concatenate(lengths), fixed_bytes=fixed)
+    keep = select(scores, budget, row_bytes=longest, fixed_bytes=fixed)
 
-    report = prune_tiles(paths, tmp_path / "out", asked(views, budget))
+    report = prune_tiles(paths, tmp_path / "out", **asked(views, budget))
 
     for path, part in zip(paths, np.split(keep, 3), strict=True):
         expected = read_ply(path).rows[part]
@@ -237,9 +232,7 @@ def test_tiles_of_other_degrees_merge_with_one_another(tmp_path, views):
     (tmp_path / "b.ply").write_bytes(plain_header(len(plain), names) + plain.tobytes())
     paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
 
-    told = prune_tiles(
-        paths, tmp_path / "out", asked(views, Budget(ratio=0.6), OCCLUSION, "absorb")
-    )
+    told = prune_tiles(paths, tmp_path / "out", **asked(views, Budget(ratio=0.6), MERGE))
 
     made = [read_ply(tmp_path / "out" / path.name).splats() for path in paths]
     assert [splats.sh_rest.shape[1] for splats in made] == [15, 0]
@@ -279,15 +272,13 @@ def test_merging_by_regions_is_as_good_as_merging_one_file(tmp_path, views, monk
     monkeypatch.setattr(regions, "REGION", 10_000)
     file = read_ply(ROOM / "point_cloud.ply")
     tiles = cut(tmp_path, file.rows, np.linspace(0, len(file), 9).astype(int).tolist())
-    settings, splats = Settings(), file.splats()
-    told = prune_tiles(
-        tiles, tmp_path / "out", asked(views, Budget(ratio=ratio), settings, "absorb")
-    )
-    whole = prune(splats, views, Budget(ratio=ratio), settings, survivors="absorb")
+    method, splats = Merge(), file.splats()
+    told = prune_tiles(tiles, tmp_path / "out", **asked(views, Budget(ratio=ratio), method))
+    whole = prune(splats, views, Budget(ratio=ratio), method)
 
     rays = validation_rays(splats, views.spread(64))
     made = joined([read_ply(tmp_path / "out" / path.name).splats() for path in tiles])
-    one = psnr_against(rays, whole.survivors(splats), views.spread(64))
+    one = psnr_against(rays, whole.splats, views.spread(64))
     psnr = psnr_against(rays, made, views.spread(64))
     assert psnr > one - 0.3
     assert len(made) == told["splats"]["kept"] == whole.report["splats"]["kept"]
@@ -307,15 +298,13 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
     few, others = ViewSet(views.views[:3]), ViewSet(views.views[10::4])
     splats = read_ply(ROOM / "point_cloud.ply").splats()
     rays = validation_rays(splats, others)
-    whole = prune(splats, few, HALF, Settings(), survivors="absorb")
+    whole = prune(splats, few, HALF, Merge())
 
-    prune_tiles(
-        [ROOM / "point_cloud.ply"], tmp_path / "out", asked(few, HALF, Settings(), "absorb")
-    )
+    prune_tiles([ROOM / "point_cloud.ply"], tmp_path / "out", **asked(few, HALF, Merge()))
 
     made = read_ply(tmp_path / "out/point_cloud.ply").splats()
     assert np.count_nonzero(whole.scores.seen) < 0.3 * len(splats)
-    one = psnr_against(rays, whole.survivors(splats), others)
+    one = psnr_against(rays, whole.splats, others)
     assert psnr_against(rays, made, others) > one - 0.3
 
 
@@ -326,11 +315,9 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, views, monke
     Stages divide along other planes, so regions of a stage are not those of the one before.
     """
     monkeypatch.setattr(regions, "REGION", 900)
-    told = prune_tiles(
-        tiles, tmp_path / "out", asked(views, Budget(ratio=0.8), OCCLUSION, "absorb")
-    )
+    told = prune_tiles(tiles, tmp_path / "out", **asked(views, Budget(ratio=0.8), MERGE))
 
-    made, counts = rows_in(tmp_path / "out", tiles), told["absorbed"]
+    made, counts = rows_in(tmp_path / "out", tiles), told["merged"]
     assert len(made) == told["splats"]["kept"] == COUNT // 5
     assert counts["merged"] + counts["deleted"] == COUNT - len(made)
     same = np.isin(made.view("V248"), room_rows().view("V248"))
@@ -347,9 +334,8 @@ def test_refitting_by_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, 
     """
     monkeypatch.setattr(round_rays, "MIN_RAYS", 1 << 14)
     monkeypatch.setattr(regions, "REGION", 1500)
-    refit, merged = (asked(views, HALF, OCCLUSION, way) for way in ("refit", "absorb"))
-    told = prune_tiles(tiles, tmp_path / "out", refit)
-    before = prune_tiles(tiles, tmp_path / "merged", merged)
+    told = prune_tiles(tiles, tmp_path / "out", views, HALF, Refit(8))
+    before = prune_tiles(tiles, tmp_path / "merged", views, HALF, MERGE)
     prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", refit)
 
     used = views.spread(8)
@@ -360,7 +346,7 @@ def test_refitting_by_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, 
     assert psnr > one - 1.3
     assert told["estimated_psnr"] == pytest.approx(psnr, abs=0.1)
     assert psnr > before["estimated_psnr"] + 1.0
-    assert told["absorbed"] == before["absorbed"]
+    assert told["merged"] == before["merged"]
     same = np.isin(rows_in(tmp_path / "out", tiles).view("V248"), room_rows().view("V248"))
     assert told["refitted"]["changed"] <= np.count_nonzero(~same) <= len(made) == COUNT // 2
 
@@ -371,7 +357,7 @@ def test_what_no_view_shows_is_refitted_to_nothing(tmp_path, tiles, views, monke
     monkeypatch.setattr(regions, "REGION", 1500)
     two = ViewSet(views.views[:2])
 
-    told = prune_tiles(tiles, tmp_path / "out", asked(two, HALF, OCCLUSION, "refit"))
+    told = prune_tiles(tiles, tmp_path / "out", **asked(two, HALF, OCCLUSION, "refit"))
 
     made = rows_in(tmp_path / "out", tiles)
     assert 0 < told["refitted"]["changed"] < len(made) // 2
@@ -555,20 +541,20 @@ def test_what_stages_returned_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "budget", "words"),
+    ("method", "budget", "words"),
     [
         (CLOSED, Budget(threshold=1e30), "would remove all 5000 splats"),
         (CLOSED, Budget(max_mb=0.001), "too small for one splat of 248 bytes"),
     ],
 )
 def test_what_cannot_be_is_refused_and_leaves_nothing(
-    tmp_path, tiles, views, settings, budget, words
+    tmp_path, tiles, views, method, budget, words
 ):
     """After the work, folders that were there are as empty as they were; others are gone."""
     (tmp_path / "there").mkdir()
     for folder in ("there", "new/deep"):
         with pytest.raises(RefineError, match=words):
-            prune_tiles(tiles, tmp_path / folder, asked(views, budget, settings))
+            prune_tiles(tiles, tmp_path / folder, **asked(views, budget, method))
 
     assert not list((tmp_path / "there").iterdir())
     assert not (tmp_path / "new").exists()
@@ -579,10 +565,10 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     """Near planes behind all splats: the message is that of one file, and nothing is left."""
     away = ViewSet(tuple(replace(view, near=1e6) for view in views))
     with pytest.raises(RefineError) as alone:
-        prune_file(tmp_path / "whole.ply", None, asked(away, settings=OCCLUSION))
+        prune_file(tmp_path / "whole.ply", None, **asked(away, method=OCCLUSION))
 
     with pytest.raises(RefineError) as together:
-        prune_tiles(tiles, tmp_path / "out", asked(away, settings=OCCLUSION))
+        prune_tiles(tiles, tmp_path / "out", **asked(away, method=OCCLUSION))
 
     assert str(together.value) == str(alone.value)
 
@@ -634,10 +620,10 @@ def test_one_tile_at_fault_stops_all(tmp_path, tiles, views, kind):
     given, words = at_fault(tmp_path / kind, tiles)
 
     with pytest.raises(RefineError, match=words):
-        prune_tiles(given, tmp_path / "out", asked(views))
+        prune_tiles(given, tmp_path / "out", **asked(views))
     if kind != "name":
         with pytest.raises(RefineError, match=words):
-            prune_tiles(given, None, asked(views))
+            prune_tiles(given, None, **asked(views))
 
     assert not list((tmp_path / "out").glob("*"))
 
@@ -649,18 +635,18 @@ def test_files_that_exist_stay_until_they_may_be_replaced(tmp_path, tiles, views
     there.write_bytes(b"mine")
 
     with pytest.raises(RefineError, match="exists already"):
-        prune_tiles(tiles, tmp_path / "out", asked(views))
+        prune_tiles(tiles, tmp_path / "out", **asked(views))
 
     assert [*(tmp_path / "out").iterdir()] == [there]
     assert there.read_bytes() == b"mine"
-    prune_tiles(tiles, tmp_path / "out", asked(views, overwrite=True))
+    prune_tiles(tiles, tmp_path / "out", **asked(views, overwrite=True))
     assert len(list((tmp_path / "out").iterdir())) == 4
 
 
 def test_tiles_are_not_replaced_while_they_are_read(tmp_path, tiles, views):
     """A run that goes on after a kill would prune again what was pruned already."""
     with pytest.raises(RefineError, match="is read until all tiles are written"):
-        prune_tiles(tiles, tmp_path, asked(views, overwrite=True))
+        prune_tiles(tiles, tmp_path, **asked(views, overwrite=True))
 
 
 def test_a_tile_that_changes_meanwhile_stops_all(tmp_path, tiles, views):
@@ -671,26 +657,9 @@ def test_a_tile_that_changes_meanwhile_stops_all(tmp_path, tiles, views):
             tiles[2].write_bytes(tiles[2].read_bytes())
 
     with pytest.raises(RefineError, match="was changed while it was worked on"):
-        prune_tiles(tiles, tmp_path / "out", asked(views), progress=progress)
+        prune_tiles(tiles, tmp_path / "out", **asked(views), progress=progress)
 
     assert not list((tmp_path / "out").glob("*"))
-
-
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"zones": (Zone("remove", "a box", Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))),)},
-        {"cleaning": Cleaning()},
-        {"pictures": PictureFiles(Path("shown"), "a")},
-    ],
-    ids=["volumes", "cleaning", "pictures"],
-)
-def test_what_needs_all_splats_in_memory_is_refused(tmp_path, tiles, views, more):
-    """Before anything is read or made; it would be left out in silence otherwise."""
-    with pytest.raises(RefineError, match="need all splats in memory"):
-        prune_tiles(tiles, tmp_path / "out", asked(views, **more))
-
-    assert not (tmp_path / "out").exists()
 
 
 def test_tiles_that_would_be_one_file_by_links_are_refused(tmp_path, tiles, views):
@@ -701,7 +670,7 @@ def test_tiles_that_would_be_one_file_by_links_are_refused(tmp_path, tiles, view
         (out / tile.name).symlink_to("real.ply")
 
     with pytest.raises(RefineError, match=r"is the same file as .*, by a link"):
-        prune_tiles(tiles, out, asked(views))
+        prune_tiles(tiles, out, **asked(views))
     assert sorted(path.name for path in out.iterdir()) == sorted(tile.name for tile in tiles[:2])
 
 
@@ -722,7 +691,7 @@ def test_a_link_to_another_disk_is_refused_before_the_work(tmp_path, tiles, view
     monkeypatch.setattr(Path, "stat", elsewhere)
 
     with pytest.raises(RefineError, match="is a link to another disk"):
-        prune_tiles(tiles, out, asked(views))
+        prune_tiles(tiles, out, **asked(views))
 
 
 # What is done after an interruption.
@@ -749,16 +718,16 @@ def test_a_job_that_was_interrupted_goes_on_behind_the_last_stage(
     tmp_path, tiles, views, monkeypatch, stop
 ):
     """What was read is not read again, what was decided not decided; the bytes are the same."""
-    prune_tiles(tiles, tmp_path / "once", asked(views))
+    prune_tiles(tiles, tmp_path / "once", **asked(views))
     with pytest.raises(KeyboardInterrupt):
-        prune_tiles(tiles, tmp_path / "out", asked(views), progress=stopping(stop), threads=1)
+        prune_tiles(tiles, tmp_path / "out", **asked(views), progress=stopping(stop), threads=1)
     assert not list((tmp_path / "out").glob("*.ply"))
     if stop != "reading":
         monkeypatch.setattr(tiles_prune, "copied", None)
     if stop == "writing":
-        monkeypatch.setattr(tiles_prune, "decide", None)
+        monkeypatch.setattr(tiles_prune, "prune", None)
 
-    prune_tiles(tiles, tmp_path / "out", asked(views))
+    prune_tiles(tiles, tmp_path / "out", **asked(views))
 
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "once")
 
@@ -807,11 +776,11 @@ def test_a_job_that_was_stopped_while_it_renamed_goes_on(
     with monkeypatch.context() as patched:
         renaming_stops(patched, tiles[1].name, error)
         with pytest.raises(raised):
-            prune_tiles(tiles, out, asked(views))
+            prune_tiles(tiles, out, **asked(views))
     assert [path.name for path in out.glob("*.ply")] == [tiles[0].name]
 
     monkeypatch.setattr(writing, "rows_of", None)  # nothing is written again
-    report = prune_tiles(tiles, out, asked(views))
+    report = prune_tiles(tiles, out, **asked(views))
 
     assert {path.name for path in out.iterdir()} == {path.name for path in tiles}
     assert sum(len(read_ply(out / path.name)) for path in tiles) == COUNT // 2
@@ -832,7 +801,7 @@ def test_ctrl_c_after_the_last_tile_was_renamed_comes_too_late(tmp_path, tiles, 
 
     monkeypatch.setattr(shutil, "rmtree", stop_at_first)
 
-    report = prune_tiles(tiles, tmp_path / "out", asked(views))
+    report = prune_tiles(tiles, tmp_path / "out", **asked(views))
 
     assert len(calls) == 1
     assert report["splats"]["written"] == COUNT // 2
@@ -845,13 +814,13 @@ def test_a_file_in_the_place_of_a_renamed_tile_is_not_replaced(tmp_path, tiles, 
     with monkeypatch.context() as patched:
         renaming_stops(patched, tiles[1].name, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):
-            prune_tiles(tiles, out, asked(views))
+            prune_tiles(tiles, out, **asked(views))
     (out / tiles[0].name).write_bytes(b"mine")
 
     with pytest.raises(RefineError, match="exists already"):
-        prune_tiles(tiles, out, asked(views))
+        prune_tiles(tiles, out, **asked(views))
     assert (out / tiles[0].name).read_bytes() == b"mine"
-    prune_tiles(tiles, out, asked(views, overwrite=True))
+    prune_tiles(tiles, out, **asked(views, overwrite=True))
 
     assert sum(len(read_ply(out / path.name)) for path in tiles) == COUNT // 2
 
@@ -872,11 +841,11 @@ def test_what_appears_in_the_place_of_a_tile_meanwhile_stops_before_the_first(
 
     request = asked(views, overwrite=overwrite)
     with pytest.raises(Interrupted, match=f"{words}.*; the same command goes on"):
-        prune_tiles(tiles, out, request, progress=progress)
+        prune_tiles(tiles, out, **request, progress=progress)
     assert [*out.glob("*.ply")] == [there]
     (Path.rmdir if overwrite else Path.unlink)(there)
     monkeypatch.setattr(writing, "rows_of", None)  # nothing is written again
-    prune_tiles(tiles, out, request)
+    prune_tiles(tiles, out, **request)
 
     assert {path.name for path in out.iterdir()} == {path.name for path in tiles}
 
@@ -884,7 +853,7 @@ def test_what_appears_in_the_place_of_a_tile_meanwhile_stops_before_the_first(
 @pytest.mark.parametrize("calls", [1, 4, 8, 12])
 def test_on_a_full_disk_what_is_done_stays(tmp_path, tiles, views, monkeypatch, calls):
     """Wherever it fills up, the file is named, and the same call goes on once there is room."""
-    prune_tiles(tiles, tmp_path / "once", asked(views))
+    prune_tiles(tiles, tmp_path / "once", **asked(views))
     done, guarded = [], mapped.writing
 
     @contextlib.contextmanager
@@ -899,23 +868,23 @@ def test_on_a_full_disk_what_is_done_stays(tmp_path, tiles, views, monkeypatch, 
         patched.setattr(mapped, "writing", filling)
         patched.setattr(writing, "writing", filling)
         with pytest.raises(Interrupted) as stopped:
-            prune_tiles(tiles, tmp_path / "out", asked(views), threads=1)
+            prune_tiles(tiles, tmp_path / "out", **asked(views), threads=1)
     words = f"{done[-1]}: no space left on the disk; the same command goes on where this one was"
     assert str(stopped.value) == words
 
-    prune_tiles(tiles, tmp_path / "out", asked(views))
+    prune_tiles(tiles, tmp_path / "out", **asked(views))
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "once")
 
 
 def test_an_array_that_a_power_cut_truncated_is_made_again(tmp_path, tiles, views):
     """The next run copies the tiles again, and ends with the same bytes."""
-    prune_tiles(tiles, tmp_path / "once", asked(views))
+    prune_tiles(tiles, tmp_path / "once", **asked(views))
     with pytest.raises(KeyboardInterrupt):
-        prune_tiles(tiles, tmp_path / "out", asked(views), progress=stopping("scoring"))
+        prune_tiles(tiles, tmp_path / "out", **asked(views), progress=stopping("scoring"))
     (damaged,) = (tmp_path / "out").rglob("splats/log_scales")
     os.truncate(damaged, 300)
 
-    prune_tiles(tiles, tmp_path / "out", asked(views))
+    prune_tiles(tiles, tmp_path / "out", **asked(views))
 
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "once")
 
@@ -925,7 +894,7 @@ def test_a_tile_with_the_longest_name_is_pruned(tmp_path, tiles, views):
     long = tmp_path / f"{'x' * 251}.ply"
     tiles[0].rename(long)
 
-    prune_tiles([long, *tiles[1:]], tmp_path / "out", asked(views))
+    prune_tiles([long, *tiles[1:]], tmp_path / "out", **asked(views))
 
     assert (tmp_path / "out" / long.name).exists()
 
@@ -933,8 +902,8 @@ def test_a_tile_with_the_longest_name_is_pruned(tmp_path, tiles, views):
 def test_another_job_does_not_take_over_what_is_left(tmp_path, tiles, views):
     """Of another budget, the folder has another name."""
     with pytest.raises(KeyboardInterrupt):
-        prune_tiles(tiles, tmp_path / "out", asked(views), progress=stopping("writing"), threads=1)
-    report = prune_tiles(tiles, tmp_path / "out", asked(views, Budget(ratio=0.25)))
+        prune_tiles(tiles, tmp_path / "out", views, HALF, CLOSED, progress=stopping("writing"))
+    report = prune_tiles(tiles, tmp_path / "out", **asked(views, Budget(ratio=0.25)))
 
     assert report["splats"]["removed"] == COUNT // 4
 
@@ -994,14 +963,14 @@ def memory(fsspec, folder):
 
 def here(folder, views, *more):
     """Give the bytes of the tiles pruned on the disk."""
-    prune_tiles(NAMES, folder / "here", asked(views, HALF, *more))
+    prune_tiles(NAMES, folder / "here", **asked(views, HALF, *more))
     return [(folder / "here" / name).read_bytes() for name in NAMES]
 
 
-@pytest.mark.parametrize("more", [(CLOSED,), (OCCLUSION, "absorb")], ids=["deleted", "merged"])
+@pytest.mark.parametrize("more", [(CLOSED,), (MERGE,)], ids=["deleted", "merged"])
 def test_behind_urls_the_same_bytes_are_written(folder, memory, views, more):
     """Tiles and folder are in memory; nothing else is left there, nor here."""
-    report = prune_tiles(URLS, "memory://out/deep", asked(views, HALF, *more))
+    report = prune_tiles(URLS, "memory://out/deep", **asked(views, HALF, *more))
 
     assert not list(folder.glob(".refine*"))
     assert sorted(memory.find("/out")) == [f"/out/deep/{name}" for name in NAMES]
@@ -1018,8 +987,8 @@ def test_behind_urls_the_same_bytes_are_written(folder, memory, views, more):
 def test_paths_and_urls_go_together(folder, views):
     """One tile of each, written to the disk; the dry run tells the same bytes."""
     tiles = [NAMES[0], URLS[1]]
-    told = prune_tiles(tiles, None, asked(views))
-    prune_tiles(tiles, folder / "out", asked(views))
+    told = prune_tiles(tiles, None, **asked(views))
+    prune_tiles(tiles, folder / "out", **asked(views))
 
     found = [(folder / "out" / name).read_bytes() for name in NAMES]
     assert found == here(folder, views)
@@ -1041,7 +1010,7 @@ def test_of_a_tile_no_more_than_its_rows_are_read(folder, memory, views, monkeyp
     monkeypatch.setattr(type(memory), "cat_file", noting)
     monkeypatch.setattr(writing, "ROWS", 100)
 
-    prune_tiles(URLS, folder / "out", asked(views))
+    prune_tiles(URLS, folder / "out", **asked(views))
 
     tiles = [source.tile_at(url) for url in URLS]
     rows = sum(tile.splats * tile.dtype.itemsize for tile in tiles)
@@ -1055,10 +1024,10 @@ def test_files_there_are_replaced_only_when_told(memory, views):
     memory.pipe_file("/out/b.ply", b"old")
 
     with pytest.raises(RefineError, match=r"^memory://out/b\.ply: exists already"):
-        prune_tiles(URLS, "memory://out", asked(views))
+        prune_tiles(URLS, "memory://out", **asked(views))
     assert memory.find("/out") == ["/out/b.ply"]
 
-    prune_tiles(URLS, "memory://out", asked(views, overwrite=True))
+    prune_tiles(URLS, "memory://out", **asked(views, overwrite=True))
     assert memory.cat_file("/out/b.ply") != b"old"
     assert memory.find("/out") == ["/out/a.ply", "/out/b.ply"]
 
@@ -1068,9 +1037,9 @@ def test_what_is_read_is_not_replaced(folder, views):
     """However it is called: by the same URL, or as a path here and a URL of a link there."""
     (folder / "link").symlink_to(folder)
     with pytest.raises(RefineError, match=r"memory:///in/a\.ply: is read until all"):
-        prune_tiles(URLS, "memory:///in", asked(views, overwrite=True))
+        prune_tiles(URLS, "memory:///in", **asked(views, overwrite=True))
     with pytest.raises(RefineError, match=r"a\.ply: is read until all"):
-        prune_tiles(NAMES, f"file://{folder}/link", asked(views, overwrite=True))
+        prune_tiles(NAMES, f"file://{folder}/link", **asked(views, overwrite=True))
 
 
 def test_a_tile_behind_a_url_that_changes_meanwhile_stops_all(folder, memory, views):
@@ -1081,7 +1050,7 @@ def test_a_tile_behind_a_url_that_changes_meanwhile_stops_all(folder, memory, vi
             memory.pipe_file("/in/b.ply", memory.cat_file("/in/b.ply"))
 
     with pytest.raises(RefineError, match=r"^memory://in/b\.ply: was changed while it was worked"):
-        prune_tiles(URLS, "memory://out", asked(views), progress=progress)
+        prune_tiles(URLS, "memory://out", **asked(views), progress=progress)
 
     assert memory.find("/out") == []
     assert not list(folder.glob(".refine*"))
@@ -1101,12 +1070,12 @@ def test_a_storage_that_fails_leaves_what_is_done(folder, memory, views, monkeyp
     with pytest.raises(
         RefineError, match=r"000001: cannot be written \(the line is dead\); the same command goes"
     ):
-        prune_tiles(URLS, "memory://out", asked(views), threads=1)
+        prune_tiles(URLS, "memory://out", **asked(views), threads=1)
     assert len(memory.find("/out")) == 1
 
     with monkeypatch.context() as patched:
         patched.setattr(writing, "rows_of", None)
-        prune_tiles(URLS, "memory://out", asked(views), threads=1)
+        prune_tiles(URLS, "memory://out", **asked(views), threads=1)
     assert [Path(path).name[-6:] for path in sent] == ["000000", "000001", "000001"]
     assert memory.find("/out") == ["/out/a.ply", "/out/b.ply"]
     assert [memory.cat_file(f"/out/{name}") for name in NAMES] == here(folder, views)
@@ -1122,7 +1091,7 @@ def test_a_storage_that_cannot_be_written_to_is_known_at_once(memory, views, mon
     monkeypatch.setattr(tiles_prune, "copied", None)
 
     with pytest.raises(RefineError, match=r"^memory://out: cannot be written to \(read-only\)$"):
-        prune_tiles(URLS, "memory://out", asked(views))
+        prune_tiles(URLS, "memory://out", **asked(views))
 
 
 ASCII = plain_header(1, splat_names(0), "ascii") + b"0 " * 17 + b"\n"
@@ -1155,7 +1124,7 @@ def test_what_is_no_tile_is_named_as_it_was_given(folder, memory, views, where, 
     path = "memory://in/b.ply" if where != "." else "b.ply"
 
     with pytest.raises(RefineError, match=rf"^{path}: .*{words}|^{path}: {words}"):
-        prune_tiles([NAMES[0], path], folder / "out", asked(views))
+        prune_tiles([NAMES[0], path], folder / "out", **asked(views))
 
 
 def test_a_storage_that_only_sends_whole_files_is_refused(memory, monkeypatch):
@@ -1208,9 +1177,9 @@ def test_without_fsspec_the_extra_is_named(folder, views, monkeypatch):
 
     needed = r": URLs need fsspec: pip install 'refine-addon\[distributed\]'"
     with pytest.raises(RefineError, match=rf"^memory://in/a\.ply{needed}"):
-        prune_tiles(URLS, None, asked(views))
+        prune_tiles(URLS, None, **asked(views))
     with pytest.raises(RefineError, match=rf"^memory://out{needed}"):
-        prune_tiles(NAMES, "memory://out", asked(views))
+        prune_tiles(NAMES, "memory://out", **asked(views))
     assert here(folder, views)
 
 
@@ -1295,11 +1264,11 @@ def test_a_server_sends_ranges(folder, server, views):
     """The same bytes as from the disk; nobody can write there."""
     urls = [f"{server.address}/{name}" for name in NAMES]
 
-    prune_tiles(urls, folder / "out", asked(views))
+    prune_tiles(urls, folder / "out", **asked(views))
 
     assert [(folder / "out" / name).read_bytes() for name in NAMES] == here(folder, views)
     with pytest.raises(RefineError, match=r"^http://.*/out: cannot be written to \("):
-        prune_tiles(urls, f"{server.address}/out", asked(views))
+        prune_tiles(urls, f"{server.address}/out", **asked(views))
     tile = source.tile_at(urls[0])
     (folder / "a.ply").write_bytes(plain_ply(130, seed=2))
     with pytest.raises(RefineError, match=r"^http://.*/a\.ply: was changed"):
@@ -1386,8 +1355,8 @@ def workers():
     ("moment", "more"),
     [
         ("scoring", (OCCLUSION,)),
-        ("merging", (OCCLUSION, "absorb")),
-        ("refitting", (OCCLUSION, "refit")),
+        ("merging", (MERGE,)),
+        ("refitting", (Refit(8),)),
         ("writing", (CLOSED,)),
     ],
     ids=["scoring", "merging", "refitting", "writing"],
@@ -1408,8 +1377,8 @@ def test_a_killed_worker_changes_no_byte(
             os.kill(killed[0], signal.SIGKILL)
 
     request = asked(views, HALF, *more)
-    prune_tiles(tiles, tmp_path / "out", request, workers=workers, progress=progress)
-    prune_tiles(tiles, tmp_path / "here", request)
+    prune_tiles(tiles, tmp_path / "out", **request, workers=workers, progress=progress)
+    prune_tiles(tiles, tmp_path / "here", **request)
 
     assert killed
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "here")
@@ -1420,11 +1389,11 @@ def test_what_workers_began_one_process_ends(tmp_path, tiles, views, workers):
     """The folder of the job does not tell who worked on it; behind URLs neither."""
     urls, out = [f"file://{path}" for path in tiles], f"file://{tmp_path}/out"
     with pytest.raises(KeyboardInterrupt), contextlib.chdir(tmp_path):
-        prune_tiles(urls, out, asked(views), workers=workers, progress=stopping("writing"))
+        prune_tiles(urls, out, **asked(views), workers=workers, progress=stopping("writing"))
 
     with contextlib.chdir(tmp_path):
-        prune_tiles(urls, out, asked(views))
-    prune_tiles(tiles, tmp_path / "here", asked(views))
+        prune_tiles(urls, out, **asked(views))
+    prune_tiles(tiles, tmp_path / "here", **asked(views))
 
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "here")
     assert not list(tmp_path.glob(".refine*"))

@@ -7,11 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import Budget, RefineError, Settings, ViewSet, prune, with_views_between
+from refine_addon.core import (
+    Budget,
+    Merge,
+    Occlusion,
+    RefineError,
+    ViewSet,
+    prune,
+    with_views_between,
+)
 from refine_addon.core.quality.curve import Quality
 from refine_addon.core.quality.psnr import psnr_kept
 from refine_addon.core.views_between import MOST, views_between
 from tests.core.test_invariance import MOTIONS, moved
+from tests.core.test_levels import merges  # noqa: F401 - a fixture
 from tests.core.test_occlusion import splats_of
 from tests.core.test_views import ring, view
 
@@ -98,8 +107,8 @@ def hidden_from_the_sides() -> tuple:
     return replace(splats, sh_dc=colors), ViewSet(tuple(views)), patch
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_what_only_views_between_see_is_told_and_warned_of(survivors):
+@pytest.mark.parametrize("method", [Occlusion(), Merge()])
+def test_what_only_views_between_see_is_told_and_warned_of(merges, method):
     """A quarter of the splats is the patch and goes: the two cameras see no change.
 
     At the middle the patch fills a seventh of the width and a fifth of the height: .03 of the
@@ -108,7 +117,7 @@ def test_what_only_views_between_see_is_told_and_warned_of(survivors):
     """
     splats, views, patch = hidden_from_the_sides()
 
-    result = prune(splats, views, Budget(ratio=0.25), Settings("occlusion"), survivors=survivors)
+    result = prune(splats, views, Budget(ratio=0.25), method)
 
     assert np.mean(result.keep[patch]) < 0.1
     assert result.report["estimated_psnr"] > 80.0
@@ -121,8 +130,7 @@ def test_views_between_that_decide_keep_what_they_see():
     splats, views, patch = hidden_from_the_sides()
 
     result = prune(
-        splats, with_views_between(views, 1), Budget(ratio=0.25), Settings("occlusion"),
-        survivors="unchanged",
+        splats, with_views_between(views, 1), Budget(ratio=0.25), Occlusion(),
     )  # fmt: skip
 
     assert np.mean(result.keep[patch]) > 0.5
@@ -133,7 +141,7 @@ def test_views_between_that_decide_keep_what_they_see():
 def test_the_estimate_between_is_that_of_rays_cast_there():
     """By the rays of the view in the middle; the curve at a share it has is the result's."""
     splats, views, _ = hidden_from_the_sides()
-    result = prune(splats, views, Budget(ratio=0.3), Settings("occlusion"), survivors="unchanged")
+    result = prune(splats, views, Budget(ratio=0.3), Occlusion())
 
     scores = result.scores
     rays = scores.between
@@ -186,7 +194,7 @@ def test_views_that_share_little_are_told_to_know_little_of_others():
     ]
     held = wall.take(prune(wall, ViewSet(tuple(apart)), Budget(ratio=0.3)).scores.seen > 0)
     few, enough = (
-        prune(held, ViewSet(tuple(chosen)), Budget(ratio=0.3), Settings("occlusion"))
+        prune(held, ViewSet(tuple(chosen)), Budget(ratio=0.3), Occlusion())
         for chosen in (apart, apart + beside)
     )
 

@@ -303,4 +303,4 @@ def test_splats_marked_to_go_go_with_those_of_volumes_but_not_the_protected():
     found = forced([zone], means, protected, marked | (np.arange(6) == 1))
 
     assert np.flatnonzero(found.out).tolist() == [0, 4]
-    assert forced([], means, None, marked).counts() == {"protected": 0, "forced": 1}
+    assert forced([], means, None, marked).counts() == {"protected": 0, "removed_by_user": 1}

@@ -9,16 +9,22 @@ import numpy as np
 import pytest
 
 from refine_addon.command import main
-from refine_addon.core import Budget, PruneRequest, Settings, prune_file, read_splats
+from refine_addon.core import (
+    Budget,
+    ClosedForm,
+    Occlusion,
+    operations,
+    prune_file,
+    read_splats,
+)
 from refine_addon.core.affine import transformed
-from refine_addon.core.operation.written import written_facts
 from refine_addon.core.quality.psnr import psnr_against
 
 from .test_cleaning import cameras, wall
 from .test_command_clean import files  # noqa: F401 - a fixture
 from .test_levels import file_of
 
-OCCLUSION = Settings("occlusion")
+OCCLUSION = Occlusion()
 
 
 @pytest.fixture
@@ -36,7 +42,7 @@ def test_what_the_file_holds_is_compared_with_all_splats(source, tmp_path):
     """As `psnr_against` says of what is read from it again."""
     out = tmp_path / "out.splat"
 
-    result = prune_file(source, out, PruneRequest(cameras(), Budget(ratio=0.1), OCCLUSION))
+    result = prune_file(source, out, cameras(), Budget(ratio=0.1), OCCLUSION)
 
     wanted = psnr_against(result.scores.ray_sample, read_splats(out).splats(), cameras())
     assert result.report["written_psnr"] == pytest.approx(wanted, abs=0.006)
@@ -45,9 +51,7 @@ def test_what_the_file_holds_is_compared_with_all_splats(source, tmp_path):
 @pytest.mark.slow
 def test_a_format_that_rounds_little_costs_next_to_nothing(source, tmp_path):
     """Glb keeps single precision: as good as the estimate for the splats kept, to .01 dB."""
-    result = prune_file(
-        source, tmp_path / "out.glb", PruneRequest(cameras(), Budget(ratio=0.3), OCCLUSION)
-    )
+    result = prune_file(source, tmp_path / "out.glb", cameras(), Budget(ratio=0.3), OCCLUSION)
 
     report = result.report
     assert report["written_psnr"] == pytest.approx(report["estimated_psnr"], abs=0.02)
@@ -56,9 +60,7 @@ def test_a_format_that_rounds_little_costs_next_to_nothing(source, tmp_path):
 @pytest.mark.slow
 def test_with_nothing_removed_it_is_what_the_format_costs(source, tmp_path):
     """All pictures are the same, 100 dB; of 8-bit colours, off by at most 1/510, 54 dB or more."""
-    result = prune_file(
-        source, tmp_path / "out.splat", PruneRequest(cameras(), Budget(ratio=0.0), OCCLUSION)
-    )
+    result = prune_file(source, tmp_path / "out.splat", cameras(), Budget(ratio=0.0), OCCLUSION)
 
     assert result.report["estimated_psnr"] == 100.0
     assert 54.0 < result.report["written_psnr"] < 70.0
@@ -71,18 +73,19 @@ def test_a_plain_ply_and_a_dry_run_cost_nothing(source, tmp_path):
         result = prune_file(
             source,
             tmp_path / name,
-            PruneRequest(cameras(), Budget(ratio=0.1), OCCLUSION, dry_run=dry),
+            cameras(),
+            Budget(ratio=0.1),
+            OCCLUSION,
+            dry_run=dry,
         )
         assert "written_psnr" not in result.report
 
 
 def test_where_nothing_was_estimated_it_is_null(source, tmp_path):
     """The closed form looks along no lines unless a PSNR is the budget."""
-    settings = Settings("closed-form")
+    settings = ClosedForm()
 
-    result = prune_file(
-        source, tmp_path / "out.splat", PruneRequest(cameras(), Budget(ratio=0.1), settings)
-    )
+    result = prune_file(source, tmp_path / "out.splat", cameras(), Budget(ratio=0.1), settings)
 
     assert result.report["written_psnr"] is None
 
@@ -91,22 +94,22 @@ def test_where_nothing_was_estimated_it_is_null(source, tmp_path):
 def test_a_file_in_another_frame_is_moved_to_that_of_the_views(source, tmp_path):
     """Written in a frame 2 to the side, and moved back by the matrix: the same to .02 dB."""
     out = tmp_path / "out.glb"
-    result = prune_file(source, out, PruneRequest(cameras(), Budget(ratio=0.3), OCCLUSION))
+    result = prune_file(source, out, cameras(), Budget(ratio=0.3), OCCLUSION)
     matrix = np.eye(4)
     matrix[0, 3] = 2.0
     aside = file_of(
         transformed(read_splats(out).splats(), np.linalg.inv(matrix)), tmp_path / "b.ply"
     )
-    moved = prune_file(
-        aside, tmp_path / "b.glb", PruneRequest(cameras(), Budget(ratio=0.0), OCCLUSION)
-    )
+    moved = prune_file(aside, tmp_path / "b.glb", cameras(), Budget(ratio=0.0), OCCLUSION)
     assert moved.report["splats"]["removed"] == 0
 
-    found = written_facts(tmp_path / "b.glb", result.scores, cameras(), matrix=matrix)
+    there = operations._written_psnr(
+        tmp_path / "b.glb", replace(result, matrix=matrix), cameras(), None
+    )
 
-    assert found["written_psnr"] == pytest.approx(result.report["written_psnr"], abs=0.02)
-    uneven = np.diag([1.0, 2.0, 1.0, 1.0])
-    assert written_facts(tmp_path / "b.glb", result.scores, cameras(), matrix=uneven) == {
+    assert there["written_psnr"] == pytest.approx(result.report["written_psnr"], abs=0.02)
+    uneven = replace(result, matrix=np.diag([1.0, 2.0, 1.0, 1.0]))
+    assert operations._written_psnr(tmp_path / "b.glb", uneven, cameras(), None) == {
         "written_psnr": None
     }
 

@@ -138,7 +138,7 @@ def cameras() -> Path:
 def pruned(cloud: Path, cameras: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Give what ``python -m refine_addon`` makes of the small room: half of its splats."""
     output = tmp_path_factory.mktemp("python") / "pruned.ply"
-    words = ("prune", cloud, "--cameras", cameras, "--ratio", "0.5", "--survivors", "unchanged")
+    words = ("prune", cloud, "--cameras", cameras, "--ratio", "0.5", "--method", "occlusion")
     done = without_blender(*words, "-o", output)
     if done.returncode != 0:
         pytest.fail(done.stdout + done.stderr, pytrace=False)

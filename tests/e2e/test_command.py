@@ -28,7 +28,7 @@ def test_prune_removes_exactly_half_and_changes_no_row(
     """
     output = binary.work / "pruned.ply"
 
-    words = ("prune", cloud, "--cameras", cameras, "--ratio", "0.5", "--survivors", "unchanged")
+    words = ("prune", cloud, "--cameras", cameras, "--ratio", "0.5", "--method", "occlusion")
     done = refine(binary, *words, "-o", output)
 
     assert done.returncode == 0, done.stdout + done.stderr
@@ -48,7 +48,7 @@ def test_every_blender_writes_the_same_file(
     """
     output = blender.work / "pruned.ply"
     words = ["prune", cloud, "--cameras", cameras, "--ratio", "0.5"]
-    words += ["--survivors", "unchanged", "-o", output]
+    words += ["--method", "occlusion", "-o", output]
 
     code = blender.step("command", arguments=words)
 
@@ -133,7 +133,7 @@ def test_pictures_are_drawn_in_the_background_without_a_display(binary: Binary, 
 
     done = binary.blender(
         *(blend, "--command", "refine", "prune", "--object", "Splats", "--ratio", "0.5"),
-        *("--survivors", "unchanged", "--dry-run", "--pictures", shown),
+        *("--method", "occlusion", "--dry-run", "--pictures", shown),
     )
 
     assert done.returncode == 0, done.stdout + done.stderr
@@ -155,7 +155,7 @@ def test_blends_cameras_decide_as_their_file_does(
     Measured: all rows agree; with lenses 1 % longer 99.6 %, with cameras 1 cm off 99.8 %.
     """
     by_file, by_scene = binary.work / "file.ply", binary.work / "scene.ply"
-    words = ("prune", cloud, "--ratio", "0.5", "--views", "0", "--survivors", "unchanged", "-o")
+    words = ("prune", cloud, "--ratio", "0.5", "--views", "0", "--method", "occlusion", "-o")
 
     from_scene = binary.blender(blend, "--command", "refine", *words, by_scene)
     from_file = without_blender(*words, by_file, "--cameras", cameras)

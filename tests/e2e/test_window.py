@@ -102,27 +102,6 @@ def test_the_viewport_shows_every_model_as_the_reference_renderer(
     assert psnr(shown, reference(found["camera"], tagged)) > 28.0
 
 
-def test_apply_is_adjusted_as_the_last_operation(binary: Binary, blend: Path):
-    """Each time from all 39,755 again: floor(.3 of them) = 11,926 go, then 35,755, then merged.
-
-    The panel says what was done. The next click goes by the panel, and remembers nothing: 60 % of
-    39,755 are 23,853.
-    """
-    found = binary.window_step("adjust", blend, name="Splats", pictures=binary.work)
-
-    left = {stage: told["vertices"] for stage, told in found.items()}
-    assert left == {
-        "applied": 39_755 - 19_877,
-        "less": 39_755 - 11_926,
-        "count": 4_000,
-        "absorbed": 4_000,
-        "again": 39_755 - 23_853,
-    }
-    assert found["less"]["panel"][:2] == ["ratio", 30.0]
-    assert found["absorbed"]["panel"] == ["keep", 30.0, 4000, "absorb"]
-    assert {told["last"] for told in found.values()} == {"REFINE_OT_apply"}
-
-
 def test_compare_shows_before_after_and_difference_in_a_window_of_their_own(
     binary: Binary, blend: Path
 ):
@@ -144,7 +123,7 @@ def test_compare_shows_before_after_and_difference_in_a_window_of_their_own(
 
 
 def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Path, cameras: Path):
-    """Before scoring *What Goes* shows what volumes force out; a volume that moves is followed.
+    """Before scoring *What Goes* shows what volumes say must go; a volume that moves is followed.
 
     All modes draw the same splats, and those that stay or go are parted between two of them. What
     is marked in edit mode is counted when that is left.
@@ -155,7 +134,7 @@ def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Pat
 
     unscored = found["unscored"]
     assert 1000 < unscored["protected"] < 30_000
-    assert 0 < found["unscored GOES"] <= unscored["forced"] < 39_755
+    assert 0 < found["unscored GOES"] <= unscored["removed_by_user"] < 39_755
     assert found["unscored SCENE"] == found["SCENE"] == found["HEAT"]
     assert found["SCENE"] == found["STAYS"] + found["GOES"]
     assert found["GOES"] > found["unscored GOES"]
@@ -167,22 +146,20 @@ def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Pat
 def test_the_window_lives_while_splats_are_scored(binary: Binary, blend: Path, cloud: Path):
     """The view orbits and zooms, and is not drawn for the bar; undo, redo and save are refused.
 
-    The closed form's scores are shown first, refined in place, and one Ctrl+Z takes both back; Esc
-    keeps them. Loading a file, closing the window, switching the extension off and quitting end
-    the thread; a file is imported by a thread that a dialog starts.
+    Esc keeps the scores of before, and one Ctrl+Z takes those back. Loading a file, closing the
+    window, switching the extension off and quitting end the thread; a file is imported by a thread
+    that a dialog starts.
     """
     found = binary.window_step(
         "alive", blend, size=(1200, 900), blend=blend, cloud=cloud, pictures=binary.work
     )
 
     assert found["before"] is None
-    assert found["shown"] == ["closed-form", True]
+    assert found["scored"] == found["stopped"] == "occlusion"
     assert found["drawn"]["view"] == 0 < found["drawn"]["panel"]
     assert found["orbited"] > 0.1
     assert found["zoomed"] < 0.95
     assert [found[what] for what in ("saved", "undone", "apply", "still")] == [False] * 3 + [True]
-    assert found["refined"] == ["occlusion", False]
-    assert found["stopped"] == ["closed-form", True]
     assert found["esc_s"] < 10.0  # at once, on a machine that may be busy
     assert found["ended by"] == {how: [True, 0] for how in ("load", "close_window", "disable")}
     assert found["imported"] == 39_755

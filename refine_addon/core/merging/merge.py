@@ -82,8 +82,9 @@ class Merged:
 
     def note(self) -> str:
         """The counts as a sentence, for the user."""
-        return "{changed:,} survivors absorbed {merged:,} splats; {deleted:,} were deleted".format(
-            **self.facts()
+        return (
+            "{merged:,} splats were merged into {changed:,} others; "
+            "{deleted:,} were deleted".format(**self.facts())
         )
 
 

@@ -9,12 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..survivor_choice import SURVIVORS, Became
+Way = Literal["delete", "merge", "refit"]
+"""What is done to reach a budget: closed form and occlusion delete."""
+
+WAYS: tuple[Way, ...] = ("delete", "merge", "refit")
 
 PSNR_CAP = 100.0
 """PSNR of equal pictures, dB, and the highest that an estimate may be."""
@@ -60,6 +64,20 @@ PARTED = 3.0
 NOTICED = 50.0
 """What decided counts as no more than that, dB: between views at 70 and at 55 nobody sees more."""
 
+ROUNDS = 2.5
+"""Scoring by occlusion takes so many times as long as measuring all splats once."""
+
+TIMED = (0.1, 0.3, 0.5, 0.55, 0.7, 0.9)
+"""Shares removed for which the next two hold; between them they are interpolated."""
+
+MERGING = (0.1, 0.5, 0.65, 1.4, 1.8, 2.4)
+"""How many times as long as measuring once merging takes after that: more stages, more time.
+
+These and the next are processor times of `room_small`, of one thread."""
+
+REFITTING = (20.0, 17.0, 8.5, 10.5, 7.5, 5.0)
+"""The same of refitting."""
+
 _LEAST_SHARE = 1e-6  # the place of "nothing removed" on the curve's axis, where that is infinite
 
 
@@ -99,16 +117,16 @@ class Quality:
     hits: float = REFIT_HITS
     between: NDArray[np.float64] | None = None
 
-    def at(self, share: float, survivors: Became = "unchanged") -> float:
-        """Return the PSNR with a share of the splats removed, dB; if survivors may change, about.
+    def at(self, share: float, way: Way = "delete") -> float:
+        """PSNR with a share of the splats removed, dB; if survivors may change, about.
 
         Between the shares of the curve the PSNR is taken as linear in the logarithm of the odds
         ``share / (1 - share)``, which it nearly is; beyond the last it stays.
         """
-        return float(np.interp(_log_odds(share), self._odds(), self._curve(survivors)))
+        return self._at(self._curve(way), share)
 
-    def of_views(self, share: float, survivors: Became = "unchanged") -> dict[str, float]:
-        """Return the PSNR of single views with a share of the splats removed, dB.
+    def of_views(self, share: float, way: Way = "delete") -> dict[str, float]:
+        """PSNR of single views with a share of the splats removed, dB.
 
         Absorbing and refitting are taken to gain as much in each view as in all together.
 
@@ -116,18 +134,16 @@ class Quality:
         --------
         >>> curve = Quality(np.array([0.2, 0.5]), *np.array([[50.0, 40.0], [53.0, 46.0]]))
         >>> curve.views["a"] = np.array([48.0, 36.0])
-        >>> curve.of_views(0.5), curve.of_views(0.5, "absorb")
+        >>> curve.of_views(0.5), curve.of_views(0.5, "merge")
         ({'a': 36.0}, {'a': 42.0})
         """
-        odds, place = self._odds(), _log_odds(share)
-        gain = self.at(share, survivors) - self.at(share)
+        gain = self.at(share, way) - self.at(share)
         return {
-            name: min(float(np.interp(place, odds, _with_start(psnr))) + gain, PSNR_CAP)
-            for name, psnr in self.views.items()
+            name: min(self._at(psnr, share) + gain, PSNR_CAP) for name, psnr in self.views.items()
         }
 
-    def at_between(self, share: float, survivors: Became = "unchanged") -> float | None:
-        """Return the PSNR in views between these with a share of the splats removed, dB.
+    def at_between(self, share: float, way: Way = "delete") -> float | None:
+        """PSNR in views between these with a share of the splats removed, dB.
 
         Absorbing and refitting are taken to gain as much there. None where nothing tells it.
 
@@ -135,47 +151,50 @@ class Quality:
         --------
         >>> between = np.array([48.0, 36.0])
         >>> curve = Quality(np.array([0.2, 0.5]), between + 2.0, between + 9.0, between=between)
-        >>> curve.at_between(0.5), curve.at_between(0.5, "absorb")
+        >>> curve.at_between(0.5), curve.at_between(0.5, "merge")
         (36.0, 43.0)
         """
         if self.between is None:
             return None
-        deleted = float(np.interp(_log_odds(share), self._odds(), _with_start(self.between)))
-        return min(deleted + self.at(share, survivors) - self.at(share), PSNR_CAP)
+        deleted = self._at(self.between, share)
+        return min(deleted + self.at(share, way) - self.at(share), PSNR_CAP)
 
-    def share(self, psnr: float, survivors: Became = "unchanged") -> float:
-        """Return the largest share that can go while the PSNR is at least `psnr`, dB; or 0.
+    def share(self, psnr: float, way: Way = "delete") -> float:
+        """Largest share that can go while the PSNR is at least `psnr`, dB; or 0.
 
         It is at most the last share of the curve.
         """
-        odds, values = self._odds(), self._curve(survivors)
+        odds, values = self._odds(), [PSNR_CAP, *self._curve(way)]
         if psnr > PSNR_CAP:
             return 0.0
         if psnr <= values[-1]:
             return float(self.shares[-1])
-        right = int(np.flatnonzero(values >= psnr)[-1])  # the last point that is good enough
+        right = sum(value >= psnr for value in values) - 1  # the last point that is good enough
         step = (values[right] - psnr) / (values[right] - values[right + 1])
         place = odds[right] + step * (odds[right + 1] - odds[right])
         return float(1.0 / (1.0 + np.exp(-place)))
 
-    def _curve(self, survivors: Became) -> NDArray[np.float64]:
-        """Return the PSNR with its beginning, where nothing is removed."""
-        if survivors == "unchanged":
-            return _with_start(self.psnr)
-        gain = refit_gain(self.shares, self.hits) if survivors == "refit" else 0.0
-        told = np.minimum(self.absorbed + gain, PSNR_CAP)
-        return _with_start(np.minimum.accumulate(told))
+    def _curve(self, way):
+        """PSNR at the shares, dB, never rising."""
+        if way == "delete":
+            return self.psnr
+        gain = refit_gain(self.shares, self.hits) if way == "refit" else 0.0
+        return np.minimum.accumulate(np.minimum(self.absorbed + gain, PSNR_CAP))
 
-    def _odds(self) -> NDArray[np.float64]:
-        return np.array([_log_odds(share) for share in (0.0, *self.shares.tolist())])
+    def _odds(self):
+        return [_log_odds(share) for share in (0.0, *self.shares.tolist())]
+
+    def _at(self, psnr, share):
+        """PSNR of a curve at a share; at its beginning nothing is removed."""
+        return float(np.interp(_log_odds(share), self._odds(), [PSNR_CAP, *psnr]))
 
     def as_good(self, share: float) -> bool:
-        """Return whether plain deletion of a share is about as good as absorbing, as foretold."""
+        """Whether plain deletion of a share is about as good as absorbing, as foretold."""
         plain = self.at(share)
-        return deletion_will_do(plain) or plain > self.at(share, "absorb") - AS_GOOD
+        return deletion_will_do(plain) or plain > self.at(share, "merge") - AS_GOOD
 
     def facts(self) -> dict[str, Any]:
-        """Return the curve as plain JSON values; those of single views to hundredths of a dB."""
+        """Plain JSON values; those of single views to hundredths of a dB."""
         return {
             "shares": self.shares.tolist(),
             "psnr": self.psnr.tolist(),
@@ -188,26 +207,24 @@ class Quality:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Quality | None:
-        """Return the curve that `facts` describe; None if they are malformed."""
-        names = ("shares", "psnr", "absorbed")
+        """The curve that `facts` describe; None if they are malformed."""
         try:
-            shares, psnr, absorbed = (np.array((facts or {})[name], np.float64) for name in names)
-            single = dict((facts or {}).get("views") or {})  # files of older versions have none
-            views = {str(name): np.array(values, np.float64) for name, values in single.items()}
-            hits = float((facts or {}).get("hits", REFIT_HITS))
-            told = (facts or {}).get("between")  # nor this
-            between = None if told is None else np.array(told, np.float64)
+            held, array = dict(facts or {}), partial(np.array, dtype=np.float64)
+            shares, psnr, absorbed = map(array, (held["shares"], held["psnr"], held["absorbed"]))
+            views = {str(name): array(each) for name, each in (held.get("views") or {}).items()}
+            between = None if held.get("between") is None else array(held["between"])
+            told = [] if between is None else [between]
+            every = np.stack([shares, psnr, absorbed, *views.values(), *told])  # of one length
+            if every.ndim != 2 or not every.size:
+                return None
+            hits, foretold = float(held.get("hits", REFIT_HITS)), bool(held.get("foretold", True))
         except (AttributeError, KeyError, TypeError, ValueError):
             return None
-        curves: list[NDArray[np.float64]] = [shares, psnr, absorbed, *views.values()]
-        curves += [] if between is None else [between]
-        whole = len(shares) and all(curve.shape == (len(shares),) for curve in curves)
-        foretold = bool((facts or {}).get("foretold", True))
-        return cls(shares, psnr, absorbed, foretold, views, hits, between) if whole else None
+        return cls(shares, psnr, absorbed, foretold, views, hits, between)
 
 
 def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.float64]:
-    """Return about what refitting gains over absorbing, dB, at least 0.
+    """About what refitting gains over absorbing, dB, at least 0.
 
     Parameters
     ----------
@@ -229,10 +246,10 @@ def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.fl
 def expected(
     curve: Quality | None,
     share: float,
-    measured: Mapping[Became, float | None],
+    measured: Mapping[Way, float | None],
     hits: float | None = None,
-) -> dict[Became, float | None]:
-    """Return about which PSNR is reached by what survivors become, dB; None where nothing tells it.
+) -> dict[Way, float | None]:
+    """About which PSNR is reached by what survivors become, dB; None where nothing tells it.
 
     Parameters
     ----------
@@ -247,23 +264,24 @@ def expected(
 
     Examples
     --------
-    >>> expected(None, 0.5, {"absorb": 46.0}, 78.0)
-    {'unchanged': None, 'absorb': 46.0, 'refit': 49.2}
+    >>> expected(None, 0.5, {"merge": 46.0}, 78.0)
+    {'delete': None, 'merge': 46.0, 'refit': 49.2}
     """
-    told: dict[Became, float | None] = {}
-    for way in SURVIVORS:
+    told: dict[Way, float | None] = {}
+    for way in WAYS:
         told[way] = measured.get(way)
-        if told[way] is None and curve is not None and (curve.foretold or way == "unchanged"):
+        if told[way] is None and curve is not None and (curve.foretold or way == "delete"):
             told[way] = curve.at(share, way)
-    absorbed = measured.get("absorb")
-    if measured.get("refit") is None and absorbed is not None:
-        gain = None if hits is None else float(refit_gain(share, hits))
-        told["refit"] = None if gain is None else min(absorbed + gain, PSNR_CAP)
+    merged = measured.get("merge")
+    if measured.get("refit") is None and merged is not None:
+        told["refit"] = None
+        if hits is not None:
+            told["refit"] = min(merged + float(refit_gain(share, hits)), PSNR_CAP)
     return told
 
 
 def deletion_will_do(psnr: float | None) -> bool:
-    """Return whether nobody would see what absorbing gains over plain deletion.
+    """Whether nobody would see what absorbing gains over plain deletion.
 
     Parameters
     ----------
@@ -275,7 +293,7 @@ def deletion_will_do(psnr: float | None) -> bool:
 
 
 def needed(gone: int | None, count: int) -> int | None:
-    """Return how many of `count` splats the curve must be known for where `gone` are removed.
+    """How many of `count` splats the curve must be known for where `gone` are removed.
 
     That is up to the next of `ABSORBED_SHARES`, so that what it says up to there is what the whole
     curve says. None if the whole is needed.
@@ -298,7 +316,7 @@ def needed(gone: int | None, count: int) -> int | None:
 def absorbed_from(
     psnr: NDArray[np.float64], gains: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
-    """Return about what absorbing reaches at the first L of `SHARES`, without absorbing; dB.
+    """About what absorbing reaches at the first L of `SHARES`, without absorbing; dB.
 
     Rays tell what the pictures would be if removed splats stayed as opaque as they are, in the
     colour of the nearest kept hit (`Rays.colors_by_nearest_kept`). That is neither an upper nor a
@@ -323,7 +341,7 @@ def absorbed_from(
 
 
 def left_to_lose(goal: float, psnr: float | None) -> float:
-    """Return which PSNR a second change may have by itself so that both together reach `goal`, dB.
+    """PSNR that a second change may have by itself so that both together reach `goal`, dB.
 
     The squared errors of changes that have nothing to do with each other add up.
 
@@ -345,7 +363,7 @@ def left_to_lose(goal: float, psnr: float | None) -> float:
 
 
 def out_of_reach(goal: float, gone: int, count: int, psnr: float | None) -> str:
-    """Return what to say where a PSNR as budget cannot be had, or "".
+    """Sentence where a PSNR as budget cannot be had, or "".
 
     Parameters
     ----------
@@ -365,17 +383,14 @@ def out_of_reach(goal: float, gone: int, count: int, psnr: float | None) -> str:
     """
     if not gone:
         return f"by the estimate nothing can go at {goal:g} dB"
-    at_end = gone >= math.floor(SHARES[-1] * count)
-    if at_end and psnr is not None and psnr > goal:
-        share = f"{SHARES[-1]:.0%}"
-        return (
-            f"the estimate ends at {share} removed, {in_words(psnr)}: for {goal:g} dB no more goes"
-        )
-    return ""
+    if psnr is None or psnr <= goal or gone < math.floor(SHARES[-1] * count):
+        return ""
+    end = f"the estimate ends at {SHARES[-1]:.0%} removed, {in_words(psnr)}"
+    return f"{end}: for {goal:g} dB no more goes"
 
 
 def in_words(psnr: float) -> str:
-    """Return an estimate as a user needs it.
+    """An estimate as a user needs it.
 
     >>> in_words(38.4), in_words(72.0)
     ('about 38 dB', 'more than 60 dB')
@@ -384,7 +399,7 @@ def in_words(psnr: float) -> str:
 
 
 def parted(psnr: float | None, between: float | None) -> bool:
-    """Return whether views in between lose more than those that decided, so that it can be seen.
+    """Whether views in between lose more than those that decided, so that it can be seen.
 
     >>> parted(50.0, 36.0), parted(50.0, 48.0), parted(80.0, 48.0), parted(50.0, None)
     (True, False, False, False)
@@ -393,7 +408,7 @@ def parted(psnr: float | None, between: float | None) -> bool:
 
 
 def in_views(psnr: float, between: float | None) -> str:
-    """Return an estimate in the views that decided and in those between them, as a user needs it.
+    """An estimate in the views that decided and in those between them, as a user needs it.
 
     >>> in_views(50.2, 36.1), in_views(50.2, None)
     ('about 50 dB in these views, about 36 between them', 'about 50 dB in these views')
@@ -408,11 +423,31 @@ def in_views(psnr: float, between: float | None) -> str:
     return f"{here}, {in_words(between).removesuffix(' dB')} between them"
 
 
-def _with_start(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a curve with its beginning, where nothing is removed."""
-    return np.concatenate([[PSNR_CAP], values])
+def expected_seconds(scored: float, share: float, *, once: bool) -> dict[Way, float]:
+    """About how long pruning takes, by what is done, seconds; without files.
+
+    Parameters
+    ----------
+    scored : float
+        How long scoring took, seconds.
+    share : float
+        Of the splats that goes.
+    once : bool
+        Whether all splats were measured once; else they were scored in rounds.
+
+    Examples
+    --------
+    >>> expected_seconds(1.0, 0.5, once=True)
+    {'delete': 2.5, 'merge': 1.65, 'refit': 10.15}
+    """
+    measured = scored if once else scored / ROUNDS
+    merging, refitting = (
+        measured * float(np.interp(share, TIMED, times)) for times in (MERGING, REFITTING)
+    )
+    merged = measured + merging
+    return {"delete": ROUNDS * measured, "merge": merged, "refit": merged + refitting}
 
 
-def _log_odds(share: float) -> float:
+def _log_odds(share):
     share = min(max(share, _LEAST_SHARE), 1.0 - _LEAST_SHARE)
     return float(np.log(share / (1.0 - share)))

@@ -197,7 +197,7 @@ def score(
             "lambda": dict(zip(("geometry", "color", "opacity"), weights, strict=True)),
             "statistics": statistics,
         },
-        method="closed-form", frustum=frustum,
+        method="closed-form",
     )  # fmt: skip
 
 

@@ -18,12 +18,15 @@ from ...version import VERSION
 from ..errors import RefineError, reason_of
 from ..execute import Cancelled, Progress, chunks, on, run, seconds, silent, stages
 from ..mapped import Interrupted, note, noted, once, write
-from ..operation.requests import PruneRequest
-from ..pipeline import decide
-from ..report import Clock, files_facts
+from ..methods import DEFAULT, Method
+from ..prune import prune
+from ..rendering import Model
+from ..report import Clock
+from ..result import Result
+from ..selection import Budget
 from ..splats import Splats, on_disk
-from ..task import Result, Task
 from ..urls import Url
+from ..views import ViewSet
 from .cluster import Cluster
 from .source import ROWS, Tile, copied, tiles_at
 from .storage import located, new_folder
@@ -38,8 +41,13 @@ except ImportError:  # Windows
 def prune_tiles(
     sources: Sequence[Path | str],
     folder: Path | str | None,
-    request: PruneRequest,
+    views: ViewSet,
+    budget: Budget,
+    method: Method = DEFAULT,
     *,
+    model: Model | None = None,
+    overwrite: bool = False,
+    dry_run: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
     workers: Cluster | None = None,
@@ -59,9 +67,10 @@ def prune_tiles(
         Where each goes under its own name; made if it is not there. None writes nothing. If it is a
         URL, the folder of the job is in the current directory, files are copied to the URL under
         other names, and renamed at the end.
-    request : PruneRequest
-        What is asked. Up to `regions.REGION` splats, kept splats that change are those of one file;
-        more are merged and refitted region by region.
+    views, budget, method
+        See `prune`. Kept splats become what those of one file would.
+    model, overwrite, dry_run
+        See `prune_file`.
     progress : callable, optional
         ``progress(fraction, what)``; returning ``False`` cancels.
     threads : int, optional
@@ -88,33 +97,32 @@ def prune_tiles(
     needs for each view at work about 160 bytes for each splat that it shows. On the disk: what the
     tiles take, and 60 bytes a splat besides.
     """
-    if request.zones or request.cleaning or request.pictures:
-        raise RefineError(
-            "volumes, cleaning and pictures need all splats in memory: not over tiles"
-        )
-    clock, tiles = Clock(), tiles_at(sources, request.model)
-    output = None if folder is None or request.dry_run else located(folder)
+    clock, tiles = Clock(), tiles_at(sources, model)
+    output = None if folder is None or dry_run else located(folder)
     with contextlib.ExitStack() as held:
         outputs = None
         if output is None:
             job = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-"))) / "job"
         else:
             near = Path.cwd() if isinstance(output, Url) else output.absolute()
-            job = near / f".refine-{_digest(tiles, request)}"
+            job = near / f".refine-{_digest(tiles, views, budget, method)}"
             held.enter_context(new_folder(output))
-            outputs = Outputs(job, tiles, output, request.overwrite)
+            outputs = Outputs(job, tiles, output, overwrite)
         held.enter_context(_opened(job, outputs))
         held.enter_context(on(workers))
         if workers is not None:
             _check(workers, job, tiles)
         count, size = sum(tile.splats for tile in tiles), sum(tile.size for tile in tiles)
-        views = len(request.views.spread(request.settings.views))
+        scoring = seconds("measure", count, len(views.spread(method.views)))
         reading, deciding, writing = stages(
-            progress, seconds("read", count), seconds("measure", count, views),
-            seconds("write", count),
-        )  # fmt: skip
+            progress, seconds("read", count), scoring, seconds("write", count)
+        )
         kept, counts, facts = once(
-            job, "kept", lambda: _decided(job, tiles, request, clock, (reading, deciding), threads)
+            job,
+            "kept",
+            lambda: _decided(
+                job, tiles, views, budget, method, clock, (reading, deciding), threads
+            ),
         )
         sizes = _written(job, tiles, kept, counts, outputs, writing, threads)
         if outputs is not None:
@@ -122,7 +130,10 @@ def prune_tiles(
         clock.lap("write_s")
     clock.stop()
     target = None if outputs is None else str(output)
-    facts["files"] = files_facts(f"{len(tiles)} tiles", target, size, sum(sizes))
+    facts["files"] = {
+        "input": f"{len(tiles)} tiles", "output": target,
+        "input_bytes": size, "output_bytes": sum(sizes),
+    }  # fmt: skip
     written = int(counts[:, 0].sum()) if outputs else None
     facts["splats"] |= {"written": written, "left_out": 0}
     names = ("input", "output", "before", "kept", "unseen", "input_bytes", "output_bytes")
@@ -148,7 +159,9 @@ def _check(workers: Cluster, job: Path, tiles: Sequence[Tile]) -> None:
 def _decided(
     job: Path,
     tiles: Sequence[Tile],
-    request: PruneRequest,
+    views: ViewSet,
+    budget: Budget,
+    method: Method,
     clock: Clock,
     progress: tuple[Progress, Progress],
     threads: int | None,
@@ -156,18 +169,14 @@ def _decided(
     """What stays; of each tile how many stay and how many are unseen, (tiles, 2); the report."""
     splats = once(job, "splats", lambda: copied(tiles, job / "splats", progress[0], threads))
     clock.lap("read_s")
-    lengths = np.array([tile.dtype.itemsize for tile in tiles])
     counts = np.array([tile.splats for tile in tiles])
-    each = np.unique(lengths[counts > 0])
-    task = Task(
-        request.budget, request.settings, splats, request.views,
-        survivors=request.survivors,
-        row_bytes=int(each[0]) if len(each) == 1 else np.repeat(lengths, counts),
-        fixed_bytes=sum(tile.fixed_bytes for tile in tiles),
+    row_bytes = max(tile.dtype.itemsize for tile in tiles)
+    result = prune(
+        splats, views, budget, method,
+        sizes=(row_bytes, sum(tile.fixed_bytes for tile in tiles)),
+        clock=clock, progress=progress[1], threads=threads,
     )  # fmt: skip
-    result = decide(task, clock=clock, progress=progress[1], threads=threads)
-    if result.stopped is not None:
-        raise result.stopped
+    assert result.scores is not None
     ends = np.cumsum(counts)
     masks = (result.keep, result.scores.seen == 0)
     before = [np.append(0, np.cumsum(mask))[[*(ends - counts), *ends]] for mask in masks]
@@ -179,9 +188,9 @@ def _decided(
 def _stored(job: Path, result: Result) -> Kept:
     """What stays, in files of the job."""
     rows, became = np.empty(0, np.int64), None
-    if result.absorbed is not None:
-        changed = np.flatnonzero(result.absorbed.changed)
-        rows, made = np.flatnonzero(result.keep)[changed], result.absorbed.splats
+    if result.merged is not None:
+        changed = np.flatnonzero(result.merged.changed)
+        rows, made = np.flatnonzero(result.keep)[changed], result.merged.splats
         pieces: Iterator[Splats] = (
             made.take(changed[piece]) for piece in chunks(len(changed), ROWS)
         )
@@ -277,12 +286,12 @@ def _remove(job: Path) -> None:
         shutil.rmtree(job, ignore_errors=True)
 
 
-def _digest(tiles: Sequence[Tile], request: PruneRequest) -> str:
+def _digest(tiles: Sequence[Tile], views: ViewSet, budget: Budget, method: Method) -> str:
     """Name of a job: that of the same job again, and of no other."""
     digest = hashlib.blake2b(digest_size=8)
-    for fact in (VERSION, [*tiles], request.budget, request.settings, request.survivors):
+    for fact in (VERSION, [*tiles], budget, method):
         digest.update(repr(fact).encode("utf-8", "surrogateescape"))
-    for view in request.views.spread(request.settings.views):
+    for view in views.spread(method.views):
         for field in fields(view):
             value = getattr(view, field.name)
             is_array = isinstance(value, np.ndarray)

@@ -44,31 +44,29 @@ def main(blend: str, cloud: str, pictures: str) -> Generator[float, None, dict[s
     yield from hand.open_tab()
     found: dict[str, Any] = {"before": record()}
 
-    yield from hand.click("refine.score(")
-    yield from window.until(gate.refining, "the closed form is shown")
-    found["shown"] = record()
-    found |= yield from meanwhile(hand, gate, blend)
-    yield from window.picture(pictures, "alive-1-refused")
-    yield from menu(hand, pictures)
     gate.opened.set()
-    yield from window.until(gate.idle, "it is over")
-    found["refined"] = record()
-    yield from hand.undo()
-    yield from window.until(lambda: not record(), "the scores are gone")
+    yield from hand.click("refine.score(")
+    yield from window.until(lambda: gate.idle() and record(), "it is over")
+    found["scored"] = record()
 
     gate.opened.clear()
     yield from hand.click("refine.score(")
-    yield from window.until(gate.refining, "the closed form is shown")
+    yield from window.until(gate.held, "it is held back")
+    found |= yield from meanwhile(hand, gate, blend)
+    yield from window.picture(pictures, "alive-1-refused")
+    yield from menu(hand, pictures)
     begun = time.monotonic()
     yield from hand.press("ESC")
     yield from window.until(gate.idle, "it is cancelled")
     found["esc_s"], found["stopped"] = time.monotonic() - begun, record()
     yield from window.picture(pictures, "alive-2-stopped")
+    yield from hand.undo()
+    yield from window.until(lambda: not record(), "the scores are gone")
 
     found["ended by"] = {}
     for how in (load, close_window, disable):
         with scoring(hand.window, gate):
-            yield from window.until(gate.refining, "the closed form is shown")
+            yield from window.until(gate.held, "it is held back")
             yield from how(blend)
             yield 0.5
             found["ended by"][how.__name__] = [gate.idle(), gate.threads()]
@@ -104,7 +102,7 @@ def meanwhile(hand: window.Hand, gate: Gate, blend: str) -> Generator[float, Non
         "saved": Path(blend).stat().st_mtime_ns != saved,
         "undone": record() != noted,
         "apply": bpy.ops.refine.apply.poll(),
-        "still": gate.refining(),
+        "still": gate.held(),
     }
 
 
@@ -179,36 +177,40 @@ def imported(hand: window.Hand, gate: Gate, cloud: str) -> Generator[float, None
     return len(hand.window.view_layer.objects.active.data.vertices)
 
 
-def record() -> list[Any] | None:
-    """Return by what the splats were scored, and whether that is to be refined."""
+def record() -> str | None:
+    """Return by what the splats were scored."""
     noted = bpy.data.objects[NAME].data.get("refine_scores")
     scores = importlib.import_module(f"{extension.MODULE}.mesh.scores")
     found = scores.record(bpy.data.objects[NAME].data) if noted else None
-    return found and [found["method"], scores.unrefined(found)]
+    return found and found["method"]
 
 
 class Gate:
-    """Holds back the scoring that was asked for, not the closed form, until it is opened."""
+    """Holds back scoring until it is opened."""
 
     def __init__(self) -> None:
         self.running = importlib.import_module(f"{extension.MODULE}.ui.running")
-        scoring = importlib.import_module(f"{extension.MODULE}.core.pipeline")
+        scoring = importlib.import_module(f"{extension.MODULE}.ui.operators")
         work = importlib.import_module(f"{extension.MODULE}.core.execute")
         self.opened, score = threading.Event(), scoring.score
+        self.waits = False
 
-        def held(splats: Any, views: Any, settings: Any, *, progress: Any, **options: Any) -> Any:
+        def held(splats: Any, views: Any, method: Any, *, progress: Any, **options: Any) -> Any:
             step = 0
-            while settings.method != "closed-form" and not self.opened.wait(0.05):
-                step += 1
-                work.report(progress, min(0.2 + 0.0005 * step, 0.9), "looking")
-            return score(splats, views, settings, progress=progress, **options)
+            try:
+                while not self.opened.wait(0.05):
+                    self.waits = True
+                    step += 1
+                    work.report(progress, min(0.2 + 0.0005 * step, 0.9), "looking")
+            finally:
+                self.waits = False
+            return score(splats, views, method, progress=progress, **options)
 
         scoring.score = held
 
-    def refining(self) -> bool:
-        """Tell whether the closed form's scores are shown and being refined."""
-        now = self.running.now()
-        return now is not None and now.stage == "shown"
+    def held(self) -> bool:
+        """Tell whether scoring is held back."""
+        return self.waits
 
     def idle(self) -> bool:
         """Tell whether nothing works."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import bpy
 import extension
-from adjust import adjust
 from view import Show
 from window import Hand, at_work, picture, price, until
 
@@ -82,9 +81,20 @@ def bring_in(
     yield 0.5
 
 
+def adjust(hand: Hand, values: dict[str, Any]) -> Generator[float, None, None]:
+    """Give the last operator other values and have it done again, as its box (F9) does."""
+    operator = bpy.context.window_manager.operators[-1]
+    for key, value in values.items():
+        setattr(operator.properties, key, value)
+    with bpy.context.temp_override(window=hand.window, area=hand.area, region=hand.sidebar):
+        # As by hand, with an undo step of its own.
+        bpy.ops.ed.undo_redo("EXEC_DEFAULT", True)
+    yield 0.5
+
+
 def prune(show: Show, hand: Hand, found: dict[str, Any]) -> Generator[float, None, None]:
     """Score, apply and take that back; no event follows the last key."""
-    bpy.context.scene.refine.survivors = "unchanged"
+    bpy.context.scene.refine.method = "occlusion"
     yield from hand.click("refine.score(")
     yield from until(lambda: not at_work() and scene()["scored"], "there are scores")
     yield from hand.scroll(down=True)

@@ -68,7 +68,7 @@ def main(
     views
         How many views score.
     refit
-        Whether survivors are refitted, too: minutes at a million splats.
+        Whether splats are refitted, too: minutes at a million of them.
     """
     extension.enable()
     on_thread = importlib.import_module(f"{extension.MODULE}.ui.on_thread")
@@ -88,14 +88,15 @@ def main(
     changing(clock, scored, f"{folder}/out.ply")
     scored.again()
     on_thread.OnThread.execute = at_once  # as in a window
-    clock.time("apply", refine.apply, survivors="unchanged")
+    clock.time("apply", refine.apply)
     clock.time("undo of apply", bpy.ops.ed.undo)
     on_thread.OnThread.execute = threaded
-    for survivors in ("absorb", "refit")[: 1 + refit]:
+    for method in ("merge", "refit")[: 1 + refit]:
         scored.again()
-        clock.time(f"apply, {survivors}", refine.apply, survivors=survivors)
+        bpy.context.scene.refine.method = method
+        clock.time(f"apply, {method}", refine.apply)
     scored.again()
-    bpy.context.scene.refine.level_survivors = "unchanged"
+    bpy.context.scene.refine.method = "closed-form"
     clock.time("make levels", refine.levels)
     return clock.stretches
 
@@ -162,9 +163,6 @@ def on_a_thread(clock: Clock, on_thread: Any) -> Callable[..., set[str]]:
         checked = self._checked(context)
         job = self.prepare(context, checked)
         targets = [on_thread.Target.of(each) for each in self.written(context, checked)]
-        if sketch := self.sketch(job):
-            sketched = waited(sketch.work)
-            self.show(context, next(target.unchanged() for target in targets), job, sketched)
         result = waited(partial(self.work, job))
         first = next(iter([target.unchanged() for target in targets]), None)
         return self.finish(context, first, job, result)

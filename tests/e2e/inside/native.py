@@ -20,7 +20,6 @@ def main(cloud: str, cameras: str, blend: str, output: str, back: str) -> dict[s
     found = {"type": splats.type, "points": len(splats.data.points)}
     bpy.context.scene.refine.method = "closed-form"
     bpy.ops.refine.score()
-    bpy.context.scene.refine.survivors = "unchanged"
     bpy.ops.refine.apply()
     name = splats.name
     bpy.ops.wm.save_as_mainfile(filepath=blend)

@@ -16,7 +16,7 @@ def main(cloud: str, cameras: str) -> dict[str, object]:
     core.score(
         core.read_ply(cloud).splats(),
         core.read_cameras(cameras),
-        core.Settings("occlusion"),
+        core.Occlusion(),
         threads=2,
     )
     found = len(processes._idle)

@@ -18,9 +18,9 @@ def main(cloud: str, cameras: str, output: str) -> dict[str, Any]:
     # Importing cameras may have made one of them active; the panel's buttons act on the active one.
     bpy.context.view_layer.objects.active = splats
     found = {"imported": len(splats.data.vertices), "cameras": len(bpy.data.cameras)}
+    bpy.context.scene.refine.method = "occlusion"
     bpy.ops.refine.score()
     found["scored"] = "refine_score" in splats.data.attributes
-    bpy.context.scene.refine.survivors = "unchanged"
     bpy.ops.refine.apply()
     found["kept"] = len(splats.data.vertices)
     bpy.ops.refine.export_ply(filepath=output)

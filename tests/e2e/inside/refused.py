@@ -45,8 +45,9 @@ def main(folder: str) -> Generator[float, None, dict[str, Any]]:
     bpy.context.preferences.view.filebrowser_display_type = "SCREEN"  # in the same window
     splats = bpy.data.objects["Splats"]
     splats.name = NAME
-    scene.refine.method, scene.refine.survivors = "closed-form", "absorb"
+    scene.refine.method = "closed-form"
     start.show.call(bpy.ops.refine.score)
+    scene.refine.method = "merge"  # which waits
     other = splats.copy()
     other["refine_level_of"] = splats
     scene.collection.objects.link(other)

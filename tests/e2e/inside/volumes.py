@@ -67,10 +67,10 @@ def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[
         show.call(bpy.ops.refine.view, mode=mode)
         yield 1.0
         found[mode] = yield from show.picture(mode)
-    before = demands.facts(splats.data)["forced"]
+    before = demands.facts(splats.data)["removed_by_user"]
     box.location.x -= 0.5
     yield from wait(lambda: not marked(demands, splats, before))
-    found["moved"] = demands.facts(splats.data)["forced"] - before
+    found["moved"] = demands.facts(splats.data)["removed_by_user"] - before
     found["edited"] = yield from edit(show, demands, splats)
     found["failure"] = show.draw.failure()
     return found
@@ -95,7 +95,7 @@ def mark(splats: bpy.types.Object, count: int) -> None:
 
 def marked(demands: Any, splats: bpy.types.Object, count: int) -> bool:
     """Tell whether so many splats are said to go."""
-    return demands.facts(splats.data).get("forced") == count
+    return demands.facts(splats.data).get("removed_by_user") == count
 
 
 def wait(is_so: Any) -> Generator[float, None, None]:

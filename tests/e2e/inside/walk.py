@@ -68,7 +68,6 @@ def main(
     yield from hand.scroll(down=True)
     yield from show.picture("4-price")
 
-    settings.survivors = "absorb"
     show.call(bpy.ops.refine.apply)
     show.call(bpy.ops.refine.view, mode="SCENE")
     yield from show.picture("5-applied")

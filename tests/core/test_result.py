@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from refine_addon.core import Splats, read_ply, survivor_columns
+from refine_addon.core import Result, Splats, read_ply
 from refine_addon.core.affine import transformed
 from refine_addon.core.formats import ply
 from refine_addon.core.formats.ply_columns import values_by_name
@@ -40,6 +40,11 @@ def absorbed_of(splats, keep, changed, factor=2.0):
     return Merged(kept, keep, changed, 0, gone)
 
 
+def changed_columns(rows, merged):
+    """Columns of a result of these kept splats."""
+    return Result(merged.keep, {}, merged=merged).changed(rows)
+
+
 KEEP = np.array([True, True, False, True, True])
 CHANGED = np.array([False, False, True, True])
 
@@ -48,7 +53,7 @@ def test_what_changed_is_put_in_and_all_else_stays_to_the_bit(file):
     """Rows 3 and 4 are doubled, in all 23 properties; the file's own rows are not touched."""
     before = file.rows.tobytes()
 
-    columns = survivor_columns(file.rows, absorbed_of(file.splats(), KEEP, CHANGED))
+    columns = changed_columns(file.rows, absorbed_of(file.splats(), KEEP, CHANGED))
 
     assert set(columns) == set(file.rows.dtype.names)
     for name, values in columns.items():
@@ -61,7 +66,7 @@ def test_what_changed_is_put_in_and_all_else_stays_to_the_bit(file):
 def test_a_file_is_written_with_its_survivors_in_one_call(file, tmp_path):
     """As the README says: rows 0 and 1 byte for byte, and then the changed ones."""
     absorbed = absorbed_of(file.splats(), KEEP, CHANGED)
-    file.write(tmp_path / "out.ply", absorbed.keep, columns=survivor_columns(file.rows, absorbed))
+    Result(KEEP, {}, merged=absorbed, source=file).write(tmp_path / "out.ply")
 
     written = read_ply(tmp_path / "out.ply")
 
@@ -83,7 +88,7 @@ def test_rows_are_written_as_their_columns_say(tmp_path, monkeypatch, wide, thre
     file = read_ply(tmp_path / "in.ply")
     keep = generator.random(100) < 0.7
     changed = (generator.random(keep.sum()) < 0.4) & (np.flatnonzero(keep) > 30)
-    columns = survivor_columns(file.rows, absorbed_of(file.splats(), keep, changed, 1 / 3))
+    columns = changed_columns(file.rows, absorbed_of(file.splats(), keep, changed, 1 / 3))
     file.write(tmp_path / "whole.ply", keep, columns=dict(columns))
 
     monkeypatch.setattr(ply, "_CHANGED_ROWS", 7)
@@ -101,7 +106,7 @@ def test_every_property_keeps_its_type_and_is_rounded_to_it_once(file, kind):
         wide = Splats(**{name: getattr(splats, name).astype(np.float64) for name in ARRAYS})
     absorbed = absorbed_of(wide, KEEP, CHANGED, factor=1 / 3)
 
-    columns = survivor_columns(rows, absorbed)
+    columns = changed_columns(rows, absorbed)
 
     for name, values in values_by_name(absorbed.splats).items():
         np.testing.assert_array_equal(columns[name][3:], values[2:].astype(kind))
@@ -113,7 +118,8 @@ def test_a_matrix_leads_the_changed_ones_to_the_frame_of_the_columns(file):
     matrix = np.array([[0.0, -1, 0, 7], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     absorbed = absorbed_of(file.splats(), KEEP, CHANGED)
 
-    columns = survivor_columns({n: file.rows[n] for n in file.rows.dtype.names}, absorbed, matrix)
+    result = Result(KEEP, {}, merged=absorbed, matrix=np.linalg.inv(matrix))
+    columns = result.changed({n: file.rows[n] for n in file.rows.dtype.names})
 
     wanted = values_by_name(transformed(absorbed.splats.take(CHANGED), matrix))
     np.testing.assert_allclose(columns["x"][3:], 7 - 2 * file.rows["y"][3:], rtol=1e-6)
@@ -125,7 +131,7 @@ def test_a_matrix_leads_the_changed_ones_to_the_frame_of_the_columns(file):
 def test_a_format_knows_nothing_of_what_is_done_with_splats():
     """The wall: files are read and written whatever scores, selects and absorbs."""
     above = {
-        "absorbing", "scoring", "pipeline", "selection", "survivors", "scores", "operation",
+        "merging", "scoring", "prune", "selection", "result", "scores", "operations",
 
     }  # fmt: skip
     for room in ("formats", "cameras"):

@@ -11,26 +11,27 @@ from refine_addon.core import (
     Box,
     Budget,
     Cleaning,
+    ClosedForm,
     Levels,
-    PruneRequest,
+    Merge,
+    Occlusion,
     RefineError,
-    Settings,
     Zone,
     clean,
     lod,
+    lod_file,
     prune,
     prune_file,
     read_ply,
     score,
 )
-from refine_addon.core.levels.files import LevelsRequest, lod_file
-from refine_addon.core.pipeline import decide
-from refine_addon.core.task import Task
 from refine_addon.core.volumes import forced as forced_by
 from tests.core.test_cleaning import FLOATER, cameras, joined, wall
 from tests.core.test_levels import cameras as level_cameras
-from tests.core.test_levels import colourful
-from tests.core.test_occlusion import cloud, ring
+from tests.core.test_levels import (
+    colourful,
+    merges,  # noqa: F401 - a fixture
+)
 from tests.strategies import ply_of
 
 pytestmark = pytest.mark.slow
@@ -43,7 +44,7 @@ BUDGETS = [
 ]  # fmt: skip
 
 
-WAYS = pytest.mark.parametrize("survivors", ["unchanged", "absorb"], ids=["delete", "absorb"])
+WAYS = pytest.mark.parametrize("method", [Occlusion(), Merge()], ids=["delete", "merge"])
 
 
 @pytest.fixture(scope="module")
@@ -73,37 +74,35 @@ def rest_budget(budget, gone):
 @WAYS
 @pytest.mark.parametrize("budget", BUDGETS, ids=lambda budget: f"{budget}")
 def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
-    splats, views, removed, budget, survivors
+    merges, splats, views, removed, budget, method
 ):
     """The same splats, values and estimate as when they are deleted first, by hand."""
-    settings, rest = Settings("occlusion"), ~removed
-    size = {"row_bytes": 20.0}
+    rest, size = ~removed, {"sizes": (20.0, 0)}
     left = prune(
-        splats.take(rest), views, rest_budget(budget, int(removed.sum())), settings,
-        survivors=survivors, **size,
+        splats.take(rest), views, rest_budget(budget, int(removed.sum())), method, **size
     )  # fmt: skip
 
-    found = prune(splats, views, budget, settings, forced_out=removed, survivors=survivors, **size)
+    found = prune(splats, views, budget, method, removed=removed, **size)
 
     assert not found.keep[removed].any()
     assert np.array_equal(found.keep[rest], left.keep)
     assert np.array_equal(found.scores.values[rest], left.scores.values)
     assert found.report["estimated_psnr"] == left.report["estimated_psnr"]
     assert found.report["splats"]["removed"] == COUNT - left.keep.sum()
-    assert found.report["splats"]["forced"] == removed.sum()
+    assert found.report["splats"]["removed_by_user"] == removed.sum()
     assert found.report["budget"] == {budget.kind: getattr(budget, budget.kind)}
-    if survivors == "absorb":
-        assert np.array_equal(found.absorbed.splats.means, left.absorbed.splats.means)
-        assert np.array_equal(found.absorbed.keep, found.keep)
+    if method.changes:
+        assert np.array_equal(found.merged.splats.means, left.merged.splats.means)
+        assert np.array_equal(found.merged.keep, found.keep)
 
 
 def test_a_share_counts_what_had_to_go(splats, views, removed):
     """Half of 576 is 288, of which what is forced out is a part; a tenth of them is less."""
-    half = prune(splats, views, Budget(ratio=0.5), forced_out=removed).report["splats"]
-    tenth = prune(splats, views, Budget(ratio=0.1), forced_out=removed).report["splats"]
+    half = prune(splats, views, Budget(ratio=0.5), removed=removed).report["splats"]
+    tenth = prune(splats, views, Budget(ratio=0.1), removed=removed).report["splats"]
 
     assert half["removed"] == 288
-    assert tenth["removed"] == tenth["forced"] == removed.sum() > 57
+    assert tenth["removed"] == tenth["removed_by_user"] == removed.sum() > 57
 
 
 def test_protection_wins_over_force(splats, views):
@@ -115,38 +114,40 @@ def test_protection_wins_over_force(splats, views):
         views,
         Budget(ratio=0.9),
         protected=rows < 10,
-        forced_out=rows < 100,
-        survivors="absorb",
+        removed=rows < 100,
+        method=Merge(),
     )
 
     assert found.keep[:10].all()
     assert not found.keep[10:100].any()
-    assert not found.absorbed.changed[:10].any()
-    assert (found.report["splats"]["protected"], found.report["splats"]["forced"]) == (10, 90)
+    assert not found.merged.changed[:10].any()
+    assert (found.report["splats"]["protected"], found.report["splats"]["removed_by_user"]) == (
+        10,
+        90,
+    )
 
 
-@pytest.mark.parametrize("method", ["occlusion", "closed-form"])
+@pytest.mark.parametrize("method", [Occlusion(), ClosedForm()])
 def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(
     splats, views, removed, method
 ):
     """As the panel does it: score without them, store, apply. They score 0 and no other does."""
-    settings, budget = Settings(method), Budget(ratio=0.6)
-    scores = score(splats, views, settings, forced_out=removed)
-    task = Task(budget, settings, scores=scores, forced_out=removed)
+    budget, scores = Budget(ratio=0.6), score(splats, views, method, removed=removed)
 
     assert np.array_equal(scores.values == 0.0, removed)
-    expected = prune(splats, views, budget, settings, forced_out=removed, survivors="unchanged")
+    expected = prune(splats, views, budget, method, removed=removed)
     for given in (scores, replace(scores, ray_sample=None)):
-        assert np.array_equal(decide(replace(task, scores=given)).keep, expected.keep)
+        later = prune(None, None, budget, method, scores=given, removed=removed)
+        assert np.array_equal(later.keep, expected.keep)
 
 
 def test_the_curve_has_protected_splats_last_though_others_must_go(splats, views, removed):
     """As where these have gone before; without protection it is another curve."""
-    settings, rest = Settings("occlusion"), ~removed
+    settings, rest = Occlusion(), ~removed
     protected = rest & (np.arange(COUNT) % 2 == 0)
 
     found, free = (
-        score(splats, views, settings, forced_out=removed, protected=stays).quality.psnr
+        score(splats, views, settings, removed=removed, protected=stays).quality.psnr
         for stays in (protected, None)
     )
 
@@ -157,12 +158,11 @@ def test_the_curve_has_protected_splats_last_though_others_must_go(splats, views
 
 def test_what_was_forced_out_when_scored_and_is_no_more_has_no_score(splats, views, removed):
     """It might be worth most: nothing tells."""
-    scores = score(splats, views, forced_out=removed)
+    scores = score(splats, views, removed=removed)
     fewer = removed & (np.arange(COUNT) > 100)
-    task = Task(Budget(ratio=0.6), scores=scores, forced_out=fewer)
 
     with pytest.raises(RefineError, match=r"splats had to go when the others were scored"):
-        decide(task)
+        prune(None, None, Budget(ratio=0.6), Occlusion(), scores=scores, removed=fewer)
 
 
 @pytest.mark.parametrize("now", ["another", "none"])
@@ -174,24 +174,25 @@ def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats,
     logits = splats.opacity_logits.copy()
     logits[5] = np.nan
     splats = replace(splats, opacity_logits=logits)
-    settings = Settings("closed-form")
+    settings = ClosedForm()
     best = int(np.argmax(score(splats, views, settings).values))
     every = np.arange(COUNT)
-    scores = score(splats, views, settings, forced_out=every == best)
+    scores = score(splats, views, settings, removed=every == best)
     removed = every == 5 if now == "another" else None
 
     with pytest.raises(RefineError, match=r"^1 splats had to go when the others were scored"):
-        decide(Task(Budget(ratio=0.5), scores=scores, forced_out=removed))
+        prune(None, None, Budget(ratio=0.5), settings, scores=scores, removed=removed)
 
-    assert not decide(Task(Budget(ratio=0.5), scores=scores, forced_out=every == best)).keep[best]
+    again = prune(None, None, Budget(ratio=0.5), settings, scores=scores, removed=every == best)
+    assert not again.keep[best]
 
 
 def test_more_than_was_forced_out_when_scored_goes_by_the_scores_there_are(splats, views, removed):
     """The others are ranked as they were."""
-    scores = score(splats, views, forced_out=removed)
+    scores = score(splats, views, removed=removed)
     more = removed | (np.arange(COUNT) < 50)
 
-    found = decide(Task(Budget(keep=200), scores=scores, forced_out=more))
+    found = prune(None, None, Budget(keep=200), Occlusion(), scores=scores, removed=more)
 
     assert not found.keep[more].any()
     assert found.keep.sum() == 200
@@ -201,9 +202,9 @@ def test_more_than_was_forced_out_when_scored_goes_by_the_scores_there_are(splat
 def test_nothing_left_is_refused(splats, views):
     """In one sentence, before any work."""
     with pytest.raises(RefineError, match="all 576 splats lie where they must go"):
-        prune(splats, views, Budget(ratio=0.5), forced_out=np.ones(COUNT, bool))
+        prune(splats, views, Budget(ratio=0.5), removed=np.ones(COUNT, bool))
     with pytest.raises(RefineError, match="all 576 splats"):
-        score(splats, views, forced_out=np.ones(COUNT, bool))
+        score(splats, views, removed=np.ones(COUNT, bool))
 
 
 def test_all_but_what_is_protected_may_go(splats, views):
@@ -211,43 +212,41 @@ def test_all_but_what_is_protected_may_go(splats, views):
     mine = np.arange(COUNT) == 300
 
     found = prune(
-        splats, views, Budget(ratio=0.0), Settings("closed-form"),
-        protected=mine, forced_out=np.ones(COUNT, bool),
+        splats, views, Budget(ratio=0.0), ClosedForm(),
+        protected=mine, removed=np.ones(COUNT, bool),
     )  # fmt: skip
 
     assert np.array_equal(found.keep, mine)
 
 
 @WAYS
-def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, removed, survivors):
+def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(
+    merges, splats, views, removed, method
+):
     """Half of 576 stays in the first, of the others; as when the others are the scene."""
     rest = ~removed
     shares = (287.5 / rest.sum(), 57.5 / rest.sum())  # rounded up
-    expected = lod(splats.take(rest), views, Levels(shares, survivors=survivors))
+    expected = list(lod(splats.take(rest), views, Levels(shares), method))
 
-    found = lod(splats, views, Levels((0.5, 0.1), survivors=survivors), forced_out=removed)
+    found = list(lod(splats, views, Levels((0.5, 0.1)), method, removed=removed))
 
     for one, other in zip(found, expected, strict=True):
-        assert np.array_equal(one.keep[rest], other.keep)
-        assert not one.keep[removed].any()
-        assert np.array_equal(one.splats.means, other.splats.means)
+        assert np.array_equal(one.result.keep[rest], other.result.keep)
+        assert not one.result.keep[removed].any()
+        assert np.array_equal(one.result.splats.means, other.result.splats.means)
         assert one.psnr == other.psnr
-    assert [level.keep.sum() for level in found] == [288, 58]
+    assert [level.result.keep.sum() for level in found] == [288, 58]
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, survivors):
+@WAYS
+def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, method):
     """Nothing is forced out then, and each level is made from the one before."""
-    levels = lod(
-        splats,
-        views,
-        Levels((0.5, 0.3), survivors=survivors),
-        protected=removed,
-        forced_out=removed,
+    levels = list(
+        lod(splats, views, Levels((0.5, 0.3)), method, protected=removed, removed=removed)
     )
 
     assert len(levels) == 2
-    assert all(level.keep[removed].all() for level in levels)
+    assert all(level.result.keep[removed].all() for level in levels)
 
 
 def test_cleaning_takes_what_is_forced_out_as_gone():
@@ -293,16 +292,14 @@ def test_a_file_is_pruned_by_volumes_as_by_masks(splats, views, tmp_path, cleani
     masks = forced_by(ZONES, loaded.means)
     budget = Budget(ratio=0.8)
 
-    found = prune_file(
-        path, tmp_path / "out.ply", PruneRequest(views, budget, zones=ZONES, cleaning=cleaning)
-    )
+    found = prune_file(path, tmp_path / "out.ply", views, budget, zones=ZONES, cleaning=cleaning)
 
     x, y = loaded.means[:, 0], loaded.means[:, 1]
     protected, removed = x < -2, ((x >= 1) | (y < -1)) & (x >= -2)
     assert np.array_equal(masks.protected, protected)
     assert np.array_equal(masks.out, removed)
     if cleaning is None:
-        expected = prune(loaded, views, budget, protected=protected, forced_out=removed)
+        expected = prune(loaded, views, budget, protected=protected, removed=removed)
         assert np.array_equal(found.keep, expected.keep)
     assert found.keep[protected].all()
     assert not found.keep[removed].any()
@@ -318,7 +315,7 @@ def test_levels_of_a_file_go_by_volumes(splats, views, tmp_path):
     """No level holds what is forced out, and each holds what is protected."""
     path = scene(splats, tmp_path / "in.ply")
 
-    told = lod_file(path, tmp_path / "out", LevelsRequest(views, Levels((0.5, 0.4)), zones=ZONES))
+    told = lod_file(path, tmp_path / "out", views, Levels((0.5, 0.4)), zones=ZONES)
 
     x = splats.means[:, 0].astype(np.float32)
     for entry in told["levels"]:
@@ -326,17 +323,3 @@ def test_levels_of_a_file_go_by_volumes(splats, views, tmp_path):
         assert (level.means[:, 0] < 1.0).all()
         assert (level.means[:, 0] < -2.0).sum() >= (x < -2.0).sum()
     assert [fact["role"] for fact in told["volumes"]] == ["keep", "protect", "remove"]
-
-
-def test_rows_of_several_lengths_are_those_of_the_splats_that_need_not_go():
-    """The first 100 of 300 take 1,000 bytes each and go; of the others, 10 each, 1,500 hold 150."""
-    splats, forced_out = cloud(300), np.arange(300) < 100
-    row_bytes = np.where(forced_out, 1000, 10)
-
-    result = prune(
-        splats, ring(), Budget(max_mb=0.0015), Settings("closed-form"),
-        forced_out=forced_out, row_bytes=row_bytes,
-    )  # fmt: skip
-
-    assert np.count_nonzero(result.keep) == 150
-    assert not result.keep[forced_out].any()

@@ -1,4 +1,4 @@
-"""Absorbing and refitting through the panel and the command's objects: the splats of core."""
+"""Merging and refitting through the panel and the command's objects: the splats of core."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from tests.windows import event, started_in_a_window, until, until_over
 
 @pytest.fixture
 def few(addon, room, room_cameras):
-    """Every tenth splat of the room, scored, to be absorbed to two fifths."""
+    """Every tenth splat of the room, to be merged to two fifths."""
     core = addon.core
     remove = np.arange(len(room.data.vertices)) % 10 != 0
     addon.mesh.edit.delete_vertices(room, remove)
     settings = bpy.context.scene.refine
-    settings.survivors, settings.ratio = "absorb", 0.6
+    settings.method, settings.ratio = "merge", 0.6
     return room, core.Budget(ratio=0.6)
 
 
-BOTH = pytest.mark.parametrize("survivors", ["absorb", "refit"])
+BOTH = pytest.mark.parametrize("method", ["merge", "refit"])
 
 
-def absorbed_in_core(addon, obj, views, budget, survivors="absorb"):
+def merged_in_core(addon, obj, views, budget, method="merge"):
     return addon.core.prune(
         addon.objects.splat_object.gather(addon.mesh.layout.check(obj), whole=True),
         views,
         budget,
-        survivors=survivors,
+        addon.core.METHODS[method](),
     )
 
 
 @BOTH
-def test_apply_leaves_what_core_says(addon, few, room_views, survivors):
-    """Survivors, changed or not, equal to the last bit: the object stands where its data is."""
+def test_apply_leaves_what_core_says(addon, few, room_views, method):
+    """Kept splats, changed or not, equal to the last bit: the object stands where its data is."""
     room, budget = few
-    bpy.context.scene.refine.survivors = survivors
-    expected = absorbed_in_core(addon, room, room_views, budget, survivors).absorbed
+    bpy.context.scene.refine.method = method
+    expected = merged_in_core(addon, room, room_views, budget, method).merged
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
 
@@ -54,23 +54,23 @@ def test_apply_leaves_what_core_says(addon, few, room_views, survivors):
 
 
 @BOTH
-def test_apply_says_what_became_of_the_survivors(addon, few, room_views, capfd, survivors):
-    """The sentences of the report: of refitting its own, and how many absorbed others by then."""
+def test_apply_says_what_became_of_the_splats(addon, few, room_views, capfd, method):
+    """The sentences of the report: of refitting its own, and into how many others were merged."""
     room, budget = few
-    bpy.context.scene.refine.survivors = survivors
-    report = absorbed_in_core(addon, room, room_views, budget, survivors).report
+    bpy.context.scene.refine.method = method
+    report = merged_in_core(addon, room, room_views, budget, method).report
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
 
     told = capfd.readouterr().out
-    assert f"{report['absorbed']['changed']:,} survivors absorbed " in told
-    assert ("survivors were refitted in" in told) == (survivors == "refit")
+    assert f" splats were merged into {report['merged']['changed']:,} others; " in told
+    assert ("were refitted in" in told) == (method == "refit")
 
 
-def test_a_moved_object_is_absorbed_in_its_own_frame(addon, few, room_views):
+def test_a_moved_object_is_merged_in_its_own_frame(addon, few, room_views):
     """Object and cameras moved together: the data changes as if neither had been."""
     room, budget = few
-    still = absorbed_in_core(addon, room, room_views, budget).absorbed
+    still = merged_in_core(addon, room, room_views, budget).merged
     move = Matrix.Translation((1, 2, 3)) @ Euler((0.3, 0.2, 0.1)).to_matrix().to_4x4()
     for obj in (room, *(o for o in bpy.data.objects if o.type == "CAMERA")):
         obj.matrix_world = move @ obj.matrix_world
@@ -80,7 +80,7 @@ def test_a_moved_object_is_absorbed_in_its_own_frame(addon, few, room_views):
 
     splats = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(room))
 
-    # float32 matrices move a few merges across; the survivors are mostly the same ones.
+    # float32 matrices move a few merges across; most kept splats are the same ones.
     here = {tuple(row) for row in np.round(splats.means, 3)}
     there = {tuple(row) for row in np.round(still.splats.means.astype(np.float32), 3)}
     assert len(splats) == len(still.splats)
@@ -88,8 +88,9 @@ def test_a_moved_object_is_absorbed_in_its_own_frame(addon, few, room_views):
 
 
 def test_uneven_scale_is_refused_and_nothing_changes(addon, few):
-    """Colours cannot follow a stretch, and absorbing writes colours."""
+    """Colours cannot follow a stretch, and refitting writes colours."""
     room, _ = few
+    bpy.context.scene.refine.method = "refit"
     bpy.ops.refine.score()
     room.scale = (1, 2, 1)
     bpy.context.view_layer.update()
@@ -103,40 +104,32 @@ def test_uneven_scale_is_refused_and_nothing_changes(addon, few):
 
 
 @BOTH
-def test_the_command_on_an_object_writes_the_same_survivors(
-    addon, few, room_views, tmp_path, survivors
-):
+def test_the_command_on_an_object_writes_the_same_splats(addon, few, room_views, tmp_path, method):
     """Exported without touching the object."""
     room, budget = few
-    expected = absorbed_in_core(addon, room, room_views, budget, survivors)
+    expected = merged_in_core(addon, room, room_views, budget, method)
     count = len(room.data.vertices)
     out = tmp_path / "out.ply"
 
     report = addon.objects.operation.prune_object(
-        room.name,
-        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), survivors=survivors),
-        output=out,
+        room.name, room_views, budget, addon.core.METHODS[method](), output=out
     )
 
     written = addon.core.read_ply(out).splats()
-    wanted = expected.absorbed.splats.means.astype(np.float32)
+    wanted = expected.merged.splats.means.astype(np.float32)
     np.testing.assert_array_equal(np.asarray(written.means), wanted)
-    assert report["absorbed"] == expected.report["absorbed"]
-    assert ("refitted" in report) == (survivors == "refit")
+    assert report["merged"] == expected.report["merged"]
+    assert ("refitted" in report) == (method == "refit")
     assert len(room.data.vertices) == count
 
 
 def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tmp_path):
-    """Survivors as in core, their scores to look at, and none to apply once more."""
+    """Splats as in core, their scores to look at, and none to apply once more."""
     room, budget = few
-    expected = absorbed_in_core(addon, room, room_views, budget).absorbed
+    expected = merged_in_core(addon, room, room_views, budget).merged
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
 
-    addon.objects.operation.prune_object(
-        room.name,
-        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), survivors="absorb"),
-        save=True,
-    )
+    addon.objects.operation.prune_object(room.name, room_views, budget, save=True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
 
     obj = bpy.data.objects["room"]
@@ -153,24 +146,22 @@ def test_nothing_is_saved_over_where_refitting_was_stopped(
     room, budget = few
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     before, count = (tmp_path / "scene.blend").read_bytes(), len(room.data.vertices)
-    decide = addon.core.pipeline.decide
+    prune, out = addon.core.prune, tmp_path / "out.ply"
 
-    def stopped(task, **options):
-        result = decide(task, **options)
-        return replace(result, stopped=addon.core.Cancelled())
+    def stopped(*arguments, **options):
+        return replace(prune(*arguments, **options), stopped=addon.core.Cancelled())
 
-    monkeypatch.setattr(addon.core.operation.requests, "decide", stopped)
-    request = addon.core.PruneRequest(room_views, budget, addon.core.Settings("closed-form"))
-    out = tmp_path / "out.ply"
+    monkeypatch.setattr(addon.core.operations, "prune", stopped)
+    asked = room.name, room_views, budget, addon.core.ClosedForm()
 
     with pytest.raises(addon.core.Cancelled):
-        addon.objects.operation.prune_object(room.name, request, output=out, save=True)
+        addon.objects.operation.prune_object(*asked, output=out, save=True)
 
     assert not out.exists()
     assert (tmp_path / "scene.blend").read_bytes() == before
     assert len(room.data.vertices) == count
     with pytest.raises(addon.core.Cancelled):
-        addon.objects.operation.prune_object(room.name, request, output=out)
+        addon.objects.operation.prune_object(*asked, output=out)
     assert out.exists()
 
 
@@ -191,36 +182,31 @@ def test_protected_splats_neither_vanish_nor_change(addon, few):
     np.testing.assert_array_equal(after[still], before)
 
 
-@pytest.mark.parametrize(("scale", "becomes"), [(1.0, "absorb"), (2.0, "unchanged")])
-def test_by_default_survivors_absorb_unless_the_scale_is_uneven(
-    addon, few, room_views, scale, becomes
-):
+@pytest.mark.parametrize(("scale", "done"), [(1.0, "merge"), (2.0, "occlusion")])
+def test_splats_are_merged_unless_the_scale_is_uneven(addon, few, room_views, scale, done):
     """The panel, as the command: colours cannot follow a stretch, so that rows stay then."""
     room, budget = few
-    bpy.context.scene.refine.property_unset("survivors")
-    bpy.context.scene.refine.method = "occlusion"
     room.scale = (1.0, scale, 1.0)
     bpy.context.view_layer.update()
-    request = addon.core.PruneRequest(room_views, budget, dry_run=True)
 
-    told = addon.objects.operation.prune_object(room.name, request)["survivors"]
+    report = addon.objects.operation.prune_object(room.name, room_views, budget, dry_run=True)
     bpy.ops.refine.score()
     before = len(room.data.vertices)
     bpy.ops.refine.apply()
 
     room.scale = (1.0, 1.0, 1.0)
-    assert told["became"] == becomes
+    assert report["method"]["done"] == done
     assert len(room.data.vertices) == before - before * 6 // 10
 
 
 @pytest.mark.parametrize("rounds", [0, 1])
 def test_esc_while_refitting_keeps_what_that_has_reached(addon, few, monkeypatch, rounds):
-    """Absorbed, or refitted in a round: as many splats as asked for, and the sentence says which.
+    """Merged, or refitted in a round: as many splats as asked for, and the sentence says which.
 
     The bar says so beforehand; what ends the work is told by core, at once.
     """
     room, _ = few
-    bpy.context.scene.refine.survivors = "refit"
+    bpy.context.scene.refine.method = "refit"
     bpy.ops.refine.score()
     done, measured = [], addon.core.refit.round_rays.RoundRays.psnr
     count = len(room.data.vertices)
@@ -266,10 +252,10 @@ def test_esc_while_the_result_of_refitting_waits_changes_nothing(addon, few):
     assert len(room.data.vertices) == count
 
 
-def test_an_object_moved_while_apply_works_keeps_its_survivors_together(addon, few, room_views):
-    """The data is what it is without the move: survivors are in the frame of their object."""
+def test_an_object_moved_while_apply_works_keeps_its_splats_together(addon, few, room_views):
+    """The data is what it is without the move: splats are in the frame of their object."""
     room, budget = few
-    expected = absorbed_in_core(addon, room, room_views, budget).absorbed.splats.means
+    expected = merged_in_core(addon, room, room_views, budget).merged.splats.means
     bpy.ops.refine.score()
     operator, context, _ = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
     room.location.x += 1.0

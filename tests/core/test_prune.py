@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import json
 import subprocess
@@ -15,11 +16,11 @@ import pytest
 from refine_addon.core import (
     Budget,
     Cancelled,
+    ClosedForm,
+    Merge,
     Occlusion,
-    PruneRequest,
     RefineError,
     Scores,
-    Settings,
     Splats,
     View,
     ViewSet,
@@ -30,20 +31,20 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.pipeline import absorb_splats, decide
-from refine_addon.core.scoring import closed_form
+from refine_addon.core.scoring import closed_form, occlusion
 from refine_addon.core.scoring.closed_form import LUMA, lambdas
 from refine_addon.core.selection import rank
 from refine_addon.core.splats import ARRAYS
-from refine_addon.core.task import Task
 from refine_addon.core.visibility import froxels, lattices, points, projection, rays
 from refine_addon.core.visibility.measuring import Measured
 from refine_addon.core.visibility.scene import principal_axes
 from tests.strategies import plain_header, ply_of
 
+PRUNE = importlib.import_module("refine_addon.core.prune")
+
 ROOM = Path(__file__).parents[1] / "data/room_small"
 PLY = ROOM / "point_cloud.ply"
-FAST = Settings("closed-form")
+FAST = ClosedForm()
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +111,7 @@ def test_protected_splats_stay_and_others_go_in_their_place(file, views):
 
 def test_a_size_in_megabytes_is_kept_to_the_row(views, tmp_path):
     """The file fits in 2 MB, and one row of 248 bytes more would not."""
-    result = prune_file(PLY, tmp_path / "out.ply", PruneRequest(views, Budget(max_mb=2.0), FAST))
+    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(max_mb=2.0), FAST)
 
     size = (tmp_path / "out.ply").stat().st_size
 
@@ -120,7 +121,7 @@ def test_a_size_in_megabytes_is_kept_to_the_row(views, tmp_path):
 
 def test_the_pruned_file_holds_the_kept_rows_and_the_report_is_json(file, views, tmp_path):
     """Rows bit for bit, in order; every number of the report is finite."""
-    result = prune_file(PLY, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.5), FAST))
+    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(ratio=0.5), FAST)
 
     assert read_ply(tmp_path / "out.ply").rows.tobytes() == file.rows[result.keep].tobytes()
     assert json.loads(json.dumps(result.report, allow_nan=False))["splats"]["before"] == 39755
@@ -140,10 +141,15 @@ def test_faces_that_count_splats_are_noted_once_splats_go(small, views, tmp_path
     path.write_bytes(header.replace(b"end_header", faces + b"end_header") + body + face)
 
     fewer, same = (
-        prune_file(path, output, PruneRequest(views, Budget(ratio=ratio), FAST)).report["notes"]
+        prune_file(path, output, views, Budget(ratio=ratio), FAST).report["notes"]
         for output, ratio in ((tmp_path / "out.ply", 0.5), (None, 0.0))
     )
 
+    if form == "ascii":  # written anew
+        assert all(
+            "without the elements beside its splats (face)" in said[0] for said in (fewer, same)
+        )
+        return
     expected = (
         "element 'face' beside the splats is kept as it is; its indices may point past the end"
     )
@@ -153,7 +159,7 @@ def test_faces_that_count_splats_are_noted_once_splats_go(small, views, tmp_path
 
 def test_no_output_writes_nothing(views, tmp_path):
     """A dry run decides and reports."""
-    result = prune_file(PLY, None, PruneRequest(views, Budget(ratio=0.5), FAST))
+    result = prune_file(PLY, None, views, Budget(ratio=0.5), FAST)
 
     assert result.report["files"]["output"] is None
     assert list(tmp_path.iterdir()) == []
@@ -161,7 +167,7 @@ def test_no_output_writes_nothing(views, tmp_path):
 
 def test_fewer_views_are_used_when_asked_for(file, views):
     """Eight of the 63, spread out."""
-    report = prune(file.splats(), views, Budget(ratio=0.5), replace(FAST, views=8)).report
+    report = prune(file.splats(), views, Budget(ratio=0.5), ClosedForm(8)).report
 
     assert report["views"] == {"given": 63, "used": 8}
 
@@ -175,19 +181,12 @@ def test_cancelling_leaves_nothing(views, tmp_path, last):
         prune_file(
             PLY,
             tmp_path / "out.ply",
-            PruneRequest(views, Budget(ratio=0.5)),
+            views,
+            Budget(ratio=0.5),
             progress=lambda _fraction, _what: next(calls) < last,
         )
 
     assert list(tmp_path.iterdir()) == []
-
-
-def test_settings_that_cannot_be_are_refused():
-    """The message names the setting and what it is."""
-    with pytest.raises(RefineError, match="method is 'guess'"):
-        Settings(method="guess")
-    with pytest.raises(RefineError, match="views is -1"):
-        Settings(views=-1)
 
 
 TENTHS = [tenth / 10 for tenth in range(1, 10)]
@@ -279,15 +278,15 @@ def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     A point on the edge of a cell falls on either side: two splats for two others at 90 %.
     """
     some = views.take(range(0, len(views), every))
-    settings = Settings("occlusion", occlusion=Occlusion(rounds=rounds))
-    scores = score(file.splats(), some, settings)
+    scores = occlusion.score(file.splats(), some, rounds=rounds)
     for module in (projection, lattices, points, froxels, rays):
         monkeypatch.setattr(module, "np", Doubles())
     monkeypatch.setattr(projection, "_by_depth", lambda depth: np.argsort(depth, kind="stable"))
     gaussians, frame, _ = projection.prepare(wide(file.splats()), some)
     assert projection.project(gaussians, frame, some[0]).centers.dtype == np.float64
 
-    expected = score(wide(file.splats()), some, settings, threads=1)  # other processes have floats
+    # Other processes have floats.
+    expected = occlusion.score(wide(file.splats()), some, rounds=rounds, threads=1)
 
     assert min(agreement(scores, expected)) >= 0.999
 
@@ -320,22 +319,20 @@ def test_absorbing_file_to_file_writes_the_changed_survivors_and_the_rest_bit_fo
 ):
     """The budget says how many survive; the report and a note say how many of them changed."""
     before = read_ply(small)
-    result = prune_file(
-        small, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.6), survivors="absorb")
-    )
+    result = prune_file(small, tmp_path / "out.ply", views, Budget(ratio=0.6), Merge())
 
     after = read_ply(tmp_path / "out.ply")
 
-    changed, kept = result.absorbed.changed, before.rows[result.keep]
+    changed, kept = result.merged.changed, before.rows[result.keep]
     assert len(after) == len(before) - len(before) * 6 // 10
     assert after.rows[~changed].tobytes() == kept[~changed].tobytes()
     np.testing.assert_array_equal(
-        after.splats().means, result.absorbed.splats.means.astype(np.float32)
+        after.splats().means, result.merged.splats.means.astype(np.float32)
     )
-    facts = result.report["absorbed"]
+    facts = result.report["merged"]
     assert facts["changed"] == np.count_nonzero(changed) > 0
     assert facts["merged"] + facts["deleted"] == result.report["splats"]["removed"]
-    assert any("survivors absorbed" in note for note in result.report["notes"])
+    assert any("merged into" in note for note in result.report["notes"])
 
 
 @pytest.mark.slow
@@ -355,103 +352,51 @@ def test_survivors_of_doubles_are_doubles(small, views, tmp_path):
     result = prune_file(
         tmp_path / "in.ply",
         tmp_path / "out.ply",
-        PruneRequest(moved, Budget(ratio=0.6), survivors="absorb"),
+        moved,
+        Budget(ratio=0.6),
+        Merge(),
     )
 
-    written, changed = read_ply(tmp_path / "out.ply").splats(), result.absorbed.changed
+    written, changed = read_ply(tmp_path / "out.ply").splats(), result.merged.changed
     assert len(np.unique(written.means[changed, 0])) == np.count_nonzero(changed) > 100
     for item in ARRAYS:
-        wanted = getattr(result.absorbed.splats, item)
+        wanted = getattr(result.merged.splats, item)
         np.testing.assert_array_equal(getattr(written, item), wanted)
         assert wanted.dtype == np.float64
-
-
-@pytest.fixture(scope="module")
-def text(small, tmp_path_factory):
-    """Write the small room as text: numbers of three digits, two spaces ahead of each."""
-    rows = read_ply(small).rows
-    lines = ["".join(f"  {value:.3g}" for value in row) for row in rows]
-    path = tmp_path_factory.mktemp("text") / "text.ply"
-    body = "\n".join([*lines, ""]).encode()
-    path.write_bytes(plain_header(len(rows), list(rows.dtype.names), "ascii") + body)
-    return path
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_the_report_says_how_large_a_text_file_is_before_it_is_written(
-    text, views, tmp_path, survivors
-):
-    """Of a dry run as of what stands on the disk: the rows of a binary file."""
-    done, dry = (
-        prune_file(
-            text, output, PruneRequest(views, Budget(ratio=0.6), survivors=survivors)
-        ).report["files"]
-        for output in (tmp_path / "out.ply", None)
-    )
-
-    assert (tmp_path / "out.ply").stat().st_size == done["output_bytes"] == dry["output_bytes"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_a_size_in_megabytes_holds_for_text(text, views, tmp_path, survivors):
-    """The rows are counted as they are written: as the numbers of a binary file, one by one."""
-    request = PruneRequest(views, Budget(max_mb=0.3), survivors=survivors)
-    prune_file(text, tmp_path / "out.ply", request)
-
-    row = read_ply(text).row_bytes
-    assert 0.3e6 - row < (tmp_path / "out.ply").stat().st_size <= 0.3e6
 
 
 @pytest.mark.slow
 def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small, views):
     """The threshold is the median score: half survive, by whatever costs least."""
     splats = read_ply(small).splats()
-    median = float(np.median(prune(splats, views, Budget(ratio=0.0), FAST).scores.values))
+    median = float(np.median(score(splats, views).values))
 
-    result = prune(splats, views, Budget(threshold=median), FAST, survivors="absorb")
+    result = prune(splats, views, Budget(threshold=median))
 
     assert np.count_nonzero(result.keep) == pytest.approx(len(splats) / 2, abs=1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
-def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, survivors):
+@pytest.mark.parametrize("method", [FAST, Occlusion(), Merge()])
+def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, method):
     """The panel scores once and applies later: the same splats, and the same report of them."""
     splats, budget = read_ply(small).splats(), Budget(threshold=0.5)
-    at_once = prune(splats, views, budget, FAST, survivors=survivors)
-    scores = score(splats, views, FAST)
-    scene = {"splats": splats, "views": views} if survivors == "absorb" else {}
+    at_once = prune(splats, views, budget, method)
+    scores = score(splats, views, method)
+    scene = (splats, views) if method.changes else (None, None)
 
-    later = decide(Task(budget, FAST, scores=scores, survivors=survivors, **scene))
+    later = prune(*scene, budget, method, scores=scores)
 
     np.testing.assert_array_equal(at_once.keep, later.keep)
     for report in (at_once.report, later.report):
-        del report["timings"]
+        del report["timings"], report["method"]["seconds"]
     assert at_once.report == later.report
 
 
 def test_splats_without_scores_need_views_to_decide(small):
     """And absorbing needs both."""
-    with pytest.raises(RefineError, match="need views to be scored"):
-        decide(Task(Budget(ratio=0.5), splats=read_ply(small).splats()))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["closed-form", "occlusion"])
-def test_a_report_of_absorbing_says_what_decided_and_what_was_asked(small, views, method):
-    """Occlusion's measure decides; a note says that another method was not used."""
-    splats = read_ply(small).splats()
-    once = score(splats, views, Settings("occlusion", occlusion=Occlusion(rounds=1)))
-
-    report = prune(splats, views, Budget(ratio=0.5), Settings(method), survivors="absorb").report
-
-    assert report["settings"]["method"] == method
-    assert report["weights"] == once.facts
-    assert report["splats"]["unseen"] == np.count_nonzero(once.seen == 0)
-    said = any("closed-form was not used" in note for note in report["notes"])
-    assert said == (method == "closed-form")
+    with pytest.raises(RefineError, match="need both"):
+        prune(read_ply(small), None, Budget(ratio=0.5))
 
 
 @pytest.mark.slow
@@ -460,38 +405,20 @@ def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
     splats = read_ply(small).splats()
     protected = np.arange(len(splats)) % 3 == 0
 
-    result = prune(splats, views, Budget(ratio=0.6), protected=protected, survivors="absorb")
+    result = prune(splats, views, Budget(ratio=0.6), protected=protected, method=Merge())
 
     assert result.keep[protected].all()
     assert np.count_nonzero(result.keep) == len(splats) - len(splats) * 6 // 10
-    assert not result.absorbed.changed[protected[result.keep]].any()
+    assert not result.merged.changed[protected[result.keep]].any()
 
 
 @pytest.mark.slow
 def test_nothing_to_remove_leaves_absorbing_nothing_to_do(small, views):
     """All stay, none changes."""
-    result = prune(read_ply(small).splats(), views, Budget(ratio=0.0), survivors="absorb")
+    result = prune(read_ply(small).splats(), views, Budget(ratio=0.0), Merge())
 
     assert result.keep.all()
-    assert not result.absorbed.changed.any()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ratio", [0.03, 0.1])
-def test_the_first_tenth_goes_as_occlusion_says_and_nothing_absorbs_it(ratio):
-    """What the views would miss least is next to nothing: any merge would change more."""
-    room, views = read_ply(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
-    splats, budget = room.take(slice(None, None, 16)), Budget(ratio=ratio)
-
-    absorbed = prune(splats, views, budget, Settings(views=8), survivors="absorb")
-    deleted = prune(splats, views, budget, Settings(views=8), survivors="unchanged")
-
-    np.testing.assert_array_equal(absorbed.keep, deleted.keep)
-    assert absorbed.report["absorbed"] == {
-        "changed": 0,
-        "merged": 0,
-        "deleted": len(splats) - np.count_nonzero(deleted.keep),
-    }
+    assert result.merged is None
 
 
 @pytest.mark.slow
@@ -508,22 +435,23 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
         ones = np.ones(len(splats))
         return Measured(ones, 2.0 * ones, np.zeros(len(splats), np.int32)), 0.25
 
-    def listening(splats, used, first, measure, count, original=absorb_splats.merge, **changes):
+    def listening(splats, used, sums, measure, count, original=PRUNE.merge, **changes):
         def tell(now, expected, progress):
             sums = measure(now, expected, progress)
             seen.append((sums, expected))
             return sums
 
-        return original(splats, used, first, tell, count, **changes)
+        return original(splats, used, sums, tell, count, **changes)
 
-    monkeypatch.setattr(absorb_splats.occlusion, "measure_part", quarter)
-    monkeypatch.setattr(absorb_splats, "merge", listening)
-    prune(read_ply(small).splats(), views, Budget(ratio=0.7), survivors="absorb")
+    monkeypatch.setattr(occlusion, "measure_part", quarter)
+    monkeypatch.setattr(PRUNE, "merge", listening)
+    prune(read_ply(small).splats(), views, Budget(ratio=0.7), Merge())
 
     assert asked == [(turn, 2) for turn in range(len(asked))]
     assert len(seen) == len(asked) > 0
     for sums, expected in seen:
-        np.testing.assert_allclose(sums, [[1.0], [2.0]] + 0.75 * expected)
+        np.testing.assert_allclose(sums[0], 1.0 + 0.75 * expected[0])
+        np.testing.assert_allclose(sums[1], 2.0 + 0.75 * expected[1])
 
 
 @pytest.fixture(
@@ -536,26 +464,28 @@ def scored_for_all(request, small, views):
     splats = read_ply(small).splats()
     every = np.arange(len(splats))
     held = every % 2 == 0 if zoned.startswith("half") else every % 7 == 0
-    demands = {"protected": held, "forced_out": every % 11 == 0} if zoned else {}
-    settings = Settings("occlusion", views=12)
-    task = Task(Budget(ratio=0.5), settings, splats, views, survivors="unchanged", **demands)
-    return task, replace(task, scores=decide(replace(task, reusable=True)).scores), zoned
+    demands = {"protected": held, "removed": every % 11 == 0} if zoned else {}
+
+    def decide(ratio, **changes):
+        return prune(splats, views, Budget(ratio=ratio), Occlusion(12), **demands, **changes)
+
+    return decide, decide(0.5, reusable=True).scores, zoned
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.05, 0.55, 0.93])
 def test_scoring_for_one_budget_decides_what_scores_for_all_would(scored_for_all, ratio):
     """Scoring ends with the round that removes the last of its splats: the same report, too."""
-    task, scored, zoned = scored_for_all
-    some = decide(replace(task, budget=Budget(ratio=ratio)))
+    decide, scores, zoned = scored_for_all
+    some = decide(ratio)
 
-    whole = decide(replace(scored, budget=Budget(ratio=ratio)))
+    whole = decide(ratio, scores=scores)
 
     assert whole.scores.settled is None
     np.testing.assert_array_equal(some.keep, whole.keep)
     for name in ("estimated_psnr", "splats", "notes"):
         assert some.report[name] == whole.report[name]
-    assert some.report["survivors"]["psnr"] == whole.report["survivors"]["psnr"]
+    assert some.report["method"]["psnr"] == whole.report["method"]["psnr"]
     known = len(some.report["quality"]["shares"])
     for name in ("shares", "psnr", "absorbed"):
         # Means over the views are products of matrices, whose last digit depends on their shape.
@@ -571,10 +501,7 @@ def test_scores_of_one_budget_are_refused_for_a_larger_one(small, views):
     """What they say of the splats that stayed is not final; views seen are."""
     splats = read_ply(small).splats()
     protected = np.arange(len(splats)) % 5 == 0
-    scores = prune(
-        splats, views, Budget(ratio=0.2), Settings("occlusion", views=8),
-        protected=protected, survivors="unchanged",
-    ).scores  # fmt: skip
+    scores = prune(splats, views, Budget(ratio=0.2), Occlusion(8), protected=protected).scores
     settled = int(0.3 * len(splats)) + np.count_nonzero(protected)
 
     assert scores.settled == settled

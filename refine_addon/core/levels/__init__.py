@@ -1,1 +1,0 @@
-"""Levels of detail: ever fewer splats of one scene, and from how far away each will do."""

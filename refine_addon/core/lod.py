@@ -1,0 +1,505 @@
+"""Levels of detail: the same scene with ever fewer splats, in memory or as files.
+
+Where kept splats may change, each level is made from the one before. What they then become does not
+depend on which levels are asked for after them. Where splats are deleted, one ranking decides all
+levels. Either way the rows of a level are among those of the level before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import RefineError
+from .execute import Progress, seconds, silent, stages
+from .formats import sog
+from .formats.images import codec_for
+from .formats.registry import format_named, held_splats, left_out, notes, scene_name, write_splats
+from .formats.streamed_sog import INDEX, StreamedSog, folder_for
+from .methods import DEFAULT, Method
+from .operations import Scene, read_scene
+from .prune import prune, score
+from .quality.curve import PSNR_CAP
+from .rendering import Model
+from .report import Clock, scored, scoring_notes
+from .result import Origin, Result
+from .scores import Scores
+from .selection import Budget
+from .splats import Splats, among_all
+from .views import ViewSet
+from .visibility import frustum
+from .volumes import Zone, refuse_all
+from .whole_file import (
+    expanded,
+    mode_of,
+    new_folder,
+    refuse_existing,
+    refuse_mapped,
+    refuse_one_file,
+)
+
+MAX_LEVELS = 16
+"""No more levels than this: the last of so many halvings would hold 0.0015 % of the splats."""
+
+SHARES = (0.5, 0.25, 0.12, 0.06)
+"""Shares that stay, by default."""
+
+_SAMPLE = 4096  # splats that tell how far away what the views see is
+_VIEWS = 8  # views that tell it
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Which levels to make: by the share of the splats that stays, or by a PSNR.
+
+    Attributes
+    ----------
+    shares : tuple of float
+        Shares that stay, each in (0, 1) and less than the one before.
+    psnr : tuple of float
+        Instead, how close the pictures of the views stay to those of all splats, dB, each less than
+        the one before; see `Budget`.
+
+    Examples
+    --------
+    >>> [budget.keep for budget in Levels((0.5, 0.25)).budgets(9)]
+    [5, 3]
+    """
+
+    shares: tuple[float, ...] = ()
+    psnr: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("shares", "psnr"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if bool(self.shares) == bool(self.psnr):
+            got = "both" if self.shares else "none"
+            raise RefineError(
+                f"levels are given by the shares that stay or by PSNR, got {got} of them"
+            )
+        values, most, unit = (self.shares, 1.0, "") if self.shares else (self.psnr, PSNR_CAP, " dB")
+        bad = next((value for value in values if not 0.0 < value < most), None)
+        if bad is not None:
+            raise RefineError(f"level is {bad}, expected more than 0 and less than {most:g}{unit}")
+        rising = next((pair for pair in pairwise(values) if pair[0] <= pair[1]), None)
+        if rising:
+            raise RefineError(
+                f"level {rising[1]} comes after {rising[0]}, expected less: the finest first"
+            )
+        if len(values) > MAX_LEVELS:
+            raise RefineError(f"got {len(values)} levels, expected at most {MAX_LEVELS}")
+
+    def __len__(self) -> int:
+        return len(self.asked)
+
+    @property
+    def asked(self) -> tuple[float, ...]:
+        """The shares, or the PSNR."""
+        return self.shares or self.psnr
+
+    def notes(self, remarks: Mapping[float, str]) -> list[str]:
+        """Which levels were not made, and what is remarked of the others, in sentences.
+
+        Parameters
+        ----------
+        remarks : mapping of float to str
+            `Level.remark` of those that were made, by `Level.asked`.
+
+        Examples
+        --------
+        >>> Levels(psnr=(99.0, 40.0)).notes({40.0: ""})
+        ['no level for 99 dB: it would be a copy of the input']
+        """
+        notes, number, unit = [], 0, "" if self.shares else " dB"
+        for asked in self.asked:
+            if asked not in remarks:
+                copied = f"level {number}" if number else "the input"
+                notes.append(f"no level for {asked:g}{unit}: it would be a copy of {copied}")
+                continue
+            number += 1
+            if remarks[asked]:
+                notes.append(f"level {number}: {remarks[asked]}")
+        return notes
+
+    def budgets(self, count: int) -> list[Budget]:
+        """The budgets of the levels for so many splats; at least one splat stays."""
+        if self.psnr:
+            return [Budget(psnr=psnr) for psnr in self.psnr]
+        # The decimals as written, as `Budget.removals`; as many as with `ratio` of 1 - share.
+        kept = (math.ceil(Fraction(repr(float(share))) * count) for share in self.shares)
+        return [Budget(keep=max(number, 1)) for number in kept]
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level.
+
+    Attributes
+    ----------
+    number : int
+        From 1; level 0 is the original.
+    asked : float
+        The share that stays or the PSNR that was asked for.
+    result : Result
+        Of all splats: what is kept, as it became; its report is that of the last step.
+    scores : Scores
+        What the views saw of all splats, the same for all levels.
+    """
+
+    number: int
+    asked: float
+    result: Result
+    scores: Scores
+
+    @property
+    def psnr(self) -> float | None:
+        """The estimated PSNR of the views against all splats, dB."""
+        return self.result.report["estimated_psnr"]
+
+    @property
+    def remark(self) -> str:
+        """Why the PSNR that was asked for is out of reach; "" if it is not."""
+        return self.result.report["budget_remark"]
+
+    def facts(self) -> dict[str, Any]:
+        """What is to be known of it as plain JSON values."""
+        report = self.result.report
+        return {
+            "level": self.number,
+            "asked": self.asked,
+            "splats": int(np.count_nonzero(self.result.keep)),
+            "psnr": self.psnr,
+            "done": report["method"]["done"],
+            **{key: report[key] for key in ("merged", "refitted") if key in report},
+        }
+
+
+def lod(
+    splats: Splats,
+    views: ViewSet,
+    levels: Levels,
+    method: Method = DEFAULT,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Iterator[Level]:
+    """Make levels of detail one by one, when they are asked for.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame of the views.
+    views : ViewSet
+    levels : Levels
+    method : Method
+    protected : (N,) bool, optional
+        Splats that are in all levels, unchanged.
+    removed : (N,) bool, optional
+        Splats that are in no level, unless they are protected. They count as removed, and levels
+        are compared with the pictures of the others.
+    progress : callable, optional
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int, optional
+
+    Yields
+    ------
+    Level
+        The finest first. One that would have as many splats as the one before, or as the original,
+        is not among them; see `Levels.notes`.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `prune`; also if no level would have fewer splats than the original.
+
+    Examples
+    --------
+    To write the second level to a file::
+
+        second = list(lod(file.splats(), views, Levels((0.5, 0.25))))[1]
+        replace(second.result, source=file).write("out.ply")
+    """
+    whole, rest, budgets = splats, None, levels.budgets(len(splats))
+    if removed is not None and removed.any():
+        gone = removed if protected is None else removed & ~protected
+        refuse_all(gone)
+        rest = ~gone
+        splats = splats.take(rest)
+        protected = None if protected is None else protected[rest]
+    make = _by_steps if method.changes else _by_one_ranking
+    share = 0.5 if method.changes else 0.02  # of the time before that the next level takes
+    of_levels = stages(progress, *(share**place for place in range(len(budgets))))
+    left, number, scores = len(whole), 0, None
+    for asked, result in zip(
+        levels.asked, make(splats, views, budgets, method, protected, of_levels, threads),
+        strict=True,
+    ):  # fmt: skip
+        scores = result.scores if scores is None else scores
+        kept = int(np.count_nonzero(result.keep))
+        if kept < left:
+            number, left = number + 1, kept
+            assert scores is not None
+            if rest is not None:
+                result = replace(result.for_all(rest), source=whole)
+            yield Level(number, asked, result, scores)
+    if not number:
+        raise RefineError(f"no level has fewer splats than the input, which has {len(whole)}")
+
+
+def _by_one_ranking(
+    splats: Splats, views: ViewSet, budgets: Sequence[Budget], method: Method,
+    protected: NDArray[np.bool_] | None, progress: Sequence[Progress], threads: int | None,
+) -> Iterator[Result]:  # fmt: skip
+    """Make levels by deleting."""
+    scores = score(splats, views, method, quality=True, progress=progress[0], threads=threads)
+    for budget in budgets:
+        yield prune(
+            splats, views, budget, method, protected=protected, scores=scores, threads=threads
+        )
+
+
+def _by_steps(
+    splats: Splats, views: ViewSet, budgets: Sequence[Budget], method: Method,
+    protected: NDArray[np.bool_] | None, progress: Sequence[Progress], threads: int | None,
+) -> Iterator[Result]:  # fmt: skip
+    """Make levels each from the one before."""
+    whole, origin, now = None, None, splats
+    for budget, of_level in zip(budgets, progress, strict=True):
+        spared = protected if protected is None or whole is None else protected[whole.keep]
+        result = prune(
+            now, views, budget, method, protected=spared, origin=origin,
+            progress=of_level, threads=threads,
+        )  # fmt: skip
+        whole = result if whole is None else _both(whole, result)
+        whole = replace(whole, source=splats)
+        if origin is None:
+            assert result.scores is not None
+            origin = Origin(splats, result.scores.ray_sample, result.scores.between, None)
+        origin = replace(origin, psnr=result.report["estimated_psnr"])
+        yield whole
+        now = whole.splats
+
+
+def _both(first: Result, second: Result) -> Result:
+    """What two steps make of the splats of the first, one after the other."""
+    keep = among_all(second.keep, first.keep)
+    second = replace(second, scores=first.scores)
+    one, two = first.merged, second.merged
+    if two is None:
+        if one is None:
+            return replace(second, keep=keep)
+        two = replace(one, splats=one.splats.take(second.keep), changed=one.changed[second.keep])
+        return replace(second, keep=keep, merged=replace(two, keep=keep))
+    changed, merged, deleted = two.changed, two.merged, two.deleted
+    if one is not None:
+        changed = one.changed[second.keep] | changed
+        merged, deleted = one.merged + merged, one.deleted + deleted
+    two = replace(two, keep=keep, changed=changed, merged=merged, deleted=deleted)
+    return replace(second, keep=keep, merged=two)
+
+
+def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") -> list[Path]:
+    """The names of the files of `count` levels.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> [path.as_posix() for path in level_paths(Path("a/b.compressed.ply"), Path("out"), 2)]
+    ['out/b.lod1.ply', 'out/b.lod2.ply']
+    """
+    name = scene_name(source)
+    return [folder / f"{name}.lod{number}{suffix}" for number in range(1, count + 1)]
+
+
+def is_streamed(target: Path) -> bool:
+    """Whether levels that go to `target` become a streamed SOG, by its name."""
+    return target.name == INDEX
+
+
+Add = Callable[[Scene, Level], tuple[dict[str, Any], list[str]]]
+"""Writes a level; what the report says of its file, and sentences."""
+
+
+@contextlib.contextmanager
+def _into_folder(
+    source: Path, target: Path, count: int, suffix: str, overwrite: bool
+) -> Iterator[tuple[Add, Callable[[], list[str]]]]:
+    """A file of each level; level 0 is not written again. New files go if the block fails."""
+    paths, written = level_paths(source, target, count, suffix), list[Path]()
+
+    def add(scene: Scene, level: Level) -> tuple[dict[str, Any], list[str]]:
+        path, result = paths[level.number - 1], level.result
+        file, form = scene.file(), format_named(path)
+        columns = result.changed(file.rows)
+        write_splats(path, file, result.keep, columns=columns, overwrite=overwrite)
+        written.append(path)
+        missing = left_out(file, form, result.keep)
+        entry = _entry(missing, level, path.name, path.stat().st_size)
+        return entry, notes(file, form, result.keep)
+
+    def finish() -> list[str]:
+        more = level_paths(source, target, MAX_LEVELS, suffix)[len(written) :]
+        return [f"{path.name} is of another run" for path in more if mode_of(path)]
+
+    with new_folder(target):
+        refuse_one_file(paths)
+        for path in paths:
+            refuse_existing(path, overwrite=overwrite)
+            refuse_mapped(path, source)
+        old = [path for path in paths if mode_of(path)]
+        try:
+            yield add, finish
+        except BaseException:
+            for path in written:
+                if path not in old:
+                    with contextlib.suppress(OSError):
+                        path.unlink()
+            raise
+
+
+@contextlib.contextmanager
+def _streamed(
+    target: Path, views: ViewSet, overwrite: bool
+) -> Iterator[tuple[Add, Callable[[], list[str]]]]:
+    """A streamed SOG of all levels, with level 0: what the user did not remove of the source."""
+    codec_for(target)  # refuses where no library for images is
+    made: list[StreamedSog] = []
+    with folder_for(target, overwrite=overwrite) as folder:
+
+        def add(scene: Scene, level: Level) -> tuple[dict[str, Any], list[str]]:
+            file, said, out = scene.file(), list[str](), scene.demands.out
+            if not made:
+                whole = np.ones(len(scene.splats), np.bool_) if out is None else ~out
+                finest = held_splats(target, sog.FORMAT, file, whole, {})
+                made.append(
+                    StreamedSog(finest.means, viewing_distance(scene.splats, views), folder)
+                )
+                made[0].add(finest)
+                said = notes(file, sog.FORMAT, whole)
+            result = level.result
+            columns = result.changed(file.rows)
+            size = made[0].add(held_splats(target, sog.FORMAT, file, result.keep, columns))
+            missing = left_out(file, sog.FORMAT, result.keep)
+            return _entry(missing, level, f"{level.number}_*/{sog.META}", size), said
+
+        def finish() -> list[str]:
+            made[0].publish(target, overwrite=overwrite)
+            return []
+
+        yield add, finish
+
+
+def _entry(missing: int, level: Level, name: str, size: int) -> dict[str, Any]:
+    """What the report says of a level's file, which holds all but `missing` splats."""
+    kept = int(np.count_nonzero(level.result.keep))
+    return {"splats": kept - missing, "left_out": missing, "file": name, "bytes": size}
+
+
+def viewing_distance(splats: Splats, views: ViewSet) -> float:
+    """Median distance from views to what lies in their pictures, world units; inf if nothing does.
+
+    A chunk of a streamed SOG is as wide, so that its far end is at most twice as far as its near.
+    """
+    means = splats.means[:: max(len(splats) // _SAMPLE, 1)].astype(np.float64)
+    distances = [np.empty(0)]
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+        for view in views.spread(_VIEWS):
+            local = view.rotation @ (means - view.center).T  # (3, n)
+            planes = frustum.clip_planes(view, float(np.finfo(np.float64).tiny))
+            inside = frustum.contains(view, local, planes)
+            distances.append(np.linalg.norm(local[:, inside], axis=0))
+    every = np.concatenate(distances)
+    return float(np.median(every)) if len(every) else math.inf
+
+
+def lod_file(
+    source: Path | str,
+    target: Path | str,
+    views: ViewSet,
+    levels: Levels,
+    method: Method = DEFAULT,
+    *,
+    zones: Sequence[Zone] = (),
+    suffix: str = ".ply",
+    model: Model | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Make levels of detail of a file of splats: a file each, or a streamed SOG of all.
+
+    Parameters
+    ----------
+    source : path-like
+        The file to read, of any format (`read_splats`); level 0, which is not written again but in
+        a streamed SOG.
+    target : path-like
+        The folder where the files go, named as by `level_paths`; or the index of a streamed SOG,
+        ``lod-meta.json`` in such a folder. The folder is made if it is not there.
+    views, levels, method, progress, threads
+        See `lod`.
+    zones, model
+        See `read_scene`.
+    suffix : str
+        Of the files, which names their format; a streamed SOG has none.
+    overwrite : bool
+
+    Returns
+    -------
+    dict
+        The report.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `lod`, `read_scene` and `Result.write`. Files that were new are removed again then; a
+        streamed SOG that was to be replaced is as it was.
+    """
+    clock, path, file = Clock(), expanded(target), expanded(source)
+    output = (
+        _streamed(path, views, overwrite)
+        if is_streamed(path)
+        else _into_folder(file, path, len(levels), suffix, overwrite)
+    )
+    with output as (add, finish):
+        scene = read_scene(source, zones, model)
+        clock.lap("read_s")
+        demands, entries, notes, remarks = scene.demands, list[dict[str, Any]](), list[str](), {}
+        facts: dict[str, Any] = {"settings": method.facts(), "volumes": list(demands.facts)}
+        count = len(scene.splats)
+        making, writing = stages(progress, seconds("merge", count), seconds("write", count))
+        for level in lod(
+            scene.splats, views, levels, method,
+            protected=demands.protected, removed=demands.out, progress=making, threads=threads,
+        ):  # fmt: skip
+            if level.number == 1:
+                seen = scored(level.scores)
+                seen["splats"] |= {"before": count, **demands.counts()}
+                facts |= {"source": {"file": file.name, "bytes": scene.bytes}, **seen}
+                facts["nested"] = not method.changes
+                notes += scoring_notes(level.scores)
+            entry, more = add(scene, level)
+            notes += [note for note in more if note not in notes]
+            entries.append({**level.facts(), **entry})
+            remarks[level.asked] = level.remark
+        writing(0.5, "writing")
+        notes += levels.notes(remarks) + finish()
+        clock.lap("levels_s")
+    clock.stop()
+    return facts | {
+        "levels": entries,
+        "files": {"input": scene.name, "output": str(path)},
+        "timings": clock.timings,
+        "notes": notes,
+    }

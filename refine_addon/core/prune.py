@@ -1,0 +1,685 @@
+"""From splats, views and a budget to the splats that stay, and what they become.
+
+Panel, command and Python code all call `prune`, so all of them keep the same splats. Splats are
+scored, and the budget selects by score. Where kept splats may change, splats are merged until as
+many are left as were selected, and these are refitted, if asked.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import report as reports
+from .errors import RefineError
+from .execute import Cancelled, Progress, report, return_freed, seconds, silent, stages
+from .formats.ply import SplatFile
+from .merging.merge import Merged, merge, stage_counts
+from .merging.stage import copied
+from .methods import DEFAULT, ClosedForm, Method, Occlusion, Refit
+from .quality.alignment import alignment
+from .quality.curve import AS_GOOD, PLAIN, Way, deletion_will_do, left_to_lose, needed
+from .quality.psnr import psnr_against, psnr_kept, quality_curve
+from .refit.refit import Refitted, expected_rounds, refit_rounds
+from .report import Clock
+from .result import Origin, Result
+from .scores import Scores
+from .scoring import closed_form, occlusion
+from .selection import Budget, quality_of, select
+from .splats import Splats
+from .views import ViewSet, refuse_other
+from .visibility.measuring import Measured
+from .visibility.ray_sample import validation_rays
+from .volumes import refuse_all
+
+TRIES = 3
+"""How often splats are merged at most to reach a PSNR."""
+
+CLOSE = 0.7
+"""How close to a PSNR the estimate for a result must be, dB, or splats are merged again."""
+
+FIRST = 0.1
+"""Share of the splats that is deleted before any are merged: those with the lowest scores, whose
+deletion changes the pictures less than any merge."""
+
+PARTS = 2
+"""While splats are merged, they are measured again in one of so many parts of the views, which take
+turns; what the other views see is carried over."""
+
+REFITTING = "refitting"
+"""What a progress callback is told while splats are refitted: from here on a cancelled prune still
+has something to offer; see `Result.stopped`."""
+
+
+def score(
+    splats: Splats | SplatFile,
+    views: ViewSet,
+    method: Method = DEFAULT,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
+    quality: bool = False,
+    settled: int | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """Score splats by how much each matters to the pictures of the views.
+
+    Parameters
+    ----------
+    splats : Splats or SplatFile
+        In the frame of the views.
+    views : ViewSet
+    method : Method
+        `ClosedForm` scores by its formula, all others by occlusion.
+    protected : (N,) bool, optional
+        Splats that are not removed: no score depends on them, the estimate of the pictures' quality
+        does.
+    removed : (N,) bool, optional
+        Splats that are to go in any case: the others are scored as if they had gone, and they
+        score 0.
+    quality : bool
+        Whether scores by the closed form get an estimate of the pictures' quality, which takes
+        longer than scoring; scores by occlusion always have one.
+    settled : int, optional
+        How many splats must be in their final order, those `removed` left aside: scoring by
+        occlusion takes less time where these are few. By default all.
+    progress : callable, optional
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int, optional
+
+    Raises
+    ------
+    RefineError
+        If there are no splats, if none of them can be drawn, if no view sees any, or the views are
+        no `ViewSet`.
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    refuse_other(views)
+    splats = splats.splats() if isinstance(splats, SplatFile) else splats
+    if removed is not None and removed.any():
+        refuse_all(removed)
+        rest = ~removed
+        scores = score(
+            splats.take(rest), views, method,
+            protected=None if protected is None else protected[rest],
+            quality=quality, settled=settled, progress=progress, threads=threads,
+        )  # fmt: skip
+        return scores.for_all(rest)
+    used, count = views.spread(method.views), len(splats)
+    by_formula = isinstance(method, ClosedForm)
+    kind = "closed form" if by_formula else "measure"
+    expected = [seconds(kind, count, len(used)), 0.0, seconds("read", count)]
+    if quality or not by_formula:
+        expected[1] = seconds("cast", count, len(used))
+    scoring, casting, estimating = stages(progress, *expected)
+    # Numbers that underflow to 0 are negligible in all sums.
+    with np.errstate(under="ignore"):
+        if by_formula:
+            scores = closed_form.score(splats, used, progress=scoring, threads=threads)
+            if quality:
+                rays = validation_rays(splats, used, progress=casting, threads=threads)
+                scores = replace(scores, ray_sample=rays)
+        else:
+            scores = occlusion.score(
+                splats, used, settled=settled, progress=scoring, threads=threads
+            )
+    scores = _with_views(scores, splats, views, used, threads)
+    return with_quality(scores, protected=protected, progress=estimating, threads=threads)
+
+
+def with_quality(
+    scores: Scores,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """Scores with the curve of the estimated PSNR, as far as their validation rays tell it.
+
+    Parameters
+    ----------
+    scores : Scores
+    protected : (N,) bool, optional
+        Splats that are not removed.
+    progress : callable, optional
+    threads : int, optional
+    """
+    if scores.ray_sample is None:
+        return scores
+    curve = quality_curve(
+        scores.ray_sample, scores.values, protected=protected, settled=scores.settled,
+        between=scores.between, progress=progress, threads=threads,
+    )  # fmt: skip
+    return replace(scores, quality=curve)
+
+
+def _with_views(
+    scores: Scores, splats: Splats, views: ViewSet, used: ViewSet, threads: int | None
+) -> Scores:
+    """Scores with what there is to say of all views given, not only of those used."""
+    notes = (*scores.notes, views.note) if views.note else scores.notes
+    # Beside the closed form, measuring would take as long as scoring.
+    measured = None if scores.ray_sample is None else used
+    aligned = alignment(splats, views, measured, threads=threads)
+    return replace(scores, views_given=len(views), notes=notes, alignment=aligned)
+
+
+def prune(
+    splats: Splats | SplatFile | None,
+    views: ViewSet | None,
+    budget: Budget,
+    method: Method = DEFAULT,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
+    scores: Scores | None = None,
+    sizes: tuple[float, int] | None = None,
+    origin: Origin | None = None,
+    reusable: bool = False,
+    partial: bool = False,
+    clock: Clock | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Result:
+    """Decide which splats stay and what they become. Nothing is changed or written.
+
+    Parameters
+    ----------
+    splats : Splats or SplatFile
+        In the frame of the views.
+    views : ViewSet
+        Both may be None where `scores` decide and nothing is merged.
+    budget : Budget
+        How much to remove. Where kept splats may change it says how many stay; which ones, and
+        their new values, come from merging.
+    method : Method
+    protected : (N,) bool, optional
+        Splats that are neither removed nor changed.
+    removed : (N,) bool, optional
+        Splats that go before all others, and count as removed; those that are protected stay. The
+        rest is scored without them, and is what the pictures of a PSNR are compared with; they are
+        merged into none.
+    scores : Scores, optional
+        Known scores. Merging measures by itself, and takes only what a threshold keeps from them.
+    sizes : (float, int), optional
+        Bytes of a splat in the output and of everything else there, for a budget in MB. By default
+        those of the file, if `splats` is one.
+    origin : Origin, optional
+        What the splats were before an earlier prune merged them; the pictures are compared to it.
+    reusable : bool
+        Whether the scores are to serve other budgets too. Else scoring ends where this budget does.
+    partial : bool
+        Whether a prune that is cancelled while it refits returns what that had reached; see
+        `Result.stopped`.
+    clock : Clock, optional
+        Gets the times of the steps.
+    progress : callable, optional
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int, optional
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `score` and `selection.select`; also if no splat would be left.
+    """
+    file = splats if isinstance(splats, SplatFile) else None
+    if file is not None:
+        splats = file.splats()
+        sizes = sizes or (file.row_bytes, file.fixed_bytes)
+    if views is not None:
+        refuse_other(views)
+    gone = None
+    if removed is not None and removed.any():
+        gone = removed if protected is None else removed & ~protected
+        refuse_all(gone)
+    run = _Prune(
+        splats, views, budget, method, protected, scores, sizes or (0.0, 0), origin, reusable,
+        clock or Clock(), threads,
+    )  # fmt: skip
+    if scores is not None and gone is None:
+        scores.refuse_unscored()
+    run = run if gone is None or not gone.any() else run.without(gone)
+    result = run.merge(progress) if method.changes else run.delete(progress)
+    if gone is not None and gone.any():
+        result = result.for_all(~gone)
+        result.report["budget"] = {budget.kind: getattr(budget, budget.kind)}
+    for name, mask in (("protected", protected), ("removed_by_user", gone)):
+        result.report["splats"][name] = 0 if mask is None else int(np.count_nonzero(mask))
+    if result.stopped is not None and not partial:
+        raise result.stopped
+    return replace(result, source=file or splats)
+
+
+class _Try(NamedTuple):
+    """How many kept splats reached which PSNR, dB."""
+
+    kept: int
+    psnr: float
+
+    def misses(self, goal: float) -> tuple[bool, float]:
+        """By how much it misses a PSNR, as a key: above is better than below."""
+        return self.psnr < goal - CLOSE, abs(self.psnr - goal)
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """What merging, and refitting if asked, made of splats.
+
+    Attributes
+    ----------
+    merged : Merged
+        Before refitting: by merging, or by deletion where that is better to begin with.
+    done : {"delete", "merge", "refit"}
+    psnr : dict of str to (float or None)
+        The estimates by what was done, dB; None if too little is seen.
+    refitted : Refitted or None
+    seconds : float
+        How long refitting took.
+    stopped : Cancelled or KeyboardInterrupt or None
+        What ended refitting before it was done.
+    """
+
+    merged: Merged
+    done: Way
+    psnr: dict[Way, float | None]
+    refitted: Refitted | None = None
+    seconds: float = 0.0
+    stopped: Cancelled | KeyboardInterrupt | None = None
+
+    @property
+    def reached(self) -> float | None:
+        """The estimate of what was made in the end, dB."""
+        return self.psnr[self.done]
+
+    @property
+    def final(self) -> Merged:
+        """The kept splats as they became in the end."""
+        if self.refitted is None:
+            return self.merged
+        changed = self.merged.changed | self.refitted.changed
+        return replace(self.merged, splats=self.refitted.splats, changed=changed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Prune:
+    """One prune; see `prune` for its values."""
+
+    splats: Any  # Splats, or None where scores are known
+    views: Any  # ViewSet, or None
+    budget: Budget
+    method: Method
+    protected: NDArray[np.bool_] | None
+    scores: Scores | None
+    sizes: tuple[float, int]
+    origin: Origin | None
+    reusable: bool
+    clock: Clock
+    threads: int | None
+
+    @property
+    def used(self) -> ViewSet:
+        """The views that decide."""
+        if self.views is None or self.splats is None:
+            raise RefineError("expected splats and views: scoring and merging need both")
+        return self.views.spread(self.method.views)
+
+    def without(self, gone: NDArray[np.bool_]) -> _Prune:
+        """The prune of what is left when some splats, (N,), have gone."""
+        rest = ~gone
+        return replace(
+            self,
+            splats=None if self.splats is None else self.splats.take(rest),
+            budget=self.budget.after(int(np.count_nonzero(gone)), len(gone)),
+            protected=None if self.protected is None else self.protected[rest],
+            scores=None if self.scores is None else self.scores.of(rest),
+        )
+
+    def delete(self, progress: Progress, tried: Made | None = None) -> Result:
+        """Decide by scores alone; `tried` is what merging had made, if it was tried."""
+        scores = self._scores(progress)
+        report(progress, 1.0, "selecting")
+        keep, psnr = self._select(scores)
+        self.clock.lap("select_s")
+        between = None
+        if scores.between is not None:
+            between = psnr_kept(scores.between, keep, threads=self.threads)
+        elif scores.quality is not None:
+            between = scores.quality.at_between(1.0 - float(np.mean(keep)))
+        facts = reports.of_prune(
+            scores, keep, self.budget, self.method, self.sizes, self.clock,
+            psnr=psnr, between=between, measured={"delete": psnr}, tried=tried,
+            timed=self.scores is None,
+        )  # fmt: skip
+        return Result(keep, facts, scores)
+
+    def merge(self, progress: Progress) -> Result:
+        """Merge down to the budget, refit if asked; delete where that is as good."""
+        views, goal = len(self.used), self.budget.psnr
+        count = len(self.splats)
+        refits = isinstance(self.method, Refit)
+        scoring, making = stages(
+            progress, seconds("measure", count, views), self._making_seconds(count // 2)
+        )
+        known = None
+        if self.budget.needs_scores:
+            scores = self._scores(scoring)
+        else:
+            scores, known = occlusion.score_once(
+                self.splats, self.used, few_views=goal is None,
+                progress=scoring, threads=self.threads,
+            )  # fmt: skip
+            scores = _with_views(scores, self.splats, self.views, self.used, self.threads)
+            if goal is not None:
+                scores = with_quality(scores, protected=self.protected, threads=self.threads)
+            self.clock.lap("score_s")
+        keep, plain = np.ones(count, np.bool_), None
+        if not (refits and goal is not None):
+            report(making, 0.0, "selecting")
+            keep, plain = self._select(scores)
+            self.clock.lap("select_s")
+        deletes = replace(self, method=Occlusion(self.method.views), scores=None)
+        if not refits and self._deletion_will_do(scores, plain):
+            return self._deleted(deletes.delete(making), None)
+        if known is None:
+            scores, known = occlusion.score_once(
+                self.splats, self.used, few_views=True, progress=making, threads=self.threads
+            )
+        if goal is None:
+            made = self._to_count(keep, scores, known, making)
+        else:
+            made = self._to_psnr(goal, scores, known, making)
+        self.clock.lap("merge_s")
+        if not refits and self._deletion_is_as_good(keep, plain, made):
+            return self._deleted(deletes.delete(silent, made), made)
+        measured = dict(made.psnr)
+        if goal is None:  # else deletion keeps another number of splats
+            measured.setdefault("delete", plain)
+        final = made.final
+        facts = reports.of_prune(
+            scores, final.keep, self.budget, self.method, self.sizes, self.clock,
+            psnr=made.reached, between=self._between(scores, made), measured=measured, made=made,
+            timed=True,
+        )  # fmt: skip
+        return Result(
+            final.keep, facts, scores, None if made.done == "delete" else final, made.stopped
+        )
+
+    def _deleted(self, result: Result, tried: Made | None) -> Result:
+        """The result of deleting where merging was asked for."""
+        facts = result.report
+        facts["method"]["asked"] = self.method.name
+        facts["settings"] = self.method.facts()
+        if facts["splats"]["removed"]:
+            reached = None if tried is None else tried.reached
+            facts["notes"].append(reports.deleted_note(facts["estimated_psnr"], reached))
+        return result
+
+    def _scores(self, progress: Progress) -> Scores:
+        """The scores that decide: those given, or new ones."""
+        scores = self.scores
+        if scores is None:
+            scores = score(
+                self.splats, self.views or self.used, self.method,
+                protected=self.protected, quality=self.budget.psnr is not None,
+                settled=self._settled(), progress=progress, threads=self.threads,
+            )  # fmt: skip
+        elif self.budget.psnr is not None and self.protected is not None:
+            # Others may have been protected when these were scored.
+            scores = with_quality(scores, protected=self.protected, threads=self.threads)
+        self.clock.lap("score_s")
+        return scores
+
+    def _settled(self) -> int | None:
+        """How many splats are needed in their final order; None for all."""
+        if self.reusable:
+            return None
+        total = len(self.splats)
+        spared = 0 if self.protected is None else int(np.count_nonzero(self.protected))
+        gone = needed(self.budget.removals(total, *self.sizes), total)
+        # Those that are protected stay, wherever in the order they are.
+        return None if gone is None or gone + spared >= total else gone + spared
+
+    def _select(self, scores: Scores) -> tuple[NDArray[np.bool_], float | None]:
+        """Which splats deletion keeps, (N,), and the estimated PSNR, dB."""
+        keep = select(
+            scores, self.budget, protected=self.protected,
+            row_bytes=self.sizes[0], fixed_bytes=self.sizes[1],
+        )  # fmt: skip
+        if scores.ray_sample is not None:
+            return keep, psnr_kept(scores.ray_sample, keep, threads=self.threads)
+        if scores.quality is not None:
+            return keep, scores.quality.at(1.0 - float(np.mean(keep)))
+        return keep, None
+
+    def _deletion_will_do(self, scores: Scores, plain: float | None) -> bool:
+        """Whether merging need not be tried, given what deletion reaches, dB."""
+        if self.budget.psnr is None:
+            return deletion_will_do(plain)
+        return quality_of(scores).share(self.budget.psnr, "merge") <= PLAIN
+
+    def _deletion_is_as_good(
+        self, keep: NDArray[np.bool_], plain: float | None, made: Made
+    ) -> bool:
+        """Whether deletion, which keeps (N,) and reaches `plain` dB, is about as good."""
+        if plain is None or made.reached is None:
+            return True
+        if self.budget.psnr is None:
+            return plain > made.reached - AS_GOOD
+        missed = made.reached < self.budget.psnr - CLOSE and made.reached < plain
+        return missed or np.count_nonzero(keep) <= len(made.merged.splats)
+
+    def _making_seconds(self, left: int) -> float:
+        """Expected seconds of merging down to so many splats, and refitting them if asked."""
+        count, views = len(self.splats), len(self.used)
+        merged = len(stage_counts(count, left))
+        merge = merged * (seconds("merge", count) + seconds("measure", count / 2, views / PARTS))
+        if not isinstance(self.method, Refit):
+            return merge
+        rounds = expected_rounds(left, self.method.rounds)
+        return merge + rounds * seconds("refit", count + left, views)
+
+    def _to_count(
+        self,
+        keep: NDArray[np.bool_],
+        scores: Scores,
+        known: Measured,
+        progress: Progress,
+    ) -> Made:
+        """Merge until as many splats are left as deletion keeps, (N,); refit them if asked."""
+        origin, used, left = self.origin, self.used, int(np.count_nonzero(keep))
+        truth = scores.ray_sample if origin is None else origin.ray_sample
+        total, views = len(self.splats), len(used)
+        merge = seconds("merge", total) + seconds("measure", left, views)
+        refit = self._making_seconds(left) - merge if isinstance(self.method, Refit) else 0.0
+        merging_progress, comparing, refitting = stages(
+            progress, merge, seconds("compare", left, views), max(refit, 0.0)
+        )
+
+        def estimated(splats: Splats, told: Progress = silent) -> float | None:
+            if truth is None:
+                return None
+            return psnr_against(truth, splats, used, progress=told, threads=self.threads)
+
+        merged = merge_down(
+            self.splats, used, left,
+            known=(scores, known), protected=self.protected,
+            began=None if origin is None else len(origin.splats),
+            progress=merging_progress, threads=self.threads,
+        )  # fmt: skip
+        psnr = estimated(merged.splats, comparing)
+        if not isinstance(self.method, Refit):
+            return Made(merged, "merge", {"merge": psnr})
+        plain = estimated(self.splats.take(keep))
+        made = Made(merged, "merge", {"delete": plain, "merge": psnr})
+        if plain is not None and psnr is not None and plain > psnr:
+            made = replace(made, merged=_as_deleted(self.splats, keep), done="delete")
+        made = self._refitted(made, refitting)
+        if made.refitted is None or made.stopped is not None:
+            return made
+        return replace(made, psnr=made.psnr | {"refit": estimated(made.refitted.splats)})
+
+    def _to_psnr(self, goal: float, scores: Scores, known: Measured, progress: Progress) -> Made:
+        """Merge to as few splats as keep a PSNR, dB.
+
+        What a number of kept splats reaches is read from the curve of the scores, put right by what
+        the last try reached; between a try that keeps the PSNR and one that does not, from these.
+        """
+        total, curve = len(self.splats), quality_of(scores)
+        way: Way = "refit" if isinstance(self.method, Refit) else "merge"
+        lost = None if self.origin is None else self.origin.psnr
+        tries = stages(progress, 1.0, 1.0, 0.2)
+        gone, tried, best = curve.share(left_to_lose(goal, lost), way), list[_Try](), None
+        for number in range(TRIES):
+            count = max(total - math.floor(gone * total), 1)
+            if any(count == one.kept for one in tried):
+                break
+            keep = select(scores, Budget(keep=count), protected=self.protected)
+            made = self._to_count(keep, scores, known, tries[number])
+            if made.stopped is not None:
+                return replace(best or made, stopped=made.stopped)
+            if made.reached is None:
+                return made
+            tried.append(_Try(count, made.reached))
+            if best is None or min(tried, key=lambda one: one.misses(goal)) is tried[-1]:
+                best = made
+            if abs(made.reached - goal) <= CLOSE:
+                break
+            gone = 1.0 - len(made.merged.splats) / total
+            gone = _share_between(tried, goal, total) or curve.share(
+                goal - made.reached + curve.at(gone, way), way
+            )
+        assert best is not None  # every try gives one
+        return best
+
+    def _refitted(self, made: Made, progress: Progress) -> Made:
+        """Refit what was made to what the views see of the unpruned splats.
+
+        Where `progress` cancels, and where a signal does, the rounds so far are returned.
+        """
+        assert isinstance(self.method, Refit)
+        merged, start = made.merged, time.perf_counter()
+        if merged.keep.all() and self.origin is None:
+            return made
+        done: Refitted | None = None
+        stopped = None
+        return_freed()
+        try:
+            for reached in refit_rounds(
+                merged.splats, self.splats if self.origin is None else self.origin.splats,
+                self.used, self.method.rounds,
+                protected=None if self.protected is None else self.protected[merged.keep],
+                progress=lambda fraction, _what: progress(fraction, REFITTING),
+                threads=self.threads,
+            ):  # fmt: skip
+                done = reached
+        except (Cancelled, KeyboardInterrupt) as stop:
+            rounds = 0 if done is None else done.rounds
+            after = f"after round {rounds}" if rounds else "before its first round was done"
+            stop.add_note(f"refitting was stopped {after}")
+            stopped = stop.with_traceback(None)  # without what was worked on
+            if not rounds:
+                return replace(made, stopped=stopped)
+        assert done is not None  # what is to be refitted is yielded first
+        return replace(
+            made, done="refit", psnr=made.psnr | {"refit": done.psnr}, refitted=done,
+            seconds=time.perf_counter() - start, stopped=stopped,
+        )  # fmt: skip
+
+    def _between(self, scores: Scores, made: Made) -> float | None:
+        """The estimate in views between those that decided, dB; None where nothing tells it."""
+        rays = scores.between if self.origin is None else self.origin.between
+        if rays is None or made.stopped is not None:
+            return None
+        return psnr_against(rays, made.final.splats, self.used, threads=self.threads)
+
+
+def _as_deleted(splats: Splats, keep: NDArray[np.bool_]) -> Merged:
+    """What deletion leaves, as merging returns it."""
+    left = copied(splats, np.flatnonzero(keep))
+    return Merged(left, keep, np.zeros(len(left), np.bool_), 0, len(keep) - len(left))
+
+
+def _share_between(tried: Sequence[_Try], goal: float, total: int) -> float | None:
+    """Share of `total` that has to go by the tries next to a PSNR; None without both.
+
+    The PSNR is taken as linear in the logarithm of the odds of that share, as by `Quality.at`.
+    """
+    above = min((one for one in tried if one.psnr >= goal), default=None)
+    below = max((one for one in tried if one.psnr < goal), default=None)
+    if above is None or below is None:
+        return None
+    odds = np.log([total / one.kept - 1.0 for one in (below, above)])
+    place = np.interp(goal, [below.psnr, above.psnr], odds)
+    return float(1.0 / (1.0 + np.exp(-place)))
+
+
+def merge_down(
+    splats: Splats,
+    views: ViewSet,
+    count: int,
+    *,
+    known: tuple[Scores, Measured] | None = None,
+    began: int | None = None,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Merged:
+    """Reduce splats to `count` that the others are merged into.
+
+    Parameters
+    ----------
+    splats, progress, threads
+        See `score`.
+    views : ViewSet
+        All of them are used.
+    count : int
+        How many stay.
+    known : tuple of Scores and Measured, optional
+        The results of `occlusion.score_once` for these splats and views, if known.
+    began : int, optional
+        How many splats there were before others were merged into these. What is deleted first, and
+        how cheap merging is, go by the share of them that has gone.
+    protected : (N,) bool, optional
+        Splats that are neither removed nor changed.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `score`.
+    """
+    total = len(splats)
+    if known is None:
+        known = occlusion.score_once(splats, views, few_views=True, threads=threads)
+    scores, measured = known
+    began = total if began is None else began
+    # How many of all are deleted before any are merged, and how many of those are still there.
+    deleted = max(min(math.floor(FIRST * began), began - count), 0)
+    first = max(deleted - (began - total), 0)
+    # Undrawable splats have the lowest scores, so these go first.
+    rest = select(scores, Budget(keep=total - first), protected=protected)
+    # The deleted splats hid almost nothing, so the first stage need not measure again.
+    sums = np.array([measured.contribution, measured.error])
+    del known, scores, measured
+    turns = itertools.count()
+
+    def measure(now: Splats, expected: NDArray[np.float64], told: Progress) -> NDArray[np.float64]:
+        measured, share = occlusion.measure_part(
+            now, views, next(turns), PARTS, progress=told, threads=threads
+        )
+        return np.array([measured.contribution, measured.error]) + (1.0 - share) * expected
+
+    with np.errstate(under="ignore"):  # as in `score`
+        return merge(
+            splats, views, sums, measure, count,
+            began=began - deleted, deleted=~rest, protected=protected,
+            progress=progress, threads=threads,
+        )  # fmt: skip
