@@ -232,7 +232,7 @@ def test_a_list_of_views_is_refused_with_what_was_expected(splats, method):
     ("make", "words"),
     [
         (lambda: Occlusion(-1), "views is -1, expected 0"),
-        (lambda: Refit(rounds=0), "rounds is 0, expected 1 or more"),
+        (lambda: Refit(rounds=0), "rounds is 0, expected 1 to 100"),
     ],
 )
 def test_settings_out_of_range_are_refused(make, words):

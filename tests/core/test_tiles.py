@@ -282,7 +282,7 @@ def test_merging_by_regions_is_as_good_as_merging_one_file(tmp_path, views, monk
     psnr = psnr_against(rays, made, views.spread(64))
     assert psnr > one - 0.3
     assert len(made) == told["splats"]["kept"] == whole.report["splats"]["kept"]
-    assert told["estimated_psnr"] == pytest.approx(psnr, abs=0.1)
+    assert min(told["estimated_psnr"], 60.0) == pytest.approx(min(psnr, 60.0), abs=0.1)
     if ratio < 0.1:
         found = rows_in(tmp_path / "out", tiles)
         assert found.tobytes() == file.rows[whole.keep].tobytes()
@@ -336,7 +336,7 @@ def test_refitting_by_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, 
     monkeypatch.setattr(regions, "REGION", 1500)
     told = prune_tiles(tiles, tmp_path / "out", views, HALF, Refit(8))
     before = prune_tiles(tiles, tmp_path / "merged", views, HALF, MERGE)
-    prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", refit)
+    prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, HALF, Refit(8))
 
     used = views.spread(8)
     rays = validation_rays(read_ply(tmp_path / "whole.ply").splats(), used)
@@ -357,7 +357,7 @@ def test_what_no_view_shows_is_refitted_to_nothing(tmp_path, tiles, views, monke
     monkeypatch.setattr(regions, "REGION", 1500)
     two = ViewSet(views.views[:2])
 
-    told = prune_tiles(tiles, tmp_path / "out", **asked(two, HALF, OCCLUSION, "refit"))
+    told = prune_tiles(tiles, tmp_path / "out", **asked(two, HALF, Refit(8)))
 
     made = rows_in(tmp_path / "out", tiles)
     assert 0 < told["refitted"]["changed"] < len(made) // 2
