@@ -48,6 +48,8 @@ def main(blend: str, cloud: str, pictures: str) -> Generator[float, None, dict[s
     yield from hand.click("refine.score(")
     yield from window.until(lambda: gate.idle() and record(), "it is over")
     found["scored"] = record()
+    yield from hand.move(hand.area.x + 50, hand.area.y + 50)  # away from that button
+    yield 0.5
 
     gate.opened.clear()
     yield from hand.click("refine.score(")
