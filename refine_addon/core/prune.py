@@ -518,7 +518,7 @@ class _Prune:
         psnr = estimated(merged.splats, comparing)
         if not isinstance(self.method, Refit):
             return Made(merged, "merge", {"merge": psnr})
-        plain = estimated(self.splats.take(keep))
+        plain = estimated(copied(self.splats, np.flatnonzero(keep), self.threads))
         made = Made(merged, "merge", {"delete": plain, "merge": psnr})
         if plain is not None and psnr is not None and plain > psnr:
             made = replace(made, merged=_as_deleted(self.splats, keep), done="delete")

@@ -378,8 +378,8 @@ def test_views_between_decide_besides_those_of_the_file(capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--survivors", "refit", "--rounds", "1000000"], "rounds is 1000000, expected 1 to 100"),
-        (["--rounds", "3"], "rounds is 3, expected only with --survivors refit"),
+        (["--method", "refit", "--rounds", "1000000"], "rounds is 1000000, expected 1 to 100"),
+        (["--rounds", "3"], "rounds is 3, expected only with --method refit"),
         (["--views-between", "1000000"], "views in between are 1,000,000, expected 0 to 1,000"),
     ],
 )
