@@ -350,9 +350,7 @@ def test_among_splats_that_nearly_touch_means_move_only_where_it_is_worth_it(mon
     pytest.importorskip("numba", reason="what benchmarks need, which make the scene")
     capture = importlib.import_module("benchmarks.speed.capture")
     splats, views = capture.make(4_000), capture.cameras(8, 160)
-    survivors = core.prune(splats, views, core.Budget(ratio=0.5), methods.Merge(0)).survivors(
-        splats
-    )
+    survivors = core.prune(splats, views, core.Budget(ratio=0.5), methods.Merge(0)).splats
 
     every = refit.refit(survivors, splats, views, 1)
     monkeypatch.setattr(refit, "LEAST_MOVE", 0.0)

@@ -732,20 +732,20 @@ def test_a_job_that_was_interrupted_goes_on_behind_the_last_stage(
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "once")
 
 
-@pytest.mark.parametrize(("way", "stop"), [("unchanged", "selecting"), ("absorb", "merging")])
-def test_scores_by_occlusion_are_a_stage(tmp_path, tiles, views, monkeypatch, way, stop):
+@pytest.mark.parametrize(("method", "stop"), [(OCCLUSION, "selecting"), (MERGE, "merging")])
+def test_scores_by_occlusion_are_a_stage(tmp_path, tiles, views, monkeypatch, method, stop):
     """What views saw is kept with the rays, which tell the estimates."""
-    request = asked(views, HALF, OCCLUSION, way)
-    once_told = prune_tiles(tiles, tmp_path / "once", request)
+    request = asked(views, HALF, method)
+    once_told = prune_tiles(tiles, tmp_path / "once", **request)
 
     def progress(_fraction, what):
         if what == stop:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        prune_tiles(tiles, tmp_path / "out", request, progress=progress)
+        prune_tiles(tiles, tmp_path / "out", **request, progress=progress)
     monkeypatch.setattr(occlusion, "_score_now", None)
-    told = prune_tiles(tiles, tmp_path / "out", request)
+    told = prune_tiles(tiles, tmp_path / "out", **request)
 
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "once")
     for key in ("estimated_psnr", "estimated_psnr_between", "quality", "views", "weights"):
