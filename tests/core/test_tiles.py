@@ -744,7 +744,7 @@ def test_scores_by_occlusion_are_a_stage(tmp_path, tiles, views, monkeypatch, me
 
     with pytest.raises(KeyboardInterrupt):
         prune_tiles(tiles, tmp_path / "out", **request, progress=progress)
-    monkeypatch.setattr(occlusion, "_score_now", None)
+    monkeypatch.setattr(occlusion.coverage, "floor_weights", None)
     told = prune_tiles(tiles, tmp_path / "out", **request)
 
     assert bytes_in(tmp_path / "out") == bytes_in(tmp_path / "once")

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from .. import execute
 from ..errors import RefineError
 from ..execute import Progress, part, report, seconds, silent, stages
-from ..mapped import once
+from ..mapped import note, noted
 from ..scores import Scores, shares_gone
 from ..splats import Splats, folder_of, refuse_undrawable
 from ..views import ViewSet
@@ -184,19 +184,15 @@ def measure_part(
     return measured, weight / math.fsum(weight for _, weight in ordered)
 
 
-def _score(splats, views, rounds, settled, *how):
+def _score(splats, views, rounds, settled, sampling, few_views, progress, threads):
     """Scores, and what was measured of all N; see `score` and `score_once`.
 
     Of splats in files they are a stage of the job.
     """
-    return once(
-        folder_of(splats), f"scores-{rounds}-{settled}",
-        lambda: _score_now(splats, views, rounds, settled, *how),
-    )  # fmt: skip
-
-
-def _score_now(splats, views, rounds, settled, sampling, few_views, progress, threads):
-    """What `_score` returns."""
+    job, stage = folder_of(splats), f"scores-{rounds}-{settled}"
+    done, found = (False, None) if job is None else noted(job, stage)
+    if done:
+        return found
     count = len(splats)
     if not count:
         raise RefineError("there are no splats to score")
@@ -252,7 +248,8 @@ def _score_now(splats, views, rounds, settled, sampling, few_views, progress, th
         {"floor": weights}, method="occlusion", ray_sample=samples[0], between=between,
         settled=settled,
     )  # fmt: skip
-    return scores, everything
+    found = scores, everything
+    return found if job is None else note(job, stage, found)
 
 
 def _folds(whole, of_groups, errors, prior, progress):
