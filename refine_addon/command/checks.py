@@ -11,7 +11,7 @@ from pathlib import Path
 from ..core import RefineError
 from ..core.formats.registry import SUFFIXES, format_named, without_suffix
 from ..core.lod import is_streamed, level_paths
-from ..core.urls import Url, refuse_url
+from ..core.whole_file import Url, refuse_url
 from . import zones
 from .options import DEFAULT_LEVELS, arrangement, budget, cleaning, levels, method
 from .report import is_report

@@ -7,9 +7,9 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-from ..core import ViewSet, picture_files, prune_file, prune_tiles
+from ..core import ViewSet, prune_file, prune_tiles
 from ..core.formats.registry import without_suffix
-from ..core.picture_files import PictureFiles
+from ..core.pictures import PictureFiles, measured_in_words
 from ..core.quality.curve import UNSEEN, in_views, in_words
 from ..core.tiles.cluster import Cluster, cluster
 from ..core.tiles.storage import located
@@ -123,7 +123,7 @@ def _say_result(run: Run, label: str, done: dict[str, Any]) -> None:
     if quality:
         run.terminal.say(f"  quality: {quality}")
     if "pictures" in done:
-        measured = picture_files.in_words(done["pictures"])
+        measured = measured_in_words(done["pictures"])
         run.terminal.say(f"  pictures: {measured} -> {run.options.pictures}")
     run.terminal.notes(done["notes"])
 

@@ -13,8 +13,7 @@ from ..core import RefineError, ViewSet, read_cameras, with_views_between
 from ..core.errors import printable
 from ..core.execute import Progress, TimeLeft, in_time
 from ..core.report import MANY_UNSEEN
-from ..core.urls import Url
-from ..core.whole_file import new_folder
+from ..core.whole_file import Url, new_folder
 from . import report
 from .terminal import Terminal, complain, described
 from .zones import words

@@ -23,8 +23,7 @@ from .selection import Budget, rank, select
 from .solid import Solid
 from .splats import Splats
 from .tiles.prune import prune_tiles
-from .views import View, ViewSet
-from .views_between import with_views_between
+from .views import View, ViewSet, with_views_between
 from .volumes import Box, MovedVolume, Sphere, Zone, forced
 
 __all__ = [

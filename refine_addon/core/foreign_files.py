@@ -7,7 +7,7 @@ import zlib
 from pathlib import Path, PurePosixPath
 
 from .errors import RefineError
-from .urls import Url
+from .whole_file import Url
 
 _POINTER = b"version https://git-lfs.github.com/spec/"
 GZIP = b"\x1f\x8b"

@@ -24,7 +24,7 @@ from .formats.ply_columns import other_properties
 from .formats.registry import format_named, read_splats, refuse_unknown_size, write_splats
 from .formats.streamed_sog import INDEX
 from .methods import DEFAULT, Method
-from .picture_files import PictureFiles
+from .pictures import PictureFiles
 from .prune import prune, score
 from .quality.psnr import psnr_against
 from .rendering import Model

@@ -14,7 +14,7 @@ from ..core.formats.format import Format
 from ..core.formats.registry import format_named, refuse_unknown_size
 from ..core.methods import DEFAULT, Method
 from ..core.operations import Scene, prune_scene, run, score_scene
-from ..core.picture_files import PictureFiles
+from ..core.pictures import PictureFiles
 from ..core.result import Result
 from ..core.selection import Budget
 from ..core.views import ViewSet

@@ -13,8 +13,7 @@ import numpy as np
 
 from ..cameras.sets import CameraChoice
 from ..core.execute import Progress, part
-from ..core.picture_files import KINDS
-from ..core.pictures import AMPLIFIED, Comparison, compare
+from ..core.pictures import AMPLIFIED, KINDS, Comparison, compare
 from ..core.prune import prune
 from ..core.quality.curve import in_words
 from ..core.splats import Splats

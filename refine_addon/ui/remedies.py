@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ..cameras.objects import UPRIGHT, WEIGHT, world_matrix
 from ..cameras.sets import CameraChoice, create_cameras
 from ..core.errors import RefineError
-from ..core.views import ViewSet
-from ..core.views_between import with_views_between
+from ..core.views import ViewSet, with_views_between
 from ..core.volumes import Forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit

@@ -8,8 +8,7 @@ import numpy as np
 
 from benchmarks.renderer.rasterizer import render
 from refine_addon.core import read_cameras, read_splats
-from refine_addon.core.picture_files import chosen
-from refine_addon.core.pictures import compare
+from refine_addon.core.pictures import CAMERAS, compare
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 
@@ -22,7 +21,7 @@ def test_pictures_are_those_of_the_reference_renderer():
     splats = read_splats(ROOM / "point_cloud.ply").splats()
     half = splats.take(np.random.default_rng(0).random(len(splats)) < 0.5)
 
-    for found in compare(splats, half, chosen(read_cameras(ROOM / "cameras.json"))):
+    for found in compare(splats, half, read_cameras(ROOM / "cameras.json").spread(CAMERAS)):
         near = found.view.near
         one, other = (render(s, found.view, near=near).clip(0.0, 1.0) for s in (splats, half))
         assert -10.0 * np.log10(np.mean((found.before / 255.0 - one) ** 2)) > 58.5

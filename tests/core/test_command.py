@@ -29,8 +29,7 @@ from refine_addon.core import (
 )
 from refine_addon.core.formats import ply
 from refine_addon.core.images import png
-from refine_addon.core.picture_files import PictureFiles, chosen
-from refine_addon.core.pictures import compare
+from refine_addon.core.pictures import CAMERAS, PictureFiles, compare
 from refine_addon.core.scoring import closed_form
 from refine_addon.version import VERSION
 from tests.strategies import plain_header, plain_ply, splat_names
@@ -477,7 +476,7 @@ def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
     made = folder / options[1] if "-o" in options else None
     decided = prune(before, read_cameras(folder / "cameras.json"), Budget(ratio=0.5))
     after = read_splats(made).splats() if made else decided.splats
-    found = compare(before, after, chosen(read_cameras(folder / "cameras.json")))
+    found = compare(before, after, read_cameras(folder / "cameras.json").spread(CAMERAS))
     assert [view["psnr"] for view in drawn["views"]] == [round(one.psnr, 2) for one in found]
     for view, one in zip(drawn["views"], found, strict=True):
         assert (folder / view["after"]).read_bytes() == png(one.after)

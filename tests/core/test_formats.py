@@ -24,7 +24,7 @@ from refine_addon.core import (
 )
 from refine_addon.core.formats import registry
 from refine_addon.core.formats.registry import SUFFIXES
-from refine_addon.core.picture_files import PictureFiles
+from refine_addon.core.pictures import PictureFiles
 from refine_addon.core.splats import base_color, opacity, opacity_logits, rotation_matrices
 from tests.strategies import ply_of, splat_names
 from tests.users import own_folder

@@ -14,8 +14,16 @@ import pytest
 from refine_addon.core import Budget, Merge, Occlusion, RefineError, Splats, prune
 from refine_addon.core.execute import Cancelled
 from refine_addon.core.images import png
-from refine_addon.core.picture_files import KINDS, PictureFiles, chosen, in_words
-from refine_addon.core.pictures import AMPLIFIED, Comparison, compare, fitted
+from refine_addon.core.pictures import (
+    AMPLIFIED,
+    CAMERAS,
+    KINDS,
+    Comparison,
+    PictureFiles,
+    compare,
+    fitted,
+    measured_in_words,
+)
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import cast
@@ -237,7 +245,7 @@ def test_files_are_named_after_splats_and_camera_and_hold_the_pictures(tmp_path)
         for kind in KINDS:
             assert np.array_equal(pixels_of(Path(told[kind]).read_bytes()), getattr(one, kind))
     assert facts["psnr"] == round(sum(one.psnr for one in found) / 3, 2)
-    assert in_words(facts).startswith(f"{facts['psnr']:.1f} dB measured in 3 views (")
+    assert measured_in_words(facts).startswith(f"{facts['psnr']:.1f} dB measured in 3 views (")
 
 
 def test_a_few_views_are_drawn_that_are_far_from_each_other():
@@ -247,7 +255,7 @@ def test_a_few_views_are_drawn_that_are_far_from_each_other():
         for k in range(10)
     ))  # fmt: skip
 
-    assert [view.name for view in chosen(views)] == ["0", "4", "9"]
+    assert [view.name for view in views.spread(CAMERAS)] == ["0", "4", "9"]
 
 
 def test_a_picture_that_exists_is_refused_before_the_work(tmp_path):

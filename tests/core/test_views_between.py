@@ -18,7 +18,7 @@ from refine_addon.core import (
 )
 from refine_addon.core.quality.curve import Quality
 from refine_addon.core.quality.psnr import psnr_kept
-from refine_addon.core.views_between import MOST, views_between
+from refine_addon.core.views import MOST_BETWEEN, views_between
 from tests.core.test_invariance import MOTIONS, moved
 from tests.core.test_levels import merges  # noqa: F401 - a fixture
 from tests.core.test_occlusion import splats_of
@@ -206,7 +206,7 @@ def test_views_that_share_little_are_told_to_know_little_of_others():
     assert not [note for note in enough.report["notes"] if "one view or none" in note]
 
 
-@pytest.mark.parametrize("count", [-1, MOST + 1, 1_000_000])
+@pytest.mark.parametrize("count", [-1, MOST_BETWEEN + 1, 1_000_000])
 def test_more_views_in_between_than_can_be_found_soon_are_refused(count):
     """A million would compare as many views with each other; with what was expected."""
     with pytest.raises(RefineError, match=f"views in between are {count:,}, expected 0 to 1,000"):

@@ -28,8 +28,7 @@ from ..foreign_files import refuse_foreign_splats
 from ..rendering import MODELS, Model
 from ..splats import Splats
 from ..splats import with_model as drawn_as
-from ..urls import Url
-from ..whole_file import expanded, refuse_mapped, whole_file
+from ..whole_file import Url, expanded, refuse_mapped, whole_file
 from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, splats_from_columns
 
 HEADER_LIMIT = 1 << 20

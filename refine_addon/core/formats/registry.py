@@ -18,8 +18,7 @@ from ..foreign_files import refuse_pointer
 from ..place import LARGEST_NUMBER
 from ..rendering import Model
 from ..splats import Splats, drawable, with_model
-from ..urls import Url
-from ..whole_file import expanded, whole_file
+from ..whole_file import Url, expanded, whole_file
 from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
 from .format import Format
 from .ply import SplatFile, read_ply

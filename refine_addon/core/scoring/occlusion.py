@@ -30,8 +30,7 @@ from ..execute import Progress, part, report, seconds, silent, stages
 from ..mapped import note, noted
 from ..scores import Scores, shares_gone
 from ..splats import Splats, folder_of, refuse_undrawable
-from ..views import ViewSet
-from ..views_between import views_between
+from ..views import ViewSet, views_between
 from ..visibility import projection
 from ..visibility.measuring import SECONDS, Measured, Sampling, measure, view_groups
 from ..visibility.ray_sample import RaySample

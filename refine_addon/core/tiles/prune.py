@@ -25,8 +25,8 @@ from ..report import Clock
 from ..result import Result
 from ..selection import Budget
 from ..splats import Splats, on_disk
-from ..urls import Url
 from ..views import ViewSet
+from ..whole_file import Url
 from .cluster import Cluster
 from .source import ROWS, Tile, copied, tiles_at
 from .storage import located, new_folder

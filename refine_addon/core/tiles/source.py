@@ -24,7 +24,7 @@ from ..formats.ply import (
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..rendering import Model
 from ..splats import Splats, joined, on_disk, with_model
-from ..urls import Url
+from ..whole_file import Url
 from . import storage
 
 ROWS = 1 << 16

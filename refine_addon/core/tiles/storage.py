@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from .. import whole_file
 from ..errors import RefineError, reason_of
 from ..mapped import Interrupted
-from ..urls import Url, is_url
-from ..whole_file import expanded
+from ..whole_file import Url, expanded, is_url
 
 _FLEETING = ("url", "access")
 """Parts of the names of facts about a file that change though it does not: where a server sends

@@ -18,8 +18,7 @@ from ..formats.ply import with_count, with_model, write_rows
 from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
 from ..mapped import Interrupted, Mapped, note, noted, writing
 from ..splats import Splats
-from ..urls import Url
-from ..whole_file import refuse_one_file
+from ..whole_file import Url, refuse_one_file
 from . import storage
 from .source import ROWS, Tile, bytes_of, rows_of
 
