@@ -366,6 +366,9 @@ class _Prune:
         views, goal = len(self.used), self.budget.psnr
         count = len(self.splats)
         refits = isinstance(self.method, Refit)
+        given = None if refits else self.scores  # these decide which splats are deleted instead
+        if given is not None and (given.settled is not None or (goal and not given.quality)):
+            given = None  # they were made for another budget
         scoring, making = stages(
             progress, seconds("measure", count, views), self._making_seconds(count // 2)
         )
@@ -384,9 +387,12 @@ class _Prune:
         keep, plain = np.ones(count, np.bool_), None
         if not (refits and goal is not None):
             report(making, 0.0, "selecting")
-            keep, plain = self._select(scores)
+            rays = scores.ray_sample
+            keep, plain = self._select(scores if given is None else replace(given, ray_sample=rays))
             self.clock.lap("select_s")
-        deletes = replace(self, method=Occlusion(self.method.views), scores=None)
+        by_formula = given is not None and given.method == ClosedForm.name
+        deletion = ClosedForm if by_formula else Occlusion
+        deletes = replace(self, method=deletion(self.method.views), scores=given)
         if not refits and self._deletion_will_do(scores, plain):
             return self._deleted(deletes.delete(making), None)
         if known is None:

@@ -393,6 +393,24 @@ def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, me
     assert at_once.report == later.report
 
 
+@pytest.mark.parametrize("budget", [Budget(ratio=0.04), Budget(psnr=80.0)])
+def test_known_scores_decide_where_merging_deletes(small, views, budget, monkeypatch):
+    """Apply keeps what the panel marked by these scores, and does not score again."""
+    splats = read_ply(small).splats()
+    scores = score(splats, views, Occlusion(3))
+    marked = prune(None, None, budget, Occlusion(12), scores=scores)
+    fresh = prune(splats, views, budget, Occlusion(12))
+    monkeypatch.delattr(PRUNE.occlusion, "score")
+
+    result = prune(splats, views, budget, Merge(12), scores=scores)
+
+    assert result.merged is None
+    assert result.report["method"]["asked"] == "merge"
+    assert result.report["method"]["done"] == "occlusion"
+    np.testing.assert_array_equal(result.keep, marked.keep)
+    assert (result.keep != fresh.keep).any()
+
+
 def test_splats_without_scores_need_views_to_decide(small):
     """And absorbing needs both."""
     with pytest.raises(RefineError, match="need both"):
