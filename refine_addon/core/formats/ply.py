@@ -20,6 +20,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import plyfile
+from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
@@ -150,8 +151,8 @@ class SplatFile:
         if model not in MODELS:
             raise RefineError(f"model is {model!r}, expected one of {', '.join(MODELS)}")
         if THIRD_SCALE not in (self.rows.dtype.names or ()):
-            problem = f"splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
-            raise RefineError(f"{self.path}: {problem}")
+            what = f"splats without {THIRD_SCALE} are drawn as 2dgs"
+            raise RefineError(f"{self.path}: {what}, got {model}")
         return replace(self, header=with_model(self.header, model))
 
     def without_third_scale(self) -> SplatFile:
@@ -159,13 +160,9 @@ class SplatFile:
         names = self.rows.dtype.names or ()
         if self.model != "2dgs" or THIRD_SCALE not in names:
             return self
-        left = [name for name in names if name != THIRD_SCALE]
-        rows = np.empty(len(self), [(name, self.rows.dtype[name]) for name in left])
-        for name in left:
-            rows[name] = self.rows[name]
-        return replace(
-            self, rows=rows, header=with_model(new_header(rows.dtype, len(rows)), "2dgs")
-        )
+        rows = repack_fields(self.rows[[name for name in names if name != THIRD_SCALE]])
+        header = with_model(new_header(rows.dtype, len(rows)), "2dgs")
+        return replace(self, rows=rows, header=header)
 
     def splats(self) -> Splats:
         """Rows as splats; the arrays are views of the file if its layout permits."""
@@ -190,8 +187,7 @@ class SplatFile:
     def notes(self, keep: NDArray[np.bool_]) -> list[str]:
         """What the user should know about a file of the kept rows, in sentences."""
         said = "beside the splats is kept as it is; its indices may point past the end"
-        beside = [] if keep.all() else self.indexing
-        return [*self.remarks, *(f"element '{name}' {said}" for name in beside)]
+        return [*self.remarks, *(f"element '{e}' {said}" for e in self.indexing if not keep.all())]
 
     def write(
         self,
@@ -259,16 +255,12 @@ class SplatFile:
                 raise RefineError(f"{self.path}: {problem}")
             if stored is None:
                 declared.append(f"property {kind} {name}".encode())
-        if declared:
-            lines = _lines(header)
-            words = [line.split()[:2] for line in lines]
-            index = last = words.index([b"element", b"vertex"])
-            while words[index + 1][:1] not in ([b"element"], [b"end_header"]):
-                index += 1
-                last = index if words[index][:1] == [b"property"] else last
-            lines[last + 1 : last + 1] = declared
-            header = _line_end(header).join(lines)
-        return header, _grown(self.rows.dtype, columns)
+        lines, last, within = _lines(header), 0, False
+        for index, words in enumerate(map(bytes.split, lines)):
+            within = words[1:2] == [b"vertex"] if words[:1] == [b"element"] else within
+            last = index if within and words[:1] in ([b"element"], [b"property"]) else last
+        lines[last + 1 : last + 1] = declared
+        return _line_end(header).join(lines), _grown(self.rows.dtype, columns)
 
 
 # Reading.
@@ -483,78 +475,63 @@ def vertex_range(header: Header, vertex: int) -> tuple[int, int]:
 
 def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> SplatFile:
     """Read an ASCII file as the binary one that holds its splats."""
-    lines, start = body.splitlines(), 0
+    path, lines, start = header.path, body.splitlines(), 0
     for index, (element, count) in enumerate(zip(header.elements, header.counts, strict=True)):
         if len(lines) < start + count:
             place = f"row {len(lines) - start} of {count} of {shown(element.name)}"
-            raise RefineError(f"{header.path}: truncated: the file ends in {place}")
+            raise RefineError(f"{path}: truncated: the file ends in {place}")
         if index == vertex:
-            rows = _numbers(header.path, element.dtype("<"), lines[start : start + count])
+            rows = _numbers(path, element.dtype("<"), lines[start : start + count])
         start += count
     left = _listed([name for name in filled if name != "vertex"])
-    remark = "is text; a PLY that is written of it is binary"
+    remark = f"{path.name} is text; a PLY that is written of it is binary"
     remark += f", without the elements beside its splats ({left})" if left else ""
-    remarks = (f"{header.path.name} {remark}",)
     origin = Origin(format_of(header.raw), len(header.raw) + len(body))
-    return SplatFile(
-        Path(header.path), rows, vertex_header(header.raw), origin=origin, remarks=remarks
-    )
+    head = vertex_header(header.raw)
+    return SplatFile(Path(path), rows, head, origin=origin, remarks=(remark,))
 
 
-def _numbers(path: Path | Url, dtype: np.dtype[Any], lines: list[bytes]) -> NDArray[Any]:
+def _numbers(path, dtype, lines):
     """Numbers in lines of text; the first line that is wrong is refused."""
-    try:
-        return _parsed(lines, dtype)
-    except _WRONG:
-        first, beyond = 0, len(lines)
+    rows, first, beyond = _parsed(lines, dtype), 0, len(lines)
+    if rows is not None:
+        return rows
     while beyond - first > 1:  # the first wrong line is one of first..beyond - 1
         middle = (first + beyond) // 2
-        if _is_right(lines[first:middle], dtype):
-            first = middle
-        else:
-            beyond = middle
-    words = lines[first].split()
-    names = dtype.names or ()
+        wrong = _parsed(lines[first:middle], dtype) is None
+        first, beyond = (first, middle) if wrong else (middle, beyond)
+    words, names = lines[first].split(), dtype.names or ()
     problem = f"expected {len(names)} numbers, got {len(words)}"
     if len(words) == len(names):
-        index = next(i for i, word in enumerate(words) if not _is_right([word], dtype[i]))
-        got = words[index][:40].decode("ascii", "backslashreplace")
-        wanted = f"expected a number of type {dtype[index]}"
-        problem = f"property {shown(names[index])}: {wanted}, got {got!r}"
+        each = zip(names, words, strict=True)
+        name, word = next(pair for pair in each if _parsed([pair[1]], dtype[pair[0]]) is None)
+        problem = f"property {shown(name)}: expected a number of type {dtype[name]}, got "
+        problem += shown(word)
     raise RefineError(f"{path}: vertex row {first}: {problem}")
 
-
-_WRONG = (ValueError, DeprecationWarning)
-"""What NumPy raises for text that is not a number of the type."""
 
 _NO_SPACES = bytes.maketrans(b"\x1c\x1d\x1e\x1f", b"????")
 """Replaces four control characters: str splits words at them, bytes and the header do not."""
 
 
-def _parsed(lines: Sequence[bytes], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Numbers in lines of text; raise one of `_WRONG` if a line is wrong."""
+def _parsed(lines: Sequence[bytes], dtype: np.dtype[Any]) -> NDArray[Any] | None:
+    """Numbers in lines of text; None if a line is wrong, or empty, which NumPy would skip."""
     if not lines:
         return np.empty(0, dtype)
-    if not all(map(bytes.strip, lines)):
-        raise ValueError("an empty line, which NumPy would skip")
+    text = (line.translate(_NO_SPACES).decode("ascii") for line in lines)
     with warnings.catch_warnings():
         # NumPy only deprecates 1.5 for an integer property.
         warnings.simplefilter("error", DeprecationWarning)
-        text = (line.translate(_NO_SPACES).decode("ascii") for line in lines)
-        return np.loadtxt(text, dtype, comments=None, ndmin=1)
-
-
-def _is_right(lines: Sequence[bytes], dtype: np.dtype[Any]) -> bool:
-    try:
-        _parsed(lines, dtype)
-    except _WRONG:
-        return False
-    return True
+        try:
+            whole = all(map(bytes.strip, lines))
+            return np.loadtxt(text, dtype, comments=None, ndmin=1) if whole else None
+        except (ValueError, DeprecationWarning):
+            return None
 
 
 def shown(word: bytes | str) -> str:
     """Word of the file for a message: in quotes, at most 40 characters."""
-    return repr((word if isinstance(word, str) else word.decode("ascii", "replace"))[:40])
+    return repr((word if isinstance(word, str) else word.decode("ascii", "backslashreplace"))[:40])
 
 
 def _listed(names: list[str]) -> str:
@@ -668,9 +645,10 @@ def write_rows(
 ) -> None:
     """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended."""
     plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
-    changed = columns if isinstance(columns, ChangedColumns) else None
-    if changed is not None and not changed.keys() <= set(rows.dtype.names or ()):
-        changed = None
+    inside = columns.keys() <= set(rows.dtype.names or ())
+    changed = columns if isinstance(columns, ChangedColumns) and inside else None
+    row = rows.dtype if changed is not None else _grown(rows.dtype, columns)
+    at: Any = {"names": ["stored"], "formats": [plain.dtype], "itemsize": row.itemsize}
 
     def bytes_of(piece: slice) -> NDArray[Any]:
         kept = slice(None) if keep is None else keep[piece]
@@ -679,9 +657,12 @@ def write_rows(
             chunk = np.array(chunk)
             changed.put(chunk, rows.dtype, piece, None if keep is None else keep[piece])
         elif columns:
-            chunk = _with_cells(
-                chunk, rows.dtype, {name: values[piece][kept] for name, values in columns.items()}
-            )
+            read, chunk = chunk, np.empty(len(chunk), row)
+            chunk.view(np.dtype(at))["stored"] = read
+            # A double may be too large or too small for a float; a signalling NaN becomes quiet.
+            with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+                for name, values in columns.items():
+                    chunk[name] = values[piece][kept]
         return np.ascontiguousarray(chunk)
 
     pieces = chunks(len(plain), _CHANGED_ROWS if columns else _ROWS)
@@ -691,25 +672,9 @@ def write_rows(
         stream.writelines(chunk.data for chunk in made)
 
 
-def _grown(dtype: np.dtype[Any], columns: Mapping[str, NDArray[Any]]) -> np.dtype[Any]:
+def _grown(dtype, columns):
     """Row with further columns behind, in the byte order of x, which has several bytes."""
-    order: Any = dtype["x"].byteorder
-    more = [
-        (name, values.dtype.newbyteorder(order))
-        for name, values in columns.items()
-        if name not in (dtype.names or ())
-    ]
-    return np.dtype([*((name, dtype[name]) for name in dtype.names or ()), *more])
-
-
-def _with_cells(chunk: NDArray[Any], dtype: np.dtype[Any], cells: Mapping):
-    """n rows of bytes, (n,) void of `dtype`, with some properties set and others appended."""
-    grown = np.empty(len(chunk), _grown(dtype, cells))
-    as_bytes = grown.view(np.uint8).reshape(len(chunk), grown.dtype.itemsize)
-    stored = np.ascontiguousarray(chunk).view(np.uint8)
-    as_bytes[:, : dtype.itemsize] = stored.reshape(len(chunk), dtype.itemsize)
-    # A double may be too large or too small for a float; a signalling NaN becomes a quiet one.
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        for name, values in cells.items():
-            grown[name] = values
-    return grown
+    names, order = dtype.names or (), dtype["x"].byteorder
+    more = [(name, values.dtype.newbyteorder(order)) for name, values in columns.items()]
+    fields = [(name, dtype[name]) for name in names]
+    return np.dtype([*fields, *(field for field in more if field[0] not in names)])

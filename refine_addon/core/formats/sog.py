@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, NoReturn
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,8 +89,7 @@ class Bundle:
         self.place, self._opened = place, opened
         self.meta = place.members(place.parsed(data))
         if self.meta.get("version", VERSION) != VERSION:
-            version = described(self.meta["version"])
-            place.at("version").fail(f"expected {VERSION}, got {version}")
+            place.at("version").expected(str(VERSION), self.meta["version"])
         self.version = VERSION if "version" in self.meta else 1
         self.files = files(self.meta)
         self.size = sum(self.files.values())
@@ -110,8 +109,7 @@ class Bundle:
         """How its splats are drawn, as splat-transform says it: a word beside the version."""
         word = self.meta.get("model", MODELS[0])
         if word not in MODELS:
-            wanted = ", ".join(MODELS)
-            self.place.at("model").fail(f"expected one of {wanted}, got {described(word)}")
+            self.place.at("model").expected(f"one of {', '.join(MODELS)}", word)
         return word
 
     @property
@@ -122,11 +120,11 @@ class Bundle:
         section, place = self.section("shN")
         if self.version == VERSION:
             return place.at("bands").whole(section.get("bands"), 1, _DEGREES)
-        across, _ = self._tried(self._codec.size, "shN", 0)
-        degrees = {_ACROSS * above_constant(degree): degree for degree in range(1, _DEGREES + 1)}
-        if across not in degrees:
-            place.fail(f"a palette {across} pixels wide, expected {', '.join(map(str, degrees))}")
-        return degrees[across]
+        widths = [_ACROSS * above_constant(degree) for degree in range(1, _DEGREES + 1)]
+        across = self.pixels("shN", 0, 1, widths[-1] << _LABEL_BITS).shape[1]
+        if across not in widths:
+            place.fail(f"a palette {across} pixels wide, expected {', '.join(map(str, widths))}")
+        return widths.index(across) + 1
 
     def section(self, name: str) -> tuple[dict[str, Any], Place]:
         """What is said of an attribute, and its place."""
@@ -152,78 +150,119 @@ class Bundle:
 
         Another width than `width` is refused, unless that is 0.
         """
-        across, down = self._tried(self._codec.size, name, index)
-        if not least <= across * down <= most:
-            self._fail(name, index, f"{across} x {down} pixels, expected {least}")
-        if width and across != width:
-            self._fail(name, index, f"{across} pixels wide, expected {width}")
-        return self._tried(self._codec.decode, name, index)
-
-    def rows(self, name: str, index: int, count: int) -> NDArray[np.uint8]:
-        """Pixels of `count` splats, (count, 4), of an image; far more pixels are refused."""
-        image = self.pixels(name, index, count, 4 * count + _SPARE_PIXELS)
-        return image.reshape(-1, 4)[:count]
-
-    def _tried(self, read: Callable[[bytes], Any], name: str, index: int) -> Any:
-        """What a codec reads of an image."""
-        try:
-            return read(self._opened(self._file(name, index), 4 * self.size))
-        except ValueError as error:
-            self._fail(name, index, f"cannot be read ({str(error)[:100]})")
-
-    def _file(self, name: str, index: int) -> str:
-        """Name of an image."""
         section, place = self.section(name)
         files = place.at("files").items(section.get("files"))
         if len(files) <= index:
             place.at("files").fail(f"expected at least {index + 1} names of images")
-        return place.at(f"files [{index}]").text(files[index])
+        file = place.at(f"files [{index}]").text(files[index])
+        data = self._opened(file, 4 * self.size)
+        place = Place(self.place.path, f"image {file[:80]!r}")
+        try:
+            across, down = self._codec.size(data)
+            if not least <= across * down <= most:
+                place.fail(f"{across} x {down} pixels, expected {least}")
+            if width and across != width:
+                place.fail(f"{across} pixels wide, expected {width}")
+            return self._codec.decode(data)
+        except ValueError as error:
+            place.fail(f"cannot be read ({str(error)[:100]})")
 
-    def _fail(self, name: str, index: int, problem: str) -> NoReturn:
-        """Raise the error of an image."""
-        Place(self.place.path).fail(f"image {self._file(name, index)[:80]!r}: {problem}")
+    def rows(self, name: str, index: int) -> NDArray[np.uint8]:
+        """Pixels of all splats, (N, 4), of an image; far more pixels are refused."""
+        image = self.pixels(name, index, self.count, 4 * self.count + _SPARE_PIXELS)
+        return image.reshape(-1, 4)[: self.count]
 
     def read(self) -> SplatFile:
         """Read its splats."""
         origin = Origin(f"{NAME} version {self.version}", self.size)
         file, splats = new_file(self.place.path, origin, self.count, self.degree, self.model)
+        first, axes = self.version == 1, np.arange(3)
+        low, high = (self.numbers("means", key, 3) for key in ("mins", "maxs"))
+        lower, upper = (self.rows("means", index) for index in (0, 1))
+        turns, scales, colors = (self.rows(name, 0) for name in ("quats", "scales", "sh0"))
+        wrong = turns[:, 3] < _ROTATIONS
+        if wrong.any():
+            place = Place(self.place.path, f"rotation of splat {np.argmax(wrong)}")
+            place.fail(f"alpha {turns[wrong][0, 3]}, expected {_ROTATIONS} to 255")
         with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in meta.json
-            _fill_means(self, splats)
-            _fill_rotations(self, splats)
-            _fill_from_tables(self, splats)
-            if splats.sh_degree:
-                _fill_harmonics(self, splats)
+            scale_tables, color_tables = self.tables("scales", 3), self.tables("sh0", 3 + first)
+            palette, labels = self._harmonics() if splats.sh_degree else (None, None)
+            for piece in pieces(len(splats)):
+                code = lower[piece, :3] + upper[piece, :3] * 256.0
+                logs = low + (high - low) * (code / _COORDINATE)
+                splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
+                others = (turns[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
+                largest = (turns[piece, 3] - _ROTATIONS).astype(np.intp)
+                splats.quaternions[piece] = join_largest(largest, others)
+                splats.log_scales[piece] = scale_tables[scales[piece, :3], axes]
+                splats.sh_dc[piece] = color_tables[colors[piece, :3], axes]
+                alpha = colors[piece, 3]
+                logits = color_tables[alpha, 3] if first else opacity_logits(alpha / 255.0)
+                splats.opacity_logits[piece] = logits
+                if palette is not None and labels is not None:
+                    splats.sh_rest[piece] = palette[labels[piece]]
         return file
+
+    def _harmonics(self) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """Palette of harmonics, (P, K, 3), and which entry each splat has."""
+        coefficients, most = above_constant(self.degree), 1 << _LABEL_BITS
+        width, (section, place) = _ACROSS * coefficients, self.section("shN")
+        if self.version == VERSION:
+            table = self.tables("shN", 1)[:, 0]
+            entries = place.at("count").whole(section.get("count"), 1, most)
+            needed = width * -(-entries // _ACROSS)
+            image = self.pixels("shN", 0, needed, 4 * needed + _SPARE_PIXELS, width)
+        else:
+            low, high = (place.at(key).number(section.get(key)) for key in ("mins", "maxs"))
+            table = np.linspace(low, high, _TABLE)
+            image = self.pixels("shN", 0, width, most * coefficients, width)
+            entries = _ACROSS * len(image)
+        places = image[: -(-entries // _ACROSS), :, :3].reshape(-1, coefficients, 3)[:entries]
+        pixels = self.rows("shN", 1).astype(np.intp)
+        labels = pixels[:, 0] + 256 * pixels[:, 1]
+        if labels.max() >= entries:
+            index = int(np.argmax(labels >= entries))
+            place = Place(self.place.path, f"splat {index}")
+            place.fail(f"entry {labels[index]} of {entries} in the palette")
+        return table.astype(np.float32)[places], labels
+
+
+def _held(place: Place, label: str, limit: int, opened: Callable[[], IO[bytes]]) -> bytes:
+    """What a file holds; one that cannot be read, or has more bytes, is refused."""
+    try:
+        with opened() as stream:
+            content = stream.read(limit + 1)
+    except _BROKEN as error:
+        place.fail(f"{label} cannot be read ({reason_of(error)[:100]})")
+    if len(content) > limit:
+        place.fail(f"{label} has more than {limit} bytes")
+    return content
 
 
 def _read_archive(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+    place = Place(path)
     try:
         archive = zipfile.ZipFile(io.BytesIO(data.tobytes()))
     except _BROKEN as error:
-        Place(path).fail(f"the archive cannot be read ({str(error)[:100]})")
-    names = (name for name in archive.namelist() if name.split("/")[-1] == META)
-    meta = next(names, None)
-    if meta is None:
-        Place(path).fail(f"no {META} in the archive, which a SOG file has")
-    folder = meta.removesuffix(META)
+        place.fail(f"the archive cannot be read ({str(error)[:100]})")
+    metas = [name for name in archive.namelist() if name.split("/")[-1] == META]
+    if not metas:
+        place.fail(f"no {META} in the archive, which a SOG file has")
+    folder = metas[0].removesuffix(META)
+
+    def member(name: str) -> IO[bytes]:
+        info = archive.getinfo(folder + name)
+        if info.compress_type not in _PACKED:
+            raise NotImplementedError(f"compressed by method {info.compress_type}")
+        return archive.open(info)
 
     def opened(name: str, limit: int) -> bytes:
-        place, label = Place(path), f"{(folder + name)[:80]!r} in the archive"
-        try:
-            info = archive.getinfo(folder + name)
-            if info.compress_type not in _PACKED:
-                raise NotImplementedError(f"compressed by method {info.compress_type}")
-            with archive.open(info) as stream:
-                content = stream.read(limit + 1)
-        except _BROKEN as error:
-            place.fail(f"{label} cannot be read ({str(error)[:100]})")
-        if len(content) > limit:
-            place.fail(f"{label} has more than {limit} bytes")
-        return content
+        label = f"{(folder + name)[:80]!r} in the archive"
+        return _held(place, label, limit, lambda: member(name))
 
     with archive:
         text = opened(META, _META_LIMIT)
-        return Bundle(Place(path, META), text, opened, lambda _meta: {path: len(data)}).read()
+        return Bundle(place.at(META), text, opened, lambda _meta: {path: len(data)}).read()
 
 
 def bundle_beside(path: Path) -> Bundle:
@@ -238,14 +277,7 @@ def bundle_beside(path: Path) -> Bundle:
     place = Place(path)
 
     def held(there: Path, limit: int) -> bytes:
-        try:
-            with there.open("rb") as stream:
-                content = stream.read(limit + 1)
-        except OSError as error:
-            place.fail(f"{there.name[:80]!r} cannot be read ({reason_of(error)})")
-        if len(content) > limit:
-            place.fail(f"{there.name[:80]!r} has more than {limit} bytes")
-        return content
+        return _held(place, repr(there.name[:80]), limit, lambda: there.open("rb"))
 
     def files(meta: dict[str, Any]) -> dict[Any, int]:
         named = [part.get("files") for part in meta.values() if isinstance(part, dict)]
@@ -282,75 +314,6 @@ def beside(place: Place, name: str) -> Path:
 def _matches_meta(path: Path, head: bytes) -> bool:
     """Whether a file is the ``meta.json`` of images beside it: by its name."""
     return path.name.lower().endswith(META) and head.lstrip().startswith(b"{")
-
-
-def _fill_means(bundle: Bundle, splats: Splats) -> None:
-    low, high = (bundle.numbers("means", key, 3) for key in ("mins", "maxs"))
-    lower, upper = (bundle.rows("means", index, len(splats)) for index in (0, 1))
-    for piece in pieces(len(splats)):
-        code = lower[piece, :3] + upper[piece, :3] * 256.0
-        logs = low + (high - low) * (code / _COORDINATE)
-        splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
-
-
-def _fill_rotations(bundle: Bundle, splats: Splats) -> None:
-    """Set quaternions from pixels: three smaller components, and which is left out."""
-    pixels = bundle.rows("quats", 0, len(splats))
-    wrong = pixels[:, 3] < _ROTATIONS
-    if wrong.any():
-        place = Place(bundle.place.path, f"rotation of splat {np.argmax(wrong)}")
-        place.fail(f"alpha {pixels[wrong][0, 3]}, expected {_ROTATIONS} to 255")
-    for piece in pieces(len(splats)):
-        others = (pixels[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
-        largest = (pixels[piece, 3] - _ROTATIONS).astype(np.intp)
-        splats.quaternions[piece] = join_largest(largest, others)
-
-
-def _fill_from_tables(bundle: Bundle, splats: Splats) -> None:
-    """Set scales, colours and, from the alpha of the colours' image, opacities."""
-    first = bundle.version == 1
-    scales, scale_tables = bundle.rows("scales", 0, len(splats)), bundle.tables("scales", 3)
-    colors, color_tables = bundle.rows("sh0", 0, len(splats)), bundle.tables("sh0", 3 + first)
-    axes = np.arange(3)
-    for piece in pieces(len(splats)):
-        splats.log_scales[piece] = scale_tables[scales[piece, :3], axes]
-        splats.sh_dc[piece] = color_tables[colors[piece, :3], axes]
-        alpha = colors[piece, 3]
-        logits = color_tables[alpha, 3] if first else opacity_logits(alpha / 255.0)
-        splats.opacity_logits[piece] = logits
-
-
-def _fill_harmonics(bundle: Bundle, splats: Splats) -> None:
-    """Set harmonics from a palette, of which each splat has an entry."""
-    palette = _palette(bundle, splats.sh_degree)
-    pixels = bundle.rows("shN", 1, len(splats)).astype(np.intp)
-    labels = pixels[:, 0] + 256 * pixels[:, 1]
-    if labels.max() >= len(palette):
-        index = int(np.argmax(labels >= len(palette)))
-        place = Place(bundle.place.path, f"splat {index}")
-        place.fail(f"entry {labels[index]} of {len(palette)} in the palette")
-    for piece in pieces(len(splats)):
-        splats.sh_rest[piece] = palette[labels[piece]]
-
-
-def _palette(bundle: Bundle, degree: int) -> NDArray[np.float32]:
-    """Palette of harmonics, (P, K, 3)."""
-    coefficients = above_constant(degree)
-    width, most = _ACROSS * coefficients, 1 << _LABEL_BITS
-    section, place = bundle.section("shN")
-    if bundle.version == VERSION:
-        table = bundle.tables("shN", 1)[:, 0]
-        entries = place.at("count").whole(section.get("count"), 1, most)
-        needed = width * -(-entries // _ACROSS)
-        image = bundle.pixels("shN", 0, needed, 4 * needed + _SPARE_PIXELS, width)
-    else:
-        low, high = (place.at(key).number(section.get(key)) for key in ("mins", "maxs"))
-        table = np.linspace(low, high, _TABLE)
-        image = bundle.pixels("shN", 0, width, most * coefficients, width)
-        entries = _ACROSS * len(image)
-    height = -(-entries // _ACROSS)
-    places = image[:height, :, :3].reshape(height * _ACROSS, coefficients, 3)[:entries]
-    return np.asarray(table.astype(np.float32)[places])
 
 
 def _write(stream: BinaryIO, splats: Splats) -> None:
@@ -450,26 +413,19 @@ def _grouped(rows: NDArray[Any]) -> NDArray[np.int64]:
     columns = np.ascontiguousarray(np.asarray(rows, np.float32).T)  # (D, N)
     labels = np.zeros(rows.shape[0], np.int64)
     for _ in range(min(_LABEL_BITS, int(rows.shape[0]).bit_length() - 1)):
-        axis, middle = _widest(columns, labels)
+        sizes = np.bincount(labels)
+        groups = len(sizes)
+        axis, middle, largest = np.zeros(groups, np.intp), np.zeros(groups), np.full(groups, -1.0)
+        for index, column in enumerate(columns):
+            with np.errstate(under="ignore"):
+                mean = np.bincount(labels, column, groups) / sizes
+                square = np.bincount(labels, np.square(column, dtype=np.float64), groups) / sizes
+                variance = square - np.square(mean)
+            wider = variance > largest
+            largest[wider], axis[wider], middle[wider] = variance[wider], index, mean[wider]
         above = columns[axis[labels], np.arange(len(labels))] > middle[labels]
         labels = np.unique(2 * labels + above, return_inverse=True)[1].reshape(-1)
     return labels
-
-
-def _widest(columns: NDArray[np.float32], labels: NDArray[np.int64]):
-    """In which of D columns (D, N) each group varies most, and its mean there, (G,) each."""
-    sizes = np.bincount(labels)
-    groups = len(sizes)
-    largest = np.full(groups, -1.0)
-    axis, middle = np.zeros(groups, np.intp), np.zeros(groups)
-    for index, column in enumerate(columns):
-        with np.errstate(under="ignore"):
-            mean = np.bincount(labels, column, groups) / sizes
-            square = np.bincount(labels, np.square(column, dtype=np.float64), groups) / sizes
-            variance = square - np.square(mean)
-        wider = variance > largest
-        largest[wider], axis[wider], middle[wider] = variance[wider], index, mean[wider]
-    return axis, middle
 
 
 def _centroids(sh_rest: NDArray[Any], labels: NDArray[np.int64], entries: int):
