@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import secrets
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import Progress, chunks, part, report, run_all, silent
-from ..regions import in_regions
-from ..splats import ARRAYS, Splats, drawable, folder_of, on_disk
+from ..regions import in_regions, new_folder
+from ..splats import ARRAYS, Splats, drawable, on_disk
 from ..views import ViewSet
 from ..visibility.scene import Scene, spatial_order, splat_fingerprint
 from .field import Array, Index, MeasuredField, measured_field
@@ -68,11 +66,10 @@ class Stage:
         excluded = self.protected | (self.members == 0)
         rows = np.flatnonzero(drawable(splats, threads=threads) & ~excluded)
         place = self.scene.positions(splats.means, rows, threads=threads)
-        rows = rows[
-            spatial_order(
-                place, lambda tied: splat_fingerprint(splats, rows[tied]), threads=threads
-            )
-        ]
+        order = spatial_order(
+            place, lambda tied: splat_fingerprint(splats, rows[tied]), threads=threads
+        )
+        rows = rows[order]
         report(progress, 0.0, "merging")
         return rows, measured_field(
             splats, rows, self.views, self.scene, self.sums, progress=progress, threads=threads
@@ -143,9 +140,8 @@ def copied(splats: Splats, rows: Index, threads: int | None = None) -> Splats:
     Of splats in files, more than a region go into files again.
     """
     if in_regions(splats, len(rows)):
-        folder = f"{folder_of(splats)}/copied-{secrets.token_hex(4)}"
         parts = chunks(len(rows), min(_CHUNK, len(rows) // 2))
-        return on_disk(Path(folder), (copied(splats, rows[part], threads) for part in parts))
+        return on_disk(new_folder(splats), (copied(splats, rows[part]) for part in parts))
     columns: dict[str, Any] = {}
     for name in ARRAYS:
         values = getattr(splats, name)

@@ -26,6 +26,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import starmap
 from typing import Any
 
 import numpy as np
@@ -196,10 +198,9 @@ def refit_rounds(
     """
     check_rounds(rounds)
     if in_regions(original, len(original)) and in_regions(original, 2 * len(splats)):
-        for outcome in refit_by_regions(
-            refit_on, splats, original, views, rounds, progress=progress, threads=threads
-        ):
-            yield Refitted(*outcome)
+        refit_region = partial(refit_on, rounds=rounds)
+        outcomes = refit_by_regions(refit_region, splats, original, views, progress, threads)
+        yield from starmap(Refitted, outcomes)
         return
     rays = RoundRays.of(original, views, len(splats), part(progress, 0.0, 0.03), threads)
     later = part(progress, 0.03, 1.0)

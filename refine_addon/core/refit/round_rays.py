@@ -214,10 +214,18 @@ class RoundRays:
     original : Target
         The unpruned splats; also an attribute.
     threads : int, optional
+    made : callable
+        Makes a `Target` of what it holds.
     """
 
-    def __init__(self, windows: Sequence[Window], original: Target, threads: int | None) -> None:
-        self.windows, self.original, self._threads = windows, original, threads
+    def __init__(
+        self,
+        windows: Sequence[Window],
+        original: Target,
+        threads: int | None,
+        made: Callable[..., Target] = Target,
+    ) -> None:
+        self.windows, self.original, self._threads, self._made = windows, original, threads, made
         step = -(-len(windows) // VALIDATION_VIEWS)
         self._validating = [window.moved(0) for window in windows[::step]] if step else []
         self._validation: list[Truth] = []
@@ -297,7 +305,7 @@ class RoundRays:
         prepared = projection.prepare(
             splats, views, scene, progress=progress, threads=self._threads
         )
-        return Target(splats, prepared[0], scene)
+        return self._made(splats, prepared[0], scene)
 
     def _each(
         self, work: Callable[[int], Any], windows: Sequence[Window], splats: Splats, told: Progress
