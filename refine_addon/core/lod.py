@@ -378,7 +378,7 @@ def _streamed(
     with folder_for(target, overwrite=overwrite) as folder:
 
         def add(scene: Scene, level: Level) -> tuple[dict[str, Any], list[str]]:
-            file, said, out = scene.file(), list[str](), scene.demands.out
+            file, said, out = scene.file(), list[str](), scene.demands.removed
             if not made:
                 whole = np.ones(len(scene.splats), np.bool_) if out is None else ~out
                 finest = held_splats(target, sog.FORMAT, file, whole, {})
@@ -481,7 +481,7 @@ def lod_file(
         making, writing = stages(progress, seconds("merge", count), seconds("write", count))
         for level in lod(
             scene.splats, views, levels, method,
-            protected=demands.protected, removed=demands.out, progress=making, threads=threads,
+            protected=demands.protected, removed=demands.removed, progress=making, threads=threads,
         ):  # fmt: skip
             if level.number == 1:
                 seen = scored(level.scores)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .affine import is_uniform, transformed
-from .cleaning.clean import Cleaned, Cleaning
+from .cleaning.clean import Cleaning
 from .cleaning.clean import clean as clean_splats
 from .errors import RefineError
-from .execute import Cancelled, Progress, report, seconds, silent, stages
+from .execute import Cancelled, Progress, part, report, seconds, silent, stages
 from .formats import registry
 from .formats.format import Format, near_ones_together
 from .formats.ply import SplatFile
@@ -30,11 +30,10 @@ from .quality.psnr import psnr_against
 from .rendering import Model
 from .report import Clock, kept_and_removed, prices, scored, scoring_notes, seen_by
 from .result import Result, file_of
-from .scores import Scores
 from .selection import Budget
 from .splats import Splats, joined
 from .views import ViewSet
-from .volumes import FREE, Forced, Zone, forced
+from .volumes import Forced, Zone, forced
 from .whole_file import expanded, refuse_existing, refuse_mapped
 
 PROPERTY = "refine_score"
@@ -145,10 +144,7 @@ def run(
         refitting is cancelled, what it had reached is written.
     """
     clock, written = Clock(), None if dry_run else output
-    with contextlib.ExitStack() as held:
-        if pictures is not None:
-            assert views is not None
-            held.enter_context(pictures.opened(views))
+    with contextlib.nullcontext() if pictures is None or views is None else pictures.opened(views):
         if written is not None:
             refuse_existing(written, overwrite=overwrite)
             if source is not None:
@@ -190,14 +186,23 @@ def run(
             "input_bytes": scene.bytes, "output_bytes": size,
         }  # fmt: skip
         try:
-            if written is not None and views is not None and result.scores is not None:
-                facts |= _written_psnr(written, result, views, threads)
+            rays = None if result.scores is None else result.scores.ray_sample
+            after = None  # what a lossy file holds, where that is to be told
+            if written is not None and views is not None and (rays or pictures):
+                after = _reread(written, scene.matrix)
+            if written is not None and views is not None and form is not None and result.scores:
+                psnr = None
+                if rays is not None and after is not None:
+                    used = views.spread(facts["settings"]["views"])
+                    psnr = psnr_against(rays, after, used, threads=threads)
+                facts["written_psnr"] = None if psnr is None else round(psnr, 2)
             if pictures is not None and views is not None:
-                after = None if written is None else _reread(written, scene.matrix)
+                if after is None:
+                    merged = result.merged
+                    after = scene.splats.take(keep) if merged is None else merged.splats
                 facts["pictures"] = pictures.write(
-                    scene.splats, result_splats(scene, result) if after is None else after, views,
-                    progress=comparing, threads=threads,
-                )  # fmt: skip
+                    scene.splats, after, views, progress=comparing, threads=threads
+                )
                 clock.lap("pictures_s")
         except (Cancelled, KeyboardInterrupt) as stop:
             if written is not None:
@@ -206,27 +211,6 @@ def run(
     clock.stop()
     facts["timings"] = clock.timings
     return result
-
-
-def result_splats(scene: Scene, result: Result) -> Splats:
-    """The kept splats as they became, in the frame of the views."""
-    return scene.splats.take(result.keep) if result.merged is None else result.merged.splats
-
-
-def _written_psnr(
-    path: Path, result: Result, views: ViewSet, threads: int | None
-) -> dict[str, Any]:
-    """What a lossy file costs, with what it rounds and leaves out; nothing of a plain PLY."""
-    if format_named(path) is None:
-        return {}
-    assert result.scores is not None
-    rays = result.scores.ray_sample
-    splats = None if rays is None else _reread(path, result.matrix)
-    if rays is None or splats is None:
-        return {"written_psnr": None}
-    used = views.spread(result.report["settings"]["views"])
-    psnr = psnr_against(rays, splats, used, threads=threads)
-    return {"written_psnr": None if psnr is None else round(psnr, 2)}
 
 
 def _reread(path: Path, matrix: NDArray[np.float64] | None) -> Splats | None:
@@ -253,28 +237,23 @@ def prune_scene(
     """For `run`: clean, if asked, and prune the rest; see `prune`."""
 
     def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
-        demands, splats = scene.demands, scene.splats
-        protected, removed = demands.protected, demands.out
-        left, cleaned = None, None
+        demands, splats, left = scene.demands, scene.splats, None
         if cleaning is not None:
-            share = 0.3
             cleaned = clean_splats(
-                splats, views, cleaning, protected=protected, forced_out=removed,
-                progress=lambda done, what: progress(share * done, what), threads=threads,
+                splats, views, cleaning, protected=demands.protected, removed=demands.removed,
+                progress=part(progress, 0.0, 0.3), threads=threads,
             )  # fmt: skip
             clock.lap("clean_s")
             # The budget counts what the user removed, so that is not cleaned away.
-            left = cleaned.keep if removed is None else cleaned.keep | removed
-            splats = splats.take(left)
-            protected, removed = (
-                None if mask is None else mask[left] for mask in (protected, removed)
-            )
+            left = cleaned.keep if demands.removed is None else cleaned.keep | demands.removed
+            splats, demands = splats.take(left), demands.of(left)
+            progress = part(progress, 0.3, 1.0)
         result = prune(
             splats, views, budget, method,
-            protected=protected, removed=removed, sizes=scene.sizes, reusable=reusable,
-            partial=True, clock=clock, progress=progress, threads=threads,
+            protected=demands.protected, removed=demands.removed, sizes=scene.sizes,
+            reusable=reusable, partial=True, clock=clock, progress=progress, threads=threads,
         )  # fmt: skip
-        if left is not None and cleaned is not None:
+        if left is not None:
             result = result.for_all(left)
             result.report["cleaned"] = cleaned.facts()
         result.report["volumes"] = list(demands.facts)
@@ -320,15 +299,21 @@ def prune_file(
 
         prune_file("in.ply", "out.ply", views, Budget(ratio=0.5))
     """
-    target = None if output is None else expanded(output)
-    form = None if target is None else format_named(target)
+    form = None if output is None else format_named(expanded(output))
     if budget.max_mb is not None and form is not None:
         refuse_unknown_size(form)
-    return run(
-        lambda form: read_scene(source, zones, model, form),
-        prune_scene(views, budget, method, cleaning, threads=threads),
-        target, source=expanded(source), overwrite=overwrite, dry_run=dry_run, views=views,
+    return _run_file(
+        source, output, prune_scene(views, budget, method, cleaning, threads=threads),
+        zones, model, overwrite=overwrite, dry_run=dry_run, views=views,
         pictures=pictures, progress=progress, threads=threads,
+    )  # fmt: skip
+
+
+def _run_file(source, output, decide, zones, model, **how: Any) -> Result:
+    """`run` for a file."""
+    return run(
+        lambda form: read_scene(source, zones, model, form), decide,
+        None if output is None else expanded(output), source=expanded(source), **how,
     )  # fmt: skip
 
 
@@ -348,27 +333,24 @@ def clean_file(
 
     def decide(scene: Scene, clock: Clock, told: Progress) -> Result:
         demands = scene.demands
-        cleaned: Cleaned = clean_splats(
-            scene.splats, views, cleaning, protected=demands.protected, forced_out=demands.out,
+        cleaned = clean_splats(
+            scene.splats, views, cleaning, protected=demands.protected, removed=demands.removed,
             progress=told, threads=threads,
         )  # fmt: skip
         clock.lap("clean_s")
-        facts: dict[str, Any] = seen_by(
-            cleaned.seen, cleaned.undrawable, cleaned.views_given, cleaned.views_used
-        )
-        facts["splats"] |= kept_and_removed(cleaned.keep) | demands.counts()
-        facts["splats"]["unseen"] -= facts["splats"]["removed_by_user"]
-        facts |= {
+        facts: dict[str, Any] = {
+            **seen_by(cleaned.seen, cleaned.undrawable, cleaned.views_given, cleaned.views_used),
             "settings": asdict(cleaning),
             "volumes": list(demands.facts),
             "cleaned": cleaned.facts(),
             "notes": cleaned.notes(),
         }
+        facts["splats"] |= kept_and_removed(cleaned.keep) | demands.counts()
+        facts["splats"]["unseen"] -= facts["splats"]["removed_by_user"]
         return Result(cleaned.keep, facts)
 
-    return run(
-        lambda form: read_scene(source, zones, model, form), decide,
-        None if output is None else expanded(output), source=expanded(source),
+    return _run_file(
+        source, output, decide, zones, model,
         overwrite=overwrite, progress=progress, threads=threads,
     )  # fmt: skip
 
@@ -380,22 +362,22 @@ def score_scene(
 
     def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands = scene.demands
-        scores: Scores = score(
-            scene.splats, views, method, protected=demands.protected, removed=demands.out,
+        scores = score(
+            scene.splats, views, method, protected=demands.protected, removed=demands.removed,
             progress=progress, threads=threads,
         )  # fmt: skip
         clock.lap("score_s")
-        facts: dict[str, Any] = scored(scores)
         gone = demands.counts()["removed_by_user"]
-        facts["splats"]["removed_by_user"] = gone
-        facts["splats"]["unseen"] -= gone
-        facts |= {
+        facts: dict[str, Any] = {
+            **scored(scores),
             "settings": method.facts(),
             "volumes": list(demands.facts),
             "weights": scores.facts,
             "prices": prices(scores, clock.timings["score_s"]),
             "notes": scoring_notes(scores),
         }
+        facts["splats"] |= {"removed_by_user": gone}
+        facts["splats"]["unseen"] -= gone
         keep = np.ones(len(scene.splats), np.bool_)
         return Result(keep, facts, columns={PROPERTY: scores.values})
 
@@ -415,10 +397,9 @@ def score_file(
     threads: int | None = None,
 ) -> Result:
     """Write a file with the float property ``refine_score``; see `prune_file` and `score`."""
-    return run(
-        lambda form: read_scene(source, zones, model, form), score_scene(views, method, threads),
-        expanded(output), source=expanded(source), overwrite=overwrite, progress=progress,
-        threads=threads,
+    return _run_file(
+        source, output, score_scene(views, method, threads), zones, model,
+        overwrite=overwrite, progress=progress, threads=threads,
     )  # fmt: skip
 
 
@@ -532,14 +513,17 @@ def convert_files(
         splats = joined(parts)
         if degree is not None:
             splats = splats.up_to_degree(degree)
-        if morton:
-            splats = splats.take(_along_curve(splats.means))
+        if morton:  # what is not finite comes last
+            finite = np.isfinite(splats.means).all(axis=1)
+            rows = np.flatnonzero(finite)
+            order = near_ones_together(splats.means[rows]) if len(rows) else rows
+            splats = splats.take(np.concatenate([rows[order], np.flatnonzero(~finite)]))
         stored = sum(file.stored_bytes for file in files)
         file = file_of(splats, files[0].path, stored)
         lost = {name for each in files for name in other_properties(each.rows.dtype.names or ())}
         names = ", ".join(sorted(lost))
         return Scene(
-            " + ".join(str(each.path) for each in files), stored, file.splats(), FREE,
+            " + ".join(str(each.path) for each in files), stored, file.splats(), Forced(),
             lambda: file, (0.0, 0),
             notes=(f"splats are written anew, without {names}",) if lost else (),
         )  # fmt: skip
@@ -567,10 +551,3 @@ def _files(sources: Sequence[Path | str], model: Model | None, level: int) -> li
                 f"{files[0].model}; expected one model, or say which (--model)"
             )
     return files
-
-
-def _along_curve(means: NDArray[Any]) -> NDArray[np.int64]:
-    """Order of positions (N, 3) along the curve; those that are not finite come last."""
-    finite = np.isfinite(means).all(axis=1)
-    rows, rest = np.flatnonzero(finite), np.flatnonzero(~finite)
-    return np.concatenate([rows[near_ones_together(means[rows])], rest]) if len(rows) else rest

@@ -176,36 +176,33 @@ class Forced:
     ----------
     protected : (N,) bool or None
         Those that stay as they are, for this or another reason.
-    out : (N,) bool or None
+    removed : (N,) bool or None
         Those that go whatever they are worth; none that is protected.
     facts : list of dict
         For the report: ``role``, ``name`` and number of ``splats`` of each volume.
     """
 
     protected: NDArray[np.bool_] | None = None
-    out: NDArray[np.bool_] | None = None
+    removed: NDArray[np.bool_] | None = None
     facts: tuple[dict[str, Any], ...] = ()
 
     def counts(self) -> dict[str, int]:
-        """Return how many splats are ``protected`` and how many were ``removed_by_user``."""
-        masks = (("protected", self.protected), ("removed_by_user", self.out))
-        return {n: 0 if mask is None else int(np.count_nonzero(mask)) for n, mask in masks}
+        """How many splats are ``protected`` and how many were ``removed_by_user``."""
+        masks = {"protected": self.protected, "removed_by_user": self.removed}
+        return {n: 0 if m is None else int(np.count_nonzero(m)) for n, m in masks.items()}
 
     def of(self, rows: NDArray[np.bool_]) -> Forced:
         """The same for the splats in `rows`, (N,) bool, alone."""
-        kept, out = (None if mask is None else mask[rows] for mask in (self.protected, self.out))
-        return Forced(kept, out, self.facts)
-
-
-FREE = Forced()
-"""Nothing must stay, and nothing must go."""
+        masks = (self.protected, self.removed)
+        protected, removed = (None if mask is None else mask[rows] for mask in masks)
+        return Forced(protected, removed, self.facts)
 
 
 def forced(
     zones: Sequence[Zone],
     means: NDArray[Any],
     protected: NDArray[np.bool_] | None = None,
-    out: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
 ) -> Forced:
     """What must stay and what must go by volumes.
 
@@ -214,7 +211,7 @@ def forced(
     zones : sequence of Zone
     means : (N, 3) floating
         Centres of the splats, in the frame of the volumes.
-    protected, out : (N,) bool, optional
+    protected, removed : (N,) bool, optional
         Splats that stay, and that go, for another reason.
 
     Returns
@@ -238,11 +235,12 @@ def forced(
         _any(*(mask for zone, mask in inside if zone.role == role))
         for role in ("protect", "remove", "keep")
     )
-    protected, out = _any(protected, protect), _any(out, remove, None if keep is None else ~keep)
-    if out is not None:
-        out = out if protected is None else out & ~protected
-        refuse_all(out)
-    return Forced(protected, out, facts)
+    protected = _any(protected, protect)
+    removed = _any(removed, remove, None if keep is None else ~keep)
+    if removed is not None:
+        removed = removed if protected is None else removed & ~protected
+        refuse_all(removed)
+    return Forced(protected, removed, facts)
 
 
 def _any(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:

@@ -181,7 +181,7 @@ def mark(checked: SplatObject, forced: Forced) -> None:
     RefineError
         If the object cannot be written to.
     """
-    mesh, forced_out = checked.mesh, forced.out
+    mesh, forced_out = checked.mesh, forced.removed
     mesh_edit.mark_forced(checked.obj, forced.protected, forced_out)
     scored = mesh_scores.record(mesh) is not None
     if forced_out is not None:

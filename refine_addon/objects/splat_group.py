@@ -121,7 +121,7 @@ def check_forced(scene: bpy.types.Scene, group: Members, before: Sequence[Forced
         If not; also see `forced_of_each`.
     """
     for member, was, now in zip(group, before, forced_of_each(scene, group), strict=True):
-        pairs = ((was.protected, now.protected), (was.out, now.out))
+        pairs = ((was.protected, now.protected), (was.removed, now.removed))
         if any(not _same_mask(*pair) for pair in pairs):
             raise RefineError(
                 f"object '{member.obj.name}': what must stay or go has changed meanwhile; nothing "
@@ -151,7 +151,7 @@ def joined_forced(each: Sequence[Forced], group: Members) -> Forced:
     counts = [len(member) for member in group]
     protected, out = (
         None if all(mask is None for mask in masks) else _joined_masks(masks, counts)
-        for masks in ([one.protected for one in each], [one.out for one in each])
+        for masks in ([one.protected for one in each], [one.removed for one in each])
     )
     return Forced(protected, out)
 

@@ -161,9 +161,9 @@ def stored_arguments(
         "views": views,
         "budget": budget,
         "method": method,
-        "scores": stored_scores(checked, forced.out),
+        "scores": stored_scores(checked, forced.removed),
         "protected": forced.protected,
-        "removed": forced.out,
+        "removed": forced.removed,
         "sizes": mesh_attributes.file_size(checked),
     }
 

@@ -58,7 +58,7 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
         """Search."""
         return clean(
             job.splats, job.views, job.settings,
-            protected=job.forced.protected, forced_out=job.forced.out, progress=progress,
+            protected=job.forced.protected, removed=job.forced.removed, progress=progress,
         )  # fmt: skip
 
     def finish(

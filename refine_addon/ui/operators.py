@@ -121,7 +121,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> _Scored:
         """Score, and count how many splats lie in each view."""
-        forced_out, means, start = job.forced.out, job.splats.means, time.perf_counter()
+        forced_out, means, start = job.forced.removed, job.splats.means, time.perf_counter()
         scores = score(
             job.splats, job.views, job.method,
             protected=job.forced.protected, removed=forced_out,
@@ -322,7 +322,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         return list(
             lod(
                 job.splats, job.views, job.levels, job.method,
-                protected=job.forced.protected, removed=job.forced.out, progress=progress,
+                protected=job.forced.protected, removed=job.forced.removed, progress=progress,
             )
         )  # fmt: skip
 

@@ -183,8 +183,8 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
 
 def _unseen(checked: SplatObject, forced: Forced) -> NDArray[np.bool_]:
     """Return which splats lie in no view, (N,), and need not go for another reason."""
-    unseen = mesh_scores.stored_scores(checked, forced.out).seen == 0
-    return unseen if forced.out is None else unseen & ~forced.out
+    unseen = mesh_scores.stored_scores(checked, forced.removed).seen == 0
+    return unseen if forced.removed is None else unseen & ~forced.removed
 
 
 def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:

@@ -132,7 +132,7 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
                 )
             return mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
         forced = Demands.of_scene(context.scene).forced(checked)
-        mask = forced.out if self.what == "OUTSIDE" else forced.protected
+        mask = forced.removed if self.what == "OUTSIDE" else forced.protected
         return np.zeros(len(checked), np.bool_) if mask is None else mask
 
 

@@ -72,7 +72,7 @@ def keep_mask(addon, obj, budget, protect=""):
 
 def deleted(addon, checked, budget, found=None):
     """What *Apply* decides by the scores of an object where splats are deleted."""
-    found = found or addon.core.volumes.FREE
+    found = found or addon.core.volumes.Forced()
     arguments = addon.objects.splat_object.stored_arguments(
         checked, budget, found, addon.core.Occlusion(), None
     )

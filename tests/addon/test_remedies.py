@@ -411,7 +411,7 @@ def test_what_must_go_is_not_kept_and_pictures_are_without_it(addon, room, room_
     bpy.context.view_layer.update()
     bpy.ops.refine.score()
     checked = addon.mesh.layout.check(room)
-    gone = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked).out
+    gone = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked).removed
     curve = addon.mesh.scores.stored_scores(checked, gone).quality
     removed = np.count_nonzero(read(addon, room, "refine_remove"))
     share = (removed - gone.sum()) / (len(gone) - gone.sum())

@@ -514,7 +514,7 @@ def test_levels_and_floaters_leave_out_what_must_go(addon, core, room, quarter, 
     expected = core.clean(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         addon.ui.operators.chosen_views(bpy.context), core.Cleaning(views=8),
-        protected=protected, forced_out=removed,
+        protected=protected, removed=removed,
     )  # fmt: skip
     bpy.ops.refine.find_floaters()
     found = mask(addon, room, "refine_floats") > 0
@@ -564,8 +564,8 @@ def test_a_volume_that_was_deleted_counts_no_more(addon, room):
         collection.objects.unlink(box)
     after = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked)
 
-    assert before.out.any()
-    assert after.out is None
+    assert before.removed.any()
+    assert after.removed is None
 
 
 def test_selected_objects_become_volumes(addon, room):

@@ -256,9 +256,9 @@ def test_cleaning_takes_what_is_forced_out_as_gone():
     half = walls & (splats.means[:, 0] > 100.0)
     half[:5] = True
 
-    found = clean(splats, cameras(), forced_out=half)
+    found = clean(splats, cameras(), removed=half)
     expected = clean(splats.take(~half), cameras())
-    alone = clean(splats, cameras(), Cleaning(), forced_out=walls)
+    alone = clean(splats, cameras(), Cleaning(), removed=walls)
 
     assert not found.keep[:5].any()
     assert np.array_equal(found.keep[5:], expected.keep)
@@ -297,7 +297,7 @@ def test_a_file_is_pruned_by_volumes_as_by_masks(splats, views, tmp_path, cleani
     x, y = loaded.means[:, 0], loaded.means[:, 1]
     protected, removed = x < -2, ((x >= 1) | (y < -1)) & (x >= -2)
     assert np.array_equal(masks.protected, protected)
-    assert np.array_equal(masks.out, removed)
+    assert np.array_equal(masks.removed, removed)
     if cleaning is None:
         expected = prune(loaded, views, budget, protected=protected, removed=removed)
         assert np.array_equal(found.keep, expected.keep)

@@ -266,7 +266,7 @@ def test_zones_of_a_kind_are_joined_and_protection_wins():
     ]  # fmt: skip
     found = forced(zones, LINE)
 
-    assert np.flatnonzero(found.out).tolist() == [2, 3, 5, 8]
+    assert np.flatnonzero(found.removed).tolist() == [2, 3, 5, 8]
     assert np.flatnonzero(found.protected).tolist() == [4, 9]
     assert [fact["splats"] for fact in found.facts] == [4, 3, 4, 1, 1]
     assert found.facts[2]["name"] == "remove 2"
@@ -276,7 +276,7 @@ def test_without_volumes_nothing_is_forced_and_a_mask_stays_what_it_was():
     """None costs nothing."""
     mask = LINE[:, 0] > 5.0
 
-    assert forced((), LINE).out is None
+    assert forced((), LINE).removed is None
     assert forced((), LINE).protected is None
     assert forced((), LINE, mask).protected is mask
 
@@ -286,7 +286,7 @@ def test_a_volume_without_splats_is_refused_unless_it_may_be_idle():
     with pytest.raises(RefineError, match=r"remove 20 holds .*they lie from 0,0,0 to 9,0,0"):
         forced([zone("remove", 20, 21)], LINE)
 
-    assert not forced([zone("remove", 20, 21, idle=True)], LINE).out.any()
+    assert not forced([zone("remove", 20, 21, idle=True)], LINE).removed.any()
 
 
 def test_volumes_that_leave_nothing_are_refused():
@@ -302,5 +302,5 @@ def test_splats_marked_to_go_go_with_those_of_volumes_but_not_the_protected():
     zone = Zone("remove", "box", Box((3.5, -1, -1), (9, 1, 1)))
     found = forced([zone], means, protected, marked | (np.arange(6) == 1))
 
-    assert np.flatnonzero(found.out).tolist() == [0, 4]
+    assert np.flatnonzero(found.removed).tolist() == [0, 4]
     assert forced([], means, None, marked).counts() == {"protected": 0, "removed_by_user": 1}

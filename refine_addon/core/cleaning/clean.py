@@ -151,7 +151,7 @@ def clean(
     settings: Cleaning = Cleaning(),
     *,
     protected: NDArray[np.bool_] | None = None,
-    forced_out: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Cleaned:
@@ -165,7 +165,7 @@ def clean(
     settings : Cleaning
     protected : (N,) bool, optional
         Splats that stay, whatever they are. They are evidence all the same.
-    forced_out : (N,) bool, optional
+    removed : (N,) bool, optional
         Splats that go, unless they are protected, and are no evidence: as if they had gone before.
     progress : callable, optional
         See `refine_addon.core.execute.Progress`.
@@ -179,7 +179,7 @@ def clean(
     Cancelled
         If `progress` answers ``False``.
     """
-    rest = np.ones(len(splats), np.bool_) if forced_out is None else ~forced_out
+    rest = np.ones(len(splats), np.bool_) if removed is None else ~removed
     if protected is not None:
         rest |= protected
     refuse_all(~rest)
