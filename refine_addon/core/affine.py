@@ -93,11 +93,13 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     # A splat is symmetric about its centre, so a reflection R acts on it like the rotation -R. Its
     # harmonics are not symmetric and follow R.
     proper = rotation if np.linalg.det(rotation) > 0 else -rotation
+    w, x, y, z = quaternion(proper)
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return replace(
         splats,
         means=means,
         log_scales=splats.log_scales + np.float64(np.log(factor)),
-        quaternions=_rotated(splats.quaternions, proper),
+        quaternions=np.asarray(splats.quaternions, np.float64) @ product.T,
         sh_rest=(
             spherical_harmonics.rotate(splats.sh_rest, rotation)
             if rotate_sh and splats.sh_degree
@@ -152,13 +154,6 @@ def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
             "colours cannot follow that exactly: bake the object's transform (Bake Transform), or "
             "make its scale uniform first"
         )
-
-
-def _rotated(quaternions, rotation):
-    """Product of a rotation and each of `quaternions`, (N, 4); lengths stay."""
-    w, x, y, z = quaternion(rotation)
-    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return np.asarray(np.asarray(quaternions, np.float64) @ left.T)
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -155,7 +155,9 @@ def drawn(
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         colors = colors_from(splats, gaussians.index[footprints.index], view)
-        depths = scene.size * projection.depths(gaussians, scene, view)[footprints.index]
+        depths = (
+            scene.size * projection.coordinates(gaussians.means, scene, view)[2, footprints.index]
+        )
 
     def work(piece: slice) -> NDArray[np.float64]:
         rows = np.arange(piece.start, piece.stop)

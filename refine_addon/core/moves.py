@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +36,7 @@ _BLOCKS = (1.0, 0.1, 0.01)
 together, what was selected by hand does not."""
 
 
-@dataclass(frozen=True, eq=False)
-class Move:
+class Move(NamedTuple):
     """Points that one affine map moved.
 
     Attributes
@@ -51,16 +49,6 @@ class Move:
 
     rows: NDArray[np.int64]
     matrix: NDArray[np.float64]
-
-    @property
-    def shifts(self) -> bool:
-        """Whether the points at most changed their place, as by a translation."""
-        return np.array_equal(self.matrix[:3, :3], np.eye(3))
-
-    @property
-    def mirrors(self) -> bool:
-        """Whether left became right."""
-        return bool(np.linalg.det(self.matrix[:3, :3]) < 0.0)
 
 
 def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:

@@ -10,7 +10,6 @@ whole, so that one ray tells of all its points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from .errors import RefineError
 _LEAF = 1 << 14  # pairs of point and triangle that are compared one by one
 
 
-@dataclass(frozen=True, eq=False)
 class Solid:
     """The inside of a closed mesh.
 
@@ -46,14 +44,10 @@ class Solid:
     [True, False]
     """
 
-    vertices: NDArray[Any]
-    triangles: NDArray[Any]
-    turned: bool = field(init=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, vertices: NDArray[Any], triangles: NDArray[Any]) -> None:
         """Join equal vertices, and check the mesh."""
-        vertices = np.asarray(self.vertices, np.float64).reshape(-1, 3) + 0.0  # -0 equals 0
-        triangles = np.asarray(self.triangles, np.int64).reshape(-1, 3)
+        vertices = np.asarray(vertices, np.float64).reshape(-1, 3) + 0.0  # -0 equals 0
+        triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
         if not len(triangles):
             raise RefineError("has no faces, expected a closed mesh")
         if not np.isfinite(vertices).all():
@@ -66,15 +60,17 @@ class Solid:
         triangles = joined[triangles]
         a, b, c = triangles.T
         triangles = triangles[(a != b) & (b != c) & (c != a)]
-        open_edges, turned = _edges(triangles, len(order))
+        start, end = triangles.reshape(-1), np.roll(triangles, -1, axis=1).reshape(-1)
+        names = np.minimum(start, end) * len(order) + np.maximum(start, end)
+        edge = np.unique(names, return_inverse=True)[1].reshape(-1)
+        open_edges = np.count_nonzero(np.bincount(edge) % 2)
         if open_edges or not len(triangles):
             raise RefineError(
                 f"is not closed: {open_edges} of its edges belong to an odd number of faces; fill "
                 "the holes, or add a Remesh modifier"
             )
-        made = {"vertices": vertices[order[new]], "triangles": triangles, "turned": turned}
-        for name, value in made.items():
-            object.__setattr__(self, name, value)
+        self.vertices, self.triangles = vertices[order[new]], triangles
+        self.turned = not np.bincount(edge, np.where(start < end, 1.0, -1.0)).any()
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Points, (N, 3) floating, that lie inside, (N,) bool; none that is not finite."""
@@ -145,14 +141,3 @@ class Solid:
         # Within its ends, which the boxes of triangles go by.
         cut = np.clip(cut, np.minimum(x[first], x[last]), np.maximum(x[first], x[last]))
         return cut, z[first] + share * (z[last] - z[first])
-
-
-def _edges(triangles, count):
-    """Number of edges of an odd number of triangles, and whether all turn one way."""
-    start = triangles.reshape(-1)
-    end = np.roll(triangles, -1, axis=1).reshape(-1)
-    names = np.minimum(start, end) * count + np.maximum(start, end)
-    _, edge = np.unique(names, return_inverse=True)
-    edge = edge.reshape(-1)
-    turns = np.bincount(edge, np.where(start < end, 1.0, -1.0))
-    return int(np.count_nonzero(np.bincount(edge) % 2)), not turns.any()

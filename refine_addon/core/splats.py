@@ -382,25 +382,21 @@ def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
     good = np.empty(len(splats), np.bool_)
 
     def fill(piece: slice) -> None:
-        good[piece] = _drawable(splats.take(piece))
+        some = splats.take(piece)
+        s0, s1, s2 = some.log_scales.T
+        largest = np.maximum(np.maximum(s0, s1), s2)
+        # Comparisons with NaN are False and np.maximum returns NaN, so every line also rejects NaN.
+        here = some.opacity_logits >= _LOG_SMALLEST
+        here &= (largest <= _LOG_LARGEST) & (largest >= _LOG_SMALLEST)
+        for axis in range(3):
+            here &= np.abs(some.means[:, axis]) <= _LARGEST
+        for values in (some.quaternions, some.sh_dc, some.sh_rest):
+            finite = np.isfinite(values)
+            if not finite.all():  # rare; testing each row costs ten times as much
+                here &= finite.reshape(len(here), -1).all(axis=1)
+        good[piece] = here
 
     run_all(fill, chunks(len(splats), _CHECKED), threads=threads)
-    return good
-
-
-def _drawable(splats: Splats) -> NDArray[np.bool_]:
-    """Return which of n splats a renderer can draw, (n,)."""
-    s0, s1, s2 = splats.log_scales.T
-    largest = np.maximum(np.maximum(s0, s1), s2)
-    # Comparisons with NaN are False and np.maximum returns NaN, so every line also rejects NaN.
-    good: NDArray[np.bool_] = splats.opacity_logits >= _LOG_SMALLEST
-    good &= (largest <= _LOG_LARGEST) & (largest >= _LOG_SMALLEST)
-    for axis in range(3):
-        good &= np.abs(splats.means[:, axis]) <= _LARGEST
-    for values in (splats.quaternions, splats.sh_dc, splats.sh_rest):
-        finite = np.isfinite(values)
-        if not finite.all():  # rare; testing each row costs ten times as much
-            good &= finite.reshape(len(splats), -1).all(axis=1)
     return good
 
 

@@ -233,7 +233,7 @@ class _Notes:
         drift = Drift(
             turned=min(step * sum(len(move.rows) for move in moves), len(self.codes)),
             bent=bent if bent > max(_FEW, _FEW_SHARE * len(self.codes)) else 0,
-            mirrored=any(move.mirrors for move in moves),
+            mirrored=any(np.linalg.det(move.matrix[:3, :3]) < 0.0 for move in moves),
             sources=len(objects),
             regrouped=len(self.regrouped()),
             unlisted=self.unlisted if len(objects) > 1 else (),
@@ -262,7 +262,8 @@ class _Notes:
             finite = np.isfinite(home + position).all(axis=1)
             loose += int(np.count_nonzero(finite)) - sum(len(move.rows) for move in of_object)
             moves += _followed(own, of_object)
-        return [move for move in moves if not move.shifts], loose
+        still = np.eye(3)  # or shifted alike
+        return [m for m in moves if not np.array_equal(m.matrix[:3, :3], still)], loose
 
     def regrouped(self) -> NDArray[np.int64]:
         """Return the splats whose harmonics stand under the names of another degree."""

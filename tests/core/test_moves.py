@@ -33,8 +33,6 @@ def test_one_map_of_all_points_is_found_to_the_precision_of_float32(linear):
     np.testing.assert_array_equal(move.rows, np.arange(len(before)))
     np.testing.assert_allclose(move.matrix[:3, :3], linear, atol=1e-6)
     np.testing.assert_allclose(move.matrix[:3, 3], [5.0, -2.0, 0.1], atol=1e-5)
-    assert not move.shifts
-    assert move.mirrors == (np.linalg.det(linear) < 0)
 
 
 def test_what_was_moved_alike_or_not_at_all_is_not_turned():
@@ -45,8 +43,8 @@ def test_what_was_moved_alike_or_not_at_all_is_not_turned():
 
     still, shifted = affine_moves(before, after)
 
-    assert still.shifts
-    assert shifted.shifts
+    for move in (still, shifted):
+        np.testing.assert_array_equal(move.matrix[:3, :3], np.eye(3))
     np.testing.assert_array_equal(still.rows, np.arange(1000))
     np.testing.assert_array_equal(shifted.rows, np.arange(1000, 4000))
 

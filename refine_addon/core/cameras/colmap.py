@@ -16,12 +16,12 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
 from ..splats import rotation_matrices
-from ..views import View, ViewSet
+from ..views import ViewSet
 from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
 from .place import CameraPlace, is_file, opened
 
@@ -40,29 +40,6 @@ IMAGE_FIELDS = ("IMAGE_ID", *POSE, "CAMERA_ID", "NAME")
 SHORT_LINE = 400
 """Only lines of points below this many bytes are checked: if the line of points is missing, the
 short line of the next image is in its place."""
-
-
-class _Lens(NamedTuple):
-    """A COLMAP camera as a pinhole, and whether it has distortion that is ignored."""
-
-    model: Model
-    focal: Sequence[float]
-    principal: Sequence[float]
-    size: Sequence[int]
-    distorted: bool
-
-
-class _Image(NamedTuple):
-    """A registered image; its pose is world to camera."""
-
-    place: CameraPlace
-    image_id: int
-    pose: Sequence[object]
-    camera_id: int
-    name: str
-
-
-_Camera = tuple[CameraPlace, int, _Lens]  # with its id
 
 
 def find_colmap(folder: Path) -> tuple[Path, str] | None:
@@ -102,40 +79,35 @@ def read_colmap(folder: Path, suffix: str) -> ViewSet:
     """
     cameras, images = (CameraPlace(folder / f"{stem}{suffix}") for stem in MODEL_FILES[:2])
     binary = suffix == ".bin"
-    lenses: dict[int, _Lens] = {}
+    lenses: dict[int, tuple[Any, ...]] = {}
     for place, camera_id, lens in (_binary_cameras if binary else _text_cameras)(cameras):
         if camera_id in lenses:
             place.fail(f"camera {camera_id} is there twice, expected each id once")
         lenses[camera_id] = lens
-    registered = list((_binary_images if binary else _text_images)(images))
-    registered.sort(key=lambda image: (image.name, image.image_id))
+    read_images = _binary_images if binary else _text_images
+    registered = sorted(read_images(images), key=lambda image: image[:2])
     if not registered:
         images.fail("no registered image, expected at least one")
     views = []
-    for image in registered:
-        if image.camera_id not in lenses:
-            image.place.fail(
-                f"refers to camera {image.camera_id}, expected one of the {len(lenses)} "
+    for name, _, place, values, camera_id in registered:
+        if camera_id not in lenses:
+            place.fail(
+                f"refers to camera {camera_id}, expected one of the {len(lenses)} "
                 f"in {cameras.path.name}"
             )
-        views.append(_view(image, lenses[image.camera_id]))
-    used = (lenses[camera_id] for camera_id in sorted({image.camera_id for image in registered}))
-    counts = Counter(lens.model for lens in used if lens.distorted)
+        pose = [place.at(key).number(value) for key, value in zip(POSE, values, strict=True)]
+        if not any(pose[:4]):
+            place.fail("expected a quaternion (w, x, y, z) of a rotation, got all zeros")
+        rotation = rotation_matrices(np.array(pose[:4]))
+        center = -rotation.T @ np.array(pose[4:])
+        views.append(place.view(name, rotation, center, *lenses[camera_id][1:]))
+    used = sorted({camera_id for *_, camera_id in registered})
+    counts = Counter(model for number in used if (model := lenses[number][0]))
     return ViewSet(tuple(views), lens_note(counts, "camera"))
 
 
-def _view(image: _Image, lens: _Lens) -> View:
-    pose = [image.place.at(key).number(value) for key, value in zip(POSE, image.pose, strict=True)]
-    if not any(pose[:4]):
-        image.place.fail("expected a quaternion (w, x, y, z) of a rotation, got all zeros")
-    rotation = rotation_matrices(np.array(pose[:4]))
-    center = -rotation.T @ np.array(pose[4:])
-    return image.place.view(image.name, rotation, center, lens.focal, lens.principal, lens.size)
-
-
-def _lens(
-    place: CameraPlace, model: Model, size: Sequence[object], values: Sequence[object]
-) -> _Lens:
+def _lens(place: CameraPlace, model: Model, size: Sequence[Any], values: Sequence[Any]) -> Any:
+    """A COLMAP camera as a pinhole, and its model if it has distortion, which is ignored."""
     if not model.focals:
         place.fail(f"camera model {model.name} is a panorama, expected one with a focal length")
     sides = [place.at(key).side(side) for key, side in zip(("width", "height"), size, strict=True)]
@@ -144,7 +116,7 @@ def _lens(
     cx, cy, *distortion = numbers[model.focals :]
     if model.name == "EUCM":
         distortion = distortion[:1]  # with alpha = 0 it is a pinhole for every beta
-    return _Lens(model, focal, (cx, cy), sides, model.fisheye or any(distortion))
+    return model if model.fisheye or any(distortion) else None, focal, (cx, cy), sides
 
 
 @dataclass
@@ -199,7 +171,8 @@ def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, 
             )
 
 
-def _binary_cameras(file: CameraPlace) -> Iterator[_Camera]:
+def _binary_cameras(file: CameraPlace) -> Iterator[Any]:
+    """Place, id and `_lens` of each camera."""
     for data, row, place in _rows(file, "camera", 24 + 8 * 2):
         camera_id, model_id, *size = data.take("IiQQ", row)
         if model_id not in MODELS:
@@ -209,13 +182,14 @@ def _binary_cameras(file: CameraPlace) -> Iterator[_Camera]:
         yield place, camera_id, _lens(place, model, size, values)
 
 
-def _binary_images(file: CameraPlace) -> Iterator[_Image]:
+def _binary_images(file: CameraPlace) -> Iterator[Any]:
+    """Name, id, place, pose (world to camera) and camera of each registered image."""
     for data, row, place in _rows(file, "image", 73):
         image_id, *pose, camera_id = data.take("I7dI", row)
         name = data.name(f"name of {row}")
         (points,) = data.take("Q", f"number of points of {row}")
         data.skip(points * POINT_BYTES, f"{points} points of {row}")
-        yield _Image(place, image_id, pose, camera_id, name)
+        yield name, image_id, place, pose, camera_id
 
 
 def _lines(file: CameraPlace) -> Iterator[tuple[CameraPlace, bytes]]:
@@ -229,7 +203,8 @@ def _lines(file: CameraPlace) -> Iterator[tuple[CameraPlace, bytes]]:
                 yield file.at(f"line {number}"), line
 
 
-def _text_cameras(file: CameraPlace) -> Iterator[_Camera]:
+def _text_cameras(file: CameraPlace) -> Iterator[Any]:
+    """Place, id and `_lens` of each camera."""
     for place, line in _lines(file):
         if not line:
             continue
@@ -246,7 +221,7 @@ def _text_cameras(file: CameraPlace) -> Iterator[_Camera]:
         yield place, _parsed(place, camera_id, int), _lens(place, model, numbers[:2], numbers[2:])
 
 
-def _text_images(file: CameraPlace) -> Iterator[_Image]:
+def _text_images(file: CameraPlace) -> Iterator[Any]:
     lines = _lines(file)
     for row, (place, line) in enumerate(item for item in lines if item[1]):
         fields = line.decode("utf-8", "replace").split(maxsplit=len(IMAGE_FIELDS) - 1)
@@ -255,9 +230,8 @@ def _text_images(file: CameraPlace) -> Iterator[_Image]:
             where.fail(f"expected {', '.join(IMAGE_FIELDS)}, got {len(fields)} fields")
         image_id, *pose, camera_id, name = fields
         numbers = [_parsed(where, field) for field in pose]
-        yield _Image(
-            where, _parsed(where, image_id, int), numbers, _parsed(where, camera_id, int), name
-        )
+        image_id, camera_id = (_parsed(where, each, int) for each in (image_id, camera_id))
+        yield name, image_id, where, numbers, camera_id
         place, points = next(lines, (place, b""))
         if len(points) < SHORT_LINE and len(points.split()) % 3:
             place.fail(

@@ -18,7 +18,8 @@ from ..execute import Progress, part, run_all, silent
 from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import projection
-from ..visibility.ray_sample import RaySample, cast_colored
+from ..visibility.cast import cast
+from ..visibility.ray_sample import RaySample, colors_from
 from .curve import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
 
 MIN_RAYS_WITH_HITS = 256
@@ -181,7 +182,8 @@ def psnr_against(
     def compare(number, rays):
         view = sample.views[number][0]
         footprints = projection.project(gaussians, scene, view)
-        other, colors = cast_colored(splats, gaussians, footprints, view, rays.columns, rays.rows)
+        other = cast(footprints, rays.columns, rays.rows)
+        colors = colors_from(splats, gaussians.index[other.hit], view)
         truth = rays.colors(sample.colors(number, rays))
         return [psnr_of(other.colors(colors), truth, view)]
 

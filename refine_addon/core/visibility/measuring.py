@@ -61,8 +61,7 @@ class Sampling:
                 raise RefineError(f"{name} is {value}, expected a positive number")
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
+class Measured(NamedTuple):
     """Sums over views, for M Gaussians.
 
     Attributes
@@ -85,9 +84,8 @@ class Measured:
     def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
         """Sums of `count` splats: these ones at `index`, 0 for all others."""
         every = Measured.zero(count)
-        every.contribution[index] = self.contribution
-        every.error[index] = self.error
-        every.seen[index] = self.seen
+        for name in self._fields:
+            getattr(every, name)[index] = getattr(self, name)
         return every
 
     def take(self, rows: NDArray[np.int64]) -> Measured:
@@ -96,9 +94,8 @@ class Measured:
 
     def add(self, other: Measured) -> None:
         """Add the sums of other views."""
-        self.contribution[:] += other.contribution
-        self.error[:] += other.error
-        self.seen[:] += other.seen
+        for name in self._fields:
+            getattr(self, name)[:] += getattr(other, name)
 
     def add_view(
         self, measurement: ViewMeasurement, weight: float, threads: int | None = 1
@@ -223,18 +220,10 @@ def measure_view(
     """Footprints in a view, and what it sees of them."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
-    colors = gaussians.colors[footprints.index]  # (n, 3)
-    return footprints, measure_footprints(footprints, colors, view, sampling)
-
-
-def measure_footprints(
-    footprints: Footprints, colors: NDArray[np.float32], view: View, sampling: Sampling
-) -> ViewMeasurement:
-    """What a view sees of n footprints in their colours, (n, 3)."""
-    rows, inside = footprints.index, footprints.inside
-    if not len(rows):
-        return ViewMeasurement(rows, inside, np.empty(0), np.empty(0))
-    with np.errstate(under="ignore"):
-        side = cell_size(footprints, view, sampling.cell, sampling.density)
-        points = scatter(footprints, view, side, sampling.density)
-        return ViewMeasurement(rows, inside, *froxels.integrals(footprints, colors, points))
+        integrals = np.empty(0), np.empty(0)
+        if len(footprints.index):
+            side = cell_size(footprints, view, sampling.cell, sampling.density)
+            points = scatter(footprints, view, side, sampling.density)
+            colors = gaussians.colors[footprints.index]  # (n, 3)
+            integrals = froxels.integrals(footprints, colors, points)
+    return footprints, ViewMeasurement(footprints.index, footprints.inside, *integrals)

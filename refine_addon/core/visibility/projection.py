@@ -312,7 +312,7 @@ def project(
     for first, chunk, start in starts:
         checkpoint()
         piece = slice(start, start + _CHUNK)
-        local = _local(chunk.means[:, piece], scene, view)  # (3, n of the piece)
+        local = coordinates(chunk.means[:, piece], scene, view)  # (3, n of the piece)
         touching = np.flatnonzero(_touches(local, chunk.largest[piece], views, planes, low_pass))
         if len(touching):
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
@@ -341,12 +341,7 @@ def in_camera(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Centres, (3, M), and covariances, (6, M), in camera coordinates, scene sizes."""
     turned = _product(_rotation6(view.rotation @ scene.axes.T), gaussians.covariances)
-    return _local(gaussians.means, scene, view), turned
-
-
-def depths(gaussians: Gaussians, scene: Scene, view: View) -> NDArray[np.float32]:
-    """How far Gaussians lie along the axis of a view, (M,), scene sizes."""
-    return _local(gaussians.means, scene, view)[2]
+    return coordinates(gaussians.means, scene, view), turned
 
 
 def _computable(scene, view):
@@ -363,7 +358,7 @@ def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
     return min(max(near / scene.size, _NEAREST), _NO_END), min(far / scene.size, _NO_END)
 
 
-def _local(means, scene, view):
+def coordinates(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
     """Camera coordinates of centres, (3, M), scene sizes."""
     shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
     local = _product((view.rotation @ scene.axes.T).astype(np.float32), means)
@@ -417,7 +412,7 @@ def boxes_touch(
     near, far = clip_planes(scene, view)
     columns = itertools.product((0, 3), (1, 4), (2, 5))
     corners = np.stack([boxes[:, corner] for corner in columns], axis=-1)  # (B, 3, 8)
-    local = _local(np.moveaxis(corners, 1, 0).reshape(3, -1), scene, view)
+    local = coordinates(np.moveaxis(corners, 1, 0).reshape(3, -1), scene, view)
     x, y, z = local.reshape(3, len(boxes), 8).astype(np.float64)
     slack = _SLACK * (1.0 + np.abs(local).max(axis=0).reshape(len(boxes), 8).max(axis=1))
     touching: NDArray[np.bool_] = (z.max(axis=1) + slack >= near) & (z.min(axis=1) - slack <= far)
@@ -483,7 +478,7 @@ def jacobian(
     In pixels for a step of one scene size along each axis of the scene's frame; see `_principal`
     for J.
     """
-    x, y, z = _local(gaussians.means, scene, view).astype(np.float64)
+    x, y, z = coordinates(gaussians.means, scene, view).astype(np.float64)
     across, down = _near_image(x / z, y / z, view)
     turned = view.rotation @ scene.axes.T  # W
     return (

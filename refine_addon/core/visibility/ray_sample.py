@@ -189,31 +189,6 @@ def cast_view(
     return cast(footprints, *pixels(view, number + 0.5 * scoring, count))
 
 
-def cast_colored(
-    splats: Splats,
-    gaussians: Gaussians,
-    footprints: Footprints,
-    view: View,
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-) -> tuple[Rays, NDArray[np.float64]]:
-    """Rays through some pixels of a view, and the colours of what they hit, (3, u).
-
-    Parameters
-    ----------
-    splats : Splats
-        What the Gaussians were made of.
-    gaussians : Gaussians
-    footprints : Footprints
-        Of these in the view.
-    view : View
-    columns, rows : (C,), (R,) int64
-        See `Rays`.
-    """
-    rays = cast(footprints, columns, rows)
-    return rays, colors_from(splats, gaussians.index[rays.hit], view)
-
-
 def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
     """Colours in which a view sees some splats, (3, n), at least 0.
 
