@@ -21,9 +21,6 @@ from .ply_columns import empty_rows
 CHUNK = 1 << 15
 """Splats that are converted at a time: 8 MB at degree 3. A multiple of `compressed_ply.SPLATS`."""
 
-WXYZ, XYZW = [3, 0, 1, 2], [1, 2, 3, 0]
-"""Components of a quaternion x y z w in our order, and of ours in that."""
-
 
 @dataclass(frozen=True)
 class Format:

@@ -31,7 +31,7 @@ from ..splats import (
     scales,
     unit_quaternions,
 )
-from .format import WXYZ, XYZW, Format, codes, new_file, pieces, refuse_short
+from .format import Format, codes, new_file, pieces, refuse_short
 from .ply import Origin, SplatFile
 
 NAME = "GLB"
@@ -138,17 +138,16 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
             continue
         mesh, where = document.item("meshes", node["mesh"], place)
         if node["mesh"] not in meshes:
-            every += (found := _parts(document, mesh, where))
-            meshes[node["mesh"]] = [part for part in found if part.splats]
-        parts = meshes[node["mesh"]]
+            meshes[node["mesh"]] = _parts(document, mesh, where)
+            every += meshes[node["mesh"]]
+        parts = [part for part in meshes[node["mesh"]] if part.splats]
         shown += [(part, matrix, place) for part in parts]
         count += sum(part.splats for part in parts)
         if count > len(data):  # many nodes may show one mesh
             wanted = f"expected at most {len(data)}, the bytes of the file"
             document.place.fail(f"its nodes show {count} splats or more, {wanted}")
     if not every:
-        said = f"no node of its scene shows a primitive with {EXTENSION}"
-        document.place.fail(f"no splats: {said}")
+        document.place.fail(f"no splats: no node of its scene shows a primitive with {EXTENSION}")
     origin = Origin(f"{NAME} with {EXTENSION}", len(data))
     file, splats = new_file(path, origin, count, max(part.degree for part in every))
     start = 0
@@ -157,14 +156,17 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
             for piece in pieces(part.splats):
                 target = splats.take(slice(start + piece.start, start + piece.stop))
                 _fill(target, part, piece)
-                moved = _placed(target, matrix, place)
+                try:
+                    unmoved = np.array_equal(matrix, np.eye(4))
+                    turned = _HALF_TURN @ matrix
+                    moved = _half_turned(target) if unmoved else transformed(target, turned)
+                except RefineError as error:
+                    place.fail(str(error))
                 for name in ARRAYS:
                     getattr(target, name)[:] = getattr(moved, name)
             start += part.splats
-    if any(part.logs for part in every):
-        remark = f"{path.name} has negative scales: its scales are read as logarithms"
-        return replace(file, remarks=(remark,))
-    return file
+    remark = f"{path.name} has negative scales: its scales are read as logarithms"
+    return replace(file, remarks=(remark,)) if any(part.logs for part in every) else file
 
 
 def _opened(path: Path, data: NDArray[np.uint8]) -> _Document:
@@ -202,8 +204,7 @@ def _moved(frame: NDArray[np.float64], node: dict[str, Any], place: Place) -> ND
     def numbers(key: str, *default: float) -> list[float]:
         return place.at(key).numbers(node.get(key, [*default]), len(default))
 
-    turn = np.array(numbers("rotation", 0.0, 0.0, 0.0, 1.0))[WXYZ]
-    matrix = np.eye(4)
+    turn, matrix = np.roll(numbers("rotation", 0.0, 0.0, 0.0, 1.0), 1), np.eye(4)
     matrix[:3, :3] = rotation_matrices(turn) * numbers("scale", 1.0, 1.0, 1.0)
     matrix[:3, 3] = numbers("translation", 0.0, 0.0, 0.0)
     return frame @ matrix
@@ -225,7 +226,7 @@ def _parts(document: _Document, mesh: dict[str, Any], place: Place) -> list[_Par
         if isinstance(more, dict) and more:
             where.fail(f"splats by {described(next(iter(more)))}, expected plain accessors")
         if primitive.get("mode", 4) != _POINTS:
-            where.at("mode").fail(f"expected {_POINTS}, got {described(primitive.get('mode', 4))}")
+            where.at("mode").expected(str(_POINTS), primitive.get("mode", 4))
         parts.append(_part(document, primitive.get("attributes"), where.at("attributes")))
     return parts
 
@@ -233,19 +234,17 @@ def _parts(document: _Document, mesh: dict[str, Any], place: Place) -> list[_Par
 def _part(document: _Document, attributes: Any, place: Place) -> _Part:
     """Look up the attributes of a primitive of splats."""
     attributes = place.members(attributes)
-    degree, count = 0, 0
-    while degree < _DEGREES and f"{EXTENSION}:{_harmonic(degree + 1, 0)}" in attributes:
+    degree, count, held = 0, 0, {}
+    while degree < _DEGREES and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
         degree += 1
-    held = {}
     wanted = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1}
     for name, width in (wanted | dict.fromkeys(_harmonics(degree), 3)).items():
         key = name if name == "POSITION" else f"{EXTENSION}:{name}"
         if key not in attributes:
             place.fail(f"no {key}")
         held[name] = document.values(attributes[key], place.at(key), width)
-        count = len(held["POSITION"][0])
-        if len(held[name][0]) != count:
-            got = len(held[name][0])
+        count, got = len(held["POSITION"][0]), len(held[name][0])
+        if got != count:
             place.at(key).fail(f"{got} values, expected {count} as for POSITION")
 
     def values(name: str, piece: slice) -> NDArray[Any]:
@@ -261,23 +260,12 @@ def _fill(target: Splats, part: _Part, piece: slice) -> None:
     target.means[:] = part.values("POSITION", piece)
     sizes = part.values("SCALE", piece)
     target.log_scales[:] = sizes if part.logs else np.log(sizes, dtype=np.float32)
-    target.quaternions[:] = part.values("ROTATION", piece)[:, WXYZ]
+    target.quaternions[:] = np.roll(part.values("ROTATION", piece), 1, axis=1)
     target.opacity_logits[:] = opacity_logits(part.values("OPACITY", piece)[:, 0], SINGLE_MARGIN)
-    target.sh_rest[:] = 0.0
     constant, *others = _harmonics(part.degree)
-    target.sh_dc[:] = part.values(constant, piece)
+    target.sh_dc[:], target.sh_rest[:] = part.values(constant, piece), 0.0
     for index, name in enumerate(others):
         target.sh_rest[:, index] = part.values(name, piece)
-
-
-def _placed(splats: Splats, matrix: NDArray[np.float64], place: Place) -> Splats:
-    """Splats as a node shows them, in the frame of captures."""
-    if np.array_equal(matrix, np.eye(4)):
-        return _half_turned(splats)
-    try:
-        return transformed(splats, _HALF_TURN @ matrix)
-    except RefineError as error:
-        place.fail(str(error))
 
 
 def _half_turned(splats: Splats) -> Splats:
@@ -294,38 +282,36 @@ def _half_turned(splats: Splats) -> Splats:
     )
 
 
-def _harmonic(degree: int, order: int) -> str:
-    return f"SH_DEGREE_{degree}_COEF_{order}"
-
-
 def _harmonics(degree: int) -> list[str]:
     """Names of all coefficients up to a degree, the constant first."""
-    return [_harmonic(band, n) for band in range(degree + 1) for n in range(2 * band + 1)]
+    bands = range(degree + 1)
+    return [f"SH_DEGREE_{band}_COEF_{n}" for band in bands for n in range(2 * band + 1)]
 
 
-def _attributes(degree: int) -> list[tuple[str, int, int, Callable[[Splats], NDArray[Any]]]]:
+def _attributes(degree):
     """What is written, in the order of the binary chunk.
 
     Name, component type, numbers of one splat, and these, (n, width), in the frame of glTF.
     """
-
-    def color(splats: Splats) -> NDArray[Any]:
-        return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
-
-    def harmonic(index: int) -> Callable[[Splats], NDArray[Any]]:
-        return lambda splats: splats.sh_rest[:, index]
-
     constant, *others = (f"{EXTENSION}:{name}" for name in _harmonics(degree))
-    turn = f"{EXTENSION}:ROTATION", _FLOAT, 4
+    harmonics = [lambda splats, k=k: splats.sh_rest[:, k] for k in range(len(others))]
     return [
         ("POSITION", _FLOAT, 3, lambda splats: splats.means),
-        ("COLOR_0", _BYTE, 4, color),
-        (*turn, lambda splats: unit_quaternions(splats.quaternions)[:, XYZW]),
+        ("COLOR_0", _BYTE, 4, _colors),
+        (f"{EXTENSION}:ROTATION", _FLOAT, 4, _rotations),
         (f"{EXTENSION}:SCALE", _FLOAT, 3, lambda splats: scales(splats.log_scales)),
         (f"{EXTENSION}:OPACITY", _FLOAT, 1, lambda splats: opacity(splats.opacity_logits)[:, None]),
         (constant, _FLOAT, 3, lambda splats: splats.sh_dc),
-        *((name, _FLOAT, 3, harmonic(index)) for index, name in enumerate(others)),
+        *((name, _FLOAT, 3, harmonic) for name, harmonic in zip(others, harmonics, strict=True)),
     ]
+
+
+def _colors(splats):
+    return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
+
+
+def _rotations(splats):
+    return np.roll(unit_quaternions(splats.quaternions), -1, axis=1)  # x y z w
 
 
 def _write(stream: BinaryIO, splats: Splats) -> None:

@@ -22,17 +22,7 @@ from ..foreign_files import GZIP, SPZ, is_spz
 from ..place import Place
 from ..rendering import MODELS, Model
 from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
-from .format import (
-    WXYZ,
-    XYZW,
-    Format,
-    codes,
-    join_largest,
-    new_file,
-    pieces,
-    refuse_short,
-    split_largest,
-)
+from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
 from .ply import Origin, SplatFile
 
 NAME, SUFFIX = "SPZ", ".spz"
@@ -83,12 +73,14 @@ class _Header(NamedTuple):
     flags: int
     streams: int
 
-    def blocks(self) -> dict[str, int]:
-        """Bytes of each attribute by its name, in their order."""
-        turn = 3 if self.version == _ONE_TURN else 4
-        rest = 3 * above_constant(self.degree)
-        widths = {"mean": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": turn, "rest": rest}
-        return {name: width * self.splats for name, width in widths.items()}
+    def widths(self) -> dict[str, int]:
+        """Bytes of each attribute of a splat by its name, in their order."""
+        turn, rest = 3 if self.version == _ONE_TURN else 4, 3 * above_constant(self.degree)
+        return {"mean": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": turn, "rest": rest}
+
+    def needed(self) -> int:
+        """Bytes of all attributes."""
+        return self.splats * sum(self.widths().values())
 
 
 def _matches(path: Path, head: bytes) -> bool:
@@ -102,13 +94,15 @@ def _matches(path: Path, head: bytes) -> bool:
 def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     """Read a file; version 4 needs a module for zstd."""
     if not data[: len(SPZ)].tobytes().startswith(SPZ):
-        header, blocks = _unpacked(path, data)
+        header, body = _unpacked(path, data)
     else:
         header = _parsed(path, data[: _HEADER.size].tobytes(), len(data))
-        if header.version == _ZSTD:
-            blocks = _streams(path, data, header)
-        else:
-            blocks = _split(path, header, data[_HEADER.size :])
+        body = _streams(path, data, header) if header.version == _ZSTD else data[_HEADER.size :]
+    refuse_short(path, header.needed(), len(body), f"{header.splats} splats (unpacked)")
+    widths = header.widths()
+    ends = header.splats * np.cumsum([*widths.values()])
+    parts = zip(widths.items(), np.split(body, ends), strict=False)
+    blocks = {name: part.reshape(header.splats, width) for (name, width), part in parts}
     origin = Origin(f"{NAME} version {header.version}", len(data))
     model: Model = "antialiased" if header.flags & _ANTIALIASED else "default"
     file, splats = new_file(path, origin, header.splats, header.degree, model)
@@ -137,24 +131,22 @@ def _parsed(path: Path, head: bytes, size: int) -> _Header:
         problem = f"byte 12: harmonics of degree {header.degree}, expected 0 to {_DEGREES - 1}"
     elif header.fraction > _LARGEST_CODE.bit_length():
         problem = f"byte 13: {header.fraction} fractional bits, expected 0 to 23"
-    elif (needed := sum(header.blocks().values())) > _INFLATION * size:
-        problem = (
-            f"truncated: {header.splats} splats need {needed} bytes unpacked, a file of "
-            f"{size} bytes holds at most {_INFLATION * size}"
-        )
+    elif header.needed() > _INFLATION * size:
+        problem = f"truncated: {header.splats} splats need {header.needed()} bytes unpacked, "
+        problem += f"a file of {size} bytes holds at most {_INFLATION * size}"
     if problem:
         Place(path).fail(problem)
     return header
 
 
-def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict]:
+def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, NDArray[np.uint8]]:
     """Header and attributes of a gzip stream."""
     engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         header = _parsed(path, engine.decompress(data.data, _HEADER.size), len(data))
         if header.version == _ZSTD:
             Place(path).fail("SPZ version 4 inside of gzip, expected its own header first")
-        needed = sum(header.blocks().values())
+        needed = header.needed()
         body = engine.decompress(engine.unconsumed_tail, needed) if needed else b""
         # The rest, extensions that are not read, a step at a time: its end has the checksum. No
         # bytes at last: what zlib still holds comes out.
@@ -165,10 +157,9 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict]:
     except zlib.error as error:
         at = _damaged_at(data)
         Place(path).fail(f"a damaged SPZ file: its gzip stream breaks at byte {at} ({error})")
-    blocks = _split(path, header, np.frombuffer(body, np.uint8))
-    if not engine.eof:
+    if len(body) == needed and not engine.eof:
         Place(path).fail("truncated: the gzip stream has no end")
-    return header, blocks
+    return header, np.frombuffer(body, np.uint8)
 
 
 def _damaged_at(data: NDArray[np.uint8]) -> int:
@@ -186,54 +177,41 @@ def _damaged_at(data: NDArray[np.uint8]) -> int:
     return at
 
 
-def _split(path: Path, header: _Header, body: NDArray[np.uint8]) -> dict:
-    """Attributes that follow each other in `body`, by name: (splats, bytes of one) each."""
-    lengths = header.blocks()
-    ends = np.cumsum([*lengths.values()])
-    refuse_short(path, int(ends[-1]), len(body), f"{header.splats} splats (unpacked)")
-    parts = zip(lengths, np.split(body, ends), strict=False)
-    return {name: _table(part, header.splats) for name, part in parts}
-
-
-def _table(block: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
-    return block.reshape(count, len(block) // count if count else 0)
-
-
-def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict:
-    """Attributes of version 4."""
+def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> NDArray[np.uint8]:
+    """Attributes of version 4, one behind the other."""
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
     (at,) = _TABLE_AT.unpack(data[_HEADER.size : first].tobytes())
-    lengths = {name: length for name, length in header.blocks().items() if length}
+    widths = header.widths() if header.splats else {}
+    lengths = {name: header.splats * width for name, width in widths.items() if width}
     if header.streams < len(lengths):
         Place(path).fail(f"byte 15: {header.streams} streams, expected {len(lengths)}")
     start = at + header.streams * _STREAM.size
     refuse_short(path, start, len(data), "the table of streams")
-    blocks = {name: np.empty((header.splats, 0), np.uint8) for name in header.blocks()}
+    body, filled = np.empty(header.needed(), np.uint8), 0
     for name, length in lengths.items():
         packed, announced = _STREAM.unpack(data[at : at + _STREAM.size].tobytes())
         at += _STREAM.size
         if announced != length:
-            problem = f"announces {announced} bytes, expected {length}"
-            Place(path).fail(f"stream '{name}' {problem}")
+            Place(path).fail(f"stream '{name}' announces {announced} bytes, expected {length}")
         end = start + packed
         refuse_short(path, end, len(data), f"stream '{name}' and what is before it")
         content = _zstd(path, name, data[start:end].tobytes(), length)
-        blocks[name] = _table(np.frombuffer(content, np.uint8), header.splats)
-        start = end
-    return blocks
+        body[filled : filled + length] = np.frombuffer(content, np.uint8)
+        start, filled = end, filled + length
+    return body
 
 
 def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
     """What is in a zstd stream; refuse it if that has another length."""
+    module: Any
     try:
         try:
-            module: Any = importlib.import_module("compression.zstd")  # Python 3.14 and later
-            reader, failure = module.ZstdFile(io.BytesIO(packed)), module.ZstdError
+            module = importlib.import_module("compression.zstd")  # Python 3.14 and later
+            reader = module.ZstdFile(io.BytesIO(packed))
         except ImportError:
             module = importlib.import_module("zstandard")
             reader = module.ZstdDecompressor().stream_reader(packed)
-            failure = module.ZstdError
     except ImportError:
         where = "run this in Blender, which brings one, or 'pip install zstandard'"
         Place(path).fail(f"SPZ version 4 needs a module for zstd: {where}; or write version 3")
@@ -241,7 +219,7 @@ def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
     try:
         while len(content) <= length and (piece := reader.read(_PIECE)):
             content += piece
-    except (failure, EOFError) as error:
+    except (module.ZstdError, EOFError) as error:
         Place(path).fail(f"stream '{name}' is damaged ({error})")
     if len(content) != length:
         held = "more" if len(content) > length else str(len(content))
@@ -260,15 +238,14 @@ def _positions(block: NDArray[np.uint8], fraction: int) -> NDArray[np.float64]:
 def _rotations(block: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Quaternions w x y z; in the file they are x y z w."""
     if block.shape[1] == 3:
-        others = block / 127.5 - 1.0
-        return join_largest(np.zeros(len(block), np.intp), others)
+        return join_largest(np.zeros(len(block), np.intp), block / 127.5 - 1.0)
     packed = np.ascontiguousarray(block).view("<u4")[:, 0]
     others = np.empty((len(packed), 3))
     for index, shift in enumerate((20, 10, 0)):
         code = packed >> np.uint32(shift)
         size = (code & np.uint32(511)) * (math.sqrt(0.5) / 511.0)
         others[:, index] = np.where(code & np.uint32(512), -size, size)
-    return join_largest((packed >> np.uint32(30)).astype(np.intp), others)[:, WXYZ]
+    return join_largest((packed >> np.uint32(30)).astype(np.intp), others)[:, [3, 0, 1, 2]]
 
 
 def _write(stream: BinaryIO, splats: Splats) -> None:
@@ -277,7 +254,7 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
     fraction = _fraction(splats)
     flags = _ANTIALIASED if splats.model == "antialiased" else 0
     header = _Header(SPZ, 3, count, splats.sh_degree, fraction, flags, 0)
-    blocks = {name: np.empty((count, n // count), np.uint8) for name, n in header.blocks().items()}
+    blocks = {name: np.empty((count, n), np.uint8) for name, n in header.widths().items()}
     for piece in pieces(count):
         batch = splats.take(piece)
         places = np.rint(np.ldexp(np.asarray(batch.means, np.float64), fraction)).astype("<i4")
@@ -289,8 +266,11 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
         blocks["scale"][piece] = np.rint(np.clip(steps, 0.0, 255.0))
         turns = _packed_rotations(batch.quaternions)
         blocks["rotation"][piece] = turns.view(np.uint8).reshape(-1, 4)
-        if rest:
-            blocks["rest"][piece] = _harmonic_codes(batch.sh_rest).reshape(-1, rest)
+        scaled = np.clip(batch.sh_rest, -1.0, 1.0) * np.float32(128.0)
+        steps = np.rint(scaled).astype(np.int16) + 128  # 128 is 0
+        for bucket, band in zip(_BUCKETS, (slice(3), slice(3, None)), strict=True):
+            steps[:, band] = (steps[:, band] + bucket // 2) // bucket * bucket
+        blocks["rest"][piece] = np.minimum(steps, 255).reshape(len(batch), rest)
     engine = zlib.compressobj(wbits=16 + zlib.MAX_WBITS)
     stream.write(engine.compress(_HEADER.pack(*header)))
     stream.writelines(engine.compress(block.data) for block in blocks.values())
@@ -306,30 +286,22 @@ def _fraction(splats: Splats) -> int:
     farthest = float(np.abs(splats.means).max())
     _, bits = math.frexp(farthest)  # before the point
     most = _LARGEST_CODE.bit_length() - bits
-    if np.rint(math.ldexp(farthest, most)) > _LARGEST_CODE:
-        most -= 1
+    most -= int(np.rint(math.ldexp(farthest, most)) > _LARGEST_CODE)
     if most < 0:
-        wanted = f"{NAME} holds coordinates up to {_LARGEST_CODE}"
-        raise RefineError(f"a coordinate is {farthest:.10g}: {wanted}")
+        raise RefineError(
+            f"a coordinate is {farthest:.10g}: {NAME} holds coordinates up to {_LARGEST_CODE}"
+        )
     return min(max(_USUAL_FRACTION, _LEAST_STEPS - bits), most, _LARGEST_CODE.bit_length())
 
 
 def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
-    largest, others = split_largest(unit_quaternions(quaternions)[:, XYZW])
+    largest, others = split_largest(unit_quaternions(quaternions)[:, [1, 2, 3, 0]])
     packed = largest.astype("<u4")
     for index in range(3):
         size = np.rint(np.abs(others[:, index]) * (511.0 * math.sqrt(2.0))).astype(np.uint32)
         sign = (others[:, index] < 0.0).astype(np.uint32) << np.uint32(9)
         packed = (packed << np.uint32(10)) | sign | np.minimum(size, np.uint32(511))
     return packed.astype("<u4")
-
-
-def _harmonic_codes(sh_rest: NDArray[Any]) -> NDArray[np.uint8]:
-    """The codes of harmonics (n, K, 3), where 128 is 0, rounded to `_BUCKETS`."""
-    steps = np.rint(np.clip(sh_rest, -1.0, 1.0) * np.float32(128.0)).astype(np.int16) + 128
-    for bucket, band in zip(_BUCKETS, (slice(3), slice(3, None)), strict=True):
-        steps[:, band] = (steps[:, band] + bucket // 2) // bucket * bucket
-    return np.asarray(np.minimum(steps, 255), np.uint8)
 
 
 _LOSS = "holds positions in 24 bits, all else in 8 to 10, and harmonics in 4 to 5"
