@@ -92,7 +92,11 @@ def _best(before, after, random):
         return whole, fits
     some = _spread(np.arange(len(before)), _SAMPLE)
     best, most = None, LEAST - 1
-    for drawn in _draws(len(before), random):
+    for number in range(_TRIES):
+        share = int(len(before) * _BLOCKS[number % len(_BLOCKS)])
+        size = max(min(len(before), 2 * _DRAWN), share)
+        start = random.integers(0, len(before) - size + 1)
+        drawn = start + random.choice(size, min(size, _DRAWN), replace=False)
         matrix = _fitted(before[drawn], after[drawn])
         if matrix is None:
             continue
@@ -111,14 +115,6 @@ def _best(before, after, random):
     if best is None:
         return None, np.zeros(len(before), np.bool_)
     return best, _fits(best, before, after)
-
-
-def _draws(count, random):
-    """Yield a few points at a time, from smaller and smaller runs of all."""
-    for number in range(_TRIES):
-        size = max(min(count, 2 * _DRAWN), int(count * _BLOCKS[number % len(_BLOCKS)]))
-        start = random.integers(0, count - size + 1)
-        yield start + random.choice(size, min(size, _DRAWN), replace=False)
 
 
 def _spread(rows, most):

@@ -60,8 +60,7 @@ class Surface(NamedTuple):
     scale: float
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
+class Prepared(NamedTuple):
     """Splats ready to be looked at from anywhere."""
 
     splats: Splats
@@ -162,8 +161,7 @@ class Sight:
 
 def prepare(splats: Splats, view: View) -> Prepared:
     """Splats ready to be looked at; the view is one of those to come."""
-    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
-    return Prepared(splats, gaussians, scene)
+    return Prepared(splats, *projection.prepare(splats, ViewSet((view,)))[:2])
 
 
 def look(prepared: Prepared, view: View) -> Sight:

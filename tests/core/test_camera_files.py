@@ -359,7 +359,7 @@ def test_what_a_view_refuses_is_refused_with_the_place():
     place = CameraPlace(Path("cameras.json"), "camera 3")
 
     with pytest.raises(RefineError, match=r"^cameras\.json: camera 3: view 'a': .*focal lengths"):
-        place.view("a", np.eye(3), np.zeros(3), (-1, 1), (0, 0), (1, 1))
+        place.view("a", (np.eye(3), np.zeros(3)), ((-1, 1), (0, 0), (1, 1)))
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")

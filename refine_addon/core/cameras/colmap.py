@@ -100,7 +100,7 @@ def read_colmap(folder: Path, suffix: str) -> ViewSet:
             place.fail("expected a quaternion (w, x, y, z) of a rotation, got all zeros")
         rotation = rotation_matrices(np.array(pose[:4]))
         center = -rotation.T @ np.array(pose[4:])
-        views.append(place.view(name, rotation, center, *lenses[camera_id][1:]))
+        views.append(place.view(name, (rotation, center), lenses[camera_id][1:]))
     used = sorted({camera_id for *_, camera_id in registered})
     counts = Counter(model for number in used if (model := lenses[number][0]))
     return ViewSet(tuple(views), lens_note(counts, "camera"))

@@ -97,8 +97,8 @@ def _view(place, values, name, world, remarks):
         place.fail("missing 'fl_x', expected fl_x, fl_y, camera_angle_x or camera_angle_y")
     both = [focal[0] or focal[1], focal[1] or focal[0]]
     rotation, offset, scale = world
-    center = scale * (rotation @ center + offset)
-    return place.view(name, (rotation @ axes).T, center, both, place.principal(values, size), size)
+    pose = (rotation @ axes).T, scale * (rotation @ center + offset)
+    return place.view(name, pose, (both, place.principal(values, size), size))
 
 
 def _pose(place, value, remarks):

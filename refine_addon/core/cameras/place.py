@@ -27,6 +27,10 @@ SNIFFED_BYTES = 4096
 """How many bytes are read to find out whether a file can be JSON."""
 
 
+Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
+Lens = tuple[Sequence[float], Sequence[float], Sequence[int]]
+
+
 class CameraPlace(Place):
     """A place in a file of cameras."""
 
@@ -69,31 +73,19 @@ class CameraPlace(Place):
             self.fail(f"expected an orthonormal rotation, got {np.round(matrix, 6).tolist()}")
         return matrix
 
-    def view(
-        self,
-        name: str,
-        rotation: NDArray[np.float64],
-        center: NDArray[np.float64],
-        focal: Sequence[float],
-        principal: Sequence[float],
-        size: Sequence[int],
-    ) -> View:
+    def view(self, name: str, pose: Pose, lens: Lens) -> View:
         """View of a camera; errors name this place.
 
         Parameters
         ----------
         name : str
             As in the file. Halves of surrogate pairs become "?", since they cannot be printed.
-        rotation : (3, 3) float64
-            World to camera (x right, y down, z forward).
-        center : (3,) float64
-            World units.
-        focal, principal : (2,) float
-            fx, fy and cx, cy; pixels.
-        size : (2,) int
-            Width, height; pixels.
+        pose : ((3, 3) float64, (3,) float64)
+            Rotation, world to camera (x right, y down, z forward), and centre, world units.
+        lens : sequence of three pairs
+            fx and fy, cx and cy, width and height; pixels.
         """
-        (fx, fy), (cx, cy), (width, height) = focal, principal, size
+        (rotation, center), ((fx, fy), (cx, cy), (width, height)) = pose, lens
         if np.abs(center).max() > LARGEST_NUMBER:
             self.fail(f"the camera's centre is farther than 1e18: {center.tolist()}")
         printable = name.encode("utf-8", "replace").decode("utf-8")

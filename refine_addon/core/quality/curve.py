@@ -195,15 +195,11 @@ class Quality:
 
     def facts(self) -> dict[str, Any]:
         """Plain JSON values; those of single views to hundredths of a dB."""
-        return {
-            "shares": self.shares.tolist(),
-            "psnr": self.psnr.tolist(),
-            "absorbed": self.absorbed.tolist(),
-            "foretold": self.foretold,
-            "hits": round(self.hits, 2),
-            "views": {name: psnr.round(2).tolist() for name, psnr in self.views.items()},
-            "between": None if self.between is None else self.between.round(2).tolist(),
-        }
+        curves = {name: getattr(self, name).tolist() for name in ("shares", "psnr", "absorbed")}
+        views = {name: psnr.round(2).tolist() for name, psnr in self.views.items()}
+        between = None if self.between is None else self.between.round(2).tolist()
+        told = {"foretold": self.foretold, "hits": round(self.hits, 2)}
+        return {**curves, **told, "views": views, "between": between}
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Quality | None:

@@ -55,8 +55,7 @@ class Sampling:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in ("cell", "density"):
-            value = getattr(self, name)
+        for name, value in vars(self).items():
             if not 0.0 < value < np.inf:
                 raise RefineError(f"{name} is {value}, expected a positive number")
 
