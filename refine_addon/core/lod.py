@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
@@ -26,7 +26,7 @@ from .formats.images import codec_for
 from .formats.registry import format_named, held_splats, left_out, notes, scene_name, write_splats
 from .formats.streamed_sog import INDEX, StreamedSog, folder_for
 from .methods import DEFAULT, Method
-from .operations import Scene, read_scene
+from .operations import read_scene
 from .prune import prune, score
 from .quality.curve import PSNR_CAP
 from .rendering import Model
@@ -237,14 +237,11 @@ def lod(
         rest = ~gone
         splats = splats.take(rest)
         protected = None if protected is None else protected[rest]
-    make = _by_steps if method.changes else _by_one_ranking
     share = 0.5 if method.changes else 0.02  # of the time before that the next level takes
     of_levels = stages(progress, *(share**place for place in range(len(budgets))))
     left, number, scores = len(whole), 0, None
-    for asked, result in zip(
-        levels.asked, make(splats, views, budgets, method, protected, of_levels, threads),
-        strict=True,
-    ):  # fmt: skip
+    results = _results(splats, views, budgets, method, protected, of_levels, threads)
+    for asked, result in zip(levels.asked, results, strict=True):
         scores = result.scores if scores is None else scores
         kept = int(np.count_nonzero(result.keep))
         if kept < left:
@@ -257,56 +254,43 @@ def lod(
         raise RefineError(f"no level has fewer splats than the input, which has {len(whole)}")
 
 
-def _by_one_ranking(
-    splats: Splats, views: ViewSet, budgets: Sequence[Budget], method: Method,
-    protected: NDArray[np.bool_] | None, progress: Sequence[Progress], threads: int | None,
-) -> Iterator[Result]:  # fmt: skip
-    """Make levels by deleting."""
-    scores = score(splats, views, method, quality=True, progress=progress[0], threads=threads)
-    for budget in budgets:
-        yield prune(
-            splats, views, budget, method, protected=protected, scores=scores, threads=threads
-        )
-
-
-def _by_steps(
-    splats: Splats, views: ViewSet, budgets: Sequence[Budget], method: Method,
-    protected: NDArray[np.bool_] | None, progress: Sequence[Progress], threads: int | None,
-) -> Iterator[Result]:  # fmt: skip
-    """Make levels each from the one before."""
-    whole, origin, now = None, None, splats
+def _results(splats, views, budgets, method, protected, progress, threads):
+    """Results of all splats: by one ranking where rows stay, else each from the one before."""
+    scores, whole, origin = None, None, None
+    if not method.changes:
+        scores = score(splats, views, method, quality=True, progress=progress[0], threads=threads)
     for budget, of_level in zip(budgets, progress, strict=True):
+        if scores is not None:
+            yield prune(
+                splats, views, budget, method, protected=protected, scores=scores, threads=threads
+            )
+            continue
         spared = protected if protected is None or whole is None else protected[whole.keep]
         result = prune(
-            now, views, budget, method, protected=spared, origin=origin,
-            progress=of_level, threads=threads,
+            splats if whole is None else whole.splats, views, budget, method,
+            protected=spared, origin=origin, progress=of_level, threads=threads,
         )  # fmt: skip
-        whole = result if whole is None else _both(whole, result)
-        whole = replace(whole, source=splats)
+        whole = replace(result if whole is None else _both(whole, result), source=splats)
         if origin is None:
             assert result.scores is not None
             origin = Origin(splats, result.scores.ray_sample, result.scores.between, None)
         origin = replace(origin, psnr=result.report["estimated_psnr"])
         yield whole
-        now = whole.splats
 
 
-def _both(first: Result, second: Result) -> Result:
+def _both(first, second):
     """What two steps make of the splats of the first, one after the other."""
-    keep = among_all(second.keep, first.keep)
-    second = replace(second, scores=first.scores)
-    one, two = first.merged, second.merged
-    if two is None:
-        if one is None:
-            return replace(second, keep=keep)
-        two = replace(one, splats=one.splats.take(second.keep), changed=one.changed[second.keep])
-        return replace(second, keep=keep, merged=replace(two, keep=keep))
-    changed, merged, deleted = two.changed, two.merged, two.deleted
-    if one is not None:
-        changed = one.changed[second.keep] | changed
-        merged, deleted = one.merged + merged, one.deleted + deleted
-    two = replace(two, keep=keep, changed=changed, merged=merged, deleted=deleted)
-    return replace(second, keep=keep, merged=two)
+    keep, one, merged = among_all(second.keep, first.keep), first.merged, second.merged
+    if one is not None and merged is None:
+        splats, changed = one.splats.take(second.keep), one.changed[second.keep]
+        merged = replace(one, splats=splats, changed=changed)
+    elif one is not None:
+        merged = replace(
+            merged, changed=one.changed[second.keep] | merged.changed,
+            merged=one.merged + merged.merged, deleted=one.deleted + merged.deleted,
+        )  # fmt: skip
+    merged = None if merged is None else replace(merged, keep=keep)
+    return replace(second, keep=keep, merged=merged, scores=first.scores)
 
 
 def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") -> list[Path]:
@@ -327,28 +311,24 @@ def is_streamed(target: Path) -> bool:
     return target.name == INDEX
 
 
-Add = Callable[[Scene, Level], tuple[dict[str, Any], list[str]]]
-"""Writes a level; what the report says of its file, and sentences."""
-
-
 @contextlib.contextmanager
-def _into_folder(
-    source: Path, target: Path, count: int, suffix: str, overwrite: bool
-) -> Iterator[tuple[Add, Callable[[], list[str]]]]:
-    """A file of each level; level 0 is not written again. New files go if the block fails."""
+def _into_folder(source, target, count, suffix, overwrite):
+    """A file of each level; level 0 is not written again. New files go if the block fails.
+
+    Yields ``add(scene, level)``, which writes a level and returns the name and size of its file, of
+    how many splats there is none in it, and sentences; and ``finish()``, which returns sentences.
+    """
     paths, written = level_paths(source, target, count, suffix), list[Path]()
 
-    def add(scene: Scene, level: Level) -> tuple[dict[str, Any], list[str]]:
-        path, result = paths[level.number - 1], level.result
-        file, form = scene.file(), format_named(path)
-        columns = result.changed(file.rows)
-        write_splats(path, file, result.keep, columns=columns, overwrite=overwrite)
+    def add(scene, level):
+        path, keep, file = paths[level.number - 1], level.result.keep, scene.file()
+        columns, form = level.result.changed(file.rows), format_named(path)
+        write_splats(path, file, keep, columns=columns, overwrite=overwrite)
         written.append(path)
-        missing = left_out(file, form, result.keep)
-        entry = _entry(missing, level, path.name, path.stat().st_size)
-        return entry, notes(file, form, result.keep)
+        missing, said = left_out(file, form, keep), notes(file, form, keep)
+        return path.name, path.stat().st_size, missing, said
 
-    def finish() -> list[str]:
+    def finish():
         more = level_paths(source, target, MAX_LEVELS, suffix)[len(written) :]
         return [f"{path.name} is of another run" for path in more if mode_of(path)]
 
@@ -361,49 +341,41 @@ def _into_folder(
         try:
             yield add, finish
         except BaseException:
-            for path in written:
-                if path not in old:
-                    with contextlib.suppress(OSError):
-                        path.unlink()
+            for path in (path for path in written if path not in old):
+                with contextlib.suppress(OSError):
+                    path.unlink()
             raise
 
 
 @contextlib.contextmanager
-def _streamed(
-    target: Path, views: ViewSet, overwrite: bool
-) -> Iterator[tuple[Add, Callable[[], list[str]]]]:
-    """A streamed SOG of all levels, with level 0: what the user did not remove of the source."""
+def _streamed(target, views, overwrite):
+    """A streamed SOG of all levels, with level 0: what the user did not remove of the source.
+
+    Yields as `_into_folder`.
+    """
     codec_for(target)  # refuses where no library for images is
     made: list[StreamedSog] = []
     with folder_for(target, overwrite=overwrite) as folder:
 
-        def add(scene: Scene, level: Level) -> tuple[dict[str, Any], list[str]]:
-            file, said, out = scene.file(), list[str](), scene.demands.removed
+        def add(scene, level):
+            file, said, removed = scene.file(), list[str](), scene.demands.removed
             if not made:
-                whole = np.ones(len(scene.splats), np.bool_) if out is None else ~out
+                whole = np.ones(len(scene.splats), np.bool_) if removed is None else ~removed
                 finest = held_splats(target, sog.FORMAT, file, whole, {})
-                made.append(
-                    StreamedSog(finest.means, viewing_distance(scene.splats, views), folder)
-                )
+                distance = viewing_distance(scene.splats, views)
+                made.append(StreamedSog(finest.means, distance, folder))
                 made[0].add(finest)
                 said = notes(file, sog.FORMAT, whole)
-            result = level.result
-            columns = result.changed(file.rows)
-            size = made[0].add(held_splats(target, sog.FORMAT, file, result.keep, columns))
-            missing = left_out(file, sog.FORMAT, result.keep)
-            return _entry(missing, level, f"{level.number}_*/{sog.META}", size), said
+            keep, columns = level.result.keep, level.result.changed(file.rows)
+            size = made[0].add(held_splats(target, sog.FORMAT, file, keep, columns))
+            missing = left_out(file, sog.FORMAT, keep)
+            return f"{level.number}_*/{sog.META}", size, missing, said
 
-        def finish() -> list[str]:
+        def finish():
             made[0].publish(target, overwrite=overwrite)
-            return []
+            return list[str]()
 
         yield add, finish
-
-
-def _entry(missing: int, level: Level, name: str, size: int) -> dict[str, Any]:
-    """What the report says of a level's file, which holds all but `missing` splats."""
-    kept = int(np.count_nonzero(level.result.keep))
-    return {"splats": kept - missing, "left_out": missing, "file": name, "bytes": size}
 
 
 def viewing_distance(splats: Splats, views: ViewSet) -> float:
@@ -489,9 +461,10 @@ def lod_file(
                 facts |= {"source": {"file": file.name, "bytes": scene.bytes}, **seen}
                 facts["nested"] = not method.changes
                 notes += scoring_notes(level.scores)
-            entry, more = add(scene, level)
+            name, size, missing, more = add(scene, level)
             notes += [note for note in more if note not in notes]
-            entries.append({**level.facts(), **entry})
+            entry = level.facts() | {"left_out": missing, "file": name, "bytes": size}
+            entries.append(entry | {"splats": entry["splats"] - missing})
             remarks[level.asked] = level.remark
         writing(0.5, "writing")
         notes += levels.notes(remarks) + finish()
