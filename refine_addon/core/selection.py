@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -50,11 +50,10 @@ class Budget:
 
     def __post_init__(self) -> None:
         """Check that exactly one value is given, and that it is in range."""
-        names = [item.name for item in fields(self) if getattr(self, item.name) is not None]
-        if len(names) != 1:
-            known = ", ".join(item.name for item in fields(self))
-            raise RefineError(f"expected one of {known}, got {names or 'none'}")
-        value = getattr(self, names[0])
+        given = [name for name, value in vars(self).items() if value is not None]
+        if len(given) != 1:
+            raise RefineError(f"expected one of {', '.join(vars(self))}, got {given or 'none'}")
+        value = getattr(self, self.kind)
         # Functions, so that only the check of the given value runs.
         checks: dict[str, tuple[str, Callable[[], bool]]] = {
             "ratio": ("0 <= ratio < 1", lambda: 0 <= value < 1),
@@ -64,14 +63,14 @@ class Budget:
             "min_seen": ("a percentage, 0 to 100", lambda: 0 <= value <= 100),
             "psnr": (f"more than 0 and less than {PSNR_CAP:g} dB", lambda: 0 < value < PSNR_CAP),
         }
-        expected, holds = checks[names[0]]
+        expected, holds = checks[self.kind]
         if not holds():
-            raise RefineError(f"{names[0]} is {value}, expected {expected}")
+            raise RefineError(f"{self.kind} is {value}, expected {expected}")
 
     @property
     def kind(self) -> str:
         """Name of the value that is given."""
-        return next(item.name for item in fields(self) if getattr(self, item.name) is not None)
+        return next(name for name, value in vars(self).items() if value is not None)
 
     @property
     def needs_scores(self) -> bool:
@@ -160,7 +159,7 @@ def select(
     """
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`
-    free = np.ones(len(values), np.bool_) if protected is None else ~protected
+    free = keep.copy() if protected is None else ~protected
     removals = _removals(scores, budget, row_bytes, fixed_bytes)
     if budget.threshold is not None:
         keep[free & (values < single(budget.threshold))] = False
@@ -168,8 +167,7 @@ def select(
         keep[free & (scores.seen < least_seen(budget.min_seen, scores.views_used))] = False
     elif removals:
         _remove_lowest(keep, values, free, removals)
-    left = int(np.count_nonzero(keep))
-    refuse_none_left(budget, len(values), left)
+    refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
     if scores.settled is not None and budget.min_seen is None:
         _refuse_unsettled(scores, budget, ~keep)
     return keep
@@ -210,14 +208,11 @@ class Tally:
 
     def is_of(self, scores: Scores, protected: NDArray[np.bool_] | None = None) -> bool:
         """Return whether it was made of equal scores and of an equal `protected`."""
-        pairs = (
-            (scores.values, self.scores.values),
-            (scores.seen, self.scores.seen),
-            (protected, self._protected),
-        )
+        theirs = (scores.values, scores.seen, protected)
+        own = (self.scores.values, self.scores.seen, self._protected)
         return all(
             one is other if one is None or other is None else np.array_equal(one, other)
-            for one, other in pairs
+            for one, other in zip(theirs, own, strict=True)
         )
 
     def removed(self, budget: Budget, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int:
