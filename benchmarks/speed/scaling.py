@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 from refine_addon.core import METHODS, Budget, Method, execute, prune_file, read_cameras
-from refine_addon.core.execute import Progress
 
 CORES = (2, 4, 8, 16)
 
@@ -51,10 +50,10 @@ class Division:
         in_turn = execute._in_turn
 
         def timed(
-            work: Callable[[Any], Any], items: list[Any], progress: Progress, what: str
+            work: Callable[[Any], Any], items: list[Any], tell: Callable[[int], None]
         ) -> Iterator[Any]:
             if self._inside:
-                return in_turn(work, items, progress, what)
+                return in_turn(work, items, tell)
             seconds: list[float] = []
             self.calls.append((getattr(work, "__qualname__", type(work).__name__), seconds))
 
@@ -69,7 +68,7 @@ class Division:
                     self._inside = False
                     self.serial.enable()
 
-            return in_turn(of_piece, items, progress, what)
+            return in_turn(of_piece, items, tell)
 
         execute._in_turn = timed
 

@@ -22,21 +22,20 @@ import math
 import mmap
 import os
 import pickle
-import queue
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 Progress = Callable[[float, str], "bool | None"]
 """Called as ``progress(fraction, what)``; returning ``False`` cancels."""
@@ -92,7 +91,16 @@ importlib.import_module(name + ".core.execute").serve()
 """What a process runs: it finds modules under the names that they have here, and runs none of the
 packages' own code."""
 
-_own = threading.local()  # `checkpoint` calls the `check` of its own thread
+
+class _Own(threading.local):
+    """What holds for the work of this thread alone."""
+
+    check: Callable[[], None] = staticmethod(lambda: None)
+    cluster: Any = None
+    cores: int | None = None
+
+
+_own = _Own()
 _idle: list[_Process] = []
 _lock = threading.Lock()
 
@@ -117,8 +125,6 @@ def report(progress: Progress, fraction: float, what: str) -> None:
 
 def part(progress: Progress, start: float, end: float) -> Progress:
     """Map fractions 0..1 to `start`..`end` of `progress`."""
-    if progress is silent:
-        return silent
     return lambda fraction, what: progress(start + (end - start) * fraction, what)
 
 
@@ -138,11 +144,8 @@ def stages(progress: Progress, *expected: float) -> list[Progress]:
     scoring 0.625
     (None, None)
     """
-    total = sum(expected) or 1.0
-    ends = np.cumsum([0.0, *expected]) / total
-    return [
-        part(progress, *pair) for pair in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
-    ]
+    ends = np.cumsum([0.0, *expected]) / (sum(expected) or 1.0)
+    return [part(progress, *pair) for pair in pairwise(ends.tolist())]
 
 
 class TimeLeft:
@@ -191,24 +194,26 @@ def checkpoint() -> None:
     Cancelled
         If the progress callback given to `run` answers ``False``. Outside of `run` nothing happens.
     """
-    check: Callable[[], None] | None = getattr(_own, "check", None)
-    if check is not None:
-        check()
+    _own.check()
 
 
 @contextmanager
-def checked_by(check: Callable[[], None]) -> Iterator[None]:
-    """Make `checkpoint` call `check` in this thread, within the block."""
-    before = getattr(_own, "check", None)
-    _own.check = check
+def _with(**own: Any) -> Iterator[None]:
+    """Let something hold in this thread, within the block."""
+    before = {name: getattr(_own, name) for name in own}
+    vars(_own).update(own)
     try:
         yield
     finally:
-        _own.check = before
+        vars(_own).update(before)
 
 
-@contextmanager
-def on(cluster: Any) -> Iterator[None]:
+def checked_by(check: Callable[[], None]) -> AbstractContextManager[None]:
+    """Make `checkpoint` call `check` in this thread, within the block."""
+    return _with(check=check)
+
+
+def on(cluster: Any) -> AbstractContextManager[None]:
     """Have `run` in this thread, within the block, give what is worth processes to a cluster.
 
     Parameters
@@ -216,21 +221,13 @@ def on(cluster: Any) -> Iterator[None]:
     cluster : tiles.cluster.Cluster or None
         None leaves it to this machine. Work that holds large arrays is not sent.
     """
-    before = getattr(_own, "cluster", None)
-    _own.cluster = cluster
-    try:
-        yield
-    finally:
-        _own.cluster = before
+    return _with(cluster=cluster)
 
 
 def alone(work: Callable[[Item], Outcome], items: Iterable[Item]) -> list[Outcome]:
     """Do the same as `run_all` in this thread alone, and whatever the work runs, too."""
-    _own.alone = True
-    try:
+    with _with(cores=1):
         return run_all(work, items, threads=1)
-    finally:
-        _own.alone = False
 
 
 def default_threads() -> int:
@@ -238,11 +235,8 @@ def default_threads() -> int:
 
     In a thread whose work is one of several pieces that a cluster does it is one.
     """
-    if getattr(_own, "alone", False):
-        return 1
-    if hasattr(os, "sched_getaffinity"):
-        return min(len(os.sched_getaffinity(0)), 8)
-    return min(os.cpu_count() or 1, 8)
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return _own.cores or min(there or 1, 8)
 
 
 def return_freed() -> None:
@@ -272,18 +266,6 @@ def chunks(total: int, size: int) -> list[slice]:
     [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
     """
     return [slice(start, min(start + size, total)) for start in range(0, total, size)]
-
-
-def concatenated(parts: Sequence[NDArray[Any]], threads: int | None = None) -> NDArray[Any]:
-    """Join arrays along their first axis, one at least, copied on several threads."""
-    ends = np.cumsum([len(part) for part in parts])
-    whole = np.empty((ends[-1], *parts[0].shape[1:]), parts[0].dtype)
-
-    def copy(number: int) -> None:
-        whole[ends[number] - len(parts[number]) : ends[number]] = parts[number]
-
-    run_all(copy, range(len(parts)), threads=threads)
-    return whole
 
 
 def run_all(work: Callable[[Item], Outcome], items: Iterable[Item], **how: Any) -> list[Outcome]:
@@ -330,79 +312,74 @@ def run(
     # Freeing one 30 MB block raises glibc's mmap threshold, so that buffers are reused instead of
     # page-faulted. No effect on other systems.
     np.empty(_HELD, np.uint8)
-    todo, done = list(items), 0
-    cluster = getattr(_own, "cluster", None)
+    todo, done, before = list(items), 0, 0
+
+    def tell(more: int) -> None:
+        report(progress, (before + more) / len(todo), what)
+
+    cluster = _own.cluster
     if cost and cluster is not None and len(packed := pickle.dumps(work)) <= _SENT:
         yield from cluster.run(packed, todo, progress, what)
         return
     threads = min(default_threads() if threads is None else threads, max(len(todo), 1))
-    if threads > 1 and cost and cost >= _least(threads) and _possible():
+    if _worth(cost, threads):
         try:
-            for result in _in_processes(work, todo, threads, progress, what):
+            for result in _in_processes(work, todo, threads, tell):
                 yield result
                 done += 1
             return
         except _LostError:  # no room for a process or a file: threads need neither
-            progress = part(progress, done / len(todo), 1.0)
-    left = todo[done:]
+            before = done
+    left = todo[before:]
     if threads <= 1 or len(left) <= 1:
-        yield from _in_turn(work, left, progress, what)
+        yield from _in_turn(work, left, tell)
     else:
-        yield from _side_by_side(work, left, threads, progress, what)
+        yield from _side_by_side(work, left, threads, tell)
 
 
-def _in_turn(work: Callable, items: list, progress: Progress, what: str) -> Iterator:
-    """Do work in this thread."""
-    step, done, told = max(len(items) // 100, 1), 0, 0.0  # enough reports for a progress bar
+def _in_turn(work, items, tell):
+    """Do work in this thread; `tell` of how many items are done."""
+    step, told = max(len(items) // 100, 1), 0.0  # enough reports for a progress bar
 
-    def tell() -> None:
+    def check():
         nonlocal told
-        told = time.monotonic()
-        report(progress, done / len(items), what)
-
-    def check() -> None:
         if time.monotonic() - told >= _INTERVAL:
-            tell()
+            told = time.monotonic()
+            tell(done)
 
     for done, item in enumerate(items):
         if done % step == 0:
             checkpoint()  # what this is a part of may be cancelled
-            tell()
+            told = -math.inf
+            check()
         with checked_by(check):
             result = work(item)
         yield result
 
 
-def _side_by_side(
-    work: Callable,
-    items: list,
-    threads: int,
-    progress: Progress,
-    what: str,
-    stop: Callable[[], None] = lambda: None,
-) -> Iterator:
+def _side_by_side(work, items, threads, tell, stop=lambda: None):
     """Do work on several threads; `stop` ends what no `checkpoint` does."""
     cancelled, step = threading.Event(), max(len(items) // 100, 1)
 
-    def check() -> None:
+    def check():
         if cancelled.is_set():
             raise Cancelled
 
-    def checked(item: Any) -> Any:
+    def checked(item):
         with checked_by(check):
             return work(item)
 
     with ThreadPoolExecutor(threads) as pool:
         left, futures = deque(items), deque[Any]()
         try:
-            for index in range(len(items)):
-                if index % step == 0:
-                    report(progress, index / len(items), what)
+            for done in range(len(items)):
+                if done % step == 0:
+                    tell(done)
                 while left and len(futures) < _AHEAD * threads:
                     futures.append(pool.submit(checked, left.popleft()))
                 future = futures.popleft()  # and forget the result once it is used
                 while not future.done() and not wait([future], _INTERVAL).done:
-                    report(progress, index / len(items), what)
+                    tell(done)
                 yield future.result()
                 del future
         except BaseException:
@@ -416,44 +393,39 @@ def _side_by_side(
 def start(cost: float, threads: int | None = None) -> None:
     """Start the processes that `run` will want soon, so that they are there by then."""
     number = default_threads() if threads is None else threads
-    if number > 1 and cost >= _least(number) and _possible():
+    if _worth(cost, number):
         with suppress(_LostError):
             team = _taken(number)
             with _lock:
                 _idle.extend(team)
 
 
-def _least(number: int) -> float:
-    """Seconds of work from which on it is worth having `number` processes."""
+def _worth(cost, number):
+    """Whether work is worth `number` processes of the Python that runs here, if one does."""
     with _lock:
-        return WORTH_READY if sum(process.ready for process in _idle) >= number else WORTH
+        least = WORTH_READY if sum(process.ready for process in _idle) >= number else WORTH
+    python = Path(sys.executable or "").name.lower().startswith("python")
+    return number > 1 and cost and cost >= least and python and not getattr(sys, "frozen", False)
 
 
-def _possible() -> bool:
-    """Whether this process was started by a Python that can be started again."""
-    frozen = getattr(sys, "frozen", False)
-    return not frozen and Path(sys.executable or "").name.lower().startswith("python")
-
-
-def _in_processes(
-    work: Callable, items: list, number: int, progress: Progress, what: str
-) -> Iterator:
+def _in_processes(work, items, number, tell):
     """Do work in `number` processes; raise `_LostError` if they, or their file, cannot be had."""
-    with _shared(work) as (task, folder):
+    with _lost(OSError):
+        folder = tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
+    with folder:
+        task = _stored(work, Path(folder.name) / "arrays")
         team = _taken(number)
-        free: queue.SimpleQueue[_Process] = queue.SimpleQueue()
-        for process in team:
-            free.put(process)
+        free = deque(team)
 
-        def call(item: Any) -> Any:
-            process = free.get()
+        def call(item):
+            process = free.popleft()  # there is one for each thread
             try:
                 process.tell(("call", item))
                 return process.answer()
             finally:
-                free.put(process)
+                free.append(process)
 
-        def stop() -> None:
+        def stop():
             for process in team:
                 process.kill()
 
@@ -461,7 +433,7 @@ def _in_processes(
             _tell_all(team, ("task", task))
             if REPLACES_MAPPED:
                 folder.cleanup()  # nothing is left if this process is killed now
-            yield from _side_by_side(call, items, number, progress, what, stop)
+            yield from _side_by_side(call, items, number, tell, stop)
             _tell_all(team, ("task", None))
         except BaseException:
             stop()
@@ -470,15 +442,22 @@ def _in_processes(
         _idle.extend(team)
 
 
+@contextmanager
+def _lost(*kinds):
+    """Raise `_LostError` instead of errors of some kinds."""
+    try:
+        yield
+    except kinds as error:
+        raise _LostError from error
+
+
 def _tell_all(team: list[_Process], message: tuple[str, Any]) -> None:
     """Tell all of a team what to call from now on, and wait until they know."""
     for process in team:
         process.tell(message)
     for process in team:
-        try:
+        with _lost(Exception):  # it has ended, or lacks a module that this process has
             process.answer()
-        except Exception as error:  # it has ended, or lacks a module that this process has
-            raise _LostError from error
 
 
 def _taken(number: int) -> list[_Process]:
@@ -503,9 +482,8 @@ def _taken(number: int) -> list[_Process]:
 def end_idle() -> None:
     """End the processes that have nothing to do."""
     with _lock:
-        for process in _idle:
-            process.kill()
-        _idle.clear()
+        while _idle:
+            _idle.pop().kill()
 
 
 class _Process:
@@ -521,14 +499,12 @@ class _Process:
         unwritten = ["-B"] * sys.dont_write_bytecode
         # Each uses one core.
         single = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
-        self._popen = subprocess.Popen(
+        self._popen: Any = subprocess.Popen(
             [sys.executable, "-I", "-S", *unwritten, "-c", _BEGIN,
              json.dumps([_PACKAGE, str(_FOLDER), path])],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             env={**os.environ, **single}, **away,
         )  # fmt: skip
-        assert self._popen.stdin and self._popen.stdout
-        self._to, self._from = self._popen.stdin, self._popen.stdout
         self._used = time.monotonic()
 
     @property
@@ -539,18 +515,14 @@ class _Process:
     def tell(self, message: tuple[str, Any]) -> None:
         """Send a task or an item; see `answer`. Raise `_LostError` if the process has ended."""
         self._used = time.monotonic()
-        try:
-            pickle.dump(message, self._to, protocol=5)
-            self._to.flush()
-        except (OSError, ValueError) as error:  # ended, or killed here
-            raise _LostError from error
+        with _lost(OSError, ValueError):  # ended, or killed here
+            pickle.dump(message, self._popen.stdin, protocol=5)
+            self._popen.stdin.flush()
 
     def answer(self) -> Any:
         """Wait for what the work returns; raise its error, or `_LostError` if the process ended."""
-        try:
-            done, result = pickle.load(self._from)
-        except Exception as error:
-            raise _LostError from error
+        with _lost(Exception):
+            done, result = pickle.load(self._popen.stdout)
         self._used = time.monotonic()
         if not done:
             raise result
@@ -558,54 +530,39 @@ class _Process:
 
     def kill(self) -> None:
         """End it now, whatever it does."""
-        self._popen.kill()
-        self._popen.wait()
-        for pipe in (self._to, self._from):
-            with suppress(OSError):  # what was still to be told
-                pipe.close()
+        with suppress(OSError), self._popen:  # closes pipes and waits; of what was yet to be told
+            self._popen.kill()
 
 
-@contextmanager
-def _shared(work: object) -> Iterator[tuple[tuple, tempfile.TemporaryDirectory[str]]]:
-    """Write the arrays of `work` to a file that all processes map; yield task and folder."""
+def _stored(work, path):
+    """What a process needs to have `work`, whose arrays are written to a file that all map."""
     arrays: list[pickle.PickleBuffer] = []
     pickled = pickle.dumps(work, protocol=5, buffer_callback=arrays.append)
     places = []
-    try:
-        folder = tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
-    except OSError as error:
-        raise _LostError from error
-    with folder:
-        path = Path(folder.name) / "arrays"
-        try:
-            with path.open("wb") as stream:
-                for array in arrays:
-                    stream.write(bytes(-stream.tell() % _ALIGNED))
-                    begin = stream.tell()
-                    stream.write(array.raw())
-                    places.append((begin, stream.tell()))
-                stream.write(bytes(1))  # an empty file cannot be mapped
-        except OSError as error:
-            raise _LostError from error
-        arrays.clear()  # copies, where what is pickled made some
-        return_freed()
-        yield (pickled, str(path), places), folder
+    with _lost(OSError), path.open("wb") as stream:
+        for array in arrays:
+            stream.write(bytes(-stream.tell() % _ALIGNED))
+            begin = stream.tell()
+            stream.write(array.raw())
+            places.append((begin, stream.tell()))
+        stream.write(bytes(1))  # an empty file cannot be mapped
+    arrays.clear()  # copies, where what is pickled made some
+    return_freed()
+    return pickled, str(path), places
 
 
-def _unpacked(pickled: bytes, path: str, places: list[tuple[int, int]]) -> Callable[[Any], Any]:
-    """The work that `_shared` has written."""
+def _unpacked(pickled, path, places):
+    """The work that `_stored` has written."""
     with Path(path).open("rb") as stream:
         mapped = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY))
-    arrays = [mapped[begin:end] for begin, end in places]
-    work: Callable[[Any], Any] = pickle.loads(pickled, buffers=arrays)
-    return work
+    return pickle.loads(pickled, buffers=[mapped[begin:end] for begin, end in places])
 
 
 def serve() -> None:
     """Do what another process asks for, until it ends or falls silent."""
     told, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever is printed is no answer
-    work: Callable[[Any], Any] | None = None
+    work: Any = None
     while True:
         watch = threading.Timer(IDLE, os._exit, (0,))
         watch.daemon = True
@@ -618,13 +575,11 @@ def serve() -> None:
             watch.cancel()
         try:
             if kind == "call":
-                assert work is not None  # it is told first
                 result = True, run_all(work, [message], threads=1)[0]
             else:
                 work = None  # first, so that the arrays of both never are there at once
+                return_freed()
                 work = _unpacked(*message) if message else None
-                if work is None:
-                    return_freed()
                 result = True, None
         except BaseException as error:  # raised again where it was asked for
             result = False, error

@@ -8,10 +8,9 @@ import sys
 import threading
 import time
 
-import numpy as np
 import pytest
 
-from refine_addon.core.execute import Cancelled, checkpoint, chunks, concatenated, run_all
+from refine_addon.core.execute import Cancelled, checkpoint, chunks, run_all
 
 LONG = 600.0  # seconds; a tenth of it is more than any machine needs to notice
 
@@ -120,13 +119,3 @@ def test_threads_of_the_command_allocate_from_its_one_heap(share):
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
     assert told.stdout.strip() == str(share)
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_arrays_are_joined_in_their_order(threads):
-    """Along their first axis; empty ones take no room."""
-    parts = [np.arange(6).reshape(3, 2), np.empty((0, 2), int), np.arange(4).reshape(2, 2)]
-
-    whole = concatenated(parts, threads)
-
-    np.testing.assert_array_equal(whole, np.concatenate(parts))

@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 
 # Of modules, not of the package: a process that runs `row` imports these too, from the same places.
-from refine_addon.core import Merge, Occlusion, execute, prune
+from refine_addon.core import execute
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
 from refine_addon.core.execute import Cancelled, run
 from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.methods import Merge, Occlusion
+from refine_addon.core.prune import prune
 from refine_addon.core.selection import Budget
 
 pytestmark = pytest.mark.slow

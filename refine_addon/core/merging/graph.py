@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, concatenated, part, report, run_all, silent
+from ..execute import Progress, chunks, part, report, run_all, silent
 from ..visibility.scene import MIX, Scene
 from . import pairs as pricing
 from .field import Array, Field, Index
@@ -140,9 +140,7 @@ class MergeGraph:
             progress=part(progress, 0.5, 0.6), what="merging", threads=self.threads,
         )  # fmt: skip
         # int32 takes half the memory of int64, and no file holds two billion splats.
-        self.first, self.second = (
-            concatenated(each, self.threads) for each in zip(*found, strict=True)
-        )
+        self.first, self.second = map(np.concatenate, zip(*found, strict=True))
         self.cost = np.empty(len(self.first), np.float32)
         self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.6, 1.0))
         self.connected = int(np.count_nonzero(self.alive))
@@ -248,10 +246,8 @@ class MergeGraph:
             stays = valid[piece]
             return self.first[piece][stays], self.second[piece][stays], self.cost[piece][stays]
 
-        self.first, self.second, self.cost = (
-            concatenated(each, self.threads)
-            for each in zip(*run_all(left, pieces, threads=self.threads), strict=True)
-        )
+        found = run_all(left, pieces, threads=self.threads)
+        self.first, self.second, self.cost = map(np.concatenate, zip(*found, strict=True))
 
 
 def _least_costs(error: Costs, first: Rows, second: Rows, cost: Costs) -> Costs:
