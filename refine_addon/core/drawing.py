@@ -155,9 +155,8 @@ def drawn(
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         colors = colors_from(splats, gaussians.index[footprints.index], view)
-        depths = (
-            scene.size * projection.coordinates(gaussians.means, scene, view)[2, footprints.index]
-        )
+        places = projection.coordinates(gaussians.means, scene, view)
+        depths = scene.size * places[2, footprints.index]
 
     def work(piece: slice) -> NDArray[np.float64]:
         rows = np.arange(piece.start, piece.stop)

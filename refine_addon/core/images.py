@@ -33,8 +33,7 @@ _MOST_SEGMENTS = 4096
 """Most segments and fill bytes that are skipped; no camera writes more."""
 
 _FILL = 0xFF
-_START_OF_SCAN = 0xDA
-_END_OF_IMAGE = 0xD9
+_LAST = 0xDA, 0xD9  # start of scan and end of image
 _STANDALONE = {0x01, *range(0xD0, 0xD9)}
 """JPEG markers that no segment follows."""
 _FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -150,7 +149,7 @@ def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
     stream.seek(len(_JPEG_START))
     for _ in range(_MOST_SEGMENTS):
         start, marker = stream.read(2)
-        if start != _FILL or marker in (_START_OF_SCAN, _END_OF_IMAGE):
+        if start != _FILL or marker in _LAST:
             return None
         if marker == _FILL:
             stream.seek(-1, 1)

@@ -187,7 +187,10 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     """
     refuse_existing(path, overwrite=overwrite)
     target = Path(os.path.realpath(path))
-    _remove_abandoned(target.parent)
+    for left in target.parent.glob(".refine-*.tmp"):
+        with contextlib.suppress(OSError):  # others remove it, too
+            if left.lstat().st_mtime < time.time() - ABANDONED:
+                left.unlink()
     temporary = target.with_name(f".refine-{secrets.token_hex(8)}.tmp")
     with _explained(path):
         try:
@@ -224,13 +227,6 @@ def publish(finished: Path, path: Path, *, overwrite: bool) -> None:
             finished.chmod(mode & 0o777)
         _rename(finished, target, overwrite)
         finished.unlink(missing_ok=True)  # which may be a second name now
-
-
-def _remove_abandoned(folder: Path) -> None:
-    for file in folder.glob(".refine-*.tmp"):
-        with contextlib.suppress(OSError):  # others remove it, too
-            if file.lstat().st_mtime < time.time() - ABANDONED:
-                file.unlink()
 
 
 def _rename(made: Path, target: Path, overwrite: bool) -> None:

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..images import image_size
 from ..views import ORTHONORMAL, ViewSet
@@ -46,11 +45,6 @@ IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 
 LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """What nerfstudio assumes for older COLMAP projects, which have no ``applied_transform``."""
-
-
-World = tuple[NDArray[np.float64], NDArray[np.float64], float]
-"""Rotation, offset and scale from the file's world to the splats':
-``p -> scale * (rotation @ p + offset)``."""
 
 
 def read_transforms(path: Path, data: object) -> ViewSet:
@@ -169,8 +163,11 @@ def _lens(place: CameraPlace, values: Mapping[str, Any]) -> list[Model]:
     return [model] if model.fisheye or distorted else []
 
 
-def _splat_world(place: CameraPlace, shared: Mapping[str, Any]) -> tuple[World, list[str]]:
-    """Transform from the file's world to the splats', and notes about it."""
+def _splat_world(place: CameraPlace, shared: Mapping[str, Any]) -> tuple[Any, list[str]]:
+    """Rotation, offset and scale from the file's world to the splats', and notes about it.
+
+    A point p goes to ``scale * (rotation @ p + offset)``.
+    """
     beside = CameraPlace(place.path.parent / DATAPARSER_FILE)
     if not is_file(beside.path):
         hint = f"splats of ns-export need {DATAPARSER_FILE} beside it"

@@ -97,42 +97,25 @@ def _read_folder(folder: Path) -> ViewSet:
 
 def _read_json_cameras(path: Path) -> ViewSet:
     """Read a JSON file in either of the two formats."""
-    data = read_json(path)
+    data, place = read_json(path), CameraPlace(path)
     if isinstance(data, list):
-        return read_inria(path, data)
+        if not data:
+            place.fail("the list of cameras is empty, expected at least one")
+        return ViewSet(tuple(_inria_view(place, index, item) for index, item in enumerate(data)))
     if not isinstance(data, dict) or "frames" not in data:
-        CameraPlace(path).expected(
+        place.expected(
             "a list of cameras (cameras.json) or an object with 'frames' (transforms.json)", data
         )
     return read_transforms(path, data)
 
 
-def read_inria(path: Path, data: list[object]) -> ViewSet:
-    """Views of the ``cameras.json`` that the reference 3DGS implementation writes.
+def _inria_view(file: CameraPlace, index: int, item: object) -> View:
+    """View of a camera as the reference 3DGS implementation writes it.
 
     ``rotation`` is camera to world; its columns are the camera's x (right), y (down) and z
     (forward). ``position`` is the camera's centre. Some forks add the principal point as ``cx`` and
     ``cy`` (pixels); without them it is the centre of the image.
-
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    data : list
-        The content of the file.
-
-    Raises
-    ------
-    RefineError
-        If the list is empty, or a camera is wrong; with its index and key.
     """
-    place = CameraPlace(path)
-    if not data:
-        place.fail("the list of cameras is empty, expected at least one")
-    return ViewSet(tuple(_inria_view(place, index, item) for index, item in enumerate(data)))
-
-
-def _inria_view(file: CameraPlace, index: int, item: object) -> View:
     place = file.at(f"camera {index}")
     camera = place.members(item)
     if "transform" in camera and "position" not in camera:

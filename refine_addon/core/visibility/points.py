@@ -104,15 +104,11 @@ def cell_size(footprints: Footprints, view: View, cell: float, density: float) -
         side *= _GROWTH  # happens for images that are only a few pixels wide or high
     # As cells grow, the points needed fall to one a footprint, which is below this limit.
     limit = max(MAX_POINTS, LEAST_POINTS * len(footprints.index))
-    while _points_needed(footprints, side, density) > limit:
+    while True:
+        along = (footprints.sigmas * np.float32(density / side)).clip(1.0, COUNTS[-1])
+        if not float(np.dot(along[0], along[1])) > limit:  # about how many points
+            return side
         side *= _GROWTH
-    return side
-
-
-def _points_needed(footprints, side, density):
-    """About how many points the footprints have with cells of this side."""
-    along = (footprints.sigmas * np.float32(density / side)).clip(1.0, COUNTS[-1])
-    return float(np.dot(along[0], along[1]))
 
 
 def scatter(footprints: Footprints, view: View, side: float, density: float) -> Points:

@@ -7,7 +7,7 @@ import secrets
 import shutil
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -154,10 +154,9 @@ class Footprints:
 
     def take(self, rows: NDArray[np.int64]) -> Footprints:
         """Some footprints, in that order."""
-        every = {item.name: getattr(self, item.name) for item in fields(self)}
         taken: dict[str, Any] = {
             name: None if values is None else np.take(values, rows, axis=-1)
-            for name, values in every.items()
+            for name, values in vars(self).items()
         }
         return Footprints(**taken)
 
