@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RefineError
+from ..place import Place
 from ..rendering import MODELS
 from ..splats import SH_C0, Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from . import ply
@@ -61,34 +61,30 @@ def _matches(_path: Path, head: bytes) -> bool:
 
 def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
     header = ply.read_header(path, io.BytesIO(data[: ply.HEADER_LIMIT].tobytes()))
+    place = Place(path)
     if header.order == ply.TEXT:
-        raise RefineError(f"{path}: a compressed PLY in ASCII, expected a binary one")
+        place.fail("a compressed PLY in ASCII, expected a binary one")
     body = data[len(header.raw) :]
     ply.check_counts(header, len(body))
     elements: dict[str, NDArray[Any]] = {}
     at = 0
     for element, count in zip(header.elements, header.counts, strict=True):
         if ply.has_lists(element):
-            raise RefineError(
-                f"{path}: element {ply.shown(element.name)} has a list, expected numbers"
-            )
+            place.fail(f"element {ply.shown(element.name)} has a list, expected numbers")
         kind = np.dtype(element.dtype(header.order))
-        end = (
-            at + count * kind.itemsize
-        )  # which is there: `ply.check_counts` is exact without lists
+        end = at + count * kind.itemsize  # is there: `ply.check_counts` is exact without lists
         elements[element.name] = body[at:end].view(kind) if count else np.empty(0, kind)
         at = end
 
     def rows_of(name: str, properties: tuple[str, ...], kind: str) -> NDArray[Any]:
         """Rows of an element that has these properties, all of one type."""
         if name not in elements:
-            raise RefineError(f"{path}: a compressed PLY without an element '{name}'")
+            place.fail(f"a compressed PLY without an element '{name}'")
         rows = elements[name]
         for key in properties:
             stored = rows.dtype[key].str[1:] if key in (rows.dtype.names or ()) else "none"
             if stored != kind:
-                place = f"{path}: element '{name}': property '{key}'"
-                raise RefineError(f"{place} is {stored}, expected {kind}")
+                place.fail(f"element '{name}': property '{key}' is {stored}, expected {kind}")
         return rows
 
     packed = rows_of("vertex", _PACKED, "u4")
@@ -98,14 +94,14 @@ def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
         rows_of("chunk", _COLOR, "f4")
     count, needed = len(packed), -(-len(packed) // SPLATS)
     if len(ranges) < needed:
-        raise RefineError(f"{path}: {len(ranges)} chunks, expected {needed} for {count} splats")
+        place.fail(f"{len(ranges)} chunks, expected {needed} for {count} splats")
     rest = np.empty((count, 0), np.uint8)
     if "sh" in elements:
         held = elements["sh"]
         names = [f"f_rest_{index}" for index in range(len(held.dtype.names or ()))]
         if len(held) != count or len(names) not in REST_COUNTS:
             got = f"element 'sh' has {len(held)} rows of {len(names)} properties"
-            raise RefineError(f"{path}: {got}, expected {count} rows of 9, 24, 45 or 72")
+            place.fail(f"{got}, expected {count} rows of 9, 24, 45 or 72")
         held = rows_of("sh", tuple(names), "u1")
         order = [(held.dtype.names or ()).index(name) for name in names]
         rest = held.view(np.uint8).reshape(count, len(names))[:, order]
@@ -114,21 +110,17 @@ def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite
         for piece in pieces(count):
             rows, here = packed[piece], ranges[_chunks_of(piece)]
-            splats.means[piece] = _between(
-                _unpacked(rows["packed_position"], _PLACES), here, _POSITION
-            )
-            splats.log_scales[piece] = _between(
-                _unpacked(rows["packed_scale"], _PLACES), here, _SCALE
-            )
+            places, sizes = (_unpacked(rows[name], _PLACES) for name in (_PACKED[0], _PACKED[2]))
+            splats.means[piece] = _between(places, here, _POSITION)
+            splats.log_scales[piece] = _between(sizes, here, _SCALE)
             shares = _unpacked(rows["packed_color"], _CHANNELS)
             colors = _between(shares[:, :3], here, _COLOR) if colored else shares[:, :3]
             splats.sh_dc[piece] = (colors - 0.5) / SH_C0
             splats.opacity_logits[piece] = opacity_logits(shares[:, 3])
             turns = rows["packed_rotation"]
             others = (_unpacked(turns, _TURNS) - 0.5) * np.sqrt(2.0)
-            splats.quaternions[piece] = join_largest(
-                (turns >> np.uint32(30)).astype(np.intp), others
-            )
+            largest = (turns >> np.uint32(30)).astype(np.intp)
+            splats.quaternions[piece] = join_largest(largest, others)
             planes = _REST.take(rest[piece]).reshape(len(rows), 3, rest.shape[1] // 3)
             splats.sh_rest[piece] = planes.transpose(0, 2, 1)
     return file

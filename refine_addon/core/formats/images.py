@@ -6,6 +6,7 @@ imported when an image is read or written.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
 import warnings
@@ -42,20 +43,22 @@ class _Pillow:
 
     def size(self, data: bytes) -> tuple[int, int]:
         """See `Codec`."""
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of large images, which are refused by their size
-                with self._image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-                    width, height = image.size
-        except (OSError, SyntaxError, self._image.DecompressionBombError) as error:
-            raise ValueError(str(error)) from error
-        return width, height
+        with self._opened(data) as image:
+            return image.size
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
         """See `Codec`."""
+        with self._opened(data) as image:
+            return np.array(image.convert("RGBA"))
+
+    @contextlib.contextmanager
+    def _opened(self, data):
         try:
-            with self._image.open(io.BytesIO(data), formats=["WEBP"]) as image:
-                return np.array(image.convert("RGBA"))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of large images, which are refused by their size
+                image = self._image.open(io.BytesIO(data), formats=["WEBP"])
+            with image:
+                yield image
         except (OSError, SyntaxError, self._image.DecompressionBombError) as error:
             raise ValueError(str(error)) from error
 

@@ -330,11 +330,35 @@ def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
         wanted = f"expected an element 'vertex', got {_listed(names) or 'none'}"
         raise RefineError(f"{path}: not a splat file: {wanted}")
     vertex = names.index("vertex")
-    _check_properties(header, vertex)
-    for element in header.elements[:vertex]:
+    kinds = {
+        prop.name: "list" if isinstance(prop, plyfile.PlyListProperty) else prop.val_dtype
+        for prop in header.elements[vertex].properties
+    }
+    missing = [name for name in REQUIRED if name not in kinds]
+    rest = [name for name in kinds if name.startswith("f_rest_")]
+    problem = ""
+    if "packed_position" in kinds:
+        problem = "a compressed splat PLY, which 'refine convert IN OUT.ply' makes a plain one of"
+    elif missing and missing != [THIRD_SCALE]:
+        mesh = any(name in INDEXING for name in names)
+        guess = f"a {'mesh' if mesh else 'point cloud'}, not splats"
+        guess = "incomplete splats" if "opacity" in kinds else guess
+        has = (_listed([*kinds]) or "no property") + ", ..." * (len(kinds) > _NAMES_SHOWN)
+        problem = f"{guess}: vertex lacks {', '.join(missing)} (it has {has})"
+    elif len(rest) not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(len(rest))):
+        problem = f"found {len(rest)} f_rest properties, "
+        problem += "expected f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
+    for name, kind in () if problem else kinds.items():
+        if kind == "list":
+            problem = f"property {shown(name)} is a list, expected one number a splat"
+        elif kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
+            problem = f"property {shown(name)} is of type {kind}, expected float or double"
+    for element in () if problem else header.elements[:vertex]:
         if has_lists(element):
-            problem = "has a list and stands before the splats, expected it behind them"
-            raise RefineError(f"{path}: element {shown(element.name)} {problem}")
+            problem = f"element {shown(element.name)} has a list and stands before the splats, "
+            problem += "expected it behind them"
+    if problem:
+        raise RefineError(f"{path}: {problem}")
     return header, vertex
 
 
@@ -347,16 +371,16 @@ def read_header(path: Path | Url, stream: BinaryIO) -> Header:
         If the file has no header, or the header is wrong; with the line.
     """
     head = stream.read(HEADER_LIMIT)
+    raw, problem = raw_header(head), ""
     if not head:
-        raise RefineError(f"{path}: the file is empty, expected a PLY")
-    if not re.match(rb"ply[\r\n]", head):
+        problem = "the file is empty, expected a PLY"
+    elif not re.match(rb"ply[\r\n]", head):
         refuse_foreign_splats(path, head)
-        wanted = f"it starts with {head[:8]!r}, expected 'ply' and a line end"
-        raise RefineError(f"{path}: not a PLY: {wanted}")
-    raw = raw_header(head)
-    if raw is None:
-        problem = f"no 'end_header' line in the first {len(head)} bytes"
-        raise RefineError(f"{path}: header without end: {problem}")
+        problem = f"not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
+    elif raw is None:
+        problem = f"header without end: no 'end_header' line in the first {len(head)} bytes"
+    if problem or raw is None:
+        raise RefineError(f"{path}: {problem}")
     plain, counts = _plain(path, raw)
     try:
         data = plyfile.PlyData.read(io.BytesIO(plain))
@@ -378,8 +402,7 @@ def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
     """Header as plyfile gets it, see the top of this file, and the counts of rows."""
     lines: list[bytes] = []
     counts: list[int] = []
-    names: set[bytes] = set()
-    elements: set[bytes] = set()
+    names, elements = set[bytes](), set[bytes]()
     for number, line in enumerate(_lines(raw), 1):
         where, words = f"{path}: header line {number}", line.split()
         keyword = words[0] if words else b""
@@ -399,35 +422,6 @@ def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
             known.add(name)
         lines.append(b" ".join(words) or b" ")  # an empty line would end the header for plyfile
     return b"\n".join([*lines[:-1], b""]), counts
-
-
-def _check_properties(header: Header, vertex: int) -> None:
-    """Refuse vertices that are not splats; the message says what they seem to be."""
-    kinds = {
-        prop.name: "list" if isinstance(prop, plyfile.PlyListProperty) else prop.val_dtype
-        for prop in header.elements[vertex].properties
-    }
-    missing = [name for name in REQUIRED if name not in kinds]
-    rest = [name for name in kinds if name.startswith("f_rest_")]
-    problem = ""
-    if "packed_position" in kinds:
-        problem = "a compressed splat PLY, which 'refine convert IN OUT.ply' makes a plain one of"
-    elif missing and missing != [THIRD_SCALE]:
-        mesh = any(element.name in INDEXING for element in header.elements)
-        guess = f"a {'mesh' if mesh else 'point cloud'}, not splats"
-        guess = "incomplete splats" if "opacity" in kinds else guess
-        has = (_listed([*kinds]) or "no property") + ", ..." * (len(kinds) > _NAMES_SHOWN)
-        problem = f"{guess}: vertex lacks {', '.join(missing)} (it has {has})"
-    elif len(rest) not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(len(rest))):
-        problem = f"found {len(rest)} f_rest properties, "
-        problem += "expected f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
-    for name, kind in () if problem else kinds.items():
-        if kind == "list":
-            problem = f"property {shown(name)} is a list, expected one number a splat"
-        elif kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
-            problem = f"property {shown(name)} is of type {kind}, expected float or double"
-    if problem:
-        raise RefineError(f"{header.path}: {problem}")
 
 
 def has_lists(element: Any) -> bool:
@@ -590,11 +584,11 @@ def model_of(raw: bytes) -> Model | None:
 
     Of several comments the last counts, as in Brush and splat-transform.
     """
-    found = [match for match in map(_MODEL_COMMENT.fullmatch, _lines(raw)) if match]
-    if not found:
-        return None
-    word = found[-1][1].lower() if found[-1][1] else (b"default", b"mip")[int(found[-1][2])]
-    return next(name for name, mode in _MODES.items() if mode == word)
+    model: Model | None = None
+    for match in filter(None, map(_MODEL_COMMENT.fullmatch, _lines(raw))):
+        word = match[1].lower() if match[1] else (b"default", b"mip")[int(match[2])]
+        model = next(name for name, mode in _MODES.items() if mode == word)
+    return model
 
 
 def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:

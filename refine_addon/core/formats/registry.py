@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RefineError, reason_of
+from ..errors import RefineError
 from ..foreign_files import refuse_pointer
-from ..place import LARGEST_NUMBER
+from ..place import LARGEST_NUMBER, Place
 from ..rendering import Model
 from ..splats import Splats, drawable, with_model
 from ..whole_file import Url, expanded, whole_file
@@ -72,24 +72,20 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
         If the file does not exist, is of no known format, or is damaged; the message names the
         file, the place, what was found and what was expected. See also `SplatFile.drawn_as`.
     """
-    path, head = expanded(path), b""
+    path, head, whole = expanded(path), b"", None
     try:
         if stat.S_ISREG(path.stat().st_mode):
             with path.open("rb") as stream:
                 head = stream.read(_HEAD)
+                whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError):
         pass  # `read_ply` says why it cannot be read
     refuse_pointer(path, head)
     form = next((form for form in READERS if form.matches(path, head)), None)
     if level and form is not streamed_sog.READER:
         raise RefineError(f"{path}: has no level {level}: only {streamed_sog.INDEX} has levels")
-    if form is None:
+    if form is None or whole is None:
         return read_ply(path).drawn_as(model)
-    try:
-        with path.open("rb") as stream:
-            whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError) as error:
-        raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error
     data = np.frombuffer(whole, np.uint8)
     file = streamed_sog.read(path, data, level) if level else form.read(path, data)
     return file.drawn_as(model).without_third_scale()
@@ -188,21 +184,17 @@ def held_splats(
         rows = rows.copy()
         for name, values in columns.items():
             if name not in (rows.dtype.names or ()):
-                problem = f"{form.suffix} holds no property '{name}'; write to a .ply"
-                raise RefineError(f"{path}: {problem}")
+                Place(path).fail(f"{form.suffix} holds no property '{name}'; write to a .ply")
             rows[name] = values if keep is None else values[keep]
     splats = with_model(splats_from_columns(rows), file.model)
     good = drawable(splats)
     if not good.any():
-        problem = f"none of the {len(splats)} splats can be drawn: nothing to write"
-        raise RefineError(f"{path}: {problem}")
-    if not good.all():
-        splats = splats.take(good)
-    splats = splats.up_to_degree(form.degree)
+        Place(path).fail(f"none of the {len(splats)} splats can be drawn: nothing to write")
+    splats = (splats if good.all() else splats.take(good)).up_to_degree(form.degree)
     return replace(splats, sh_dc=_tame(splats.sh_dc), sh_rest=_tame(splats.sh_rest))
 
 
-def _tame(colors: NDArray[Any]) -> NDArray[Any]:
+def _tame(colors):
     """Colours of which none is larger than files that name numbers in text may hold."""
     if not colors.size or -LARGEST_NUMBER <= colors.min() <= colors.max() <= LARGEST_NUMBER:
         return colors
@@ -243,29 +235,25 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
     """What the user should know about a file of the kept splats in a format, in sentences."""
     if form is None:
         return file.notes(keep)
-    suffix, degree = form.suffix, file.splats().sh_degree
-    said = [*file.remarks, f"{suffix} {form.loss} (docs/conventions.md, Formats)"]
+    suffix, degree, model = form.suffix, file.splats().sh_degree, file.model
     extra = other_properties(file.rows.dtype.names or ())
     lost = left_out(file, form, keep)
-    if degree > form.degree:
-        held = f"{suffix} holds harmonics of degree {form.degree}"
-        said.append(f"{held}, the file has degree {degree}: the others are left out")
-    if file.model not in form.models:
-        model = f"splats are {file.model}: read it with --model {file.model}"
-        said.append(f"{suffix} does not say that {model}")
-    if extra:
-        said.append(f"{suffix} does not hold {', '.join(extra)}: left out")
-    if lost:
-        cannot = f"cannot be drawn and {suffix} cannot hold them"
-        said.append(f"{lost} of the kept splats {cannot}: left out")
-    return said
+    held = f"{suffix} holds harmonics of degree {form.degree}, the file has degree {degree}"
+    stated = f"{suffix} does not say that splats are {model}: read it with --model {model}"
+    undrawn = f"{lost} of the kept splats cannot be drawn and {suffix} cannot hold them: left out"
+    said = {
+        f"{suffix} {form.loss} (docs/conventions.md, Formats)": True,
+        f"{held}: the others are left out": degree > form.degree,
+        stated: model not in form.models,
+        f"{suffix} does not hold {', '.join(extra)}: left out": extra,
+        undrawn: lost,
+    }
+    return [*file.remarks, *(sentence for sentence, applies in said.items() if applies)]
 
 
 def refuse_unknown_size(form: Format) -> None:
     """Raise `RefineError` if the size of a file does not follow from the number of its splats."""
     if form.sizes is None:
+        problem = f"a size cannot be kept to in {form.suffix}, which is compressed as a whole"
         fixed = ", ".join(other.suffix for other in FORMATS if other.sizes)
-        raise RefineError(
-            f"a size cannot be kept to in {form.suffix}, which is compressed as a whole: choose "
-            f"another budget, or write .ply, {fixed}"
-        )
+        raise RefineError(f"{problem}: choose another budget, or write .ply, {fixed}")

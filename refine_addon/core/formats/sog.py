@@ -311,9 +311,9 @@ def beside(place: Place, name: str) -> Path:
     return path
 
 
-def _matches_meta(path: Path, head: bytes) -> bool:
-    """Whether a file is the ``meta.json`` of images beside it: by its name."""
-    return path.name.lower().endswith(META) and head.lstrip().startswith(b"{")
+def named_json(end: str) -> Callable[[Path, bytes], bool]:
+    """`Format.matches` of JSON files whose names end so, which all readers go by."""
+    return lambda path, head: path.name.lower().endswith(end) and head.lstrip().startswith(b"{")
 
 
 def _write(stream: BinaryIO, splats: Splats) -> None:
@@ -445,4 +445,4 @@ def _centroids(sh_rest: NDArray[Any], labels: NDArray[np.int64], entries: int):
 
 _LOSS = "holds positions in 16 bits, all else in 8, takes harmonics from a palette, and sorts"
 FORMAT = Format(NAME, ".sog", is_sog, _read_archive, _write, _DEGREES, _LOSS, models=MODELS)
-META_READER = Format(NAME, META, _matches_meta, lambda path, _data: bundle_beside(path).read())
+META_READER = Format(NAME, META, named_json(META), lambda path, _: bundle_beside(path).read())

@@ -20,7 +20,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from ..splats import ARRAYS, Splats, rotation_matrices, scales
 from ..whole_file import mode_of, new_folder, refuse_existing, whole_file
 from .format import Format, near_ones_together, new_file, pieces
 from .ply import Origin, SplatFile
-from .sog import GENERATOR, IMAGES, META, Bundle, beside, bundle_beside, contents
+from .sog import GENERATOR, IMAGES, META, Bundle, beside, bundle_beside, contents, named_json
 
 NAME, VERSION = "streamed SOG", 1
 INDEX = "lod-meta.json"
@@ -49,11 +49,6 @@ _MOST_LEVELS = 1 << 10
 
 _FOLDER = re.compile(rf"(\d+_\d+)/{re.escape(META)}")
 """A folder as an index names it, as splat-transform has it: of the level, and counted."""
-
-
-def _matches(path: Path, head: bytes) -> bool:
-    """Whether this is an index: by its name, which all readers go by."""
-    return path.name.lower().endswith(INDEX) and head.lstrip().startswith(b"{")
 
 
 def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
@@ -75,9 +70,8 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
     """
     place = Place(path)
     meta = place.members(place.parsed(data.tobytes()))
-    version = meta.get("version", VERSION)
-    if version != VERSION:
-        place.at("version").fail(f"expected {VERSION}, got {described(version)}")
+    if meta.get("version", VERSION) != VERSION:
+        place.at("version").expected(str(VERSION), meta["version"])
     levels = place.at("lodLevels").whole(meta.get("lodLevels"), 1, _MOST_LEVELS)
     if not 0 <= level < levels:
         place.fail(f"no level {level}, expected 0 to {levels - 1}")
@@ -99,13 +93,9 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
     for bundle, spans in units:
         stored = bundle.read().splats()
         for rows in spans:
-            target = splats.take(slice(start, start + len(rows)))
+            target = splats.take(slice(start, start + len(rows))).up_to_degree(stored.sh_degree)
             for name in ARRAYS:
-                values = getattr(stored, name)[rows.start : rows.stop]
-                held = getattr(target, name)
-                if name == "sh_rest":
-                    held = held[:, : values.shape[1]]
-                held[:] = values
+                getattr(target, name)[:] = getattr(stored, name)[rows.start : rows.stop]
             start += len(rows)
     return file
 
@@ -146,39 +136,26 @@ def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[ra
         where = place.at(f"chunk {number} level {level}")
         lods = where.members(node.get("lods", {}))
         number += bool(lods)
-        if str(level) not in lods:
-            continue
-        held = where.members(lods[str(level)])
-        file = where.at("file").whole(held.get("file"), 0, files - 1)
-        start = where.at("offset").whole(held.get("offset"))
-        count = where.at("count").whole(held.get("count"))
-        if count:
-            spans.setdefault(file, []).append(range(start, start + count))
+        if str(level) in lods:
+            held = where.members(lods[str(level)])
+            file = where.at("file").whole(held.get("file"), 0, files - 1)
+            start, count = (where.at(key).whole(held.get(key)) for key in ("offset", "count"))
+            if count:
+                spans.setdefault(file, []).append(range(start, start + count))
     return spans
 
 
-class _Split(NamedTuple):
-    """A plane across an axis: what lies below `value` belongs to `below`."""
-
-    axis: int
-    value: float
-    below: _Tree
-    above: _Tree
-
-
-_Tree: TypeAlias = "_Split | int"
-"""Its leaves are numbers of chunks."""
-
-
-def _planted(means: NDArray[np.float64], width: float) -> tuple[_Tree, int]:
+def _planted(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
     """Tree over positions (N, 3), and how many chunks it has.
 
-    A chunk is halved across its longest side at the median of its splats while it has more than
-    `UNIT` of them, or is wider than `width` and has more than `LEAST`.
+    A leaf is the number of a chunk. A branch is an axis, a place on it, the tree of what lies below
+    that and the tree of the others. A chunk is halved across its longest side at the median of its
+    splats while it has more than `UNIT` of them, or is wider than `width` and has more than
+    `LEAST`.
     """
     numbers = itertools.count()
 
-    def grown(rows: NDArray[np.intp]) -> _Tree:
+    def grown(rows):
         here = means[rows]
         low, high = here.min(axis=0), here.max(axis=0)
         axis = int(np.argmax(high - low))
@@ -190,7 +167,7 @@ def _planted(means: NDArray[np.float64], width: float) -> tuple[_Tree, int]:
         if value == low[axis]:  # more than half of them lie there
             value = along[along > value].min()
         below = along < value
-        return _Split(axis, float(value), grown(rows[below]), grown(rows[~below]))
+        return axis, float(value), grown(rows[below]), grown(rows[~below])
 
     return grown(np.arange(len(means))), next(numbers)
 
@@ -226,29 +203,28 @@ class StreamedSog:
         """
         level, size = len(self._counts), 0
         self._counts.append(len(splats))
-        unit = np.empty(0, np.intp)
-        for number, rows in self._chunks_of(np.asarray(splats.means, np.float64)):
-            rows = rows[near_ones_together(splats.means[rows])]
-            self._widen(number, splats, rows)
-            place = {"file": len(self._levels), "offset": len(unit), "count": len(rows)}
-            self._rows[number][str(level)] = place
-            unit = np.concatenate([unit, rows])
-            if len(unit) > UNIT:
-                size += self._write_unit(level, splats.take(unit))
-                unit = unit[:0]
-        return size + (self._write_unit(level, splats.take(unit)) if len(unit) else 0)
-
-    def _chunks_of(self, means: NDArray[np.float64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
-        """Yield the number of each chunk that has some of the positions (N, 3), and which."""
-        left: list[tuple[_Tree, NDArray[np.intp]]] = [(self._tree, np.arange(len(means)))]
+        means, unit = np.asarray(splats.means, np.float64), np.empty(0, np.intp)
+        left = [(self._tree, np.arange(len(means)))]
         while left:
             node, rows = left.pop()
-            if isinstance(node, int):
-                if len(rows):
-                    yield node, rows
-                continue
-            below = means[rows, node.axis] < node.value
-            left += [(node.above, rows[~below]), (node.below, rows[below])]
+            if not isinstance(node, int):
+                axis, value, *sides = node
+                below = means[rows, axis] < value
+                left += [(sides[1], rows[~below]), (sides[0], rows[below])]
+            elif len(rows):
+                rows = rows[near_ones_together(splats.means[rows])]
+                self._widen(node, splats, rows)
+                place = {"file": len(self._levels), "offset": len(unit), "count": len(rows)}
+                self._rows[node][str(level)] = place
+                unit = np.concatenate([unit, rows])
+            if len(unit) > (UNIT if left else 0):
+                folder = self._folder / str(len(self._levels))
+                self._levels.append(level)
+                folder.mkdir()
+                files = contents(self._folder / INDEX, splats.take(unit))
+                size += sum((folder / file).write_bytes(data) for file, data in files)
+                unit = unit[:0]
+        return size
 
     def _widen(self, number: int, splats: Splats, rows: NDArray[np.intp]) -> None:
         """Let the box of a chunk hold boxes around ellipsoids of one deviation."""
@@ -259,14 +235,6 @@ class StreamedSog:
             means = np.asarray(batch.means, np.float64)
             self._low[number] = np.minimum(self._low[number], (means - half).min(axis=0))
             self._high[number] = np.maximum(self._high[number], (means + half).max(axis=0))
-
-    def _write_unit(self, level: int, splats: Splats) -> int:
-        """Write the next folder; return its bytes."""
-        folder = self._folder / str(len(self._levels))
-        self._levels.append(level)
-        folder.mkdir()
-        files = contents(self._folder / INDEX, splats)
-        return sum((folder / file).write_bytes(data) for file, data in files)
 
     def publish(self, path: Path, *, overwrite: bool) -> None:
         """Move the folders beside `path`, under names that are free, and write the index there.
@@ -290,7 +258,16 @@ class StreamedSog:
                 free = (path.parent / f"{level}_{index}" for index in itertools.count())
                 moved.append(next(there for there in free if not there.exists()))
                 (self._folder / str(number)).rename(moved[-1])
-            index = self._index([there.name for there in moved])
+            index = {
+                "version": VERSION,
+                "asset": {"generator": GENERATOR},
+                "count": sum(self._counts),
+                "counts": self._counts,
+                "lodLevels": len(self._counts),
+                "lodErrors": False,
+                "filenames": [f"{there.name}/{META}" for there in moved],
+                "tree": self._branch(self._tree),
+            }
             text = json.dumps(index, allow_nan=False).encode() + b"\n"
             with whole_file(path, overwrite=overwrite) as stream:
                 stream.write(text)
@@ -320,12 +297,12 @@ class StreamedSog:
             "tree": self._branch(self._tree),
         }
 
-    def _branch(self, node: _Tree) -> dict[str, Any]:
+    def _branch(self, node: Any) -> dict[str, Any]:
         """What the index says of a part of the tree."""
         if isinstance(node, int):
             bound = {"min": self._low[node].tolist(), "max": self._high[node].tolist()}
             return {"bound": bound, "lods": self._rows[node]}
-        children = [self._branch(node.below), self._branch(node.above)]
+        children = [self._branch(side) for side in node[2:]]
         ends = [[child["bound"][end] for child in children] for end in ("min", "max")]
         low, high = np.min(ends[0], axis=0), np.max(ends[1], axis=0)
         return {"bound": {"min": low.tolist(), "max": high.tolist()}, "children": children}
@@ -372,4 +349,4 @@ def _folders_of(path: Path) -> list[str]:
     return [name[1] for name in found if name]
 
 
-READER = Format(NAME, INDEX, _matches, read)
+READER = Format(NAME, INDEX, named_json(INDEX), read)
