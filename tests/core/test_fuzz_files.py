@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import Budget, RefineError, prune, read_cameras
-from refine_addon.core.formats.ply import splats_from_columns
+from refine_addon.core.formats.ply_columns import splats_from_columns
 from tests.fuzz import TARGETS, Crash, attempt, fuzz, main
 from tests.strategies import plain_ply, splat_names
 

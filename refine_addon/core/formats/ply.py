@@ -13,7 +13,7 @@ import mmap
 import re
 import stat
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -30,7 +30,8 @@ from ..rendering import MODELS, Model
 from ..splats import Splats
 from ..splats import with_model as drawn_as
 from ..whole_file import Url, expanded, refuse_mapped, whole_file
-from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, splats_from_columns
+from . import ply_columns
+from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, Changes, Keep
 
 HEADER_LIMIT = 1 << 20
 """Longest header that is read, bytes."""
@@ -166,13 +167,9 @@ class SplatFile:
 
     def splats(self) -> Splats:
         """Rows as splats; the arrays are views of the file if its layout permits."""
-        return drawn_as(splats_from_columns(self.rows), self.model)
+        return drawn_as(ply_columns.splats_from_columns(self.rows), self.model)
 
-    def size(
-        self,
-        keep: NDArray[np.bool_] | None = None,
-        columns: Mapping[str, NDArray[Any]] | None = None,
-    ) -> int:
+    def size(self, keep: Keep = None, columns: Changes = None) -> int:
         """Bytes that `write` would write.
 
         Parameters
@@ -192,9 +189,9 @@ class SplatFile:
     def write(
         self,
         path: Path | str,
-        keep: NDArray[np.bool_] | None = None,
+        keep: Keep = None,
         *,
-        columns: Mapping[str, NDArray[Any]] | None = None,
+        columns: Changes = None,
         overwrite: bool = False,
         threads: int | None = 1,
     ) -> None:
@@ -233,7 +230,7 @@ class SplatFile:
             write_rows(stream, self.rows, keep, columns, threads=threads)
             stream.write(self.after.data)
 
-    def _layout(self, keep: NDArray[np.bool_] | None, columns: Mapping[str, NDArray[Any]]):
+    def _layout(self, keep, columns):
         """Header and row of a file of the kept rows with these columns; refuse what none can be."""
         header = with_count(self.header, len(self) if keep is None else int(np.count_nonzero(keep)))
         names = self.rows.dtype.names or ()
@@ -632,12 +629,12 @@ def _lines(raw: bytes) -> list[bytes]:
 def write_rows(
     stream: BinaryIO,
     rows: NDArray[Any],
-    keep: NDArray[np.bool_] | None,
-    columns: Mapping[str, NDArray[Any]],
-    *,
+    keep: Keep,
+    columns: Changes,
     threads: int | None = 1,
 ) -> None:
     """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended."""
+    columns = columns or {}
     plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
     inside = columns.keys() <= set(rows.dtype.names or ())
     changed = columns if isinstance(columns, ChangedColumns) and inside else None

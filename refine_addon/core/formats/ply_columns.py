@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +40,7 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
     count = sum(name.startswith("f_rest_") for name in names)
     rest = [f"f_rest_{index}" for index in range(count)]
     size = len(columns["x"])
-    if rest:
-        planes = _stack(columns, rest).reshape(size, 3, count // 3)
-        sh_rest = planes.transpose(0, 2, 1)
-    else:
-        sh_rest = np.zeros((size, 0, 3), np.float32)
+    planes = _stack(columns, rest) if rest else np.zeros((size, 0), np.float32)
     flat = THIRD_SCALE not in names
     scales = _stack(columns, REQUIRED[7 : 9 if flat else 10])
     if flat:
@@ -55,7 +51,7 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
         quaternions=_stack(columns, ["rot_0", "rot_1", "rot_2", "rot_3"]),
         opacity_logits=columns["opacity"],
         sh_dc=_stack(columns, ["f_dc_0", "f_dc_1", "f_dc_2"]),
-        sh_rest=sh_rest,
+        sh_rest=planes.reshape(size, 3, count // 3).transpose(0, 2, 1),
         model="2dgs" if flat else "default",
     )
 
@@ -101,14 +97,18 @@ def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
     coefficients = splats.sh_rest.shape[1]
     axes = 2 if splats.model == "2dgs" else 3
     planes = [splats.sh_rest[:, k, channel] for channel in range(3) for k in range(coefficients)]
-    return {
-        **dict(zip("xyz", splats.means.T, strict=True)),
-        **{f"f_dc_{channel}": splats.sh_dc[:, channel] for channel in range(3)},
-        **{f"f_rest_{index}": plane for index, plane in enumerate(planes)},
-        "opacity": splats.opacity_logits,
-        **{f"scale_{axis}": splats.log_scales[:, axis] for axis in range(axes)},
-        **{f"rot_{index}": splats.quaternions[:, index] for index in range(4)},
-    }
+    rest = [f"f_rest_{index}" for index in range(len(planes))]
+    names = [*REQUIRED[:6], *rest, *REQUIRED[6 : 7 + axes], *REQUIRED[10:]]
+    first, last = [*splats.means.T, *splats.sh_dc.T], [*splats.log_scales.T[:axes]]
+    values = [*first, *planes, splats.opacity_logits, *last, *splats.quaternions.T]
+    return dict(zip(names, values, strict=True))
+
+
+Keep: TypeAlias = "NDArray[np.bool_] | None"
+"""Which of N rows of a file are kept, (N,); None stands for all."""
+
+Changes: TypeAlias = "Mapping[str, NDArray[Any]] | None"
+"""Properties of N splats by their names, (N,) each, to be set or appended; None for none."""
 
 
 class Columns(Protocol):
@@ -153,9 +153,7 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
         """The number of properties."""
         return len(self._values)
 
-    def put(
-        self, chunk: NDArray[Any], dtype: np.dtype[Any], piece: slice, kept: NDArray[Any] | None
-    ) -> None:
+    def put(self, chunk: NDArray[Any], dtype: np.dtype[Any], piece: slice, kept: Keep) -> None:
         """Put the values into rows of a file.
 
         Parameters

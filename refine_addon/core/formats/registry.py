@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 import mmap
 import stat
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +20,7 @@ from ..whole_file import Url, expanded, whole_file
 from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
 from .format import Format
 from .ply import SplatFile, read_ply
-from .ply_columns import other_properties, splats_from_columns
+from .ply_columns import Changes, Keep, other_properties, splats_from_columns
 
 # ``.splat`` is known by its name alone, if a file is none of the others.
 FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, dot_splat.FORMAT)
@@ -131,9 +129,9 @@ def scene_name(path: Path) -> str:
 def write_splats(
     path: Path | str,
     file: SplatFile,
-    keep: NDArray[np.bool_] | None = None,
+    keep: Keep = None,
     *,
-    columns: Mapping[str, NDArray[Any]] | None = None,
+    columns: Changes = None,
     overwrite: bool = False,
     threads: int | None = 1,
 ) -> None:
@@ -166,18 +164,12 @@ def write_splats(
     if form is None or form.write is None:
         file.write(path, keep, columns=columns, overwrite=overwrite, threads=threads)
         return
-    splats = held_splats(path, form, file, keep, columns or {})
+    splats = held_splats(path, form, file, keep, columns)
     with whole_file(path, overwrite=overwrite) as stream:
         form.write(stream, splats)
 
 
-def held_splats(
-    path: Path,
-    form: Format,
-    file: SplatFile,
-    keep: NDArray[np.bool_] | None,
-    columns: Mapping[str, NDArray[Any]],
-) -> Splats:
+def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: Changes) -> Splats:
     """Splats that a file of a format gets, see `write_splats`; errors name `path`."""
     rows = file.rows if keep is None else file.rows[keep]
     if columns:
@@ -213,10 +205,7 @@ def row_sizes(file: SplatFile, form: Format | None, count: int | None = None) ->
 
 
 def written_size(
-    file: SplatFile,
-    form: Format | None,
-    keep: NDArray[np.bool_],
-    columns: Mapping[str, NDArray[Any]] | None = None,
+    file: SplatFile, form: Format | None, keep: NDArray[np.bool_], columns: Changes = None
 ) -> int | None:
     """Bytes of the file that `write_splats` makes, at most; None where only writing tells."""
     if form is None:

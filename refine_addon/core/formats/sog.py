@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,9 @@ _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How files of an archive may be compressed: the other ways take any memory, raise anything."""
 
 
+_Opened: TypeAlias = Callable[[str, int], bytes]
+
+
 class Bundle:
     """A ``meta.json``, what it says and the files that it names.
 
@@ -70,29 +73,22 @@ class Bundle:
     ----------
     place : Place
         Of the ``meta.json``.
-    data : bytes
+    meta : dict
         What that holds.
     opened : callable
         ``opened(name, limit)`` returns what a file beside it holds; more bytes are refused.
-    files : callable
-        ``files(meta)`` returns the bytes of each file that it is made of, by what tells it from
-        others.
+    files : dict
+        Bytes of each file that it is made of, by its path.
     """
 
     def __init__(
-        self,
-        place: Place,
-        data: bytes,
-        opened: Callable[[str, int], bytes],
-        files: Callable[[dict[str, Any]], dict[Any, int]],
+        self, place: Place, meta: dict[str, Any], opened: _Opened, files: dict[Path, int]
     ) -> None:
-        self.place, self._opened = place, opened
-        self.meta = place.members(place.parsed(data))
+        self.place, self.meta, self.files, self._opened = place, meta, files, opened
         if self.meta.get("version", VERSION) != VERSION:
             place.at("version").expected(str(VERSION), self.meta["version"])
         self.version = VERSION if "version" in self.meta else 1
-        self.files = files(self.meta)
-        self.size = sum(self.files.values())
+        self.size = sum(files.values())
         self._codec = codec_for(place.path)
 
     @property
@@ -261,8 +257,8 @@ def _read_archive(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         return _held(place, label, limit, lambda: member(name))
 
     with archive:
-        text = opened(META, _META_LIMIT)
-        return Bundle(place.at(META), text, opened, lambda _meta: {path: len(data)}).read()
+        meta = place.at(META).members(place.at(META).parsed(opened(META, _META_LIMIT)))
+        return Bundle(place.at(META), meta, opened, {path: len(data)}).read()
 
 
 def bundle_beside(path: Path) -> Bundle:
@@ -279,15 +275,12 @@ def bundle_beside(path: Path) -> Bundle:
     def held(there: Path, limit: int) -> bytes:
         return _held(place, repr(there.name[:80]), limit, lambda: there.open("rb"))
 
-    def files(meta: dict[str, Any]) -> dict[Any, int]:
-        named = [part.get("files") for part in meta.values() if isinstance(part, dict)]
-        every = [name for group in named if isinstance(group, list) for name in group]
-        names = {name for name in every if isinstance(name, str)}
-        paths = [path, *(beside(place, name) for name in names)]
-        return {there.resolve(): there.stat().st_size for there in paths}
-
-    text = held(path, _META_LIMIT)
-    return Bundle(place, text, lambda name, limit: held(beside(place, name), limit), files)
+    meta = place.members(place.parsed(held(path, _META_LIMIT)))
+    named = [part.get("files") for part in meta.values() if isinstance(part, dict)]
+    every = [name for group in named if isinstance(group, list) for name in group]
+    paths = {path, *(beside(place, name) for name in every if isinstance(name, str))}
+    files = {there.resolve(): there.stat().st_size for there in paths}
+    return Bundle(place, meta, lambda name, limit: held(beside(place, name), limit), files)
 
 
 def beside(place: Place, name: str) -> Path:
