@@ -37,7 +37,7 @@ from .splats import Splats
 from .views import ViewSet, refuse_other
 from .visibility.measuring import Measured
 from .visibility.ray_sample import validation_rays
-from .volumes import refuse_all
+from .volumes import Forced, refuse_all
 
 TRIES = 3
 """How often splats are merged at most to reach a PSNR."""
@@ -237,9 +237,9 @@ def prune(
         sizes = sizes or (file.row_bytes, file.fixed_bytes)
     if views is not None:
         refuse_other(views)
-    gone = None
-    if removed is not None and removed.any():
-        gone = removed if protected is None else removed & ~protected
+    gone = removed if protected is None or removed is None else removed & ~protected
+    gone = gone if gone is not None and gone.any() else None
+    if gone is not None:
         refuse_all(gone)
     run = _Prune(
         splats, views, budget, method, protected, scores, sizes or (0.0, 0), origin, reusable,
@@ -247,13 +247,12 @@ def prune(
     )  # fmt: skip
     if scores is not None and gone is None:
         scores.refuse_unscored()
-    run = run if gone is None or not gone.any() else run.without(gone)
+    run = run if gone is None else run.without(gone)
     result = run.merge(progress) if method.changes else run.delete(progress)
-    if gone is not None and gone.any():
+    if gone is not None:
         result = result.for_all(~gone)
         result.report["budget"] = {budget.kind: getattr(budget, budget.kind)}
-    for name, mask in (("protected", protected), ("removed_by_user", gone)):
-        result.report["splats"][name] = 0 if mask is None else int(np.count_nonzero(mask))
+    result.report["splats"] |= Forced(protected, gone).counts()
     if result.stopped is not None and not partial:
         raise result.stopped
     return replace(result, source=file or splats)
@@ -393,7 +392,11 @@ class _Prune:
         by_formula = given is not None and given.method == ClosedForm.name
         deletion = ClosedForm if by_formula else Occlusion
         deletes = replace(self, method=deletion(self.method.views), scores=given)
-        if not refits and self._deletion_will_do(scores, plain):
+        will_do = not refits and (  # so that merging need not be tried
+            deletion_will_do(plain) if goal is None
+            else quality_of(scores).share(goal, "merge") <= PLAIN
+        )  # fmt: skip
+        if will_do:
             return self._deleted(deletes.delete(making), None)
         if known is None:
             scores, known = occlusion.score_once(
@@ -406,9 +409,8 @@ class _Prune:
         self.clock.lap("merge_s")
         if not refits and self._deletion_is_as_good(keep, plain, made):
             return self._deleted(deletes.delete(silent, made), made)
-        measured = dict(made.psnr)
-        if goal is None:  # else deletion keeps another number of splats
-            measured.setdefault("delete", plain)
+        # Where a PSNR is asked for, deletion keeps another number of splats.
+        measured = made.psnr if goal is not None else {"delete": plain, **made.psnr}
         final = made.final
         facts = reports.of_prune(
             scores, final.keep, self.budget, self.method, self.sizes, self.clock,
@@ -466,15 +468,7 @@ class _Prune:
             return keep, scores.quality.at(1.0 - float(np.mean(keep)))
         return keep, None
 
-    def _deletion_will_do(self, scores: Scores, plain: float | None) -> bool:
-        """Whether merging need not be tried, given what deletion reaches, dB."""
-        if self.budget.psnr is None:
-            return deletion_will_do(plain)
-        return quality_of(scores).share(self.budget.psnr, "merge") <= PLAIN
-
-    def _deletion_is_as_good(
-        self, keep: NDArray[np.bool_], plain: float | None, made: Made
-    ) -> bool:
+    def _deletion_is_as_good(self, keep, plain: float | None, made: Made) -> bool:
         """Whether deletion, which keeps (N,) and reaches `plain` dB, is about as good."""
         if plain is None or made.reached is None:
             return True
@@ -493,13 +487,7 @@ class _Prune:
         rounds = expected_rounds(left, self.method.rounds)
         return merge + rounds * seconds("refit", count + left, views)
 
-    def _to_count(
-        self,
-        keep: NDArray[np.bool_],
-        scores: Scores,
-        known: Measured,
-        progress: Progress,
-    ) -> Made:
+    def _to_count(self, keep, scores: Scores, known: Measured, progress: Progress) -> Made:
         """Merge until as many splats are left as deletion keeps, (N,); refit them if asked."""
         origin, used, left = self.origin, self.used, int(np.count_nonzero(keep))
         truth = scores.ray_sample if origin is None else origin.ray_sample
@@ -546,7 +534,7 @@ class _Prune:
         gone, tried, best = curve.share(left_to_lose(goal, lost), way), list[_Try](), None
         for number in range(TRIES):
             count = max(total - math.floor(gone * total), 1)
-            if any(count == one.kept for one in tried):
+            if count in (one.kept for one in tried):
                 break
             keep = select(scores, Budget(keep=count), protected=self.protected)
             made = self._to_count(keep, scores, known, tries[number])
@@ -575,8 +563,7 @@ class _Prune:
         merged, start = made.merged, time.perf_counter()
         if merged.keep.all() and self.origin is None:
             return made
-        done: Refitted | None = None
-        stopped = None
+        done, stopped = None, None
         return_freed()
         try:
             for reached in refit_rounds(
@@ -588,12 +575,11 @@ class _Prune:
             ):  # fmt: skip
                 done = reached
         except (Cancelled, KeyboardInterrupt) as stop:
-            rounds = 0 if done is None else done.rounds
-            after = f"after round {rounds}" if rounds else "before its first round was done"
-            stop.add_note(f"refitting was stopped {after}")
             stopped = stop.with_traceback(None)  # without what was worked on
-            if not rounds:
+            if done is None or not done.rounds:
+                stop.add_note("refitting was stopped before its first round was done")
                 return replace(made, stopped=stopped)
+            stop.add_note(f"refitting was stopped after round {done.rounds}")
         assert done is not None  # what is to be refitted is yielded first
         return replace(
             made, done="refit", psnr=made.psnr | {"refit": done.psnr}, refitted=done,

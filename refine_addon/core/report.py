@@ -152,32 +152,42 @@ def of_prune(
     tried : prune.Made, optional
         What merging had made where splats were deleted instead.
     """
-    count, notes = len(keep), scoring_notes(scores)
+    count, curve = len(keep), scores.quality
     facts: dict[str, Any] = {**scored(scores)}
     facts["splats"] |= kept_and_removed(keep)
     facts["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
     removed = facts["splats"]["removed"]
-    share, curve = removed / count, scores.quality
-    note = None
+    share, note, why = removed / count, None, ""  # why the budget is out of reach
+    if budget.psnr is not None:
+        why = out_of_reach(budget.psnr, removed, count, psnr)
+    elif budget.max_mb is not None and not removed:
+        size = size_in_words(int(sizes[0] * count + sizes[1]))
+        why = f"already {size}: the budget removes nothing"
     if psnr is None:
         note = NOT_ESTIMATED if scores.ray_sample is None else SEES_TOO_LITTLE
-        notes += [SEES_TOO_LITTLE] if scores.ray_sample is not None else []
-    if why := _remark(budget, removed, count, psnr, sizes):
-        notes.append(why)
-    if made is not None:
-        notes.append(made.merged.note())
+    notes = [
+        *scoring_notes(scores),
+        SEES_TOO_LITTLE if note == SEES_TOO_LITTLE else "",
+        why,
+        "" if made is None else made.merged.note(),
+    ]
     if between is not None and parted(psnr, between):
         notes.append(
             f"views between these lose more, {in_words(between)}: have views in between decide "
             "too, or remove less"
         )
-    if between is not None and (few := little_seen(scores.seen)):
-        notes.append(few)
+    if between is not None:
+        notes.append(little_seen(scores.seen))
     told = dict(measured)
     if tried is not None and budget.psnr is None:  # of as many kept splats
         told = {**tried.psnr, **told}
     if made is not None:
-        notes += _refit_notes(made)
+        if made.refitted is not None:
+            notes.append(made.refitted.note(made.seconds))
+        if {"delete", "merge"} <= made.psnr.keys() and not made.merged.merged:
+            began, merge = (in_words(made.psnr[way]) for way in ("delete", "merge"))
+            notes.append(f"refitting began with plain deletion: {began}, merging {merge}")
+        notes += getattr(made.stopped, "__notes__", ())
         plain = measured.get("delete")
         if made.done == "merge" and plain is not None and plain > (psnr or plain):
             notes.append(f"plain deletion reaches more: {in_words(plain)}")
@@ -203,7 +213,7 @@ def of_prune(
         },
         "quality": None if curve is None else curve.facts(),
         "budget_remark": why,
-        "notes": notes,
+        "notes": [words for words in notes if words],
     }
     if made is not None:
         facts["merged"] = made.merged.facts()
@@ -213,29 +223,6 @@ def of_prune(
                 **made.refitted.facts(made.seconds),
             }
     return facts
-
-
-def _remark(
-    budget: Budget, gone: int, total: int, psnr: float | None, sizes: tuple[float, int]
-) -> str:
-    """Why a budget is out of reach or removes nothing, or ""."""
-    if budget.psnr is not None:
-        return out_of_reach(budget.psnr, gone, total, psnr)
-    if budget.max_mb is not None and not gone:
-        size = int(sizes[0] * total + sizes[1])
-        return f"already {size_in_words(size)}: the budget removes nothing"
-    return ""
-
-
-def _refit_notes(made: Any) -> list[str]:
-    """What there is to say of refitting, in sentences."""
-    notes, done = [], made.refitted
-    if done is not None:
-        notes.append(done.note(made.seconds))
-    if {"delete", "merge"} <= made.psnr.keys() and not made.merged.merged:
-        plain, merge = (in_words(made.psnr[way]) for way in ("delete", "merge"))
-        notes.append(f"refitting began with plain deletion: {plain}, merging {merge}")
-    return [*notes, *getattr(made.stopped, "__notes__", ())]
 
 
 def deleted_note(plain: float | None, tried: float | None) -> str:

@@ -96,24 +96,17 @@ class Scores:
             If some of them were not scored.
         """
         self.refuse_unscored(rest)
-        values, count = self.values[rest], int(np.count_nonzero(rest))
+        count = int(np.count_nonzero(rest))
         # Of a scene with other splats they tell nothing.
         ray_sample, between = (
             None if rays is None or len(rays.splats) != count else rays
             for rays in (self.ray_sample, self.between)
         )
-        settled = self.settled
-        if settled is not None:
-            settled = max(settled - (len(rest) - count), 0)
+        settled = None if self.settled is None else max(self.settled - (len(rest) - count), 0)
         return replace(
-            self,
-            values=values,
-            seen=self.seen[rest],
-            ray_sample=ray_sample,
-            between=between,
-            settled=settled,
-            scored=None,
-        )
+            self, values=self.values[rest], seen=self.seen[rest], ray_sample=ray_sample,
+            between=between, settled=settled, scored=None,
+        )  # fmt: skip
 
     def refuse_unscored(self, rest: NDArray[np.bool_] | None = None) -> None:
         """Raise `RefineError` if some of the splats in question, (N,) bool, have no score.
