@@ -45,7 +45,7 @@ from ..views import View
 from ..visibility import projection
 from ..visibility.cast import BEHIND
 from ..visibility.projection import Footprints, Gaussians
-from ..visibility.rays import LEAST_LEFT, Rays, VisibleRays
+from ..visibility.rays import LEAST_LEFT, Rays
 from ..visibility.scene import Scene
 from .stored import Stored
 
@@ -454,7 +454,7 @@ def _add(total: NDArray[np.float32], hit: NDArray[np.int64], values: NDArray[np.
 
 
 def linear_view(
-    visible: VisibleRays,
+    visible: tuple[Rays, NDArray[np.float32]],
     footprints: Footprints,
     truth: NDArray[np.float32],
     colors: NDArray[np.float32],
@@ -465,7 +465,7 @@ def linear_view(
 
     Parameters
     ----------
-    visible : VisibleRays
+    visible : (Rays, (h,) float32)
         At most 2^16 rays.
     footprints : Footprints
         In the view.

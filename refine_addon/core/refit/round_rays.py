@@ -388,7 +388,7 @@ def _linearized(
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
         seen = cast_visible(footprints, truth.columns, truth.rows)
-        colors = target.colors(seen.rays.hit, window.view)
+        colors = target.colors(seen[0].hit, window.view)
         view, mine = linear_view(seen, footprints, truth.colors, colors, shapes, window.view)
         del seen, footprints  # which take more memory than the view
         return view, view.backward(view.errors), view.diagonal(mine)

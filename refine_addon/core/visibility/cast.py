@@ -13,7 +13,7 @@ from ..execute import checkpoint
 from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..views import View
 from .projection import Footprints
-from .rays import LOG_OPAQUE, Rays, VisibleRays
+from .rays import LOG_OPAQUE, Rays
 
 MIN_RAYS_OF_VIEW = 16
 """A view has at least this many rays, if it has as many pixels."""
@@ -135,7 +135,7 @@ def cast(
 
 def cast_visible(
     footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]
-) -> VisibleRays:
+) -> tuple[Rays, NDArray[np.float32]]:
     """The same as `Rays.visible` of `cast`, without following rays on behind opaque hits.
 
     Footprints come front to back, some at a time: it is known of each ray how much is left of it.

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,20 +31,6 @@ LEAST_LEFT = 1e-8
 hidden is left out before (`LOG_OPAQUE`), so it only guards against a division by 0."""
 
 _PIECE = 1 << 15  # hits processed at a time: what stays in the second-level cache
-
-
-class VisibleRays(NamedTuple):
-    """Rays with the hits that are not hidden alone.
-
-    Attributes
-    ----------
-    rays : Rays
-    transmittance : (h,) float32
-        In front of each hit.
-    """
-
-    rays: Rays
-    transmittance: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +90,18 @@ class Rays:
         """
         return self._with_hits(np.flatnonzero(keep.take(self.owner)))
 
-    def visible(self) -> VisibleRays:
-        """The rays with the hits that are not hidden alone: they see the same."""
+    def visible(self) -> tuple[Rays, NDArray[np.float32]]:
+        """The rays with the hits that are not hidden alone: they see the same.
+
+        Besides the transmittance in front of each hit, (h,) float32.
+        """
         kept, log_front = self._seen()
         owner = self.owner.take(kept)
         used = np.zeros(len(self.hit), np.bool_)
         used[owner] = True
         place = np.cumsum(used, dtype=np.int32) - np.int32(1)
         seen = replace(self._with_hits(kept), owner=place.take(owner), hit=self.hit[used])
-        return VisibleRays(seen, np.exp(log_front))
+        return seen, np.exp(log_front)
 
     def composited(
         self, weight: NDArray[np.float32], colors: NDArray[np.float32]
