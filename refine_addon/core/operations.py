@@ -188,9 +188,10 @@ def run(
         try:
             rays = None if result.scores is None else result.scores.ray_sample
             after = None  # what a lossy file holds, where that is to be told
-            if written is not None and views is not None and (rays or pictures):
-                after = _reread(written, scene.matrix)
-            if written is not None and views is not None and form is not None and result.scores:
+            lossy = None if form is None or views is None else written
+            if lossy is not None and (rays or pictures):
+                after = _reread(lossy, scene.matrix)
+            if lossy is not None and views is not None and result.scores:
                 psnr = None
                 if rays is not None and after is not None:
                     used = views.spread(facts["settings"]["views"])
@@ -216,15 +217,15 @@ def run(
 def _reread(path: Path, matrix: NDArray[np.float64] | None) -> Splats | None:
     """What a lossy file holds, in the frame of the views; None where that cannot be told.
 
-    It cannot of a plain PLY, which is exact; of a file that may not be read, since it has the
-    permissions of the one it replaced; and where `matrix` scales directions differently.
+    It cannot of a file that may not be read, since it has the permissions of the one it replaced;
+    and where `matrix` scales directions differently.
     """
     matrix = np.eye(4) if matrix is None else matrix
     try:
         path.open("rb").close()
     except PermissionError:
         return None
-    if format_named(path) is None or not is_uniform(matrix):
+    if not is_uniform(matrix):
         return None
     splats = read_splats(path).splats()
     return splats if np.array_equal(matrix, np.eye(4)) else transformed(splats, matrix)
@@ -505,7 +506,18 @@ def convert_files(
     def read(form: Format | None) -> Scene:
         if alone:
             return read_scene(sources[0], model=model, form=form)
-        files = _files(sources, model, level)
+        paths = [expanded(path) for path in sources]
+        streamed = [path.name.lower().endswith(INDEX) for path in paths]
+        files = [
+            read_splats(path, model, level if has_levels or not any(streamed) else 0)
+            for path, has_levels in zip(paths, streamed, strict=True)
+        ]
+        for file in files:
+            if file.model != files[0].model:
+                raise RefineError(
+                    f"{file.path}: its splats are {file.model}, those of {files[0].path} "
+                    f"{files[0].model}; expected one model, or say which (--model)"
+                )
         parts = [
             file.splats() if move == Move() else transformed(file.splats(), move.matrix)
             for file, move in zip(files, moves or (Move(),) * len(files), strict=True)
@@ -534,20 +546,3 @@ def convert_files(
 
     source = expanded(sources[0]) if alone else None
     return run(read, decide, expanded(output), source=source, overwrite=overwrite)
-
-
-def _files(sources: Sequence[Path | str], model: Model | None, level: int) -> list[SplatFile]:
-    """The files, all of one model."""
-    paths = [expanded(path) for path in sources]
-    streamed = [path.name.lower().endswith(INDEX) for path in paths]
-    files = [
-        read_splats(path, model, level if has_levels or not any(streamed) else 0)
-        for path, has_levels in zip(paths, streamed, strict=True)
-    ]
-    for file in files:
-        if file.model != files[0].model:
-            raise RefineError(
-                f"{file.path}: its splats are {file.model}, those of {files[0].path} "
-                f"{files[0].model}; expected one model, or say which (--model)"
-            )
-    return files
