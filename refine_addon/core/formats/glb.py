@@ -115,6 +115,10 @@ class _Part(NamedTuple):
     values: Callable[[str, slice], NDArray[Any]]  # of an attribute without its prefix
 
 
+def _matches(_path: Path, head: bytes) -> bool:
+    return head.startswith(_MAGIC)
+
+
 def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     """Read the splats of all nodes of a file's scene, each where the node puts it."""
     document = _opened(path, data)
@@ -274,12 +278,9 @@ def _half_turned(splats: Splats) -> Splats:
     # Half a turn multiplies the harmonic of order m by (-1)^m.
     bands = range(1, splats.sh_degree + 1)
     signs = np.array([(-1.0) ** m for n in bands for m in range(-n, n + 1)], np.float32)
-    return replace(
-        splats,
-        means=splats.means * np.array([-1.0, -1.0, 1.0], np.float32),
-        quaternions=np.stack([-z, -y, x, w], axis=1),
-        sh_rest=splats.sh_rest * signs[:, None],
-    )
+    means = splats.means * np.array([-1.0, -1.0, 1.0], np.float32)
+    turns = np.stack([-z, -y, x, w], axis=1)
+    return replace(splats, means=means, quaternions=turns, sh_rest=splats.sh_rest * signs[:, None])
 
 
 def _harmonics(degree: int) -> list[str]:
@@ -323,8 +324,8 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
         text, body = _json(attributes, len(splats), *ends)
         total = _HEADER.size + 2 * _CHUNK.size + len(text) + body
         if total > _LONGEST:
-            what = f"{len(splats)} splats are {total} bytes"
-            raise RefineError(f"{what} as {NAME}, which holds {_LONGEST}")
+            what = f"{len(splats)} splats are {total} bytes as {NAME}"
+            raise RefineError(f"{what}, which holds {_LONGEST}")
         stream.write(_HEADER.pack(_MAGIC, _VERSION, total) + _CHUNK.pack(len(text), _JSON) + text)
         stream.write(_CHUNK.pack(body, _BINARY))
         for _, kind, _, values in attributes:
@@ -372,6 +373,4 @@ def _sizes(count: int, degree: int) -> tuple[float, int]:
 
 
 _LOSS = "holds activated values in single precision, with y up"
-FORMAT = Format(
-    NAME, ".glb", lambda _, head: head.startswith(_MAGIC), _read, _write, _DEGREES, _LOSS, _sizes
-)
+FORMAT = Format(NAME, ".glb", _matches, _read, _write, _DEGREES, _LOSS, _sizes)

@@ -24,15 +24,12 @@ class Codec(Protocol):
 
     def size(self, data: bytes) -> tuple[int, int]:
         """Return width and height of an image, without unpacking it; raise `ValueError`."""
-        ...
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
         """Return the pixels of an image, (height, width, 4), the top row first; see `size`."""
-        ...
 
     def encode(self, pixels: NDArray[np.uint8]) -> bytes:
         """Return a WebP image that holds these pixels, (height, width, 4), to the bit."""
-        ...
 
 
 class _Pillow:
@@ -92,6 +89,5 @@ def codec_for(path: Path) -> Codec:
     try:
         return _Pillow()
     except ImportError as error:
-        raise RefineError(
-            f"{path}: WebP images need a library: run this in Blender, or 'pip install pillow'"
-        ) from error
+        wanted = "run this in Blender, or 'pip install pillow'"
+        raise RefineError(f"{path}: WebP images need a library: {wanted}") from error

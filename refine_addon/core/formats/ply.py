@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..errors import RefineError, reason_of
 from ..execute import chunks, run
 from ..foreign_files import refuse_foreign_splats
+from ..place import Place
 from ..rendering import MODELS, Model
 from ..splats import Splats
 from ..splats import with_model as drawn_as
@@ -152,8 +153,7 @@ class SplatFile:
         if model not in MODELS:
             raise RefineError(f"model is {model!r}, expected one of {', '.join(MODELS)}")
         if THIRD_SCALE not in (self.rows.dtype.names or ()):
-            what = f"splats without {THIRD_SCALE} are drawn as 2dgs"
-            raise RefineError(f"{self.path}: {what}, got {model}")
+            Place(self.path).fail(f"splats without {THIRD_SCALE} are drawn as 2dgs, got {model}")
         return replace(self, header=with_model(self.header, model))
 
     def without_third_scale(self) -> SplatFile:
@@ -177,8 +177,7 @@ class SplatFile:
         keep, columns
             See `write`.
         """
-        header, row = self._layout(keep, columns or {})
-        count = len(self) if keep is None else int(np.count_nonzero(keep))
+        header, row, count = self._layout(keep, columns or {})
         return len(header) + len(self.before) + count * row.itemsize + len(self.after)
 
     def notes(self, keep: NDArray[np.bool_]) -> list[str]:
@@ -221,7 +220,7 @@ class SplatFile:
         if keep is not None and (keep.shape != self.rows.shape or keep.dtype != np.bool_):
             wanted = f"expected one bool for each of {len(self)} splats"
             raise RefineError(f"{self.path}: keep is {keep.dtype} {keep.shape}, {wanted}")
-        header, _ = self._layout(keep, columns)
+        header, *_ = self._layout(keep, columns)
         if not self.rows.flags.writeable:
             refuse_mapped(path, self.path)
         with whole_file(path, overwrite=overwrite) as stream:
@@ -231,33 +230,31 @@ class SplatFile:
             stream.write(self.after.data)
 
     def _layout(self, keep, columns):
-        """Header and row of a file of the kept rows with these columns; refuse what none can be."""
-        header = with_count(self.header, len(self) if keep is None else int(np.count_nonzero(keep)))
-        names = self.rows.dtype.names or ()
+        """Header, row and splats of a file with these columns; refuse what none can be."""
+        count = len(self) if keep is None else int(np.count_nonzero(keep))
+        header, names = with_count(self.header, count), self.rows.dtype.names or ()
         if isinstance(columns, ChangedColumns) and columns.keys() <= set(names):
-            return header, self.rows.dtype  # they have the stored types, and need not be made
-        declared = []
+            return header, self.rows.dtype, count  # they have the stored types: not made here
+        declared, place = [], Place(self.path)
         for name, values in columns.items():
             stored = self.rows.dtype[name] if name in names else None
-            kind, problem = PLY_TYPES.get(values.dtype.str[1:]), ""
+            kind, what = PLY_TYPES.get(values.dtype.str[1:]), f"column '{name}'"
             if values.shape != self.rows.shape:
-                problem = f"column '{name}' has shape {values.shape}, expected {self.rows.shape}"
-            elif stored is not None and not np.can_cast(values.dtype, stored, "same_kind"):
-                problem = f"property '{name}' is there already, of type {stored}; "
-                problem += f"expected one that holds {values.dtype}"
-            elif stored is None and not (kind and re.fullmatch(r"[!-~]+", name)):
-                problem = f"column '{name}' of type {values.dtype} cannot be a property, "
-                problem += f"expected ASCII without spaces and one of {', '.join(PLY_TYPES)}"
-            if problem:
-                raise RefineError(f"{self.path}: {problem}")
+                place.fail(f"{what} has shape {values.shape}, expected {self.rows.shape}")
+            if stored is None and not (kind and re.fullmatch(r"[!-~]+", name)):
+                wanted = f"expected ASCII without spaces and one of {', '.join(PLY_TYPES)}"
+                place.fail(f"{what} of type {values.dtype} cannot be a property, {wanted}")
             if stored is None:
                 declared.append(f"property {kind} {name}".encode())
+            elif not np.can_cast(values.dtype, stored, "same_kind"):
+                what = f"property '{name}' is there already, of type {stored}"
+                place.fail(f"{what}; expected one that holds {values.dtype}")
         lines, last, within = _lines(header), 0, False
         for index, words in enumerate(map(bytes.split, lines)):
             within = words[1:2] == [b"vertex"] if words[:1] == [b"element"] else within
             last = index if within and words[:1] in ([b"element"], [b"property"]) else last
         lines[last + 1 : last + 1] = declared
-        return _line_end(header).join(lines), _grown(self.rows.dtype, columns)
+        return _line_end(header).join(lines), _grown(self.rows.dtype, columns), count
 
 
 # Reading.
@@ -327,10 +324,9 @@ def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
         wanted = f"expected an element 'vertex', got {_listed(names) or 'none'}"
         raise RefineError(f"{path}: not a splat file: {wanted}")
     vertex = names.index("vertex")
-    kinds = {
-        prop.name: "list" if isinstance(prop, plyfile.PlyListProperty) else prop.val_dtype
-        for prop in header.elements[vertex].properties
-    }
+    properties = header.elements[vertex].properties
+    lists = [prop.name for prop in properties if isinstance(prop, plyfile.PlyListProperty)]
+    kinds = {prop.name: prop.val_dtype for prop in properties}
     missing = [name for name in REQUIRED if name not in kinds]
     rest = [name for name in kinds if name.startswith("f_rest_")]
     problem = ""
@@ -346,7 +342,7 @@ def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
         problem = f"found {len(rest)} f_rest properties, "
         problem += "expected f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
     for name, kind in () if problem else kinds.items():
-        if kind == "list":
+        if name in lists:
             problem = f"property {shown(name)} is a list, expected one number a splat"
         elif kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
             problem = f"property {shown(name)} is of type {kind}, expected float or double"
@@ -447,14 +443,12 @@ def check_counts(header: Header, available: int) -> None:
         kinds = (getattr(prop, "len_dtype", prop.val_dtype) for prop in element.properties)
         # Of text: one digit and one separator for each number; lists have a length.
         row = sum(2 if text else np.dtype(kind).itemsize for kind in kinds)
-        least, problem, name = least + row * count, "", shown(element.name)
+        least, name = least + row * count, shown(element.name)
         if not row and count:
-            problem = f"element {name} has {count} rows and no property"
-        elif least > available + text:  # plus 1 for text, whose last line may lack its line end
-            problem = f"truncated: the header announces {count} rows of {name}, at least {least} "
-            problem += f"bytes so far, but only {available} bytes follow it"
-        if problem:
-            raise RefineError(f"{header.path}: {problem}")
+            raise RefineError(f"{header.path}: element {name} has {count} rows and no property")
+        if least > available + text:  # plus 1 for text, whose last line may lack its line end
+            what = f"truncated: the header announces {count} rows of {name}, at least {least} bytes"
+            raise RefineError(f"{header.path}: {what} so far, but only {available} bytes follow it")
 
 
 def vertex_range(header: Header, vertex: int) -> tuple[int, int]:
@@ -627,11 +621,7 @@ def _lines(raw: bytes) -> list[bytes]:
 
 
 def write_rows(
-    stream: BinaryIO,
-    rows: NDArray[Any],
-    keep: Keep,
-    columns: Changes,
-    threads: int | None = 1,
+    stream: BinaryIO, rows: NDArray[Any], keep: Keep, columns: Changes, threads: int | None = 1
 ) -> None:
     """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended."""
     columns = columns or {}

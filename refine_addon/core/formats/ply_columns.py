@@ -116,7 +116,6 @@ class Columns(Protocol):
 
     def __getitem__(self, name: str, /) -> NDArray[Any]:
         """A property, (N,)."""
-        ...
 
 
 class ChangedColumns(Mapping[str, "NDArray[Any]"]):

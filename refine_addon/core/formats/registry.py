@@ -39,8 +39,8 @@ READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))
 INDEX_NAMES = (streamed_sog.INDEX, sog.META)
 """Names of files that stand for a folder."""
 
-_OTHERS = (".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
-NOT_WRITTEN = (*(form.suffix for form in READERS if form.write is None), *_OTHERS)
+NOT_WRITTEN: tuple[str, ...] = (".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
+NOT_WRITTEN += tuple(form.suffix for form in READERS if form.write is None)
 """Endings of other splat formats and of compressed files: a PLY of such a name would mislead."""
 
 _HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed PLY has fewer

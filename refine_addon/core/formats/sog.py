@@ -369,10 +369,19 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
     turns = np.column_stack([codes(others * math.sqrt(0.5) + 0.5), largest + _ROTATIONS])
     values = [code & 255, code >> 8, turns, scales, np.column_stack([colors, alpha])]
     images = [*map(image, values)]
-    if splats.sh_degree:
+    if splats.sh_degree:  # a palette of the mean harmonics of each group
         labels = _grouped(splats.sh_rest.reshape(count, -1))
         entries = int(labels.max()) + 1
-        table, palette = _centroids(splats.sh_rest, labels, entries)
+        coefficients, sizes = splats.sh_rest.shape[1], np.bincount(labels)
+        means = np.empty((entries, coefficients, 3))
+        for k, channel in np.ndindex(coefficients, 3):
+            column = np.asarray(splats.sh_rest[:, k, channel], np.float64)
+            means[:, k, channel] = np.bincount(labels, column) / sizes
+        table, places = _tabulated(means)
+        rows = -(-entries // _ACROSS)
+        palette = np.zeros((rows, _ACROSS * coefficients, 4), np.uint8)
+        palette[..., 3] = 255
+        palette.reshape(-1, coefficients, 4)[:entries, :, :3] = places
         images += [image(np.column_stack([labels & 255, labels >> 8])), palette]
         held = {"count": entries, "bands": splats.sh_degree, "codebook": table.tolist()}
         meta["shN"] = {**held, "files": ["shN_centroids.webp", "shN_labels.webp"]}
@@ -419,21 +428,6 @@ def _grouped(rows: NDArray[Any]) -> NDArray[np.int64]:
         above = columns[axis[labels], np.arange(len(labels))] > middle[labels]
         labels = np.unique(2 * labels + above, return_inverse=True)[1].reshape(-1)
     return labels
-
-
-def _centroids(sh_rest: NDArray[Any], labels: NDArray[np.int64], entries: int):
-    """Table and the image of a palette: the mean harmonics of each group."""
-    coefficients, sizes = sh_rest.shape[1], np.bincount(labels, minlength=entries)
-    means = np.empty((entries, coefficients, 3))
-    for k, channel in np.ndindex(coefficients, 3):
-        column = np.asarray(sh_rest[:, k, channel], np.float64)
-        means[:, k, channel] = np.bincount(labels, column, entries) / sizes
-    table, places = _tabulated(means)
-    rows = -(-entries // _ACROSS)
-    image = np.zeros((rows * _ACROSS, coefficients, 4), np.uint8)
-    image[..., 3] = 255
-    image[:entries, :, :3] = places
-    return table, image.reshape(rows, _ACROSS * coefficients, 4)
 
 
 _LOSS = "holds positions in 16 bits, all else in 8, takes harmonics from a palette, and sorts"

@@ -6,6 +6,7 @@ attribute; it is read where a module for zstd is there, which Blender brings. Ve
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
 import math
@@ -164,16 +165,14 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, NDArray[np.
 
 def _damaged_at(data: NDArray[np.uint8]) -> int:
     """Byte of a gzip stream that zlib cannot go on from."""
-    engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
-    at = 0
+    engine, at = zlib.decompressobj(16 + zlib.MAX_WBITS), 0
     for size in (_STEP, 1):  # the step with the damage, then the byte
-        try:
+        with contextlib.suppress(zlib.error):
             while at < len(data):
                 before = engine.copy()
                 engine.decompress(data[at : at + size].data)
                 at += size
-        except zlib.error:
-            engine = before
+        engine = before
     return at
 
 

@@ -213,7 +213,13 @@ class StreamedSog:
                 left += [(sides[1], rows[~below]), (sides[0], rows[below])]
             elif len(rows):
                 rows = rows[near_ones_together(splats.means[rows])]
-                self._widen(node, splats, rows)
+                for piece in pieces(len(rows)):  # boxes around ellipsoids of one deviation
+                    batch = splats.take(rows[piece])
+                    turns = np.abs(rotation_matrices(batch.quaternions))
+                    half = np.einsum("nij,nj->ni", turns, scales(batch.log_scales))
+                    low, high = (means[rows[piece]] + side * half for side in (-1.0, 1.0))
+                    self._low[node] = np.minimum(self._low[node], low.min(axis=0))
+                    self._high[node] = np.maximum(self._high[node], high.max(axis=0))
                 place = {"file": len(self._levels), "offset": len(unit), "count": len(rows)}
                 self._rows[node][str(level)] = place
                 unit = np.concatenate([unit, rows])
@@ -225,16 +231,6 @@ class StreamedSog:
                 size += sum((folder / file).write_bytes(data) for file, data in files)
                 unit = unit[:0]
         return size
-
-    def _widen(self, number: int, splats: Splats, rows: NDArray[np.intp]) -> None:
-        """Let the box of a chunk hold boxes around ellipsoids of one deviation."""
-        for piece in pieces(len(rows)):
-            batch = splats.take(rows[piece])
-            turns = np.abs(rotation_matrices(batch.quaternions))
-            half = np.einsum("nij,nj->ni", turns, scales(batch.log_scales))
-            means = np.asarray(batch.means, np.float64)
-            self._low[number] = np.minimum(self._low[number], (means - half).min(axis=0))
-            self._high[number] = np.maximum(self._high[number], (means + half).max(axis=0))
 
     def publish(self, path: Path, *, overwrite: bool) -> None:
         """Move the folders beside `path`, under names that are free, and write the index there.
