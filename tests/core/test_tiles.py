@@ -68,7 +68,7 @@ CLOSED, OCCLUSION, MERGE = ClosedForm(8), Occlusion(8), Merge(8)
 def small(monkeypatch):
     """Make pieces and boxes so small that 5000 splats have several of each."""
     monkeypatch.setattr(source, "ROWS", 1000)
-    monkeypatch.setattr(tiles_prune, "ROWS", 300)
+    monkeypatch.setattr(regions, "_ROWS", 300)
     monkeypatch.setattr(writing, "ROWS", 900)
     monkeypatch.setattr(projection, "CHUNK", 700)
 

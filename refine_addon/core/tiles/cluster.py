@@ -157,12 +157,9 @@ class Cluster:
                 raise RefineError("the scheduler has no workers") from error
             except Exception as error:
                 raise Interrupted(f"the workers do not answer: {error}") from error
-            there = {
-                worker: answer
-                for worker, answer in answers.items()
-                if not isinstance(answer, OSError)  # lost meanwhile
-            }
-            for worker, answer in there.items():
+            # Others were lost meanwhile.
+            there = [pair for pair in answers.items() if not isinstance(pair[1], OSError)]
+            for worker, answer in there:
                 if isinstance(answer, BaseException):
                     answer = f"it cannot run refine {VERSION}: {answer}"
                 if answer:
@@ -225,10 +222,7 @@ def _run(packed: bytes, items: Sequence[Any]) -> list[Any]:
     return alone(_unpacked(packed), items)
 
 
-@functools.lru_cache(maxsize=2)
-def _unpacked(packed: bytes) -> Callable[[Any], Any]:
-    work: Callable[[Any], Any] = pickle.loads(packed)
-    return work
+_unpacked = functools.lru_cache(maxsize=2)(pickle.loads)
 
 
 async def _answer(version: str, job: Path, tiles: Sequence[Tile]) -> str:

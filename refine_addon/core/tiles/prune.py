@@ -8,29 +8,30 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...version import VERSION
 from ..errors import RefineError, reason_of
-from ..execute import Cancelled, Progress, chunks, on, run, seconds, silent, stages
+from ..execute import Cancelled, Progress, on, seconds, silent, stages
 from ..mapped import Interrupted, note, noted, once, write
 from ..methods import DEFAULT, Method
 from ..prune import prune
+from ..regions import pieces
 from ..rendering import Model
 from ..report import Clock
 from ..result import Result
 from ..selection import Budget
-from ..splats import Splats, on_disk
+from ..splats import on_disk
 from ..views import ViewSet
 from ..whole_file import Url
 from .cluster import Cluster
-from .source import ROWS, Tile, copied, tiles_at
+from .source import Tile, copied, tiles_at
 from .storage import located, new_folder
-from .writing import Kept, Outputs, WriteTile, header_of, waiting_in
+from .writing import Kept, Outputs, header_of, waiting_in
 
 try:
     import fcntl
@@ -117,15 +118,16 @@ def prune_tiles(
         reading, deciding, writing = stages(
             progress, seconds("read", count), scoring, seconds("write", count)
         )
-        kept, counts, facts = once(
-            job,
-            "kept",
-            lambda: _decided(
-                job, tiles, views, budget, method, clock, (reading, deciding), threads
-            ),
-        )
-        sizes = _written(job, tiles, kept, counts, outputs, writing, threads)
-        if outputs is not None:
+        decided = partial(_decided, job, tiles, views, budget, method, clock)
+        kept, counts, facts = once(job, "kept", lambda: decided(reading, deciding, threads))
+        if outputs is None:
+            sizes = [
+                tile.size - tile.header + len(header_of(tile, count))
+                - (tile.splats - count) * tile.dtype.itemsize
+                for tile, (count, _) in zip(tiles, counts, strict=True)
+            ]  # fmt: skip
+        else:
+            sizes = outputs.write(kept, writing, threads)
             outputs.publish()
         clock.lap("write_s")
     clock.stop()
@@ -134,13 +136,13 @@ def prune_tiles(
         "input": f"{len(tiles)} tiles", "output": target,
         "input_bytes": size, "output_bytes": sum(sizes),
     }  # fmt: skip
-    written = int(counts[:, 0].sum()) if outputs else None
+    written = sum(count for count, _ in counts) if outputs else None
     facts["splats"] |= {"written": written, "left_out": 0}
     names = ("input", "output", "before", "kept", "unseen", "input_bytes", "output_bytes")
     targets = [str(each) for each in outputs.targets] if outputs else [None] * len(tiles)
     facts["tiles"] = [
         dict(zip(names, (t.path, to, t.splats, kept, unseen, t.size, after), strict=True))
-        for t, to, (kept, unseen), after in zip(tiles, targets, counts.tolist(), sizes, strict=True)
+        for t, to, (kept, unseen), after in zip(tiles, targets, counts, sizes, strict=True)
     ]
     facts["timings"] = clock.timings
     return facts
@@ -156,33 +158,22 @@ def _check(workers: Cluster, job: Path, tiles: Sequence[Tile]) -> None:
         raise (Interrupted(str(error)) if goes_on else error) from error
 
 
-def _decided(
-    job: Path,
-    tiles: Sequence[Tile],
-    views: ViewSet,
-    budget: Budget,
-    method: Method,
-    clock: Clock,
-    progress: tuple[Progress, Progress],
-    threads: int | None,
-) -> tuple[Kept, NDArray[np.int64], dict[str, Any]]:
-    """What stays; of each tile how many stay and how many are unseen, (tiles, 2); the report."""
-    splats = once(job, "splats", lambda: copied(tiles, job / "splats", progress[0], threads))
+def _decided(job, tiles, views, budget, method, clock, reading, deciding, threads):
+    """What stays; of each tile how many stay and how many are unseen; the report."""
+    splats = once(job, "splats", lambda: copied(tiles, job / "splats", reading, threads))
     clock.lap("read_s")
-    counts = np.array([tile.splats for tile in tiles])
     row_bytes = max(tile.dtype.itemsize for tile in tiles)
     result = prune(
         splats, views, budget, method,
         sizes=(row_bytes, sum(tile.fixed_bytes for tile in tiles)),
-        clock=clock, progress=progress[1], threads=threads,
+        clock=clock, progress=deciding, threads=threads,
     )  # fmt: skip
     assert result.scores is not None
-    ends = np.cumsum(counts)
-    masks = (result.keep, result.scores.seen == 0)
-    before = [np.append(0, np.cumsum(mask))[[*(ends - counts), *ends]] for mask in masks]
-    told = np.stack([sums[len(tiles) :] - sums[: len(tiles)] for sums in before], axis=1)
+    begins = np.cumsum([tile.splats for tile in tiles])[:-1]
+    masks = result.keep, result.scores.seen == 0
+    told = [[int(part.sum()) for part in np.split(mask, begins)] for mask in masks]
     result.report["splats"].pop("unseen_removed", None)
-    return _stored(job, result), told, result.report
+    return _stored(job, result), [*zip(*told, strict=True)], result.report
 
 
 def _stored(job: Path, result: Result) -> Kept:
@@ -191,37 +182,9 @@ def _stored(job: Path, result: Result) -> Kept:
     if result.merged is not None:
         changed = np.flatnonzero(result.merged.changed)
         rows, made = np.flatnonzero(result.keep)[changed], result.merged.splats
-        pieces: Iterator[Splats] = (
-            made.take(changed[piece]) for piece in chunks(len(changed), ROWS)
-        )
-        became = on_disk(job / "became", pieces) if len(changed) else None
+        became = on_disk(job / "became", pieces(made, changed)) if len(changed) else None
     arrays = write(job / "keep", [{"keep": result.keep, "changed": rows}])
     return Kept(**arrays, became=became)
-
-
-def _written(
-    job: Path,
-    tiles: Sequence[Tile],
-    kept: Kept,
-    counts: NDArray[np.int64],
-    outputs: Outputs | None,
-    progress: Progress,
-    threads: int | None,
-) -> list[int]:
-    """Bytes of each tile, which is written where it waits, unless it is in its place."""
-    if outputs is None:
-        return [
-            tile.size - tile.header + len(header_of(tile, count))
-            - (tile.splats - count) * tile.dtype.itemsize
-            for tile, count in zip(tiles, counts[:, 0].tolist(), strict=True)
-        ]  # fmt: skip
-    sizes = outputs.in_place()
-    numbers = [number for number in range(len(tiles)) if number not in sizes]
-    work = WriteTile(job, tiles, kept, outputs.urls)
-    cost = seconds("write", sum(tiles[number].splats for number in numbers))
-    written = run(work, numbers, progress=progress, what="writing", threads=threads, cost=cost)
-    sizes |= dict(zip(numbers, written, strict=True))
-    return [sizes[number] for number in range(len(tiles))]
 
 
 @contextlib.contextmanager
@@ -244,22 +207,19 @@ def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
             _lock(job, lock)
             for left in (*job.glob("gaussians-*"), *job.glob("*.tmp")):
                 shutil.rmtree(left, ignore_errors=True)  # of a run that was killed
-            stays = False
             try:
                 yield
+                stays = False
             except Interrupted as error:
                 stays = outputs is not None
-                if stays:
-                    raise Interrupted(
-                        f"{error}; the same command goes on where this one was"
-                    ) from error
-                raise
+                if outputs is None:
+                    raise
+                told = f"{error}; the same command goes on where this one was"
+                raise Interrupted(told) from error
             except (RefineError, Cancelled):
+                stays = False
                 if outputs:
                     outputs.discard()
-                raise
-            except BaseException:
-                stays = True
                 raise
     finally:
         if not stays:  # after the lock is closed: Windows removes no open file

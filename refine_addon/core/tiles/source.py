@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, run
+from ..execute import Progress, chunks, run
 from ..formats.ply import (
     HEADER_LIMIT,
     TEXT,
@@ -131,7 +131,7 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
         )
     check_counts(header, size - len(header.raw))
     begin, _ = vertex_range(header, vertex)
-    dtype, stated = header.elements[vertex].dtype(header.order), None
+    dtype = header.elements[vertex].dtype(header.order)
     stated = stated_model(header.raw, dtype) or "default"
     if model not in (None, stated) and THIRD_SCALE not in (dtype.names or ()):
         raise RefineError(f"{place}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}")
@@ -182,14 +182,9 @@ def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int
     RefineError, Cancelled
         See `rows_of` and `splats.on_disk`.
     """
-    empty = {tile.dtype: np.empty(0, tile.dtype) for tile in tiles if tile.splats}
-    kinds = [splats_from_columns(rows) for rows in empty.values()]
-    kinds = kinds if len(kinds) > 1 else []
-    pieces = [
-        (tile, start, min(start + ROWS, tile.splats))
-        for tile in tiles
-        for start in range(0, tile.splats, ROWS)
-    ]
+    dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
+    kinds = [splats_from_columns(np.empty(0, each)) for each in dtypes] if len(dtypes) > 1 else []
+    pieces = [(tile, part.start, part.stop) for tile in tiles for part in chunks(tile.splats, ROWS)]
 
     def read(piece: tuple[Tile, int, int]) -> Splats:
         splats = joined([*kinds, splats_from_columns(rows_of(*piece))])

@@ -7,6 +7,7 @@ import secrets
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
+from ..execute import Progress, run, seconds
 from ..formats.ply import with_count, with_model, write_rows
 from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
 from ..mapped import Interrupted, Mapped, note, noted, writing
@@ -56,55 +58,6 @@ class Kept:
         splats, changed = self.became.take(slice(first, end)), self.changed[first:end] - begin
         degree = splats_from_columns(rows[:1]).sh_rest.shape[1]
         return ChangedColumns(rows, changed, replace(splats, sh_rest=splats.sh_rest[:, :degree]))
-
-
-@dataclass(frozen=True)
-class WriteTile:
-    """Writes what stays of a tile into the folder of the job; any process can.
-
-    Attributes
-    ----------
-    job : Path
-    tiles : sequence of Tile
-    kept : Kept
-    urls : sequence of Url or None
-        Where to copy each file.
-    """
-
-    job: Path
-    tiles: Sequence[Tile]
-    kept: Kept
-    urls: Sequence[Url | None]
-
-    def __call__(self, number: int) -> int:
-        """Write the file of a tile, unless an earlier run has; return its bytes."""
-        waiting, url = waiting_in(self.job) / self.tiles[number].name, self.urls[number]
-        if not waiting.exists():
-            unfinished = waiting_in(self.job) / f"{number:06d}-{secrets.token_hex(8)}.tmp"
-            try:
-                with writing(waiting):
-                    self._write(number, unfinished)
-                    unfinished.replace(waiting)
-            finally:
-                unfinished.unlink(missing_ok=True)
-        if url is not None:
-            storage.upload(waiting, url)
-        return waiting.stat().st_size
-
-    def _write(self, number: int, path: Path) -> None:
-        tile, begin = self.tiles[number], sum(tile.splats for tile in self.tiles[:number])
-        header = header_of(tile, int(np.count_nonzero(self.kept.keep[begin : begin + tile.splats])))
-        with path.open("wb") as stream:
-            stream.write(header)
-            for beside in bytes_of(tile, tile.header, tile.begin):
-                stream.write(beside.data)
-            for start in range(0, tile.splats, ROWS):
-                rows = rows_of(tile, start, min(start + ROWS, tile.splats))
-                first = begin + start
-                columns = self.kept.columns(rows, first)
-                write_rows(stream, rows, self.kept.keep[first : first + len(rows)], columns)
-            for beside in bytes_of(tile, tile.end, tile.size):
-                stream.write(beside.data)
 
 
 def header_of(tile: Tile, kept: int) -> bytes:
@@ -164,11 +117,6 @@ class Outputs:
             return [self.folder / f"{name}-{number:06d}" for number in range(len(self.tiles))]
         return [waiting_in(self.job) / tile.name for tile in self.tiles]
 
-    @property
-    def urls(self) -> list[Url | None]:
-        """Where to copy each tile; None on a disk, where it is written at once."""
-        return [place if isinstance(place, Url) else None for place in self.waiting]
-
     def in_place(self) -> dict[int, int]:
         """Bytes of the tiles, by number, that an interrupted run has renamed."""
         return {
@@ -176,6 +124,16 @@ class Outputs:
             for number, (size, changed) in enumerate(noted(self.job, RENAMED)[1] or ())
             if self._is_renamed(number, size, changed)
         }
+
+    def write(self, kept: Kept, progress: Progress, threads: int | None) -> list[int]:
+        """Bytes of each tile, which is written where it waits, unless it is in its place."""
+        sizes = self.in_place()
+        numbers = [number for number in range(len(self.tiles)) if number not in sizes]
+        work = partial(_write_tile, self.job, self.tiles, kept, self.waiting)
+        cost = seconds("write", sum(self.tiles[number].splats for number in numbers))
+        made = run(work, numbers, progress=progress, what="writing", threads=threads, cost=cost)
+        sizes |= dict(zip(numbers, made, strict=True))
+        return [sizes[number] for number in range(len(self.tiles))]
 
     def publish(self) -> None:
         """Rename all tiles that are not in their places yet.
@@ -202,9 +160,9 @@ class Outputs:
 
     def discard(self) -> None:
         """Remove what waits behind URLs."""
-        for url in self.urls:
-            if url is not None:
-                storage.discard(url)
+        for place in self.waiting:
+            if isinstance(place, Url):
+                storage.discard(place)
 
     def _refuse_existing(self, there: Mapping[int, int]) -> None:
         """Raise `RefineError` if a tile that is not in its place could not get there."""
@@ -228,6 +186,37 @@ class Outputs:
         if isinstance(target, Path):
             return target.is_file() and _state(target) == (size, changed)
         return storage.size_of(waiting) is None and storage.size_of(target) == size
+
+
+def _write_tile(job, tiles, kept, places, number):
+    """Write what stays of a tile, unless an earlier run has, and copy it to a URL: its bytes."""
+    waiting = waiting_in(job) / tiles[number].name
+    if not waiting.exists():
+        unfinished = waiting_in(job) / f"{number:06d}-{secrets.token_hex(8)}.tmp"
+        try:
+            with writing(waiting):
+                _write_rows(tiles, kept, number, unfinished)
+                unfinished.replace(waiting)
+        finally:
+            unfinished.unlink(missing_ok=True)
+    if isinstance(places[number], Url):
+        storage.upload(waiting, places[number])
+    return waiting.stat().st_size
+
+
+def _write_rows(tiles, kept, number, path):
+    tile, begin = tiles[number], sum(tile.splats for tile in tiles[:number])
+    header = header_of(tile, int(np.count_nonzero(kept.keep[begin : begin + tile.splats])))
+    with path.open("wb") as stream:
+        stream.write(header)
+        for beside in bytes_of(tile, tile.header, tile.begin):
+            stream.write(beside.data)
+        for start in range(0, tile.splats, ROWS):
+            rows, first = rows_of(tile, start, min(start + ROWS, tile.splats)), begin + start
+            stays = kept.keep[first : first + len(rows)]
+            write_rows(stream, rows, stays, kept.columns(rows, first))
+        for beside in bytes_of(tile, tile.end, tile.size):
+            stream.write(beside.data)
 
 
 def _state(path: Path | Url) -> tuple[int, int]:
