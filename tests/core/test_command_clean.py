@@ -78,12 +78,13 @@ def test_an_unknown_reason_is_wrong_usage(files, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [[], ["--absorb"]])
-def test_prune_cleans_before_the_budget_counts(files, capsys, absorb):
+@pytest.mark.parametrize("method", ["occlusion", "merge"])
+def test_prune_cleans_before_the_budget_counts(files, capsys, method):
     """Of 577, one floats; half of the other 576 stay, and none of them is dark like the floater."""
     out = files / "out.ply"
 
-    assert call(files, "prune", "--clean", "--ratio", ".5", "-o", str(out), *absorb) == 0
+    options = ["--clean", "--ratio", ".5", "--method", method]
+    assert call(files, "prune", *options, "-o", str(out)) == 0
     assert "kept 288 of 577" in capsys.readouterr().out
     assert (read_ply(out).splats().means[:, 2] > 3.0).all()
 

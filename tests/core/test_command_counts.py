@@ -61,7 +61,7 @@ def test_a_report_counts_what_the_written_file_holds(broken, capsys, command, su
 @pytest.mark.slow
 def test_a_manifest_counts_what_the_files_of_levels_hold(broken):
     """Of 577, .997 are 576 (575.3): the first that cannot be drawn goes, two are left out."""
-    options = ["--nested", "--levels", ".997", "--format", ".SPLAT", "-o", str(broken / "out")]
+    options = ["--levels", ".997", "--format", ".SPLAT", "-o", str(broken / "out")]
 
     entry = told(broken, "lod", "--cameras", str(broken), *options, *QUICK)["levels"][0]
 
@@ -96,7 +96,7 @@ def test_every_report_says_what_was_seen_by_how_many_views(broken):
         told(broken, "prune", *options, "--dry-run"),
         told(broken, "score", *options, "--method", "occlusion", "-o", str(broken / "s.ply")),
         told(broken, "clean", *options),
-        told(broken, "lod", *options, "--nested", "-o", str(broken / "lod")),
+        told(broken, "lod", *options, "--method", "occlusion", "-o", str(broken / "lod")),
     ]
 
     assert BROKEN < unseen < WHOLE / 2
@@ -110,7 +110,7 @@ def test_every_report_says_what_was_seen_by_how_many_views(broken):
 def test_clean_and_lod_say_what_lies_in_no_view(files, capsys):
     """In the words of `prune`, and by how many views."""
     assert call(files, "clean", "--views", "2") == 0
-    assert call(files, "lod", "--nested", "--views", "2", "-o", str(files / "out")) == 0
+    assert call(files, "lod", *QUICK, "-o", str(files / "out")) == 0
     said = capsys.readouterr().out
     assert said.count(f" of {WHOLE} splats lie in no view\n") == 2
     assert said.count("by 2 of 6 views") == 2

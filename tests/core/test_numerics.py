@@ -104,7 +104,7 @@ def check(splats, scores):
 def check_the_others(splats, scores, settings):
     """Assert that all but the first splat are ordered as if it were not there."""
     expected = scored(splats.take(slice(1, None)), settings=settings).values
-    if isinstance(settings, dict) or settings.method == "closed-form":
+    if isinstance(settings, dict | ClosedForm):
         np.testing.assert_allclose(
             scores.values[1:] / scores.values[1], expected / expected[0], rtol=1e-6
         )
