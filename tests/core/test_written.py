@@ -103,15 +103,20 @@ def test_a_file_in_another_frame_is_moved_to_that_of_the_views(source, tmp_path)
     moved = prune_file(aside, tmp_path / "b.glb", cameras(), Budget(ratio=0.0), OCCLUSION)
     assert moved.report["splats"]["removed"] == 0
 
-    there = operations._written_psnr(
-        tmp_path / "b.glb", replace(result, matrix=matrix), cameras(), None
-    )
+    def psnr(matrix):
+        """Of the other file, as told of the first."""
+        scene = replace(operations.read_scene(aside), matrix=matrix)
+        kept = np.ones(len(scene.splats), np.bool_)
+        decided = replace(result, keep=kept, report=dict(result.report))
+        written = operations.run(
+            lambda form: scene, lambda *_: decided, tmp_path / "b.glb",
+            overwrite=True, views=cameras(),
+        )  # fmt: skip
+        return written.report["written_psnr"]
 
-    assert there["written_psnr"] == pytest.approx(result.report["written_psnr"], abs=0.02)
-    uneven = replace(result, matrix=np.diag([1.0, 2.0, 1.0, 1.0]))
-    assert operations._written_psnr(tmp_path / "b.glb", uneven, cameras(), None) == {
-        "written_psnr": None
-    }
+    told = result.report["written_psnr"]
+    assert psnr(matrix) == pytest.approx(told, abs=0.02)
+    assert psnr(np.diag([1.0, 2.0, 1.0, 1.0])) is None
 
 
 @pytest.mark.slow
