@@ -43,8 +43,9 @@ QUICK = ClosedForm()
 @pytest.fixture
 def merges(monkeypatch):
     """Let merging seem better: so few splats can be deleted as well."""
-    for name in ("_deletion_will_do", "_deletion_is_as_good"):
-        monkeypatch.setattr(PRUNE._Prune, name, lambda *_: False)
+    monkeypatch.setattr(PRUNE, "deletion_will_do", lambda *_: False)
+    monkeypatch.setattr(PRUNE, "PLAIN", -1.0)
+    monkeypatch.setattr(PRUNE._Prune, "_deletion_is_as_good", lambda *_: False)
 
 
 def colourful():
