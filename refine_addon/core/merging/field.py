@@ -33,6 +33,8 @@ LARGEST_LENS = 1e18
 _CHUNK = 1 << 14  # splats at a time: some MB of temporary memory a thread
 _LOG_RANGE = 80.0  # of log scales, either way, so that squares of scales stay finite
 
+_BRIGHTEST = 1e18  # its square is a float32
+
 
 @dataclass(eq=False)
 class Field:
@@ -199,7 +201,7 @@ def measured_field(
             xx, xy, yy = footprint(covariances, across(direction), wider)  # (n,) each
             # In pixels of a view, over 2 pi; a constant factor does not matter here.
             mass[piece] = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / pixel
-        seen_from = direction, deviation, np.maximum(color, 0.0), blur
+        seen_from = direction, deviation, np.clip(color, 0.0, _BRIGHTEST), blur
         values = means, covariances, alpha, *sums[:, rows[piece]], *seen_from
         for item, of_piece in zip(fields(Field), values, strict=False):
             getattr(result, item.name)[piece] = of_piece

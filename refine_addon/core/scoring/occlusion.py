@@ -183,6 +183,7 @@ def measure_part(
     return measured, weight / math.fsum(weight for _, weight in ordered)
 
 
+@np.errstate(under="ignore")  # numbers that underflow to 0 are negligible in all sums
 def _score(splats, views, rounds, settled, sampling, few_views, progress, threads):
     """Scores, and what was measured of all N; see `score` and `score_once`.
 

@@ -47,7 +47,7 @@ def registered(commands: dict[object, str]) -> list[str]:
         kind = getattr(bpy.types, name)
         lines.append(f"type {name}")
         if isinstance(kind, type) and issubclass(kind, bpy.types.ID):
-            lines += [f"property {name}.{key}" for key in kind.bl_rna.properties]
+            lines += [f"property {name}.{entry.identifier}" for entry in kind.bl_rna.properties]
         # A menu or panel that others append to keeps their functions here, and then its own.
         for function in getattr(getattr(kind, "draw", None), "_draw_funcs", ()):
             if function.__module__ == kind.__module__:
