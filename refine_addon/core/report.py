@@ -184,9 +184,10 @@ def of_prune(
     if made is not None:
         if made.refitted is not None:
             notes.append(made.refitted.note(made.seconds))
-        if {"delete", "merge"} <= made.psnr.keys() and not made.merged.merged:
-            began, merge = (in_words(made.psnr[way]) for way in ("delete", "merge"))
-            notes.append(f"refitting began with plain deletion: {began}, merging {merge}")
+        began, merge = made.psnr.get("delete"), made.psnr.get("merge")
+        if began is not None and merge is not None and not made.merged.merged:
+            said = f"{in_words(began)}, merging {in_words(merge)}"
+            notes.append(f"refitting began with plain deletion: {said}")
         notes += getattr(made.stopped, "__notes__", ())
         plain = measured.get("delete")
         if made.done == "merge" and plain is not None and plain > (psnr or plain):
