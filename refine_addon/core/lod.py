@@ -37,7 +37,7 @@ from .selection import Budget
 from .splats import Splats, among_all
 from .views import ViewSet
 from .visibility import frustum
-from .volumes import Zone, refuse_all
+from .volumes import Zone, must_go
 from .whole_file import (
     expanded,
     mode_of,
@@ -231,9 +231,7 @@ def lod(
         replace(second.result, source=file).write("out.ply")
     """
     whole, rest, budgets = splats, None, levels.budgets(len(splats))
-    if removed is not None and removed.any():
-        gone = removed if protected is None else removed & ~protected
-        refuse_all(gone)
+    if (gone := must_go(removed, protected)) is not None:
         rest = ~gone
         splats = splats.take(rest)
         protected = None if protected is None else protected[rest]

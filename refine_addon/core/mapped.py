@@ -121,13 +121,12 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
     }
 
 
-def once(job: Path | None, stage: str, make: Callable[[], Result]) -> Result:
+def once(job: Path, stage: str, make: Callable[[], Result]) -> Result:
     """Result of a stage of a job: that of an earlier run, or what `make` returns, which is kept.
 
     Parameters
     ----------
-    job : Path or None
-        Without one `make` is called.
+    job : Path
     stage : str
     make : callable
 
@@ -136,8 +135,6 @@ def once(job: Path | None, stage: str, make: Callable[[], Result]) -> Result:
     Interrupted
         If the disk is full or fails.
     """
-    if job is None:
-        return make()
     done, result = noted(job, stage)
     return result if done else note(job, stage, make())
 

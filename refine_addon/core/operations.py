@@ -300,9 +300,8 @@ def prune_file(
 
         prune_file("in.ply", "out.ply", views, Budget(ratio=0.5))
     """
-    form = None if output is None else format_named(expanded(output))
-    if budget.max_mb is not None and form is not None:
-        refuse_unknown_size(form)
+    if budget.max_mb is not None:
+        refuse_unknown_size(None if output is None else expanded(output))
     return _run_file(
         source, output, prune_scene(views, budget, method, cleaning, threads=threads),
         zones, model, overwrite=overwrite, dry_run=dry_run, views=views,

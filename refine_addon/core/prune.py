@@ -37,7 +37,7 @@ from .splats import Splats
 from .views import ViewSet, refuse_other
 from .visibility.measuring import Measured
 from .visibility.ray_sample import validation_rays
-from .volumes import Forced, refuse_all
+from .volumes import Forced, must_go
 
 TRIES = 3
 """How often splats are merged at most to reach a PSNR."""
@@ -105,9 +105,8 @@ def score(
     """
     refuse_other(views)
     splats = splats.splats() if isinstance(splats, SplatFile) else splats
-    if removed is not None and removed.any():
-        refuse_all(removed)
-        rest = ~removed
+    if (gone := must_go(removed)) is not None:
+        rest = ~gone
         scores = score(
             splats.take(rest), views, method,
             protected=None if protected is None else protected[rest],
@@ -237,10 +236,7 @@ def prune(
         sizes = sizes or (file.row_bytes, file.fixed_bytes)
     if views is not None:
         refuse_other(views)
-    gone = removed if protected is None or removed is None else removed & ~protected
-    gone = gone if gone is not None and gone.any() else None
-    if gone is not None:
-        refuse_all(gone)
+    gone = must_go(removed, protected)
     run = _Prune(
         splats, views, budget, method, protected, scores, sizes or (0.0, 0), origin, reusable,
         clock or Clock(), threads,
@@ -512,10 +508,12 @@ class _Prune:
         psnr = estimated(merged.splats, comparing)
         if not isinstance(self.method, Refit):
             return Made(merged, "merge", {"merge": psnr})
-        plain = estimated(copied(self.splats, np.flatnonzero(keep), self.threads))
+        deleted = _as_deleted(self.splats, keep, self.threads)
+        plain = estimated(deleted.splats)
         made = Made(merged, "merge", {"delete": plain, "merge": psnr})
         if plain is not None and psnr is not None and plain > psnr:
-            made = replace(made, merged=_as_deleted(self.splats, keep), done="delete")
+            made = replace(made, merged=deleted, done="delete")
+        del merged, deleted  # one of them is not needed while splats are refitted
         made = self._refitted(made, refitting)
         if made.refitted is None or made.stopped is not None:
             return made
@@ -594,9 +592,9 @@ class _Prune:
         return psnr_against(rays, made.final.splats, self.used, threads=self.threads)
 
 
-def _as_deleted(splats: Splats, keep: NDArray[np.bool_]) -> Merged:
+def _as_deleted(splats: Splats, keep: NDArray[np.bool_], threads: int | None) -> Merged:
     """What deletion leaves, as merging returns it."""
-    left = copied(splats, np.flatnonzero(keep))
+    left = copied(splats, np.flatnonzero(keep), threads)
     return Merged(left, keep, np.zeros(len(left), np.bool_), 0, len(keep) - len(left))
 
 

@@ -238,8 +238,8 @@ def forced(
     protected = _any(protected, protect)
     removed = _any(removed, remove, None if keep is None else ~keep)
     if removed is not None:
-        removed = removed if protected is None else removed & ~protected
-        refuse_all(removed)
+        gone = must_go(removed, protected)
+        removed = np.zeros_like(removed) if gone is None else gone
     return Forced(protected, removed, facts)
 
 
@@ -248,10 +248,22 @@ def _any(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
     return reduce(or_, given) if given else None
 
 
-def refuse_all(removed: NDArray[np.bool_]) -> None:
-    """Raise `RefineError` if all splats must go."""
-    if len(removed) and removed.all():
-        raise RefineError(f"all {len(removed)} splats lie where they must go; nothing was removed")
+def must_go(
+    removed: NDArray[np.bool_] | None, protected: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_] | None:
+    """Which splats are removed and not protected, (N,) bool; None if none are.
+
+    Raises
+    ------
+    RefineError
+        If all are.
+    """
+    gone = removed if protected is None or removed is None else removed & ~protected
+    if gone is None or not gone.any():
+        return None
+    if gone.all():
+        raise RefineError(f"all {len(gone)} splats lie where they must go; nothing was removed")
+    return gone
 
 
 def _extent(means: NDArray[Any]) -> str:

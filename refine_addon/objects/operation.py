@@ -11,7 +11,7 @@ from ..cameras.objects import world_matrix
 from ..core.errors import RefineError
 from ..core.execute import Progress, silent
 from ..core.formats.format import Format
-from ..core.formats.registry import format_named, refuse_unknown_size
+from ..core.formats.registry import refuse_unknown_size
 from ..core.methods import DEFAULT, Method
 from ..core.operations import Scene, prune_scene, run, score_scene
 from ..core.pictures import PictureFiles
@@ -85,9 +85,8 @@ def prune_object(
     compares = method.name != "closed-form" or budget.psnr is not None or pictures is not None
     harmonics = True if method.changes else None if compares else False
     target = None if output is None else expanded(output)
-    form = None if target is None else format_named(target)
-    if budget.max_mb is not None and form is not None:
-        refuse_unknown_size(form)
+    if budget.max_mb is not None:
+        refuse_unknown_size(target)
     if save:
         mesh_edit.check_deletable(checked.obj)
         if not bpy.data.filepath:

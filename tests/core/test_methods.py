@@ -19,7 +19,6 @@ from refine_addon.core import (
     Refit,
     prune,
     prune_file,
-    read_cameras,
     read_ply,
     score,
 )
@@ -28,25 +27,11 @@ from refine_addon.core.quality.curve import AS_GOOD, expected
 from refine_addon.core.report import deleted_note
 from tests.strategies import ply_of
 
+from .test_prune import file, small, views  # noqa: F401 - fixtures
+
 ROOM = Path(__file__).parents[1] / "data/room_small"
 FEW = Merge(12)
 HALF = Budget(ratio=0.5)
-
-
-@pytest.fixture(scope="module")
-def views():
-    names = json.loads((ROOM / "split.json").read_text())["train"]
-    return read_cameras(ROOM / "cameras.json").select(names)
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """Every twentieth splat of the room, as a file."""
-    file, path = read_ply(ROOM / "point_cloud.ply"), tmp_path_factory.mktemp("small") / "in.ply"
-    keep = np.zeros(len(file), np.bool_)
-    keep[::20] = True
-    file.write(path, keep)
-    return path
 
 
 @pytest.fixture(scope="module")

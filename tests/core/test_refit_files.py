@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from refine_addon.core import (
     lod_file,
     prune,
     prune_file,
-    read_cameras,
     read_ply,
 )
 from refine_addon.core.execute import Cancelled
@@ -29,27 +27,13 @@ from refine_addon.core.splats import ARRAYS
 from refine_addon.core.visibility.ray_sample import validation_rays
 from tests.strategies import ply_of
 
+from .test_prune import file, small, views  # noqa: F401 - fixtures
+
 ROOM = Path(__file__).parents[1] / "data/room_small"
 FEW, REFIT = Merge(12), Refit(12)
 HALF = Budget(ratio=0.5)
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def views():
-    names = json.loads((ROOM / "split.json").read_text())["train"]
-    return read_cameras(ROOM / "cameras.json").select(names)
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """Every twentieth splat of the room, as a file."""
-    file, path = read_ply(ROOM / "point_cloud.ply"), tmp_path_factory.mktemp("small") / "small.ply"
-    keep = np.zeros(len(file), np.bool_)
-    keep[::20] = True
-    file.write(path, keep)
-    return path
 
 
 @pytest.fixture(scope="module")

@@ -1350,6 +1350,13 @@ def workers():
         yield workers
 
 
+def wait_for(workers):
+    """Let the workers end what they have begun: each does one thing at a time."""
+    client = workers._client
+    each = [client.submit(len, "", workers=[name], pure=False) for name in client.nthreads()]
+    client.gather(each)
+
+
 @needs_dask
 @pytest.mark.parametrize(
     ("moment", "more"),
@@ -1390,6 +1397,7 @@ def test_what_workers_began_one_process_ends(tmp_path, tiles, views, workers):
     urls, out = [f"file://{path}" for path in tiles], f"file://{tmp_path}/out"
     with pytest.raises(KeyboardInterrupt), contextlib.chdir(tmp_path):
         prune_tiles(urls, out, **asked(views), workers=workers, progress=stopping("writing"))
+    wait_for(workers)
 
     with contextlib.chdir(tmp_path):
         prune_tiles(urls, out, **asked(views))

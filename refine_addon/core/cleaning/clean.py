@@ -23,7 +23,7 @@ from ..execute import Progress, part, silent
 from ..splats import Splats, refuse_undrawable
 from ..views import ViewSet
 from ..visibility import projection
-from ..volumes import refuse_all
+from ..volumes import must_go
 from .judge import FAINT, judge
 from .search import Search, is_slender
 
@@ -179,11 +179,9 @@ def clean(
     Cancelled
         If `progress` answers ``False``.
     """
-    rest = np.ones(len(splats), np.bool_) if removed is None else ~removed
-    if protected is not None:
-        rest |= protected
-    refuse_all(~rest)
-    left = splats if rest.all() else splats.take(rest)
+    gone = must_go(removed, protected)
+    rest = np.ones(len(splats), np.bool_) if gone is None else ~gone
+    left = splats if gone is None else splats.take(rest)
     with np.errstate(under="ignore"):
         gaussians, scene, good = projection.prepare(
             left, views, progress=part(progress, 0.0, 0.05), threads=threads

@@ -240,9 +240,13 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
     return [*file.remarks, *(sentence for sentence, applies in said.items() if applies)]
 
 
-def refuse_unknown_size(form: Format) -> None:
-    """Raise `RefineError` if the size of a file does not follow from the number of its splats."""
-    if form.sizes is None:
+def refuse_unknown_size(output: Path | None) -> None:
+    """Raise `RefineError` if the size of an output does not follow from the number of its splats.
+
+    See also `format_named`.
+    """
+    form = None if output is None else format_named(output)
+    if form is not None and form.sizes is None:
         problem = f"a size cannot be kept to in {form.suffix}, which is compressed as a whole"
         fixed = ", ".join(other.suffix for other in FORMATS if other.sizes)
         raise RefineError(f"{problem}: choose another budget, or write .ply, {fixed}")

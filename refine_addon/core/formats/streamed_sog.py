@@ -254,16 +254,7 @@ class StreamedSog:
                 free = (path.parent / f"{level}_{index}" for index in itertools.count())
                 moved.append(next(there for there in free if not there.exists()))
                 (self._folder / str(number)).rename(moved[-1])
-            index = {
-                "version": VERSION,
-                "asset": {"generator": GENERATOR},
-                "count": sum(self._counts),
-                "counts": self._counts,
-                "lodLevels": len(self._counts),
-                "lodErrors": False,
-                "filenames": [f"{there.name}/{META}" for there in moved],
-                "tree": self._branch(self._tree),
-            }
+            index = self._index([there.name for there in moved])
             text = json.dumps(index, allow_nan=False).encode() + b"\n"
             with whole_file(path, overwrite=overwrite) as stream:
                 stream.write(text)

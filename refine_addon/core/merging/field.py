@@ -186,16 +186,15 @@ def measured_field(
     closest = NEAR_RELATIVE * scene.size
 
     def fill(piece: slice) -> None:
-        some = splats.take(rows[piece])
-        means = np.ascontiguousarray(some.means, np.float64)
-        logs = np.asarray(some.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
-        axes = rotation_matrices(some.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
-        covariances = packed(axes @ np.swapaxes(axes, 1, 2))
         with np.errstate(under="ignore"):
+            some = splats.take(rows[piece])
+            means = np.ascontiguousarray(some.means, np.float64)
+            logs = np.asarray(some.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
+            axes = rotation_matrices(some.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
+            covariances = packed(axes @ np.swapaxes(axes, 1, 2))
             direction, deviation, pixel, seen[piece] = viewing(means, weighted, closest)
-        color = spherical_harmonics.colors(direction, some.sh_dc, some.sh_rest)
-        alpha, blur = opacity(some.opacity_logits), LOW_PASS * pixel
-        with np.errstate(under="ignore"):
+            color = spherical_harmonics.colors(direction, some.sh_dc, some.sh_rest)
+            alpha, blur = opacity(some.opacity_logits), LOW_PASS * pixel
             # Antialiasing keeps the mass that splats have without the low-pass.
             wider = np.zeros(len(blur)) if splats.model == "antialiased" else blur
             xx, xy, yy = footprint(covariances, across(direction), wider)  # (n,) each

@@ -35,11 +35,11 @@ def near_order(means: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
         Those of a cell, and those beyond the same face of the grid, keep their order.
     """
     sample = means[:: max(len(means) // _SAMPLE, 1)].astype(np.float64)
-    low, high = np.quantile(sample, _ENDS, axis=0)  # (3,) each
-    # Cubes: a run is about as wide as high, however flat the scene.
-    scale = (1 << _BITS) / max(float(np.max(high - low)), _LEAST_SPAN)
     cell = np.zeros(len(means), np.uint16)
     with np.errstate(under="ignore"):
+        low, high = np.quantile(sample, _ENDS, axis=0)  # (3,) each
+        # Cubes: a run is about as wide as high, however flat the scene.
+        scale = (1 << _BITS) / max(float(np.max(high - low)), _LEAST_SPAN)
         for values, least in zip(means.T, low, strict=True):
             number = np.subtract(values, least, dtype=np.float64)  # (N,)
             number *= scale

@@ -132,7 +132,8 @@ def score_once(
     RefineError, Cancelled
         See `score`.
     """
-    return _score(splats, views, 1, None, sampling, few_views, progress, threads)
+    with np.errstate(under="ignore"):  # numbers that underflow to 0 are negligible in all sums
+        return _score(splats, views, 1, None, sampling, few_views, progress, threads)
 
 
 def measure_part(
@@ -183,13 +184,12 @@ def measure_part(
     return measured, weight / math.fsum(weight for _, weight in ordered)
 
 
-@np.errstate(under="ignore")  # numbers that underflow to 0 are negligible in all sums
 def _score(splats, views, rounds, settled, sampling, few_views, progress, threads):
     """Scores, and what was measured of all N; see `score` and `score_once`.
 
     Of splats in files they are a stage of the job.
     """
-    job, stage = folder_of(splats), f"scores-{rounds}-{settled}"
+    job, stage = folder_of(splats), f"scores-{rounds}-{settled}-{few_views}"
     done, found = (False, None) if job is None else noted(job, stage)
     if done:
         return found

@@ -20,8 +20,6 @@ from ..execute import Progress, part, run_all
 from ..visibility.measuring import Measured
 from ..visibility.ray_sample import RaySample
 
-Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
-
 KNOWN = 10.0
 """What was measured counts as much as so many rays."""
 

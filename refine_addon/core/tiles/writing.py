@@ -201,6 +201,8 @@ def _write_tile(job, tiles, kept, places, number):
             unfinished.unlink(missing_ok=True)
     if isinstance(places[number], Url):
         storage.upload(waiting, places[number])
+        if not waiting.exists():  # others have ended the job meanwhile: nobody will rename this
+            storage.discard(places[number])
     return waiting.stat().st_size
 
 

@@ -246,9 +246,11 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
 def _activate(splats, index, positions, scene, progress, threads):
     """Some splats, (M,) rows, as Gaussians; their positions, (M, 3), are in the scene's frame."""
     count = len(index)
+    with np.errstate(under="ignore"):
+        means = np.ascontiguousarray(positions.T, np.float32)
     result = Gaussians(
         index,
-        np.ascontiguousarray(positions.T, np.float32),
+        means,
         np.empty((6, count), np.float32),
         np.empty(count, np.float32),
         np.empty(count, np.float32),

@@ -76,7 +76,8 @@ class Scene:
             # At least two rows at a time: BLAS rounds the product of one otherwise.
             begin = max(min(piece.start, piece.stop - 2), 0)
             chosen = slice(begin, piece.stop) if rows is None else rows[begin : piece.stop]
-            product = (means[chosen] - self.origin) @ turn
+            with np.errstate(under="ignore"):
+                product = (means[chosen] - self.origin) @ turn
             places[piece] = product[piece.start - begin :]
 
         run_all(fill, chunks(count, _CHUNK), threads=threads)
