@@ -6,7 +6,7 @@ import bpy
 from bpy.props import PointerProperty
 
 from . import command
-from .core.formats import images
+from .core import images
 from .core.formats.registry import READ_SUFFIXES
 from .ui import (
     camera_list,

@@ -19,7 +19,7 @@ _LOSSLESS = 100
 
 
 class BlenderImages:
-    """A codec, see `refine_addon.core.formats.images.Codec`; works on Blender's main thread."""
+    """A codec, see `refine_addon.core.images.Codec`; works on Blender's main thread."""
 
     def size(self, data: bytes) -> tuple[int, int]:
         """Return width and height, read from the first bytes of the file.

@@ -1,17 +1,25 @@
-"""Image files: PNG written, OpenEXR read, the size of a PNG or JPEG read from its header.
+"""Image files: PNG, OpenEXR and WebP, and the size of a PNG or JPEG, read from its header.
 
 PNG is written with 8 bits a channel (ISO/IEC 15948). OpenEXR is read as Blender writes it
 for us, in one part without compression (Academy Software Foundation, "OpenEXR File Layout"): a
 header of named attributes, a table of offsets, and then for each line its number, its size and its
 channels one after another, in the order of their names.
+
+Lossless WebP is read and written by Blender's own library or by Pillow, since core has no codec of
+its own. `use` names one, as the extension does in Blender; without, Pillow is imported when an
+image is read or written.
 """
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
 import struct
+import warnings
 import zlib
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,3 +168,77 @@ def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
                 return width, height
             stream.seek(max(length - 2, 0), 1)
     return None
+
+
+class Codec(Protocol):
+    """What reads and writes images."""
+
+    def size(self, data: bytes) -> tuple[int, int]:
+        """Return width and height of an image, without unpacking it; raise `ValueError`."""
+
+    def decode(self, data: bytes) -> NDArray[np.uint8]:
+        """Return the pixels of an image, (height, width, 4), the top row first; see `size`."""
+
+    def encode(self, pixels: NDArray[np.uint8]) -> bytes:
+        """Return a WebP image that holds these pixels, (height, width, 4), to the bit."""
+
+
+class _Pillow:
+    """Pillow as a codec."""
+
+    def __init__(self) -> None:
+        self._image: Any = importlib.import_module("PIL.Image")
+
+    def size(self, data: bytes) -> tuple[int, int]:
+        """See `Codec`."""
+        with self._opened(data) as image:
+            return image.size
+
+    def decode(self, data: bytes) -> NDArray[np.uint8]:
+        """See `Codec`."""
+        with self._opened(data) as image:
+            return np.array(image.convert("RGBA"))
+
+    @contextlib.contextmanager
+    def _opened(self, data):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of large images, which are refused by their size
+                image = self._image.open(io.BytesIO(data), formats=["WEBP"])
+            with image:
+                yield image
+        except (OSError, SyntaxError, self._image.DecompressionBombError) as error:
+            raise ValueError(str(error)) from error
+
+    def encode(self, pixels: NDArray[np.uint8]) -> bytes:
+        """See `Codec`."""
+        stream = io.BytesIO()
+        # Without `exact`, the colours of pixels whose alpha is 0 would be lost.
+        image = self._image.fromarray(pixels, "RGBA")
+        image.save(stream, "WEBP", lossless=True, exact=True, quality=25, method=2)
+        return stream.getvalue()
+
+
+_named: list[Codec] = []
+
+
+def use(codec: Codec | None) -> None:
+    """Read and write images by `codec` from now on; None stands for Pillow."""
+    _named[:] = [] if codec is None else [codec]
+
+
+def codec_for(path: Path) -> Codec:
+    """Return what reads and writes images.
+
+    Raises
+    ------
+    RefineError
+        If there is nothing; `path` is the file that needs it.
+    """
+    if _named:
+        return _named[0]
+    try:
+        return _Pillow()
+    except ImportError as error:
+        wanted = "run this in Blender, or 'pip install pillow'"
+        raise RefineError(f"{path}: WebP images need a library: {wanted}") from error

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from .errors import RefineError
 from .execute import Progress, seconds, silent, stages
 from .formats import sog
-from .formats.images import codec_for
 from .formats.registry import format_named, held_splats, left_out, notes, scene_name, write_splats
 from .formats.streamed_sog import INDEX, StreamedSog, folder_for
+from .images import codec_for
 from .methods import DEFAULT, Method
 from .operations import read_scene
 from .prune import prune, score

@@ -12,8 +12,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, read_splats, write_splats
-from refine_addon.core.formats import images
+from refine_addon.core import RefineError, images, read_splats, write_splats
 from refine_addon.core.formats.sog import _grouped
 from tests.strategies import plain_ply
 

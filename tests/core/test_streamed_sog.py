@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, read_splats
-from refine_addon.core.formats import images, streamed_sog
+from refine_addon.core import RefineError, images, read_splats
+from refine_addon.core.formats import streamed_sog
 from refine_addon.core.formats.streamed_sog import StreamedSog, folder_for
 from refine_addon.core.splats import rotation_matrices
 

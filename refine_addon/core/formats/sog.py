@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..foreign_files import is_sog
+from ..images import codec_for
 from ..place import Place, described
 from ..rendering import MODELS, Model
 from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from ..whole_file import mode_of
 from .format import Format, codes, join_largest, near_ones_together, new_file, pieces, split_largest
-from .images import codec_for
 from .ply import Origin, SplatFile
 
 NAME, VERSION = "SOG", 2
