@@ -1,18 +1,22 @@
-"""A place in a file, and checks of the JSON values that stand there.
+"""What is refused in a file: at a place in it, or since the file is of another kind.
 
-A `Place` is a position in a file, such as "cameras.json: camera 3". Each check is one method of it,
-and each error names the file, the place, what was got and what was expected.
+A `Place` is a position in a file, such as "cameras.json: camera 3". Each check of a JSON value
+there is one method of it, and each error names the file, the place, what was got and what was
+expected. Files of known kinds where another kind is expected are refused with advice what to do.
 """
 
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, Self, TypeGuard
 
 from .errors import RefineError
+from .whole_file import Url
 
 LARGEST_NUMBER = 1e18
 """Largest number that is taken, such as a coordinate: its square still fits float32."""
@@ -24,6 +28,14 @@ NEGLIGIBLE = 1e-30
 """Smaller numbers are read as 0, so that products of two numbers do not underflow."""
 
 _SHOWN = 40  # most characters of a value in a message
+
+GZIP = b"\x1f\x8b"
+"""The first bytes of a gzip file."""
+
+SPZ = b"NGSP"
+"""The first bytes of what an SPZ file holds."""
+
+_ZIP = b"PK\x03\x04"
 
 
 @dataclass(frozen=True)
@@ -126,3 +138,70 @@ def described(value: object) -> str:
         return f"a list of {len(value)}"
     text = json.dumps(value)
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+
+
+def refuse_pointer(path: Path | Url, head: bytes) -> None:
+    """Refuse a Git LFS pointer, which Git leaves in place of a large file.
+
+    Parameters
+    ----------
+    path : Path or Url
+        For the message.
+    head : bytes
+        The first bytes of the file.
+
+    Raises
+    ------
+    RefineError
+        If it is one; with advice.
+    """
+    if head.startswith(b"version https://git-lfs.github.com/spec/"):
+        raise RefineError(
+            f"{path}: a Git LFS pointer, not the file itself: 'git lfs pull' fetches that"
+        )
+
+
+def foreign_kind(path: Path | Url, head: bytes) -> str:
+    """What a file in another format is and what to do with it; "" if it is not known.
+
+    Parameters
+    ----------
+    path, head
+        See `refuse_pointer`; a few hundred bytes.
+    """
+    suffix, read = path.suffix.lower(), "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
+    if suffix in (".splat", ".ksplat"):  # only the name tells: they have no signature
+        return f"a {suffix} file: {read}"
+    if is_spz(head):
+        return f"an SPZ file: {read}"
+    if is_sog(path, head):
+        return f"a SOG file: {read}"
+    for signature, packed in ((GZIP, "compressed with gzip"), (_ZIP, "a ZIP archive")):
+        if head.startswith(signature):
+            return f"{packed}: unpack it first"
+    if suffix == ".spz" and head and not head.startswith(b"ply"):
+        return f"a damaged SPZ file: begins with {head[:4]!r}, expected {SPZ!r} or {GZIP!r}"
+    return ""
+
+
+def is_spz(head: bytes) -> bool:
+    """Whether a file with these first bytes is an SPZ file, as it is or within gzip."""
+    if head.startswith(SPZ):
+        return True
+    try:
+        beginning = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(SPZ))
+    except zlib.error:
+        return False
+    return beginning.startswith(SPZ)
+
+
+def is_sog(path: Path | Url, head: bytes) -> bool:
+    """Whether a file is a SOG file: a ZIP archive by that name or with meta.json and images."""
+    if not head.startswith(_ZIP) or path.suffix.lower() == ".sog":
+        return head.startswith(_ZIP)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [PurePosixPath(name) for name in archive.namelist()]
+    except (OSError, ValueError, ArithmeticError, NotImplementedError, zipfile.BadZipFile):
+        return False
+    return any(n.name == "meta.json" for n in names) and any(n.suffix == ".webp" for n in names)

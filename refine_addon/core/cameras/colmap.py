@@ -13,7 +13,7 @@ import codecs
 import mmap
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -22,7 +22,6 @@ import numpy as np
 
 from ..splats import rotation_matrices
 from ..views import ViewSet
-from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
 from .place import CameraPlace, is_file, opened
 
 SUFFIXES = (".bin", ".txt")
@@ -40,6 +39,76 @@ IMAGE_FIELDS = ("IMAGE_ID", *POSE, "CAMERA_ID", "NAME")
 SHORT_LINE = 400
 """Only lines of points below this many bytes are checked: if the line of points is missing, the
 short line of the next image is in its place."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A camera model. Its parameters are the focal lengths, cx, cy, then those of distortion.
+
+    Attributes
+    ----------
+    name : str
+        As in ``cameras.txt``.
+    focals : int
+        Number of focal lengths: 2, 1 if fx = fy, or 0 for a panorama.
+    count : int
+        Number of parameters.
+    fisheye : bool
+        Whether the distance from the centre grows with the angle, not with its tangent.
+    """
+
+    name: str
+    focals: int
+    count: int
+    fisheye: bool = False
+
+
+MODELS = {
+    0: Model("SIMPLE_PINHOLE", 1, 3),
+    1: Model("PINHOLE", 2, 4),
+    2: Model("SIMPLE_RADIAL", 1, 4),
+    3: Model("RADIAL", 1, 5),
+    4: Model("OPENCV", 2, 8),
+    5: Model("OPENCV_FISHEYE", 2, 8, fisheye=True),
+    6: Model("FULL_OPENCV", 2, 12),
+    7: Model("FOV", 2, 5),
+    8: Model("SIMPLE_RADIAL_FISHEYE", 1, 4, fisheye=True),
+    9: Model("RADIAL_FISHEYE", 1, 5, fisheye=True),
+    10: Model("THIN_PRISM_FISHEYE", 2, 12, fisheye=True),
+    11: Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 16, fisheye=True),
+    12: Model("SIMPLE_DIVISION", 1, 4),
+    13: Model("DIVISION", 2, 5),
+    14: Model("SIMPLE_FISHEYE", 1, 3, fisheye=True),
+    15: Model("FISHEYE", 2, 4, fisheye=True),
+    16: Model("EUCM", 2, 6),
+    17: Model("EQUIRECTANGULAR", 0, 2),
+}
+"""COLMAP's camera models by their number in ``cameras.bin``."""
+
+MODELS_BY_NAME = {model.name: model for model in MODELS.values()}
+
+
+def counted(count: int, thing: str) -> str:
+    """A count and a noun, with a plural s if the count is not 1."""
+    return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
+
+
+def lens_note(counts: Mapping[Model, int], thing: str) -> str:
+    """Note about lenses that are not pinholes, or "" if there are none.
+
+    Parameters
+    ----------
+    counts : mapping of Model to int
+        How many things have each model.
+    thing : str
+        What is counted, in the singular: "camera" or "frame".
+    """
+    ways = (
+        "distortion of {} ignored (model {})",
+        "{} (fisheye, {}) taken as pinhole: wrong away from the centre",
+    )
+    each = counts.items()
+    return "; ".join(ways[m.fisheye].format(counted(count, thing), m.name) for m, count in each)
 
 
 def find_colmap(folder: Path) -> tuple[Path, str] | None:

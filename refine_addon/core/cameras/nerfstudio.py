@@ -24,7 +24,7 @@ import numpy as np
 
 from ..images import image_size
 from ..views import ORTHONORMAL, ViewSet
-from .lenses import FISHEYE624, MODELS_BY_NAME, PANORAMAS, Model, counted, lens_note
+from .colmap import MODELS_BY_NAME, Model, counted, lens_note
 from .place import CameraPlace, is_file, is_folder, read_json
 
 DATAPARSER_FILE = "dataparser_transforms.json"
@@ -39,7 +39,15 @@ DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PANORAMA_KEYS = ("equirectangular", "latlong")
 """Keys that mark a panorama for instant-ngp."""
 
-LENSES = {**MODELS_BY_NAME, "FISHEYE624": FISHEYE624}
+LENSES = {**MODELS_BY_NAME, "FISHEYE624": Model("FISHEYE624", 1, 15, fisheye=True)}
+"""Models by their names: also that of Project Aria's lenses, for which COLMAP has no number."""
+
+PANORAMAS = {
+    *("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R"),
+    *("VR180_L", "VR180_R", "ORTHOPHOTO"),
+}
+"""Models of nerfstudio and COLMAP that a pinhole cannot approximate."""
+
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 """Suffixes tried when the size is read from the image; names of NeRF synthetic scenes have none."""
 

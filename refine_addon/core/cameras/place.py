@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
-from ..foreign_files import foreign_kind, refuse_pointer
-from ..place import LARGEST_NUMBER, Place
+from ..place import LARGEST_NUMBER, Place, foreign_kind, refuse_pointer
 from ..views import View, is_orthonormal
 from ..whole_file import mode_of
 

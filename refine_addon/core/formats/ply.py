@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..execute import chunks, run
-from ..foreign_files import refuse_foreign_splats
-from ..place import Place
+from ..place import Place, foreign_kind, refuse_pointer
 from ..rendering import MODELS, Model
 from ..splats import Splats
 from ..splats import with_model as drawn_as
@@ -368,8 +367,11 @@ def read_header(path: Path | Url, stream: BinaryIO) -> Header:
     if not head:
         problem = "the file is empty, expected a PLY"
     elif not re.match(rb"ply[\r\n]", head):
-        refuse_foreign_splats(path, head)
-        problem = f"not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
+        refuse_pointer(path, head)
+        problem = foreign_kind(path, head)
+        problem = (
+            problem or f"not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
+        )
     elif raw is None:
         problem = f"header without end: no 'end_header' line in the first {len(head)} bytes"
     if problem or raw is None:

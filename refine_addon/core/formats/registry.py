@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..foreign_files import refuse_pointer
-from ..place import LARGEST_NUMBER, Place
+from ..place import LARGEST_NUMBER, Place, refuse_pointer
 from ..rendering import Model
 from ..splats import Splats, drawable, with_model
 from ..whole_file import Url, expanded, whole_file

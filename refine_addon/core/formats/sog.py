@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
-from ..foreign_files import is_sog
 from ..images import codec_for
-from ..place import Place, described
+from ..place import Place, described, is_sog
 from ..rendering import MODELS, Model
 from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from ..whole_file import mode_of

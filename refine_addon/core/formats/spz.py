@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..foreign_files import GZIP, SPZ, is_spz
-from ..place import Place
+from ..place import GZIP, SPZ, Place, is_spz
 from ..rendering import MODELS, Model
 from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
