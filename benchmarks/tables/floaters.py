@@ -27,9 +27,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from refine_addon.core.cleaning.clean import Cleaning, clean
-from refine_addon.core.cleaning.clusters import touching
-from refine_addon.core.cleaning.judge import (
+from refine_addon.core.cleaning.clean import (
     AGREE,
     AT_SURFACE,
     FAINT,
@@ -43,9 +41,11 @@ from refine_addon.core.cleaning.judge import (
     POWER,
     SUPPORT,
     WIDE,
+    Cleaning,
+    clean,
     judge,
 )
-from refine_addon.core.cleaning.search import Found, Search, is_slender
+from refine_addon.core.cleaning.search import Found, Search, is_slender, touching
 from refine_addon.core.cleaning.support import share
 from refine_addon.core.execute import silent
 from refine_addon.core.formats.ply import read_ply

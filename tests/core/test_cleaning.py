@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Cleaning, RefineError, Splats, View, ViewSet, clean
-from refine_addon.core.cleaning.clusters import connected
+from refine_addon.core.cleaning.search import connected
 from refine_addon.core.splats import ARRAYS
 
 SIDE = 24

@@ -7,9 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from refine_addon.core.cleaning import judge
-from refine_addon.core.cleaning.clusters import small_clusters
-from refine_addon.core.cleaning.search import VIEW_PARTS, Found
+from refine_addon.core.cleaning.clean import _clumps
+from refine_addon.core.cleaning.search import VIEW_PARTS, Found, small_clusters
 from refine_addon.core.cleaning.support import Evidence
 from refine_addon.core.execute import silent
 from refine_addon.core.visibility import projection
@@ -33,7 +32,7 @@ def judged(count, past=8.0, near=0.0, past_by=2.0, parted=(), denied=()):
     chain = np.arange(count)
     near, touch = np.minimum(chain + 1, count - 1)[:, None], ~np.isin(chain + 1, parted)[:, None]
     gaussians = SimpleNamespace(alphas=0.5 * ones)
-    return judge._clumps(gaussians, found, 0.1 * ones, chain, near, touch)
+    return _clumps(gaussians, found, 0.1 * ones, chain, near, touch)
 
 
 def test_ten_splats_that_touch_go_together():
