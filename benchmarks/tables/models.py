@@ -21,9 +21,8 @@ import numpy as np
 
 from refine_addon.core import METHODS, prune
 from refine_addon.core.affine import quaternion
-from refine_addon.core.rendering import MODELS, Model
 from refine_addon.core.selection import Budget
-from refine_addon.core.splats import Splats, rotation_matrices, with_model
+from refine_addon.core.splats import MODELS, Model, Splats, rotation_matrices, with_model
 from refine_addon.core.views import ViewSet
 
 from .evaluate import Evaluator, read_scene

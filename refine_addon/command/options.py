@@ -23,7 +23,7 @@ from ..core import (
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.lod import SHARES as DEFAULT_LEVELS
-from ..core.rendering import MODELS
+from ..core.splats import MODELS
 from ..core.whole_file import Url, expanded, is_url, refuse_url
 from ..version import VERSION
 from . import zones

@@ -20,11 +20,10 @@ from .prune import prune, score
 from .result import Result
 from .scores import Scores
 from .selection import Budget, rank, select
-from .solid import Solid
 from .splats import Splats
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet, with_views_between
-from .volumes import Box, MovedVolume, Sphere, Zone, forced
+from .volumes import Box, MovedVolume, Solid, Sphere, Zone, forced
 
 __all__ = [
     "METHODS",

@@ -29,12 +29,11 @@ from .methods import DEFAULT, Method
 from .operations import read_scene
 from .prune import prune, score
 from .quality.curve import PSNR_CAP
-from .rendering import Model
 from .report import Clock, scored, scoring_notes
 from .result import Origin, Result
 from .scores import Scores
 from .selection import Budget
-from .splats import Splats, among_all
+from .splats import Model, Splats, among_all
 from .views import ViewSet
 from .visibility import frustum
 from .volumes import Zone, must_go

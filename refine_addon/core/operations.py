@@ -27,11 +27,10 @@ from .methods import DEFAULT, Method
 from .pictures import PictureFiles
 from .prune import prune, score
 from .quality.psnr import psnr_against
-from .rendering import Model
 from .report import Clock, kept_and_removed, prices, scored, scoring_notes, seen_by
 from .result import Result, file_of
 from .selection import Budget
-from .splats import Splats, joined
+from .splats import Model, Splats, joined
 from .views import ViewSet
 from .volumes import Forced, Zone, forced
 from .whole_file import expanded, refuse_existing, refuse_mapped

@@ -21,6 +21,9 @@ WIDEST = math.radians(90.0)
 MOST_BETWEEN = 1000
 """So many may be added at most: each is compared with all others, so more would take minutes."""
 
+FAR = 1000.0
+"""Extents of the splats from which a view without perspective is looked at instead."""
+
 _CANDIDATES = 64
 """So many of the nearest views of each are looked at for neighbours."""
 
@@ -395,3 +398,73 @@ def _halfway(one, other):
         weight=one.weight / 2.0 + other.weight / 2.0,
         name=f"{one.name} - {other.name}",
     )
+
+
+def pinhole(
+    matrix: NDArray[Any],
+    projection_matrix: NDArray[Any],
+    size: tuple[int, int],
+    means: NDArray[Any],
+) -> View:
+    """View of a camera that is given by OpenGL's matrices.
+
+    A camera without perspective is looked at from `FAR` extents of the splats away, where rays are
+    parallel but for a thousandth.
+
+    Parameters
+    ----------
+    matrix : (4, 4) float64
+        World to camera: x right, y up, z back; rigid.
+    projection_matrix : (4, 4) float64
+    size : (int, int)
+        Pixels across and up.
+    means : (N, 3) floating
+        Centres of the splats, in the world.
+    """
+    flip = np.diag([1.0, -1.0, -1.0])
+    axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)  # float32
+    rotation = flip @ axes
+    center = -rotation.T @ flip @ matrix[:3, 3]
+    if projection_matrix[3, 3] == 0.0:
+        return view_through(projection_matrix, (rotation, center), size)
+    finite, middle, extent = means[np.isfinite(means).all(axis=1)], center, 1.0
+    if len(finite):
+        middle = np.median(finite, axis=0)
+        extent = float(max([*np.ptp(finite, axis=0), 2.0 / projection_matrix[0, 0]]))
+    depth = float((rotation @ (middle - center))[2])
+    return view_through(projection_matrix, (rotation, center), size, (depth, FAR * extent))
+
+
+def view_through(
+    projection_matrix: NDArray[np.float64],
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]],
+    size: tuple[int, int],
+    parallel: tuple[float, float] = (0.0, 1.0),
+) -> View:
+    """View of a camera with one of OpenGL's projection matrices.
+
+    Parameters
+    ----------
+    projection_matrix : (4, 4) float64
+    pose : ((3, 3) float64, (3,) float64)
+        Rotation and centre of the view.
+    size : (int, int)
+        Pixels across and up.
+    parallel : (float, float)
+        Of a camera without perspective: the depth at which pixels have their exact size, along its
+        axis, and how far from there the view stands instead.
+    """
+    p, (width, height), (rotation, center) = projection_matrix, size, pose
+    fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0
+    # What shifts the image stands in the third column of a matrix with perspective, else in the
+    # fourth.
+    cx = (1.0 - p[0, 2] + p[0, 3]) * width / 2.0
+    cy = (1.0 + p[1, 2] - p[1, 3]) * height / 2.0
+    if p[3, 3] == 0.0:
+        near = max(float(p[2, 3] / (p[2, 2] - 1.0)), 0.0)
+        return View(rotation, center, fx, fy, cx, cy, width, height, near)
+    depth, away = parallel
+    center = center + rotation[2] * (depth - away)
+    near = float((p[2, 3] + 1.0) / p[2, 2])  # along the axis, from the camera; may be behind it
+    near = max(near - depth + away, 0.0)
+    return View(rotation, center, fx * away, fy * away, cx, cy, width, height, near)

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.formats.ply_columns import THIRD_SCALE, Columns
 from ..core.formats.registry import scene_name
-from ..core.rendering import MODELS
-from ..core.splats import Splats, single_unit_quaternions, with_model
+from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
 from .native import Place
 

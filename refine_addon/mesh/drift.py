@@ -16,8 +16,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.affine import Move, affine_moves
 from ..core.formats.ply_columns import THIRD_SCALE
-from ..core.moves import Move, affine_moves
 from . import attributes as mesh_attributes
 from . import native
 from .layout import sh_degree, unlisted

@@ -18,7 +18,7 @@ import numpy as np
 from ..core.errors import RefineError
 from ..core.formats.ply import new_header, stated_model, vertex_header, with_model
 from ..core.formats.ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE
-from ..core.rendering import MODELS, Model
+from ..core.splats import MODELS, Model
 from . import native
 from .native import Place
 

@@ -17,8 +17,7 @@ from ..cameras.objects import world_matrix
 from ..core import volumes as core_volumes
 from ..core.affine import moved
 from ..core.errors import RefineError
-from ..core.solid import Solid
-from ..core.volumes import Box, Forced, MovedVolume, Role, Sphere, Volume, Zone
+from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Volume, Zone
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters

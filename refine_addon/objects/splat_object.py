@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.objects import world_matrix
-from ..core.affine import baked, check_affine, is_uniform, transformed
+from ..core.affine import Move, baked, check_affine, is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.execute import chunks, run_all
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
 from ..core.merging.merge import Merged
 from ..core.methods import Merge, Method, Occlusion
-from ..core.moves import Move
 from ..core.result import Result
 from ..core.selection import Budget
 from ..core.splats import Splats

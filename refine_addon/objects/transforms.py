@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.objects import snapped, world_matrix
-from ..core.affine import is_flat
+from ..core.affine import Move, is_flat
 from ..core.errors import RefineError
 from ..core.execute import Progress, report
 from ..core.formats.ply import REST_COUNTS
-from ..core.moves import Move
 from ..core.splats import above_constant, refuse_mixed
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift

@@ -1,6 +1,6 @@
 """Splats of a render drawn on the graphics card, by the shader of the 3D views.
 
-On Blender's main thread, where the 3D views draw, too; core's renderer (`core.drawing`) does the
+On Blender's main thread, where the 3D views draw, too; core's renderer (`core.pictures`) does the
 same where there is no card.
 """
 
@@ -14,9 +14,8 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.drawing import Layers
-from ..core.rendering import MODELS
-from ..core.splats import Splats
+from ..core.pictures import Layers
+from ..core.splats import MODELS, Splats
 from ..core.views import View
 from ..viewport import shader
 from ..viewport.arrays import Eye, as_texture, colors, farthest_first, in_front, pack
@@ -61,7 +60,7 @@ def prepare(splats: Splats, view: View, layers: Layers | None) -> Sheet:
     Parameters
     ----------
     splats, view, layers
-        As `core.drawing.draw` takes them; the splats look the same from all directions.
+        As `core.pictures.draw` takes them; the splats look the same from all directions.
     """
     matrix = np.empty((3, 4))  # world to camera: x right, y up, z back
     matrix[:, :3] = np.array([1.0, -1.0, -1.0])[:, None] * view.rotation
@@ -101,7 +100,7 @@ def prepare(splats: Splats, view: View, layers: Layers | None) -> Sheet:
 
 
 def paint(sheet: Sheet, layers: Layers | None) -> NDArray[np.float64]:
-    """Draw splats on the card; return what `core.drawing.draw` does. On the main thread."""
+    """Draw splats on the card; return what `core.pictures.draw` does. On the main thread."""
     textures = {name: shader.texture(*given) for name, given in sheet.textures.items()}
     if layers is None:
         return _drawn(sheet, textures)

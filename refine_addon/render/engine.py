@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 from .. import main_thread
 from ..cameras.objects import pose
 from ..core.affine import is_flat, transformed
-from ..core.drawing import Layers, draw, seen_from
 from ..core.errors import RefineError
 from ..core.execute import Cancelled, checked_by, checkpoint
-from ..core.sight import view_through
+from ..core.pictures import Layers, draw, seen_from
 from ..core.splats import Splats, drawable, joined
-from ..core.views import View, ViewSet
+from ..core.views import View, ViewSet, view_through
 from ..core.visibility.scene import scene_of
 from ..mesh import attributes as mesh_attributes
 from ..mesh.layout import SplatObject, check, splat_count

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.drawing import Layers, in_order
 from ..core.images import read_exr
+from ..core.pictures import Layers, in_order
 
 _ROUNDS = 2
 """Pixels by which known depths are spread to pixels at edges without one."""

@@ -24,8 +24,8 @@ from ..core.formats.ply import REQUIRED
 from ..core.lod import Levels
 from ..core.methods import METHODS as CORE_METHODS
 from ..core.methods import Merge, Method, Refit
-from ..core.rendering import MODELS
 from ..core.selection import Budget
+from ..core.splats import MODELS
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING

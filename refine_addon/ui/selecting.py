@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.objects import world_matrix
-from ..core import picking, sight
+from ..core import picking
 from ..core.affine import transformed
 from ..core.execute import Progress
-from ..core.picking import Mode
-from ..core.sight import Prepared, Sight, Surface
+from ..core.picking import Mode, Prepared, Sight, Surface
 from ..core.splats import Splats
+from ..core.views import pinhole
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import selection
@@ -90,10 +90,10 @@ class _Job:
         source = self.source
         if isinstance(source, Splats):
             world = transformed(source, self.matrix, rotate_sh=False)
-            source = sight.prepare(world, sight.pinhole(*self.camera, world.means))
+            source = picking.prepare(world, pinhole(*self.camera, world.means))
         if isinstance(source, Prepared):
-            view = sight.pinhole(*self.camera, source.splats.means)
-            source = sight.look(source, view)
+            view = pinhole(*self.camera, source.splats.means)
+            source = picking.look(source, view)
         return _Kept(self.splats, source.prepared, self.view, source)
 
 

@@ -1,6 +1,6 @@
 """What the 3D view draws of splats, as arrays: what is uploaded, its order, its colours.
 
-No Blender here. The rules are those of the reference implementation (`core.rendering`).
+No Blender here. The rules are those of the reference implementation (`core.splats`).
 """
 
 from __future__ import annotations
@@ -13,9 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.formats.format import pieces
-from ..core.rendering import ALPHA_CUT, Model
 from ..core.spherical_harmonics import colors as colors_along
-from ..core.splats import SH_C0, Splats, drawable, opacity, rotation_matrices, scales
+from ..core.splats import (
+    ALPHA_CUT,
+    SH_C0,
+    Model,
+    Splats,
+    drawable,
+    opacity,
+    rotation_matrices,
+    scales,
+)
 
 WIDTH = 4096
 """Columns of a texture that holds a value a splat, row by row."""

@@ -14,7 +14,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-from ..core.rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS, LOW_PASS
+from ..core.splats import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS, LOW_PASS
 from .arrays import SELECTED, SELECTED_SHARE, WIDTH
 
 _CONSTANTS = f"""

@@ -50,7 +50,7 @@ def drawn(addon, scene, obj, **changes):
         scene.camera, scene, bpy.context.evaluated_depsgraph_get()
     )
     splats = addon.objects.splat_object.gather(addon.mesh.layout.check(obj), whole=True)
-    picture = addon.core.drawing.draw(splats, addon.render.engine.replace(view, **changes))
+    picture = addon.core.pictures.draw(splats, addon.render.engine.replace(view, **changes))
     picture[:3] /= np.maximum(picture[3], 1e-6)
     return np.moveaxis(picture, 0, -1).clip(0.0, 1.0)
 

@@ -18,8 +18,7 @@ from refine_addon.core import Splats, View, ViewSet, read_splats, write_splats
 from refine_addon.core.formats import streamed_sog
 from refine_addon.core.formats.registry import format_named
 from refine_addon.core.formats.streamed_sog import StreamedSog, folder_for
-from refine_addon.core.rendering import MODELS
-from refine_addon.core.splats import base_color, opacity, rotation_matrices
+from refine_addon.core.splats import MODELS, base_color, opacity, rotation_matrices
 from tests.fuzz import version_1_of
 from tests.strategies import ply_of, splat_names
 

@@ -12,9 +12,8 @@ from benchmarks.renderer import rasterizer
 from benchmarks.renderer.footprints import camera_of, disc_distance, footprints_of, gaussians_of
 from benchmarks.tables.models import discs, version
 from refine_addon.core import Splats, View
-from refine_addon.core.drawing import draw
-from refine_addon.core.rendering import MODELS
-from refine_addon.core.splats import rotation_matrices, scales, with_model
+from refine_addon.core.pictures import draw
+from refine_addon.core.splats import MODELS, rotation_matrices, scales, with_model
 
 VIEW = View(np.eye(3), np.zeros(3), 100.0, 110.0, 60.3, 41.7, 120, 80, near=0.2)
 

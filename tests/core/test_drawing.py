@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError
-from refine_addon.core.drawing import draw, in_order, seen_from
 from refine_addon.core.images import read_exr
+from refine_addon.core.pictures import draw, in_order, seen_from
 
 from .test_pictures import crowd, splats_of, view_of
 

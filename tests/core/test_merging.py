@@ -18,8 +18,14 @@ from refine_addon.core.merging.field import Field
 from refine_addon.core.merging.graph import MergeGraph
 from refine_addon.core.merging.merge import ALONE, STAGE, merge, merge_penalty, stage_counts
 from refine_addon.core.merging.neighbours import nearest
-from refine_addon.core.rendering import ALPHA_MAX, LOW_PASS
-from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
+from refine_addon.core.splats import (
+    ALPHA_MAX,
+    LOW_PASS,
+    Splats,
+    drawable,
+    opacity,
+    rotation_matrices,
+)
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility.scene import Scene, scene_of
 

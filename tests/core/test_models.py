@@ -24,8 +24,16 @@ from refine_addon.core.formats.registry import FORMATS
 from refine_addon.core.merging import field as merge_field
 from refine_addon.core.merging import pairs as merging
 from refine_addon.core.merging.merge import merge
-from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS, MODELS
-from refine_addon.core.splats import LOG_ZERO, joined, opacity, rotation_matrices, with_model
+from refine_addon.core.splats import (
+    DISC_LOW_PASS,
+    LOG_ZERO,
+    LOW_PASS,
+    MODELS,
+    joined,
+    opacity,
+    rotation_matrices,
+    with_model,
+)
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import hits
 

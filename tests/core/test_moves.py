@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from refine_addon.core.moves import affine_moves
+from refine_addon.core.affine import affine_moves
 
 TURN = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
 TURN *= np.sign(np.linalg.det(TURN))

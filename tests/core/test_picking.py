@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from refine_addon.core import picking, sight
+from refine_addon.core import picking
 from refine_addon.core.picking import Axis
 from refine_addon.core.splats import SH_C0, Splats
-from refine_addon.core.views import View
+from refine_addon.core.views import View, pinhole
 
 SIZE = 100
 
@@ -45,7 +45,7 @@ def wall(depth, edge=1.2, step=0.03):
 def seen(scene, camera=None):
     """Return what a view shows of splats."""
     camera = camera or view()
-    return sight.look(sight.prepare(scene, camera), camera)
+    return picking.look(picking.prepare(scene, camera), camera)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_surfaces_lie_where_a_ray_has_lost_its_light():
     shown = seen(scene)
     footprints = shown.footprints
     depths = scene.means[shown.prepared.gaussians.index[footprints.index], 2]
-    found = sight.surfaces(footprints, depths, view(), 10)
+    found = picking.surfaces(footprints, depths, view(), 10)
     covariances = [
         np.outer(a, a) + np.outer(b, b)
         for a, b in zip(footprints.major.T, footprints.minor.T, strict=True)
@@ -257,7 +257,7 @@ def test_the_view_of_opengls_matrices_is_the_one_they_were_made_of():
     c, s = math.cos(math.pi / 6), 0.5
     turned = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     camera = View(turned, np.array([1.0, 2, 3]), 80.0, 90.0, 60.0, 45.0, 120, 100, 0.01)
-    found = sight.pinhole(to_camera(camera), opengl(camera), (120, 100), np.zeros((1, 3)))
+    found = pinhole(to_camera(camera), opengl(camera), (120, 100), np.zeros((1, 3)))
 
     np.testing.assert_allclose(found.rotation, camera.rotation, atol=1e-12)
     np.testing.assert_allclose(found.center, camera.center, atol=1e-12)
@@ -274,7 +274,7 @@ def test_without_perspective_centres_lie_where_parallel_rays_meet_them():
     matrix[0, 3] = -1.0
     projected = np.diag([0.5, 0.5, -0.01, 1.0])  # clips from -100 to 100
     points = np.array([[1.0, 0, 0], [2, 1, -3], [0, -0.5, 2], [1.5, 0.5, 1]])
-    found = sight.pinhole(matrix, projected, (200, 200), points)
+    found = pinhole(matrix, projected, (200, 200), points)
     shown = seen(splats(points), found)
     expected = [[100, 100], [150, 50], [50, 125], [125, 75]]
 

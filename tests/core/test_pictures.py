@@ -121,7 +121,7 @@ def test_pictures_do_not_depend_on_threads_or_on_how_many_pairs_are_drawn_at_a_t
     splats, views = crowd(), ViewSet((view_of(400, 300, 300.0),))
     half = splats.take(np.arange(0, len(splats), 2))
     (one,) = compare(splats, half, views, threads=1)
-    monkeypatch.setattr("refine_addon.core.drawing._PAIRS", 1000)
+    monkeypatch.setattr("refine_addon.core.pictures._PAIRS", 1000)
     (other,) = compare(splats, half, views, threads=3)
 
     assert abs(one.psnr - other.psnr) < 1e-9

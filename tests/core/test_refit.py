@@ -14,8 +14,13 @@ from refine_addon import core
 from refine_addon.core import ViewSet, execute, methods, spherical_harmonics
 from refine_addon.core.execute import Cancelled, silent
 from refine_addon.core.refit import linear, refit, round_rays, stored
-from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS
-from refine_addon.core.splats import drawable, rotation_matrices, with_model
+from refine_addon.core.splats import (
+    DISC_LOW_PASS,
+    LOW_PASS,
+    drawable,
+    rotation_matrices,
+    with_model,
+)
 from refine_addon.core.visibility import cast as casting
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import cast, cast_visible, pixels

@@ -15,7 +15,7 @@ from view_pictures import psnr, reference, view_in
 from benchmarks.tables.models import version
 from refine_addon.core.formats.ply import new_header, read_ply, with_model
 from refine_addon.core.formats.ply_columns import values_by_name
-from refine_addon.core.rendering import Model
+from refine_addon.core.splats import Model
 
 
 def test_score_apply_and_undo_by_hand(binary: Binary, blend: Path):

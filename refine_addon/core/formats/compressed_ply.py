@@ -17,8 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..place import Place
-from ..rendering import MODELS
-from ..splats import SH_C0, Splats, above_constant, opacity, opacity_logits, unit_quaternions
+from ..splats import (
+    MODELS,
+    SH_C0,
+    Splats,
+    above_constant,
+    opacity,
+    opacity_logits,
+    unit_quaternions,
+)
 from . import ply
 from .format import Format, join_largest, near_ones_together, new_file, pieces, split_largest
 from .ply_columns import REST_COUNTS

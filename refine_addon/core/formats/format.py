@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import chunks
-from ..rendering import MODELS, Model
-from ..splats import Splats
+from ..splats import MODELS, Model, Splats
 from ..visibility.scene import spatial_order
 from .ply import Origin, SplatFile, new_header, with_model
 from .ply_columns import empty_rows

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from ..errors import RefineError, reason_of
 from ..execute import chunks, run
 from ..place import Place, foreign_kind, refuse_pointer
-from ..rendering import MODELS, Model
-from ..splats import Splats
+from ..splats import MODELS, Model, Splats
 from ..splats import with_model as drawn_as
 from ..whole_file import Url, expanded, refuse_mapped, whole_file
 from . import ply_columns

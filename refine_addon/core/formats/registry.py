@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..place import LARGEST_NUMBER, Place, refuse_pointer
-from ..rendering import Model
-from ..splats import Splats, drawable, with_model
+from ..splats import Model, Splats, drawable, with_model
 from ..whole_file import Url, expanded, whole_file
 from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
 from .format import Format

@@ -26,8 +26,15 @@ from numpy.typing import NDArray
 from ..errors import RefineError, reason_of
 from ..images import codec_for
 from ..place import Place, described, is_sog
-from ..rendering import MODELS, Model
-from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
+from ..splats import (
+    MODELS,
+    Model,
+    Splats,
+    above_constant,
+    opacity,
+    opacity_logits,
+    unit_quaternions,
+)
 from ..whole_file import mode_of
 from .format import Format, codes, join_largest, near_ones_together, new_file, pieces, split_largest
 from .ply import Origin, SplatFile

@@ -20,8 +20,15 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..place import GZIP, SPZ, Place, is_spz
-from ..rendering import MODELS, Model
-from ..splats import Splats, above_constant, opacity, opacity_logits, unit_quaternions
+from ..splats import (
+    MODELS,
+    Model,
+    Splats,
+    above_constant,
+    opacity,
+    opacity_logits,
+    unit_quaternions,
+)
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
 from .ply import Origin, SplatFile
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from .. import spherical_harmonics
 from ..execute import Progress, chunks, run_all, silent
-from ..rendering import LOW_PASS, NEAR_RELATIVE, Model
-from ..splats import Splats, opacity, rotation_matrices
+from ..splats import LOW_PASS, NEAR_RELATIVE, Model, Splats, opacity, rotation_matrices
 from ..views import View, ViewSet
 from ..visibility import frustum
 from ..visibility.scene import Scene
@@ -63,7 +62,7 @@ class Field:
     blur : (N,) float64
         Variance of the low-pass at the splat, world units squared.
     model : {"default", "antialiased", "2dgs"}
-        How they are drawn, see `rendering.Model`.
+        How they are drawn, see `Model`.
     """
 
     means: Array

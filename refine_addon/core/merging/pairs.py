@@ -39,8 +39,7 @@ from numpy.typing import NDArray
 
 from ..affine import quaternion
 from ..execute import Progress, chunks, run_all
-from ..rendering import ALPHA_MAX, LOW_PASS, Model
-from ..splats import LOG_ZERO
+from ..splats import ALPHA_MAX, LOG_ZERO, LOW_PASS, Model
 from ..visibility.projection import disc_axes
 from .field import Array, Field, Footprint, Index, across, footprint, normalized, packed
 

@@ -38,9 +38,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import Progress, run
-from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..spherical_harmonics import basis
-from ..splats import SH_C0, Splats, rotation_matrices
+from ..splats import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS, SH_C0, Splats, rotation_matrices
 from ..views import View
 from ..visibility import projection
 from ..visibility.cast import BEHIND

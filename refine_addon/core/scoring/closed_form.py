@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, chunks, run_all, silent, stages
-from ..rendering import NEAR_RELATIVE
 from ..scores import Scores
-from ..splats import Splats, base_color, drawable, opacity, refuse_undrawable
+from ..splats import NEAR_RELATIVE, Splats, base_color, drawable, opacity, refuse_undrawable
 from ..views import ViewSet
 from ..visibility.frustum import Frustums
 from ..visibility.scene import principal_axes, size_of

@@ -21,11 +21,10 @@ from ..mapped import Interrupted, note, noted, once, write
 from ..methods import DEFAULT, Method
 from ..prune import prune
 from ..regions import pieces
-from ..rendering import Model
 from ..report import Clock
 from ..result import Result
 from ..selection import Budget
-from ..splats import on_disk
+from ..splats import Model, on_disk
 from ..views import ViewSet
 from ..whole_file import Url
 from .cluster import Cluster

@@ -22,8 +22,7 @@ from ..formats.ply import (
     vertex_range,
 )
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
-from ..rendering import Model
-from ..splats import Splats, joined, on_disk, with_model
+from ..splats import Model, Splats, joined, on_disk, with_model
 from ..whole_file import Url
 from . import storage
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import checkpoint
-from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
+from ..splats import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..views import View
 from .projection import Footprints
 from .rays import LOG_OPAQUE, Rays

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import checkpoint
-from ..rendering import ALPHA_CUT, ALPHA_MAX
+from ..splats import ALPHA_CUT, ALPHA_MAX
 from .points import Points, runs
 from .projection import Footprints
 from .rays import behind, in_front, paired

@@ -15,8 +15,19 @@ from numpy.typing import NDArray
 
 from ..execute import Progress, checkpoint, chunks, part, report, run, run_all, silent
 from ..mapped import write
-from ..rendering import ALPHA_CUT, DISC_LOW_PASS, LOW_PASS, NEAR_RELATIVE, Model
-from ..splats import SH_C0, Splats, drawable, folder_of, opacity, rotation_matrices
+from ..splats import (
+    ALPHA_CUT,
+    DISC_LOW_PASS,
+    LOW_PASS,
+    NEAR_RELATIVE,
+    SH_C0,
+    Model,
+    Splats,
+    drawable,
+    folder_of,
+    opacity,
+    rotation_matrices,
+)
 from ..views import View, ViewSet
 from . import frustum
 from .scene import Scene, scene_of, spatial_order, splat_fingerprint
@@ -71,7 +82,7 @@ class Gaussians:
     normals : (3, M) float32 or None
         Of discs: unit vectors at right angles to them, in the scene's frame.
     model : {"default", "antialiased", "2dgs"}
-        How they are drawn, see `rendering.Model`.
+        How they are drawn, see `Model`.
     boxes : (C, 7) float32 or None
         Of Gaussians in files (`mapped`), see `boxes_touch`: a box for each `CHUNK` of them, so that
         a view reads only what it may show. Means, covariances and normals are then (C, k, CHUNK).
