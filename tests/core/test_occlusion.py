@@ -461,7 +461,7 @@ def test_the_score_is_the_error_times_a_power_of_the_contribution():
     """3 x 16^(1/4) = 6."""
     sums = Measured(np.array([16.0]), np.array([3.0]), np.array([1], np.int32))
 
-    assert occlusion.combined(sums) == pytest.approx([6.0])
+    assert occlusion._combined(sums) == pytest.approx([6.0])
 
 
 def test_a_view_of_thrice_the_weight_counts_thrice():

@@ -11,7 +11,7 @@ import pytest
 from refine_addon.core import ViewSet
 from refine_addon.core.execute import Cancelled, silent
 from refine_addon.core.scoring import occlusion
-from refine_addon.core.scoring.removal_rounds import KNOWN, RemovalRounds
+from refine_addon.core.scoring.occlusion import KNOWN, _RemovalRounds
 from refine_addon.core.visibility import cast, projection, ray_sample
 from refine_addon.core.visibility import rays as rays_module
 from refine_addon.core.visibility.measuring import Measured
@@ -107,7 +107,7 @@ def test_while_all_are_there_rays_are_weighed_against_what_was_measured(scene):
     every = np.arange(len(measured.seen))
     error, _, hits = told(sample, np.ones(len(every), np.bool_))
 
-    found = RemovalRounds(sample, measured, silent, 1).remove_and_measure(every, silent)
+    found = _RemovalRounds(sample, measured, silent, 1).remove_and_measure(every, silent)
 
     expected = (hits * error + KNOWN * measured.error) / (hits + KNOWN)
     np.testing.assert_allclose(found.error, expected, rtol=1e-9)
@@ -132,7 +132,7 @@ def test_what_is_left_grows_as_rays_tell_and_unhit_splats_as_all_do(scene, threa
         prior = KNOWN / np.maximum(hits, 1) * own
         expected.append(own * (later + prior * later.sum() / then.sum()) / (then + prior))
     expected[0] = (hits * now[0][left] + KNOWN * expected[0]) / (hits + KNOWN)
-    at_once, halves = (RemovalRounds(sample, measured, silent, threads) for _ in range(2))
+    at_once, halves = (_RemovalRounds(sample, measured, silent, threads) for _ in range(2))
 
     found = at_once.remove_and_measure(left, silent)
     halves.remove_and_measure(np.flatnonzero(keep | (np.arange(count) < count // 2)), silent)
@@ -156,7 +156,7 @@ def test_what_no_line_hits_grows_as_all_others(scene):
     keep[left] = True
     before, now = (told(sample, some)[0][left].sum() for some in (np.ones_like(keep), keep))
 
-    found = RemovalRounds(sample, measured, silent, 1).remove_and_measure(left, silent)
+    found = _RemovalRounds(sample, measured, silent, 1).remove_and_measure(left, silent)
 
     place = int(np.searchsorted(left, last))
     assert found.error[place] == pytest.approx(measured.error[last] * now / before)
@@ -164,10 +164,10 @@ def test_what_no_line_hits_grows_as_all_others(scene):
 
 def test_it_can_be_cancelled(scene):
     sample, measured = scene
-    rounds = RemovalRounds(sample, measured, silent, 1)
+    rounds = _RemovalRounds(sample, measured, silent, 1)
 
     with pytest.raises(Cancelled):
-        RemovalRounds(sample, measured, lambda *_: False, 1)
+        _RemovalRounds(sample, measured, lambda *_: False, 1)
     with pytest.raises(Cancelled):
         rounds.remove_and_measure(np.arange(5), lambda *_: False)
 

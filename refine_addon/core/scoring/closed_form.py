@@ -20,6 +20,7 @@ Splats are read once, in chunks, and may lie in files: 49 bytes of each are kept
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -32,7 +33,6 @@ from ..splats import NEAR_RELATIVE, Splats, base_color, drawable, opacity, refus
 from ..views import ViewSet
 from ..visibility.frustum import Frustums
 from ..visibility.scene import principal_axes, size_of
-from .nearness import near_order
 
 LUMA = (0.299, 0.587, 0.114)
 """Factors of red, green and blue in the luma (Rec. 601)."""
@@ -72,6 +72,13 @@ _VIEW_BLOCK = 64
 _SMALLEST_AREA = -300.0  # natural logarithm
 _SMALLEST_SQUARE = 1e-300
 _NOISE = 1e-12  # a smaller statistic counts as 0: rounding leaves about this much of a zero
+
+# The grid whose cells a Hilbert curve connects, see `_near_order`. Bits of a cell's number along
+# each axis: those of three axes fit into 16, which NumPy sorts by radix.
+_BITS = 5
+_SAMPLE = 4096  # splats that say where it lies
+_ENDS = (0.02, 0.98)  # quantiles of the sample along each axis between which it lies
+_LEAST_SPAN = 1e-200
 
 
 class _Columns(NamedTuple):
@@ -310,7 +317,7 @@ def _sum_views(columns, counted, progress, threads):
     seen, order = np.empty(total, np.int32), np.arange(total, dtype=np.int32)
 
     def sort(rows):
-        order[rows] = rows.start + near_order(columns.means[rows])
+        order[rows] = rows.start + _near_order(columns.means[rows])
 
     def sum_views(piece):
         rows = order[piece]
@@ -325,6 +332,57 @@ def _sum_views(columns, counted, progress, threads):
         sum_views, chunks(total, 8 * _CHUNK), progress=progress, what="scoring", threads=threads
     )
     return columns.reach, seen
+
+
+def _near_order(means):
+    """Order of finite positions, (n, 3), in which consecutive ones lie near each other.
+
+    It follows a Hilbert curve through a grid of 32 x 32 x 32 cells. Those of a cell, and those
+    beyond the same face of the grid, keep their order.
+    """
+    sample = means[:: max(len(means) // _SAMPLE, 1)].astype(np.float64)
+    cell = np.zeros(len(means), np.uint16)
+    with np.errstate(under="ignore"):
+        low, high = np.quantile(sample, _ENDS, axis=0)  # (3,) each
+        # Cubes: a run is about as wide as high, however flat the scene.
+        scale = (1 << _BITS) / max(float(np.max(high - low)), _LEAST_SPAN)
+        for values, least in zip(means.T, low, strict=True):
+            number = np.subtract(values, least, dtype=np.float64)  # (N,)
+            number *= scale
+            cell <<= _BITS
+            cell |= np.clip(number, 0, (1 << _BITS) - 1, out=number).astype(np.uint16)
+    return np.argsort(_places()[cell], kind="stable")
+
+
+@cache
+def _places():
+    """Place of each cell along the curve; cells count z first, then y, then x.
+
+    J. Skilling, Programming the Hilbert curve, AIP Conf. Proc. 707, 2004: the loops are those of
+    ``AxestoTranspose`` there, for all cells at once.
+    """
+    cells = np.arange(1 << 3 * _BITS)
+    axes = np.stack([cells >> 2 * _BITS, cells >> _BITS, cells]) & ((1 << _BITS) - 1)  # (3, cells)
+    for bit in range(_BITS - 1, 0, -1):
+        lower = (1 << bit) - 1
+        for axis in axes:
+            # Where the bit is set the lower ones of the first axis turn over, elsewhere they are
+            # exchanged with this axis'.
+            turned = (axis >> bit & 1).astype(bool)
+            swap = np.where(turned, 0, (axes[0] ^ axis) & lower)
+            axes[0] ^= np.where(turned, lower, swap)
+            np.bitwise_xor(axis, swap, out=axis)
+    axes[1] ^= axes[0]
+    axes[2] ^= axes[1]
+    turns = np.zeros_like(cells)
+    for bit in range(_BITS - 1, 0, -1):
+        turns ^= np.where(axes[2] >> bit & 1, (1 << bit) - 1, 0)
+    axes ^= turns
+    places = np.zeros_like(cells)
+    for bit in range(_BITS - 1, -1, -1):
+        for axis in axes:
+            places = places << 1 | axis >> bit & 1
+    return places.astype(np.uint16)
 
 
 class _Views:
@@ -382,11 +440,17 @@ class _Views:
                 share = 1.0 - away / limit.ravel()[index]
                 # The depth at which the image is wide enough for the centre.
                 across = np.square(depth.ravel()[index] + away)
-            squared = self._squared(points, depth, some)
-            if count and self.by_distance:
-                across = squared[view, splat]
-            squared += self.eta
-            counted = np.divide(1.0, squared, out=squared)
+            if self.by_distance:  # `depth` becomes d^2
+                depth[:] = 0.0
+                for axis in range(3):
+                    step = points[axis] - self.frustums.centers[some, axis, None]
+                    depth += np.multiply(step, step, out=step)
+                if count:
+                    across = depth[view, splat]
+            else:
+                depth *= depth
+            depth += self.eta
+            counted = np.divide(1.0, depth, out=depth)
             if count:
                 counted[:count] *= inside
             summed = np.einsum("v,vn->n", self.weights[some], counted)
@@ -395,16 +459,6 @@ class _Views:
                 summed += np.bincount(splat, self.weights[some[view]] * share, len(reach))
             total += summed
         return total, seen
-
-    def _squared(self, points, depth, views):
-        """d^2, (V, n); `depth` is overwritten by it."""
-        if not self.by_distance:
-            return np.multiply(depth, depth, out=depth)
-        depth[:] = 0.0
-        for axis in range(3):
-            step = points[axis] - self.frustums.centers[views, axis, None]
-            depth += np.multiply(step, step, out=step)
-        return depth
 
 
 def _cells(place):

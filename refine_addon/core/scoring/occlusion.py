@@ -9,11 +9,20 @@ neighbours are removed too.
 A floor is added to every score, for views that were not given: the closed form, with a weight that
 rises with the share removed (`coverage`).
 
-Splats hide each other, so they are removed in rounds: a part of the splats goes, the rest is scored
-again, until a tenth is left. The views are measured once; what the rest is worth later is told by
-scoring rays (`removal_rounds`). The result is one order of removal, so a larger budget also removes
-all that a smaller one does. Scoring for one budget ends with the round that removes the last of its
-splats.
+Splats hide each other, so what one is worth rises as those around it go, and they are removed in
+rounds: a part of the splats goes, the rest is scored again, until a tenth is left. The result is
+one order of removal, so a larger budget also removes all that a smaller one does. Scoring for one
+budget ends with the round that removes the last of its splats.
+
+The views are measured once. Later, rays that were cast once (`ray_sample`) tell what the rest is
+worth: the hits of a ray are known, front to back, and so is what it would show without any one of
+them. Few rays hit a small splat, so what they tell is weighed against what the views measured of
+all splats::
+
+    error_i = (n_i  error on the rays now  +  KNOWN  error measured, grown) / (n_i + KNOWN)
+
+n_i is how many rays hit the splat while all were there. A measured sum grows as the rays tell, see
+`_grown`.
 """
 
 from __future__ import annotations
@@ -22,11 +31,10 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import execute
 from ..errors import RefineError
-from ..execute import Progress, part, report, seconds, silent, stages
+from ..execute import Progress, part, report, run_all, seconds, silent, stages
 from ..mapped import note, noted
 from ..scores import Scores, shares_gone
 from ..splats import Splats, folder_of, refuse_undrawable
@@ -35,7 +43,6 @@ from ..visibility import projection
 from ..visibility.measuring import SECONDS, Measured, Sampling, measure, view_groups
 from ..visibility.ray_sample import RaySample
 from . import closed_form, coverage
-from .removal_rounds import RemovalRounds
 
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
@@ -49,6 +56,10 @@ BETWEEN = 12
 BETWEEN_RAYS = 0.375
 """How many rays they have together, as a part of `VALIDATION_RAYS`."""
 
+KNOWN = 10.0
+"""What was measured counts as much as so many rays."""
+
+_LOADING = 0.3  # share of the time of getting ready that getting colours takes, to show progress
 _SAMPLING = Sampling()
 
 
@@ -98,7 +109,8 @@ def score(
     Memory: about 300 bytes a splat, plus a third of that for each thread beyond the first; and 100
     bytes for each point of a view, per thread. A view has at most about 4 million points
     (`points.MAX_POINTS`); only a view that shows more than 3 million splats has more.
-    Each hit of the scoring rays takes 16 bytes, see `removal_rounds.RemovalRounds`.
+    Each hit of the scoring rays takes 16 bytes, of which there are at most about
+    `ray_sample.MAX_SCORING_HITS`.
     """
     if rounds < 1:
         raise RefineError(f"rounds is {rounds}, expected 1 or more")
@@ -197,7 +209,7 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
     if not count:
         raise RefineError("there are no splats to score")
     execute.start(SECONDS * count * len(views), threads)
-    kept = kept_after_rounds(count, rounds, settled)
+    kept = _kept_after_rounds(count, rounds, settled)
     preparing, closed, looking, weighing, casting, loading, *ranking = stages(
         progress, seconds("read", count), seconds("closed form", count, len(views)),
         seconds("measure", count, len(views)), 5e-6 * min(count, coverage.SAMPLE),
@@ -235,7 +247,7 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
         between = RaySample(ViewSet(tuple(halfway)).by_distance(), gaussians, splats)
         between.share = BETWEEN_RAYS
         between.cast_all(gaussians, scene, casting, threads)
-    rays = RemovalRounds(samples.pop(), measured, loading, threads) if rounds > 1 else None
+    rays = _RemovalRounds(samples.pop(), measured, loading, threads) if rounds > 1 else None
     undrawn = np.setdiff1d(np.arange(count), index)
     first = undrawn[np.argsort(prior[undrawn], kind="stable")]
     order = _order(index, prior, measured, rays, weights, kept, ranking)
@@ -267,7 +279,7 @@ def _folds(whole, of_groups, errors, prior, progress):
             whole.seen - without.seen,
         )
         floors = coverage.floor(prior.astype(np.float64), others.seen, 1.0 + EXPONENT)
-        yield combined(others), floors, of_views
+        yield _combined(others), floors, of_views
 
 
 def _order(index, prior, measured, rays, weights, kept, progress):
@@ -286,13 +298,98 @@ def _order(index, prior, measured, rays, weights, kept, progress):
         go, gone = max(len(left) - stay, 0), count - len(left)
         stops = np.clip(np.rint(np.multiply(coverage.SHARES, count)) - gone, 0, go).astype(int)
         stops[-1] = go
-        order = coverage.order(combined(now), floors, worth, weights, stops)
+        order = coverage.order(_combined(now), floors, worth, weights, stops)
         removed.append(index[left[order[:go]]])
         left = np.sort(left[order[go:]])
     return np.concatenate(removed)
 
 
-def kept_after_rounds(count: int, rounds: int, settled: int | None = None) -> list[int]:
+class _RemovalRounds:
+    """M Gaussians, of which ever more are removed, and scoring rays cast while all were there."""
+
+    def __init__(self, scoring_rays, measured, progress, threads):
+        self._measured, self._threads = measured, threads
+
+        def colored(number):
+            rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
+            with np.errstate(under="ignore"):
+                colors = scoring_rays.colors(number, rays).astype(np.float32)
+            return rays, colors, weight * view.width * view.height / rays.count
+
+        # Of each view: rays, (3, u) colours of what they hit, and the area of the image for each
+        # ray, px^2, times the view's weight.
+        self._views = run_all(
+            colored, [k for k, rays in enumerate(scoring_rays.rays) if rays is not None],
+            progress=part(progress, 0.0, _LOADING), what="scoring", threads=threads,
+        )  # fmt: skip
+        self._rays_hitting = np.zeros(len(measured.seen), np.int64)  # (M,), n_i
+        for rays, _, _ in self._views:
+            self._rays_hitting[rays.hit] += np.bincount(rays.owner, minlength=len(rays.hit))
+        every = np.arange(len(self._rays_hitting))
+        self._first = self._sums(every, part(progress, _LOADING, 1.0))
+
+    def remove_and_measure(self, left, progress):
+        """Remove all Gaussians but some, (n,) rows, ascending; what each of these is worth now."""
+        nothing_gone = len(left) == len(self._rays_hitting)
+        now = self._first if nothing_gone else self._sums(left, progress)
+        measured = self._measured.error[left], self._measured.contribution[left]
+        count = self._rays_hitting[left]  # (n,)
+        error, contribution = (
+            _grown(sums, before[left], after, KNOWN / np.maximum(count, 1))
+            for sums, before, after in zip(measured, self._first, now, strict=True)
+        )
+        error = (count * now[0] + KNOWN * error) / (count + KNOWN)
+        return Measured(contribution, error, self._measured.seen[left])
+
+    def _sums(self, left, progress):
+        """Error and contribution of Gaussians that are left, (n,) each, by the rays."""
+        keep = np.zeros(len(self._rays_hitting), np.bool_)
+        keep[left] = True
+        nothing_gone = len(left) == len(keep)
+
+        def removal_errors(number):
+            rays, colors, area = self._views[number]
+            if not nothing_gone:
+                rays = rays.keeping(keep.take(rays.hit))
+                self._views[number] = rays, colors, area
+            with np.errstate(under="ignore"):
+                error, contribution = rays.removal_errors(colors)
+                return area * error, area * contribution
+
+        of_views = run_all(
+            removal_errors, range(len(self._views)),
+            progress=progress, what="scoring", threads=self._threads,
+        )  # fmt: skip
+        error, contribution = np.zeros(len(keep)), np.zeros(len(keep))
+        for (rays, _, _), (errors, contributions) in zip(self._views, of_views, strict=True):
+            error[rays.hit] += errors
+            contribution[rays.hit] += contributions
+        return error[left], contribution[left]
+
+
+def _grown(measured, before, now, known):
+    """Measured sums times what they have grown by since, (n,).
+
+    The growth of a splat is what the rays tell of it, and the mean growth of the scene as if that
+    were so many rays more::
+
+        growth = (now + scene growth  prior) / (before + prior),    prior = known  measured
+
+    `measured` is from before any splat had gone, `before` and `now` are what the rays told then and
+    what they tell now. `known` is the weight of the scene's growth, over the measured sum: large
+    for a splat that few rays hit. All are (n,).
+    """
+    total = float(before.sum())
+    scene_growth = float(now.sum()) / total if total > 0.0 else 1.0
+    prior = known * measured
+    both = before + prior
+    growth = np.divide(
+        now + scene_growth * prior, both, out=np.ones_like(measured), where=both > 0.0
+    )
+    return measured * growth
+
+
+def _kept_after_rounds(count, rounds, settled):
     """How many of `count` splats are left after each round: `LEAST` before the last, then 0.
 
     The last is the first round that removes `settled` splats or more together with those before.
@@ -302,10 +399,10 @@ def kept_after_rounds(count: int, rounds: int, settled: int | None = None) -> li
     return [*itertools.takewhile(lambda stay: stay > rest, stays), 0]
 
 
-def combined(measured: Measured) -> NDArray[np.float64]:
+def _combined(measured):
     """``error contribution^p``, (M,).
 
     The error is exact for one splat. The more of its neighbours go too, the more it matters how
     much of the picture the splat covers, whatever lies behind it.
     """
-    return np.asarray(measured.error * measured.contribution**EXPONENT)
+    return measured.error * measured.contribution**EXPONENT

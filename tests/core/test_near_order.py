@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from refine_addon.core.scoring import nearness
-from refine_addon.core.scoring.nearness import near_order
+from refine_addon.core.scoring.closed_form import _near_order, _places
 
 
 def test_consecutive_cells_of_the_curve_share_a_face():
@@ -14,11 +13,11 @@ def test_consecutive_cells_of_the_curve_share_a_face():
 
     The curve begins in the first cell, and ends at the far end of an axis.
     """
-    path = np.argsort(nearness._places())
+    path = np.argsort(_places())
 
     cells = np.stack([path >> 10, path >> 5 & 31, path & 31])
     assert (np.abs(np.diff(cells, axis=1)).sum(axis=0) == 1).all()
-    assert sorted(nearness._places().tolist()) == list(range(32**3))
+    assert sorted(_places().tolist()) == list(range(32**3))
     assert not cells[:, 0].any()
     assert sorted(cells[:, -1].tolist()) == [0, 0, 31]
 
@@ -32,7 +31,7 @@ def test_runs_are_small_boxes(flat):
     """
     positions = np.random.default_rng(1).random((1 << 16, 3)) * (1.0, 1.0, flat)
 
-    runs = positions[near_order(positions)].reshape(64, 1024, 3)
+    runs = positions[_near_order(positions)].reshape(64, 1024, 3)
 
     assert np.ptp(runs, axis=1).max(axis=1).mean() < 0.5
 
@@ -49,9 +48,9 @@ def test_runs_are_small_boxes(flat):
 )
 def test_any_finite_positions_have_an_order(positions):
     """No warning, and each row once."""
-    assert sorted(near_order(positions).tolist()) == list(range(len(positions)))
+    assert sorted(_near_order(positions).tolist()) == list(range(len(positions)))
 
 
 def test_positions_at_one_place_keep_their_order():
     """All are in one cell."""
-    assert near_order(np.full((100, 3), 7.0)).tolist() == list(range(100))
+    assert _near_order(np.full((100, 3), 7.0)).tolist() == list(range(100))
