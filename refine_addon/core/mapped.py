@@ -1,11 +1,14 @@
-"""Arrays in files: indexing reads them, so scenes larger than memory are pruned by the same code.
+"""What lies in files: arrays, splats and regions of these, and what a job has done.
 
-Each access maps the file, copies what is asked for and lets the map go: pages that stay mapped
-count as memory of the process. Pickled, an array is its file's name, type and shape, so processes
-that see the file share it.
+Indexing an array reads it, so scenes larger than memory are pruned by the same code. Each access
+maps the file, copies what is asked for and lets the map go: pages that stay mapped count as memory
+of the process. Pickled, an array is its file's name, type and shape, so processes that see the file
+share it.
 
 The files lie in the folder of a job. It also keeps what its finished stages returned (`once`), so
-that the same job goes on from there after a kill.
+that the same job goes on from there after a kill. Splats that are too many to be merged or refitted
+at once are divided into regions; each is worked on by itself, by any process, and what belongs to
+it waits in that folder.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import os
 import pickle
 import secrets
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -25,8 +28,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError, reason_of
+from .execute import checkpoint, chunks
+from .splats import ARRAYS, Splats
 
 Result = TypeVar("Result")
+
+REGION = 1 << 20
+"""Splats of a region at most; merging takes about 900 bytes of each."""
+
+_ROWS = 1 << 16  # splats copied at a time
+_SAMPLE = 1 << 14  # splats that decide along which axis a box is divided
+_ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32(3.0)
 
 
 class Interrupted(RefineError):
@@ -185,3 +197,117 @@ def writing(path: Path) -> Iterator[None]:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         reason = "no space left on the disk" if full else f"cannot be written ({reason_of(error)})"
         raise Interrupted(f"{path}: {reason}") from error
+
+
+# Splats in files.
+
+
+def on_disk(folder: Path, parts: Iterable[Splats]) -> Splats:
+    """Splats in files of a new folder, see `write`.
+
+    Parameters
+    ----------
+    folder : Path
+        In that of a job, in which what is made of the splats goes too.
+    parts : iterable of Splats
+        At least one; all have the types, degree and model of the first.
+
+    Raises
+    ------
+    Interrupted
+        If the disk is full or fails.
+    """
+    model: Any = None
+
+    def columns() -> Iterator[dict[str, NDArray[Any]]]:
+        nonlocal model
+        for each in parts:
+            model = each.model
+            for piece in chunks(max(len(each), 1), _ROWS):
+                yield {name: getattr(each, name)[piece] for name in ARRAYS}
+
+    return Splats(**write(folder, columns()), model=model)
+
+
+def pieces(splats: Splats, rows: NDArray[np.int64]) -> Iterator[Splats]:
+    """Some splats by their rows, in that order, some at a time, for `on_disk`."""
+    return (splats.take(rows[piece]) for piece in chunks(len(rows), _ROWS))
+
+
+def folder_of(splats: Splats) -> Path | None:
+    """The folder of a job in whose files the splats lie; None of those in memory."""
+    return splats.means.path.parents[1] if isinstance(splats.means, Mapped) else None
+
+
+def new_folder(splats: Splats) -> Path:
+    """A new folder for what is made of splats in files, in that of their job."""
+    job = folder_of(splats)
+    assert job is not None
+    folder = job / f"regions-{secrets.token_hex(4)}"
+    folder.mkdir()
+    return folder
+
+
+# Regions of them.
+
+
+def in_regions(splats: Splats, count: int) -> bool:
+    """Whether so many of some splats are too many at once: they lie in files, not in memory."""
+    return folder_of(splats) is not None and count > REGION
+
+
+def divided(
+    means: NDArray[np.floating[Any]], share: float = 1.0, *, askew: bool = False
+) -> list[NDArray[np.int64]]:
+    """Divide splats into boxes of about equally many, by planes at right angles to where they vary.
+
+    Parameters
+    ----------
+    means : (n, 3) floating
+        Where they are; what is not finite counts as the origin.
+    share : float
+        How many there may be in a box, in `REGION`.
+    askew : bool
+        Whether the planes lie askew.
+
+    Returns
+    -------
+    list of (m,) int64
+        Rows of each box, ascending.
+    """
+    with np.errstate(over="ignore"):  # doubles that are no floats
+        place = np.asarray(means, np.float32)
+    place = np.where(np.isfinite(place).all(axis=1, keepdims=True), place, np.float32(0.0))
+    place = place @ (_ASKEW if askew else np.eye(3, dtype=np.float32))
+
+    def halved(rows: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+        if count <= 1:
+            return [rows]
+        sample = place[rows[:: max(len(rows) // _SAMPLE, 1)]]
+        low, high = np.quantile(sample, (0.05, 0.95), axis=0)
+        along = place[rows, int(np.argmax(high - low))]
+        less = count // 2
+        cut = len(rows) * less // count
+        order = np.argpartition(along, cut)
+        one, other = np.sort(rows[order[:cut]]), np.sort(rows[order[cut:]])
+        return halved(one, less) + halved(other, count - less)
+
+    return halved(np.arange(len(place)), -(-len(place) // max(int(share * REGION), 1)))
+
+
+def look(_fraction: float, _what: str) -> None:
+    """Progress within a region: nobody is told, but the work can be cancelled."""
+    checkpoint()
+
+
+def in_one(
+    folder: Path, regions: Sequence[Splats], boxes: Sequence[NDArray[np.int64]]
+) -> tuple[Splats, NDArray[np.int64]]:
+    """Splats of all regions, ascending by their rows, and the order, (N,), that makes them ascend.
+
+    `boxes` are the rows of each region. The folder of the regions is removed.
+    """
+    every, order = on_disk(folder / "every", regions), np.argsort(np.concatenate(boxes))
+    result = on_disk(folder.with_name(f"{folder.name}-done"), pieces(every, order))
+    shutil.rmtree(folder, ignore_errors=True)
+    return result, order

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .execute import Progress, silent
-from .merging.neighbours import nearest
+from .merging.graph import nearest
 from .splats import Splats
 from .views import View, ViewSet
 from .visibility import projection

@@ -21,8 +21,7 @@ from . import report as reports
 from .errors import RefineError
 from .execute import Cancelled, Progress, report, return_freed, seconds, silent, stages
 from .formats.ply import SplatFile
-from .merging.merge import Merged, merge, stage_counts
-from .merging.stage import copied
+from .merging.merge import Merged, copied, merge, stage_counts
 from .methods import DEFAULT, ClosedForm, Method, Occlusion, Refit
 from .quality.alignment import alignment
 from .quality.curve import AS_GOOD, PLAIN, Way, deletion_will_do, left_to_lose, needed

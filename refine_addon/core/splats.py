@@ -11,9 +11,8 @@ words are those of splat-transform and SOG; how a PLY says it: `formats.ply`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 
 from .errors import RefineError
 from .execute import chunks, run_all
-from .mapped import Mapped, write
 
 Model = Literal["default", "antialiased", "2dgs"]
 """How splats are drawn.
@@ -130,37 +128,6 @@ class Splats:
             for name, values in rows.items():
                 columns[name][piece] = values[piece]
         return replace(self, **columns)
-
-
-def on_disk(folder: Path, pieces: Iterable[Splats]) -> Splats:
-    """Splats in files of a new folder, see `mapped.write`.
-
-    Parameters
-    ----------
-    folder : Path
-        In that of a job, in which what is made of the splats goes too.
-    pieces : iterable of Splats
-        At least one; all have the types, degree and model of the first.
-
-    Raises
-    ------
-    Interrupted
-        If the disk is full or fails.
-    """
-    models: list[Model] = []
-
-    def columns() -> Iterator[dict[str, NDArray[Any]]]:
-        for piece in pieces:
-            models.append(piece.model)
-            yield {name: getattr(piece, name) for name in ARRAYS}
-
-    arrays = write(folder, columns())
-    return Splats(**arrays, model=models[0])
-
-
-def folder_of(splats: Splats) -> Path | None:
-    """The folder of a job in whose files the splats lie (`mapped`); None of those in memory."""
-    return splats.means.path.parents[1] if isinstance(splats.means, Mapped) else None
 
 
 def with_model(splats: Splats, model: Model) -> Splats:

@@ -15,9 +15,8 @@ from refine_addon.core.merging import field as merge_field
 from refine_addon.core.merging import graph as merge_graph
 from refine_addon.core.merging import pairs as merging
 from refine_addon.core.merging.field import Field
-from refine_addon.core.merging.graph import MergeGraph
+from refine_addon.core.merging.graph import MergeGraph, nearest
 from refine_addon.core.merging.merge import ALONE, STAGE, merge, merge_penalty, stage_counts
-from refine_addon.core.merging.neighbours import nearest
 from refine_addon.core.splats import (
     ALPHA_MAX,
     LOW_PASS,

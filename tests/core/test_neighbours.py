@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core.execute import Cancelled
-from refine_addon.core.merging.neighbours import nearest
+from refine_addon.core.merging.graph import nearest
 
 
 def brute_force(points, count):

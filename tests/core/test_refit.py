@@ -13,7 +13,7 @@ import pytest
 from refine_addon import core
 from refine_addon.core import ViewSet, execute, methods, spherical_harmonics
 from refine_addon.core.execute import Cancelled, silent
-from refine_addon.core.refit import linear, refit, round_rays, stored
+from refine_addon.core.refit import linear, refit, round_rays
 from refine_addon.core.splats import (
     DISC_LOW_PASS,
     LOW_PASS,
@@ -131,7 +131,7 @@ def linear_of(splats, view, count=12, *, pixels=(COLUMNS, ROWS)):
     black = np.zeros((3, visible[0].count), np.float32)
     found, mine = linear.linear_view(visible, footprints, black, colors, shapes, view)
     seen = found, found.backward(found.errors), found.diagonal(mine)
-    return linear.LinearRays.of(shapes, [seen])
+    return round_rays.LinearRays(shapes, [seen])
 
 
 def forward(found, change):
@@ -501,14 +501,14 @@ def test_what_lies_in_a_file_changes_no_bit(monkeypatch):
     splats, views = cloud(3000), ring(5)
     survivors = splats.take(slice(None, None, 2))
     inside = refit.refit(survivors, splats, views, 1, threads=2)
-    files, make = [], stored.tempfile.TemporaryFile
+    files, make = [], round_rays.tempfile.TemporaryFile
 
     def opened(*given, **named):
         files.append(make(*given, **named))
         return files[-1]
 
-    monkeypatch.setattr(stored, "HELD", 0)
-    monkeypatch.setattr(stored.tempfile, "TemporaryFile", opened)
+    monkeypatch.setattr(round_rays, "HELD", 0)
+    monkeypatch.setattr(round_rays.tempfile, "TemporaryFile", opened)
 
     found = refit.refit(survivors, splats, views, 1, threads=2)
 
@@ -522,8 +522,8 @@ def test_what_lies_in_a_file_changes_no_bit(monkeypatch):
 def test_what_a_file_has_no_room_for_stays_in_memory(monkeypatch):
     """The third write ends half-way, as on a full disk, and the next one begins behind it."""
     items = [{"one": np.arange(k, k + 7), "two": np.zeros((k, 0))} for k in range(3)]
-    monkeypatch.setattr(stored, "HELD", 0)
-    kept = stored.Stored()
+    monkeypatch.setattr(round_rays, "HELD", 0)
+    kept = round_rays.Stored()
     kept.append(items[0])
     file = kept._file
     kept._file = SimpleNamespace(

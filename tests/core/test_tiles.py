@@ -40,16 +40,15 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
     read_splats,
-    regions,
     score,
 )
-from refine_addon.core.mapped import Interrupted, Mapped, note, noted, once
+from refine_addon.core.mapped import Interrupted, Mapped, note, noted, on_disk, once
 from refine_addon.core.merging import merge
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.refit import round_rays
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.selection import select
-from refine_addon.core.splats import joined, on_disk, with_model
+from refine_addon.core.splats import joined, with_model
 from refine_addon.core.tiles import cluster, source, storage, writing
 from refine_addon.core.tiles import prune as tiles_prune
 from refine_addon.core.views import ViewSet
@@ -68,7 +67,7 @@ CLOSED, OCCLUSION, MERGE = ClosedForm(8), Occlusion(8), Merge(8)
 def small(monkeypatch):
     """Make pieces and boxes so small that 5000 splats have several of each."""
     monkeypatch.setattr(source, "ROWS", 1000)
-    monkeypatch.setattr(regions, "_ROWS", 300)
+    monkeypatch.setattr(mapped, "_ROWS", 300)
     monkeypatch.setattr(writing, "ROWS", 900)
     monkeypatch.setattr(projection, "CHUNK", 700)
 
@@ -269,7 +268,7 @@ def test_merging_by_regions_is_as_good_as_merging_one_file(tmp_path, views, monk
 
     Of 5 %, which are deleted alone, the same rows stay to the byte.
     """
-    monkeypatch.setattr(regions, "REGION", 10_000)
+    monkeypatch.setattr(mapped, "REGION", 10_000)
     file = read_ply(ROOM / "point_cloud.ply")
     tiles = cut(tmp_path, file.rows, np.linspace(0, len(file), 9).astype(int).tolist())
     method, splats = Merge(), file.splats()
@@ -294,7 +293,7 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
 
     Regions that no view shows are merged like others, and keep what they would keep of one file.
     """
-    monkeypatch.setattr(regions, "REGION", 10_000)
+    monkeypatch.setattr(mapped, "REGION", 10_000)
     few, others = ViewSet(views.views[:3]), ViewSet(views.views[10::4])
     splats = read_ply(ROOM / "point_cloud.ply").splats()
     rays = validation_rays(splats, others)
@@ -314,7 +313,7 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, views, monke
 
     Stages divide along other planes, so regions of a stage are not those of the one before.
     """
-    monkeypatch.setattr(regions, "REGION", 900)
+    monkeypatch.setattr(mapped, "REGION", 900)
     told = prune_tiles(tiles, tmp_path / "out", **asked(views, Budget(ratio=0.8), MERGE))
 
     made, counts = rows_in(tmp_path / "out", tiles), told["merged"]
@@ -333,7 +332,7 @@ def test_refitting_by_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, 
     Larger ones come closer (docs/scale.md).
     """
     monkeypatch.setattr(round_rays, "MIN_RAYS", 1 << 14)
-    monkeypatch.setattr(regions, "REGION", 1500)
+    monkeypatch.setattr(mapped, "REGION", 1500)
     told = prune_tiles(tiles, tmp_path / "out", views, HALF, Refit(8))
     before = prune_tiles(tiles, tmp_path / "merged", views, HALF, MERGE)
     prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, HALF, Refit(8))
@@ -354,7 +353,7 @@ def test_refitting_by_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, 
 @pytest.mark.slow
 def test_what_no_view_shows_is_refitted_to_nothing(tmp_path, tiles, views, monkeypatch):
     """Two views of the room show regions in part; splats beyond them stay as they were."""
-    monkeypatch.setattr(regions, "REGION", 1500)
+    monkeypatch.setattr(mapped, "REGION", 1500)
     two = ViewSet(views.views[:2])
 
     told = prune_tiles(tiles, tmp_path / "out", **asked(two, HALF, Refit(8)))
@@ -370,7 +369,7 @@ def test_regions_divide_all_splats(count, most, askew, seed):
     means = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
     means[::17] = np.nan
 
-    found = regions.divided(means, most / regions.REGION, askew=askew)
+    found = mapped.divided(means, most / mapped.REGION, askew=askew)
 
     assert sorted(np.concatenate(found).tolist()) == list(range(count))
     sizes = [len(rows) for rows in found]
@@ -383,8 +382,8 @@ def test_regions_of_one_stage_cross_those_of_the_next():
     """Of 1000 splats in a cube, halves along an axis and askew: each pair has some in common."""
     means = np.random.default_rng(1).uniform(size=(1000, 3)).astype(np.float32)
 
-    share = 500 / regions.REGION
-    first, second = (regions.divided(means, share, askew=askew) for askew in (False, True))
+    share = 500 / mapped.REGION
+    first, second = (mapped.divided(means, share, askew=askew) for askew in (False, True))
 
     common = [len(np.intersect1d(one, other)) for one in first for other in second]
     assert min(common) > 50
@@ -1375,7 +1374,7 @@ def test_a_killed_worker_changes_no_byte(
 
     With regions of 1500 splats, which workers merge and refit.
     """
-    monkeypatch.setattr(regions, "REGION", 1500)
+    monkeypatch.setattr(mapped, "REGION", 1500)
     killed = []
 
     def progress(_fraction, what):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, part, run_all
-from ..merging.neighbours import nearest
+from ..merging.graph import nearest
 from ..visibility import projection
 from ..visibility.measuring import VIEW_GROUPS
 from ..visibility.projection import Gaussians

@@ -3,25 +3,42 @@
 `pairs` prices a merge and makes the merged splat, `graph` carries out the cheapest operations. What
 is hidden changes as splats go, so the work is done in stages: before each but the first, the splats
 left are measured again. Kept splats that nothing is merged into stay as they were, to the bit.
+
+Of splats in files, larger than memory, a stage goes region by region: they are divided into boxes
+of about equally many, and each box is merged by itself. How many of a region stay is decided by one
+ranking of the cheapest merges and deletions of all. The next stage divides along other planes, so
+neighbours that a plane separates can merge then.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, report, return_freed, seconds, silent, stages
-from ..regions import in_regions
-from ..splats import Splats, drawable
+from ..execute import (
+    Progress,
+    chunks,
+    part,
+    report,
+    return_freed,
+    run_all,
+    seconds,
+    silent,
+    stages,
+)
+from ..mapped import divided, in_one, in_regions, look, new_folder, note, noted, on_disk, pieces
+from ..splats import ARRAYS, Splats, drawable
 from ..views import ViewSet
-from ..visibility.scene import scene_of
-from .field import Array
-from .regions import stage_by_regions
-from .stage import Stage, copied, reduced_at_once
+from ..visibility.scene import Scene, scene_of, spatial_order, splat_fingerprint
+from .field import Array, measured_field
+from .graph import MergeGraph
+from .pairs import as_splats, blend, groups
 
 Measure = Callable[[Splats, Array, Progress], Array]
 """``measure(splats, expected, progress)`` returns the sums of the splats left, (2, n).
@@ -50,6 +67,8 @@ regions half goes in two stages: four regions in one stage lost 0.5 dB.
 
 PENALTY = 2.0
 """Factor on the cost of merging if half of the splats go; see `merge_penalty`."""
+
+_CHUNK = 1 << 14  # splats copied at a time: some MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,13 +199,14 @@ def merge(
         measuring, merging = next(steps), next(steps)
         if left is not splats:
             sums = measure(left.up_to_degree(0), sums, measuring)
-        stage = Stage(
+        stage = _Stage(
             left, members, np.asarray(sums, np.float64), spared[origin], views, scene, penalty,
-            number, threads,
+            threads,
         )  # fmt: skip
-        many = in_regions(left, int(np.count_nonzero(members)))
-        reduced = stage_by_regions if many else reduced_at_once
-        left, keep, members, sums = reduced(stage, count, merging)
+        if in_regions(left, int(np.count_nonzero(members))):
+            left, keep, members, sums = _by_regions(stage, count, number % 2 == 1, merging)
+        else:
+            left, keep, members, sums = stage.at_once(count, merging)
         origin = origin[keep]
         del stage
         return_freed()  # views are measured next, by processes that need memory of their own
@@ -216,3 +236,184 @@ def stage_counts(count: int, goal: int, alone: float = ALONE) -> list[int]:
     number = 1 if share >= alone else math.ceil(math.log(share) / math.log(STAGE) + FINER)
     shares = [(goal / count) ** ((stage + 1) / number) for stage in range(number)]
     return [max(round(count * share), goal) for share in shares]
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """What a stage begins with: N splats, or those of a region; the rest is as in `merge`."""
+
+    splats: Splats
+    members: NDArray[np.int64]  # (N,), for how many of the first splats each stands, 0 if deleted
+    sums: Array  # (2, N)
+    protected: NDArray[np.bool_]
+    views: ViewSet
+    scene: Scene
+    penalty: float
+    threads: int | None
+
+    def at_once(self, keep_count, progress):
+        """What `reduced` makes of all splats together."""
+        rows, measured = self.measured(part(progress, 0.0, 0.3))
+        graph = self.graph(measured, measured.seen_and_whole())
+        del measured
+        return self.reduced(rows, graph, keep_count, part(progress, 0.3, 1.0))
+
+    def measured(self, progress):
+        """Rows of the splats that may merge, (M,), and these as merging needs them.
+
+        By their place in the scene, so that ties do not depend on the order of the file.
+        """
+        splats, threads = self.splats, self.threads
+        excluded = self.protected | (self.members == 0)
+        rows = np.flatnonzero(drawable(splats, threads=threads) & ~excluded)
+        place = self.scene.positions(splats.means, rows, threads=threads)
+        order = spatial_order(
+            place, lambda tied: splat_fingerprint(splats, rows[tied]), threads=threads
+        )
+        rows = rows[order]
+        report(progress, 0.0, "merging")
+        return rows, measured_field(
+            splats, rows, self.views, self.scene, self.sums, progress=progress, threads=threads
+        )
+
+    def graph(self, measured, whole):
+        """Graph of measured splats; `whole` is `MeasuredField.seen_and_whole` of all splats."""
+        return MergeGraph(measured.with_bias(whole), self.scene, self.penalty, threads=self.threads)
+
+    def reduced(self, rows, graph, keep_count, progress):
+        """The K kept splats, at least `keep_count`; which these are, (N,); their members and sums.
+
+        Undrawable splats go first, then the cheapest operations of the graph of the splats in
+        `rows`, (M,), are carried out. Sums, (2, K), are predicted from those before and the errors
+        of the merges.
+        """
+        splats, threads = self.splats, self.threads
+        keep = self.members > 0
+        excess = max(int(np.count_nonzero(keep)) - keep_count, 0)
+        others = keep & ~self.protected
+        others[rows] = False
+        undrawable = np.flatnonzero(others)[:excess]
+        keep[undrawable] = False
+        graph.reduce(max(len(rows) - (excess - len(undrawable)), 0), part(progress, 0.0, 0.95))
+        keep[rows[~graph.alive]] = False
+        owner, share = groups(graph.merges, len(rows))
+        changed = graph.alive & (np.bincount(owner, minlength=len(rows)) > 1)
+        # Drop the rest of the field before the kept splats are copied, to save memory.
+        field = graph.field = graph.field.take(np.flatnonzero(changed))
+        kept = np.flatnonzero(keep)
+        left, target = copied(splats, kept, threads), np.searchsorted(kept, rows[changed])
+        shapes = as_splats(field, part(progress, 0.95, 0.97), threads)
+        for name, values in zip(ARRAYS, (field.means, *shapes), strict=False):
+            getattr(left, name)[target] = values
+        inside = np.flatnonzero(changed[owner])
+        order = inside[np.argsort(owner[inside], kind="stable")]
+        into, of_group, told = np.searchsorted(kept, rows[owner[order]]), rows[order], share[order]
+        for before, after in ((splats.sh_dc[:, None], left.sh_dc[:, None]),
+                              (splats.sh_rest, left.sh_rest)):  # fmt: skip
+            blend(before, of_group, told, after, into, part(progress, 0.97, 1.0), threads)
+        members = self.members.copy()
+        members[rows] = np.bincount(owner, members[rows], len(rows))
+        expected = self.sums[:, keep]
+        expected[:, target] = field.contribution, field.error
+        return left, keep, members[keep], expected
+
+
+def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) -> Splats:
+    """Copies of some splats as `Merged` has them: merged ones merge again, in float64.
+
+    Of splats in files, more than a region go into files again.
+    """
+    if in_regions(splats, len(rows)):
+        some = pieces(splats, rows)
+        return on_disk(new_folder(splats), (copied(each, np.arange(len(each))) for each in some))
+    columns: dict[str, Any] = {}
+    for name in ARRAYS:
+        values = getattr(splats, name)
+        kind = values.dtype if name == "sh_rest" else np.float64
+        columns[name] = np.empty((len(rows), *values.shape[1:]), kind)
+
+    def copy(piece: slice) -> None:
+        for name, column in columns.items():
+            column[piece] = getattr(splats, name)[rows[piece]]
+
+    run_all(copy, chunks(len(rows), _CHUNK), threads=threads)
+    return replace(splats, **columns)
+
+
+def _by_regions(stage, keep_count, askew, progress):
+    """What `_Stage.reduced` makes of splats in files, region by region; the kept ones lie there."""
+    folder, there = new_folder(stage.splats), np.flatnonzero(stage.members)
+    boxes = [there[box] for box in divided(stage.splats.means[there], askew=askew)]
+    for number, rows in enumerate(boxes):
+        members, sums, protected = stage.members[rows], stage.sums[:, rows], stage.protected[rows]
+        region = replace(stage, members=members, sums=sums, protected=protected)
+        note(folder, f"region-{number}", (rows, region))
+    measuring, pricing, merging = stages(progress, 0.3, 0.3, 0.4)
+    # Each uses all threads by itself.
+    how = {"what": "merging", "threads": 1, "cost": seconds("merge", len(there))}
+    numbers = range(len(boxes))
+    whole = np.sum(run_all(partial(_measure, folder), numbers, progress=measuring, **how), axis=0)
+    priced = run_all(partial(_price, folder, whole), numbers, progress=pricing, **how)
+    counts = _staying(priced, keep_count)
+    del priced
+    made = run_all(partial(_merge, folder), [*enumerate(counts)], progress=merging, **how)
+    kept, members, sums, regions = zip(*made, strict=True)
+    left, order = in_one(folder, regions, kept)
+    keep = np.zeros(len(stage.members), np.bool_)
+    keep[np.concatenate(kept)] = True
+    return left, keep, np.concatenate(members)[order], np.concatenate(sums, axis=1)[:, order]
+
+
+# The steps of a region. Any process can do them; between them it lies in the folder.
+
+
+def _measure(folder, number):
+    """`MeasuredField.seen_and_whole` of a region."""
+    rows, stage = noted(folder, f"region-{number}")[1]
+    stage = replace(stage, splats=copied(stage.splats, rows, stage.threads))
+    measured = note(folder, f"measured-{number}", stage.measured(look))[1]
+    return measured.seen_and_whole()
+
+
+def _price(folder, whole, number):
+    """Of each splat's cheapest operation its cost, and how many splats go by it, 1 or .5."""
+    _, stage = noted(folder, f"region-{number}")[1]
+    rows, measured = noted(folder, f"measured-{number}")[1]
+    graph = stage.graph(measured, whole)
+    graph.connect(look)
+    best, merges = graph.best()
+    note(folder, f"graph-{number}", (rows, graph))
+    costs = np.full(len(stage.members), -1.0)  # what cannot be drawn goes first
+    weights = np.ones(len(costs), np.float32)
+    # Of two splats that merge, one goes.
+    costs[rows], weights[rows] = best, np.where(merges, np.float32(0.5), np.float32(1.0))
+    return costs, weights
+
+
+def _merge(folder, item):
+    """Rows kept of a region that is merged down to a count, their members and sums, and they."""
+    number, count = item
+    origin, stage = noted(folder, f"region-{number}")[1]
+    stage = replace(stage, splats=copied(stage.splats, origin, stage.threads))
+    rows, graph = noted(folder, f"graph-{number}")[1]
+    with np.errstate(under="ignore"):
+        left, keep, members, sums = stage.reduced(rows, graph, count, look)
+    return origin[keep], members, sums, on_disk(folder / f"left-{number}", [left])
+
+
+def _staying(priced, left):
+    """How many splats of each region stay, of `left` that do of all, by what `_price` says of each.
+
+    As many go as a region has among the cheapest merges and deletions of all. All merges together
+    count half of the splats; so a stage has to leave half of them, or there would not be enough to
+    go.
+    """
+    ends = np.cumsum([len(costs) for costs, _ in priced])
+    costs, weights = (np.concatenate(each) for each in zip(*priced, strict=True))
+    order, goal = np.argsort(costs, kind="stable"), len(costs) - left
+    last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), goal))
+    weights[order[last + 1 :]] = 0.0
+    gone = np.cumsum(weights, dtype=np.float64)[ends - 1]
+    # Rounded so that the sum is exact: each gets what is added up to its end.
+    gone = np.rint(gone * (goal / gone[-1])).astype(np.int64)
+    return np.diff(ends - gone, prepend=0).tolist()

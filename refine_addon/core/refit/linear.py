@@ -30,14 +30,13 @@ and a splat of a view keeps J W.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, run
 from ..spherical_harmonics import basis
 from ..splats import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS, SH_C0, Splats, rotation_matrices
 from ..views import View
@@ -46,7 +45,6 @@ from ..visibility.cast import BEHIND
 from ..visibility.projection import Footprints, Gaussians
 from ..visibility.rays import LEAST_LEFT, Rays
 from ..visibility.scene import Scene
-from .stored import Stored
 
 COLOR, DEGREE_1, OPACITY, MEAN, SCALE, TURN = (
     slice(0, 3), slice(3, 12), slice(12, 13), slice(13, 16), slice(16, 19), slice(19, 22)
@@ -389,67 +387,6 @@ def _squared(
     result = a * a * sums[0] + (b * b + 2.0 * a * c) * sums[2] + c * c * sums[4]
     result += 2.0 * b * (a * sums[1] + c * sums[3])
     return np.asarray(np.maximum(result, np.float32(0.0)))
-
-
-@dataclass(frozen=True, eq=False)
-class LinearRays:
-    """The colours of the rays of all views, as a linear function of what M Gaussians change.
-
-    Attributes
-    ----------
-    shapes : Shapes
-    views : Stored
-        A `LinearView` of each view.
-    residual, diagonal : (22, M) float32
-        J'r and the diagonal of J'J, see `refit`.
-    count : int
-        How many rays there are.
-    """
-
-    shapes: Shapes
-    views: Stored
-    residual: NDArray[np.float32]
-    diagonal: NDArray[np.float32]
-    count: int
-
-    @classmethod
-    def of(cls, shapes: Shapes, seen: Iterable[Seen]) -> LinearRays:
-        """Put views together, each as soon as it is there."""
-        views, count = Stored(), 0
-        residual, diagonal = (np.zeros((COUNT, len(shapes)), np.float32) for _ in range(2))
-        for view, of_residual, of_diagonal in seen:
-            views.append(view)
-            count += view.errors.shape[1]
-            _add(residual, view.hit, of_residual)
-            _add(diagonal, view.hit, of_diagonal)
-        return cls(shapes, views, shapes.by_parameter(residual), diagonal, count)
-
-    def normal(
-        self, change: NDArray[np.float32], progress: Progress, threads: int | None
-    ) -> NDArray[np.float32]:
-        """J'J times some change of the parameters, (22, M)."""
-        in_scene = self.shapes.in_scene(change)
-        total = np.zeros_like(in_scene)
-
-        def of_view(number: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-            view = self.views[number]
-            with np.errstate(under="ignore"):
-                return view.hit, view.normal(in_scene)
-
-        every = range(len(self.views))
-        for of_hit in run(of_view, every, progress=progress, what="refitting", threads=threads):
-            _add(total, *of_hit)
-        return self.shapes.by_parameter(total)
-
-
-Seen = tuple[LinearView, NDArray[np.float32], NDArray[np.float32]]
-"""A view, with what it adds to the residual and to the diagonal of `LinearRays`, (22, u) each."""
-
-
-def _add(total: NDArray[np.float32], hit: NDArray[np.int64], values: NDArray[np.float32]) -> None:
-    """Add the values of the u Gaussians of a view, (k, u), to a sum over views, (k, M)."""
-    for row, of_row in zip(total, values, strict=True):  # four times as fast as all at once
-        row[hit] += of_row
 
 
 def linear_view(

@@ -19,6 +19,10 @@ k is `DAMPING` over how many rays there are for each kept splat: the more rays, 
 Validation rays, which nothing is learned from, compare kept splats before and after a round. One
 that loses is undone, and the next is damped more. Rounds end where little is gained, or after many
 rays.
+
+Splats in files, too many for memory, are divided into boxes of about equally many. Each box is
+refitted by itself; splats of other regions are drawn as they are, in front and behind, and do not
+change.
 """
 
 from __future__ import annotations
@@ -27,20 +31,30 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import starmap
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, part, silent
-from ..regions import in_regions
+from ..execute import Progress, part, run_all, seconds, silent, stages
+from ..mapped import (
+    divided,
+    folder_of,
+    in_one,
+    in_regions,
+    look,
+    new_folder,
+    note,
+    noted,
+    on_disk,
+)
 from ..splats import Splats, rotation_matrices, unit_quaternions
-from ..views import ViewSet
-from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, LinearRays
-from .regions import refit_by_regions
-from .round_rays import LARGEST, RoundRays, limits
+from ..views import View, ViewSet
+from ..visibility import projection
+from ..visibility.projection import Footprints, Gaussians
+from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN
+from .round_rays import LARGEST, LinearRays, RoundRays, Target, Window, limits, steps_of
 
 STEPS = 8
 """Steps of conjugate gradients in a round."""
@@ -75,9 +89,13 @@ MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3
 LEAST_MOVE = 0.02
 """A mean that would move by less in a round stays, in longest scales; see `_worthwhile`."""
 
+SHARE = 0.5
+"""Kept splats of a region, in `mapped.REGION`: one takes twice the memory of one that merges."""
 
 _FIRST = 0.1  # share of progress until the first round
 _CASTING, _SOLVED = 0.35, 0.9  # of that of a round
+_SAMPLE = 1 << 12  # splats of a region that tell where it is in each view
+_EDGE = 0.005  # share of them that may lie outside on each side
 _NOTHING = 1e-30  # rays that tell less of a parameter tell nothing; 1 over it is a float32
 
 
@@ -198,9 +216,7 @@ def refit_rounds(
     """
     check_rounds(rounds)
     if in_regions(original, len(original)) and in_regions(original, 2 * len(splats)):
-        refit_region = partial(refit_on, rounds=rounds)
-        outcomes = refit_by_regions(refit_region, splats, original, views, progress, threads)
-        yield from starmap(Refitted, outcomes)
+        yield from _by_regions(splats, original, views, rounds, progress, threads)
         return
     rays = RoundRays.of(original, views, len(splats), part(progress, 0.0, 0.03), threads)
     later = part(progress, 0.03, 1.0)
@@ -413,3 +429,118 @@ def _product(quaternions: NDArray[np.float64], turns: NDArray[np.float64]) -> ND
         ],
         axis=1,
     )
+
+
+def _by_regions(kept, original, views, rounds, progress, threads):
+    """Yield kept splats before and, if that is better, after all regions are refitted."""
+    count, folder = len(kept), new_folder(original)
+    cost = seconds("refit", count, len(views))
+    preparing, before, refitting, after = stages(progress, 0.1 * cost, 0.1 * cost, cost, 0.1 * cost)
+    if folder_of(kept) is None:
+        kept = on_disk(new_folder(original), [kept])
+    rays = RoundRays.of(original, views, count, preparing, threads)
+    psnr = rays.psnr(kept, before)
+    yield Refitted(kept, np.zeros(count, np.bool_), 0, psnr, psnr)
+    boxes = divided(kept.means[...], SHARE)
+    for number, rows in enumerate(boxes):
+        note(folder, f"rows-{number}", rows)
+    work = partial(
+        _refit_region, folder, views, rounds, rays.original, rays.target(kept, silent), threads
+    )
+    made = run_all(work, range(len(boxes)), progress=refitting, what="refitting", threads=1,
+                   cost=cost)  # fmt: skip
+    changed, numbers, regions = zip(*made, strict=True)
+    splats, order = in_one(folder, regions, boxes)
+    better = rays.psnr(splats, after)
+    if better > psnr:
+        yield Refitted(splats, np.concatenate(changed)[order], max(numbers), psnr, better)
+
+
+def _refit_region(folder, views, rounds, original, kept, threads, number):
+    """Refit the splats of a region amid all others: which changed, in how many rounds, and they."""
+    rows = noted(folder, f"rows-{number}")[1]
+    others = np.ones(len(kept.splats), np.bool_)
+    others[rows] = False
+    splats = kept.splats.take(rows)
+    done = Refitted(splats, np.zeros(len(rows), np.bool_), 0, 0.0, 0.0)
+    windows = _windows(splats, len(others), original.scene, views.by_distance())
+    if windows:
+        amid = partial(_Amid, every=kept, others=others[kept.gaussians.index[...]])
+        rays = RoundRays(windows, original, threads, amid)
+        *_, done = refit_on(rays, splats, rounds, progress=look, threads=threads)
+    return done.changed, done.rounds, on_disk(folder / f"region-{number}", [done.splats])
+
+
+@dataclass(frozen=True, eq=False)
+class _Amid(Target):
+    """The splats of a region amid all others, for rays to hit."""
+
+    every: Target  # of all regions
+    others: NDArray[np.bool_]  # (M,), which of the Gaussians of all are not of the region
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "every": self.every, "others": self.others}
+
+    def footprints(self, window: Window) -> Footprints:
+        """Footprints in a window; those of the region have the first numbers."""
+        both = _Both(**vars(self.gaussians), every=self.every.gaussians, others=self.others)
+        return projection.project(both, self.scene, window.view, window.part)
+
+    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
+        """Colours in which a view sees some of the Gaussians, ascending, (3, u)."""
+        count = len(self.gaussians)
+        mine = int(np.searchsorted(hit, count))
+        parts = [super().colors(hit[:mine], view), self.every.colors(hit[mine:] - count, view)]
+        return np.concatenate(parts, axis=1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Both(Gaussians):
+    """The Gaussians of a region and, behind them, all but these, as far as `project` asks."""
+
+    every: Gaussians
+    others: NDArray[np.bool_]
+
+    def parts(self, *seen: Any) -> Iterator[tuple[int, Gaussians]]:
+        """See `Gaussians.parts`."""
+        yield 0, self
+        for first, chunk in self.every.parts(*seen):
+            there = self.others[first : first + len(chunk)]
+            hidden = np.where(there, chunk.largest, np.float32(np.nan))  # which reaches nowhere
+            yield first + len(self), replace(chunk, largest=hidden)
+
+
+def _windows(splats, total, scene, views):
+    """Windows of the views, with their weights, that show a region.
+
+    Rays are as dense in them as if all of the `total` kept splats were refitted together. A view
+    counts by how much of the region it shows.
+    """
+    sample = splats.take(slice(None, None, max(len(splats) // _SAMPLE, 1)))
+    only = [view for view, _ in views]
+    gaussians, _, _ = projection.prepare(sample, ViewSet(tuple(only)), scene, threads=1)
+    boxes = {}
+    for number, view in enumerate(only):
+        with np.errstate(under="ignore"):
+            footprints = projection.project(gaussians, scene, view)
+        centers = footprints.centers[:, footprints.inside]
+        if centers.shape[1]:
+            boxes[number] = centers.shape[1], _box(centers, view)
+    shown = sum(count for count, _ in boxes.values())
+    rays, hits = limits(total)[0] / len(views), limits(len(splats))[1]
+    steps, windows = steps_of(only, scene), []
+    for number, (count, (left, top, width, height)) in boxes.items():
+        (view, weight), share = views[number], count / shown
+        rays_here = rays * (width * height / (view.width * view.height))
+        counts = weight * share, rays_here, hits * share
+        windows.append(Window(view, number, *counts, left, top, width, height, steps[number]))
+    return windows
+
+
+def _box(centers, view):
+    """Left, top, width and height, at least 1 px, of where most points, (2, n), lie."""
+    low, high = np.quantile(centers, (_EDGE, 1.0 - _EDGE), axis=1)
+    size = np.array([view.width, view.height])
+    first = np.floor(low).astype(np.int64).clip(0, size - 1)
+    end = np.ceil(high).astype(np.int64).clip(first + 1, size)
+    return (*first.tolist(), *(end - first).tolist())

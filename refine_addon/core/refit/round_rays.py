@@ -9,7 +9,13 @@ Views are cast in processes of their own, as they are measured (`execute`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import os
+import pickle
+import tempfile
+import threading
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -18,16 +24,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import Progress, chunks, part, return_freed, run, seconds
+from ..mapped import folder_of
 from ..quality.psnr import psnr_of
 from ..spherical_harmonics import single_colors
-from ..splats import ARRAYS, Splats, folder_of
+from ..splats import ARRAYS, Splats
 from ..views import View, ViewSet
 from ..visibility import projection
 from ..visibility.cast import cast_visible, depth_complexity, pixels
 from ..visibility.projection import Footprints, Gaussians
 from ..visibility.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, VALIDATION_VIEWS
 from ..visibility.scene import Scene
-from .linear import LEAST_WEIGHT, LinearRays, Seen, Shapes, linear_view
+from .linear import COUNT, LEAST_WEIGHT, LinearView, Shapes, linear_view
+
+Singles = NDArray[np.float32]
 
 RAYS_OF_SPLAT = 7.0
 """Rays of a round for each kept splat: with fewer, they are learned by heart, and two rounds of
@@ -38,7 +47,7 @@ MIN_RAYS = 1 << 17
 
 HITS_OF_SPLAT, MIN_HITS = 112, 3 << 21
 """About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`), for each
-kept splat, and where that would be fewer. Each takes 14 bytes of a file (`stored`)."""
+kept splat, and where that would be fewer. Each takes 14 bytes of a file (`Stored`)."""
 
 MANY_HITS, FEWER_HITS = 1 << 24, 64
 """Rounds of more hits have no more than so many for each kept splat, to bound that file."""
@@ -46,6 +55,9 @@ MANY_HITS, FEWER_HITS = 1 << 24, 64
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """About how far a view is moved in a round: so many times as far as the view next to it is, at most
 so many scene sizes."""
+
+HELD = 1 << 23
+"""So many bytes stay in memory; small scenes need no file."""
 
 LARGEST = np.float32(1e36)
 """Coefficients of harmonics count as no larger: 25 of them add up to a float32."""
@@ -283,7 +295,7 @@ class RoundRays:
         truth = partial(cast_truth, self.original, windows, number, shown)
         work = partial(_linearized, truth, windows, target, shapes)
         seen = self._each(work, windows, splats, part(progress, 0.05, 1.0))
-        result = LinearRays.of(shapes, seen)
+        result = LinearRays(shapes, seen)
         return_freed()
         return result
 
@@ -307,15 +319,11 @@ class RoundRays:
         )
         return self._made(splats, prepared[0], scene)
 
-    def _each(
-        self, work: Callable[[int], Any], windows: Sequence[Window], splats: Splats, told: Progress
-    ) -> Iterator[Any]:
-        """Yield what is found on the rays of each of some windows."""
+    def _each(self, work, windows, splats, told):
+        """Iterator of what is found on the rays of each of some windows."""
         numbers = range(len(windows))
         cost = seconds("refit", len(self.original.splats) + len(splats), len(windows))
-        yield from run(
-            work, numbers, cost=cost, progress=told, what="refitting", threads=self._threads
-        )
+        return run(work, numbers, cost=cost, progress=told, what="refitting", threads=self._threads)
 
 
 def limits(count: int) -> tuple[float, float]:
@@ -369,7 +377,7 @@ def cast_truth(
     return Truth(columns, rows, colors, each / max(predicted, _NOTHING))
 
 
-def _psnr(target: Target, windows: Sequence[Window], truths: Sequence[Truth], place: int) -> float:
+def _psnr(target, windows, truths, place):
     """PSNR of the colours that the rays of a view see, dB."""
     window, truth = windows[place], truths[place]
     with np.errstate(under="ignore"):
@@ -380,10 +388,8 @@ def _psnr(target: Target, windows: Sequence[Window], truths: Sequence[Truth], pl
     return psnr_of(seen, truth.colors, window.part)
 
 
-def _linearized(
-    cast: Callable[[int], Truth], windows: Sequence[Window], target: Any, shapes: Any, place: int
-) -> Seen:
-    """How the colours of a view's rays change with the kept splats."""
+def _linearized(cast, windows, target, shapes, place):
+    """How the colours of a view's rays change with the kept splats, see `LinearRays`."""
     window, truth = windows[place], cast(place)
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
@@ -392,3 +398,98 @@ def _linearized(
         view, mine = linear_view(seen, footprints, truth.colors, colors, shapes, window.view)
         del seen, footprints  # which take more memory than the view
         return view, view.backward(view.errors), view.diagonal(mine)
+
+
+class LinearRays:
+    """The colours of the rays of all views, as a linear function of what M Gaussians change.
+
+    Parameters
+    ----------
+    shapes : Shapes
+        Of these; also an attribute.
+    seen : iterable of (LinearView, (22, u) float32, (22, u) float32)
+        Each view, with what it adds to the residual and to the diagonal.
+
+    Attributes
+    ----------
+    views : Stored
+        A `LinearView` of each view.
+    residual, diagonal : (22, M) float32
+        J'r and the diagonal of J'J, see `refit`.
+    count : int
+        How many rays there are.
+    """
+
+    def __init__(self, shapes: Shapes, seen: Iterable[tuple[LinearView, Singles, Singles]]) -> None:
+        self.shapes, self.views, self.count = shapes, Stored(), 0
+        residual, self.diagonal = np.zeros((2, COUNT, len(shapes)), np.float32)
+        for view, of_residual, of_diagonal in seen:  # each as soon as it is there
+            self.views.append(view)
+            self.count += view.errors.shape[1]
+            _add(residual, view.hit, of_residual)
+            _add(self.diagonal, view.hit, of_diagonal)
+        self.residual = shapes.by_parameter(residual)
+
+    def normal(self, change: Singles, progress: Progress, threads: int | None) -> Singles:
+        """J'J times some change of the parameters, (22, M)."""
+        in_scene = self.shapes.in_scene(change)
+        total = np.zeros_like(in_scene)
+
+        def of_view(number: int) -> tuple[NDArray[np.int64], Singles]:
+            view = self.views[number]
+            with np.errstate(under="ignore"):
+                return view.hit, view.normal(in_scene)
+
+        every = range(len(self.views))
+        for of_hit in run(of_view, every, progress=progress, what="refitting", threads=threads):
+            _add(total, *of_hit)
+        return self.shapes.by_parameter(total)
+
+
+def _add(total, hit, values):
+    """Add the values of the u Gaussians of a view, (k, u), to a sum over views, (k, M)."""
+    for row, of_row in zip(total, values, strict=True):  # four times as fast as all at once
+        row[hit] += of_row
+
+
+class Stored:
+    """A list of objects, most of them in a file, which goes with this list.
+
+    The first of them, up to `HELD` bytes, stay in memory, and so does what the file has no room
+    for. One of the file is read whenever it is asked for.
+    """
+
+    def __init__(self) -> None:
+        self._held, self._lock = 0, threading.Lock()
+        self._places: list[Any] = []  # what is pickled, or its start and end in the file
+        self._file: Any = None
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._places)
+
+    def append(self, item: Any) -> None:
+        """Add one."""
+        place: Any = (told := pickle.dumps(item, 5))
+        if self._held + len(told) > HELD:
+            with suppress(OSError):
+                if self._file is None:
+                    # Without a buffer, so that nothing is left to be written when it closes.
+                    self._file = tempfile.TemporaryFile("w+b", 0, prefix="refine-")  # noqa: SIM115
+                    weakref.finalize(self, self._file.close)
+                start = self._file.seek(0, os.SEEK_END)
+                if self._file.write(told) == len(told):
+                    place = start, start + len(told)
+        if place is told:
+            self._held += len(told)
+        self._places.append(place)
+
+    def __getitem__(self, number: int) -> Any:
+        """One of them, equal to the bit. Any thread can ask."""
+        place = self._places[number]
+        if isinstance(place, tuple):
+            start, end = place
+            with self._lock:
+                self._file.seek(start)
+                place = self._file.read(end - start)
+        return pickle.loads(place)

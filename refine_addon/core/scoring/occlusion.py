@@ -35,9 +35,9 @@ import numpy as np
 from .. import execute
 from ..errors import RefineError
 from ..execute import Progress, part, report, run_all, seconds, silent, stages
-from ..mapped import note, noted
+from ..mapped import folder_of, note, noted
 from ..scores import Scores, shares_gone
-from ..splats import Splats, folder_of, refuse_undrawable
+from ..splats import Splats, refuse_undrawable
 from ..views import ViewSet, views_between
 from ..visibility import projection
 from ..visibility.measuring import SECONDS, Measured, Sampling, measure, view_groups

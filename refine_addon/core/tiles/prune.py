@@ -17,14 +17,13 @@ import numpy as np
 from ...version import VERSION
 from ..errors import RefineError, reason_of
 from ..execute import Cancelled, Progress, on, seconds, silent, stages
-from ..mapped import Interrupted, note, noted, once, write
+from ..mapped import Interrupted, note, noted, on_disk, once, pieces, write
 from ..methods import DEFAULT, Method
 from ..prune import prune
-from ..regions import pieces
 from ..report import Clock
 from ..result import Result
 from ..selection import Budget
-from ..splats import Model, on_disk
+from ..splats import Model
 from ..views import ViewSet
 from ..whole_file import Url
 from .cluster import Cluster

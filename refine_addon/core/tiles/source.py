@@ -22,7 +22,8 @@ from ..formats.ply import (
     vertex_range,
 )
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
-from ..splats import Model, Splats, joined, on_disk, with_model
+from ..mapped import on_disk
+from ..splats import Model, Splats, joined, with_model
 from ..whole_file import Url
 from . import storage
 
@@ -179,7 +180,7 @@ def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int
     Raises
     ------
     RefineError, Cancelled
-        See `rows_of` and `splats.on_disk`.
+        See `rows_of` and `mapped.on_disk`.
     """
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
     kinds = [splats_from_columns(np.empty(0, each)) for each in dtypes] if len(dtypes) > 1 else []

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import Progress, checkpoint, chunks, part, report, run, run_all, silent
-from ..mapped import write
+from ..mapped import folder_of, write
 from ..splats import (
     ALPHA_CUT,
     DISC_LOW_PASS,
@@ -24,7 +24,6 @@ from ..splats import (
     Model,
     Splats,
     drawable,
-    folder_of,
     opacity,
     rotation_matrices,
 )
