@@ -52,7 +52,7 @@ class Scores:
         How many splats, from those with the lowest scores on, are in their final order; None for
         all. Scores that were computed for one budget end where that does.
     scored : (N,) bool, optional
-        Which splats were scored; None for all. The others were forced out (`for_all`).
+        Which splats were scored; None for all. The others had to go (`for_all`).
     """
 
     values: NDArray[np.float32]
@@ -71,7 +71,7 @@ class Scores:
     scored: NDArray[np.bool_] | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
-        """Return these scores as scores of all N splats, of which some were forced out before.
+        """Return these scores as scores of all N splats, of which some had gone before.
 
         Parameters
         ----------

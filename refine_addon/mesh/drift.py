@@ -164,7 +164,7 @@ def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Callable[[], Mending
 
 
 def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Note anew the splats whose scales and rotations were just written, as by absorbing."""
+    """Note anew the splats whose scales and rotations were just written, as by merging."""
     if not is_stamped(mesh):
         return
     notes = _Notes(mesh)

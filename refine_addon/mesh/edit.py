@@ -154,7 +154,7 @@ def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
 def mark_forced(
     obj: bpy.types.Object,
     protected: NDArray[np.bool_] | None,
-    forced_out: NDArray[np.bool_] | None,
+    removed: NDArray[np.bool_] | None,
 ) -> None:
     """Mark, for the 3D views, what stays and what goes in any case: (N,) each, or None.
 
@@ -165,7 +165,7 @@ def mark_forced(
     """
     check_writable(obj)
     force = np.zeros(splat_count(obj.data), np.int32)
-    for number, mask in ((2, forced_out), (1, protected)):
+    for number, mask in ((2, removed), (1, protected)):
         if mask is not None:
             force[mask] = number
     if force.any():

@@ -26,7 +26,7 @@ SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
 
 SCORED = "refine_scored"
-"""Boolean point attribute: which splats have a score. Neither those that were forced out have one,
+"""Boolean point attribute: which splats have a score. Neither those that had to go have one,
 nor those that were joined or added since, for which Blender writes False."""
 
 RECORD = "refine_scores"
@@ -172,13 +172,13 @@ def move_origin(
         mesh[RECORD] = json.dumps({**recorded, "origin": origin})
 
 
-def stored_scores(checked: SplatObject, forced_out: NDArray[np.bool_] | None = None) -> Scores:
+def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None) -> Scores:
     """Return the scores that an object's mesh holds.
 
     Parameters
     ----------
     checked : SplatObject
-    forced_out : (N,) bool, optional
+    removed : (N,) bool, optional
         Splats that have to go, and need no score.
 
     Raises
@@ -192,16 +192,16 @@ def stored_scores(checked: SplatObject, forced_out: NDArray[np.bool_] | None = N
         raise RefineError(f"{label}: has no scores; score it first")
     values = mesh_attributes.read_attribute(mesh, SCORE)
     scored = mesh_attributes.read_attribute(mesh, SCORED)
-    forced_out = np.zeros_like(scored) if forced_out is None else forced_out
-    unscored = int(np.count_nonzero(~scored & ~forced_out))
+    removed = np.zeros_like(scored) if removed is None else removed
+    unscored = int(np.count_nonzero(~scored & ~removed))
     if len(values) > recorded["splats"] or unscored:
         raise RefineError(
             f"{label}: scored with {recorded['splats']} splats, has {len(values)} now, "
             f"{unscored} of them without a score; score it again"
         )
-    # The curve is that of all splats that were scored: of one object, with the same forced out.
+    # The curve is that of all splats that were scored: of one object, with the same removed.
     whole = len(values) == recorded["splats"] and not recorded.get("together")
-    whole = whole and np.array_equal(forced_out, ~scored)
+    whole = whole and np.array_equal(removed, ~scored)
     return Scores(
         values=values,
         seen=mesh_attributes.read_attribute(mesh, SEEN),

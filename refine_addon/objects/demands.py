@@ -180,15 +180,15 @@ def mark(checked: SplatObject, forced: Forced) -> None:
     RefineError
         If the object cannot be written to.
     """
-    mesh, forced_out = checked.mesh, forced.removed
-    mesh_edit.mark_forced(checked.obj, forced.protected, forced_out)
+    mesh, removed = checked.mesh, forced.removed
+    mesh_edit.mark_forced(checked.obj, forced.protected, removed)
     scored = mesh_scores.record(mesh) is not None
-    if forced_out is not None:
+    if removed is not None:
         if not scored:
-            mesh_edit.mark_removed(checked.obj, forced_out)
+            mesh_edit.mark_removed(checked.obj, removed)
     elif not scored and not mesh_floaters.counts(mesh):
         mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
-    if forced.facts or forced.protected is not None or forced_out is not None:
+    if forced.facts or forced.protected is not None or removed is not None:
         volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]
         _record(mesh, {**forced.counts(), "volumes": volumes})
     elif FACTS in mesh:

@@ -352,14 +352,14 @@ def _check_scored_together(group: Members) -> None:
 
 def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:
     """Return the scores of all objects as one; their curve, if all that were scored are there."""
-    record, forced_out = mesh_scores.record(group[0].mesh) or {}, masks.get("removed")
+    record, removed = mesh_scores.record(group[0].mesh) or {}, masks.get("removed")
     values = np.concatenate([part.values for part in parts])
     scored = ~_joined_masks(
         [None if part.scored is None else ~part.scored for part in parts],
         [len(part.values) for part in parts],
     )
-    forced_out = np.zeros_like(scored) if forced_out is None else forced_out
-    whole = record["together"]["splats"] == len(values) and np.array_equal(forced_out, ~scored)
+    removed = np.zeros_like(scored) if removed is None else removed
+    whole = record["together"]["splats"] == len(values) and np.array_equal(removed, ~scored)
     return replace(
         parts[0],
         values=values,
@@ -396,10 +396,10 @@ def _joined_masks(parts: list[Any], counts: list[int]) -> NDArray[np.bool_]:
     ])  # fmt: skip
 
 
-def _part(absorbed: Merged, rows: slice) -> Merged:
-    """Return the survivors of one object."""
-    first = int(np.count_nonzero(absorbed.keep[: rows.start]))
-    keep = absorbed.keep[rows]
-    survivors = slice(first, first + int(np.count_nonzero(keep)))
-    splats = absorbed.splats.take(survivors)
-    return replace(absorbed, keep=keep, splats=splats, changed=absorbed.changed[survivors])
+def _part(merged: Merged, rows: slice) -> Merged:
+    """The kept splats of one object."""
+    first = int(np.count_nonzero(merged.keep[: rows.start]))
+    keep = merged.keep[rows]
+    kept = slice(first, first + int(np.count_nonzero(keep)))
+    splats = merged.splats.take(kept)
+    return replace(merged, keep=keep, splats=splats, changed=merged.changed[kept])

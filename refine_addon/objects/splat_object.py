@@ -86,7 +86,7 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     ----------
     checked : SplatObject
     whole : bool or None
-        Whether to read view-dependent colour, for absorbing; the object's scale must be uniform
+        Whether to read view-dependent colour, for merging; the object's scale must be uniform
         then. None reads it if the scale is uniform, for an estimate of the pictures' quality.
 
     Raises
@@ -206,20 +206,20 @@ def frame_of(checked: SplatObject) -> Frame:
     return Frame(mesh_layout.sh_degree(checked.mesh), np.linalg.inv(matrix))
 
 
-def changed(frame: Frame, keep: NDArray[np.bool_], absorbed: Merged | None) -> Change:
+def changed(frame: Frame, keep: NDArray[np.bool_], merged: Merged | None) -> Change:
     """Return what is to become of an object's splats; touches nothing of Blender's.
 
     Parameters
     ----------
     frame : Frame
     keep : (N,) bool
-    absorbed : Merged or None
-        What the survivors became, in the world.
+    merged : Merged or None
+        What the kept splats became, in the world.
     """
-    if absorbed is None:
+    if merged is None:
         return Change(keep, np.empty(0, np.int64), {})
-    rows = np.flatnonzero(absorbed.changed)
-    splats = absorbed.splats.take(rows).up_to_degree(frame.degree)
+    rows = np.flatnonzero(merged.changed)
+    splats = merged.splats.take(rows).up_to_degree(frame.degree)
     if not np.array_equal(frame.matrix, np.eye(4)):
         splats = transformed(splats, frame.matrix)
     columns = {name: np.ascontiguousarray(v) for name, v in values_by_name(splats).items()}

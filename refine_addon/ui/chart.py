@@ -134,7 +134,7 @@ def by_views(seen: NDArray[np.int32], views: int) -> Histogram:
 
 
 def _ways(quality: Quality) -> tuple[Way, ...]:
-    """Return of what survivors may become curves are drawn."""
+    """Of what kept splats may become curves are drawn."""
     return WAYS if quality.foretold else WAYS[:1]
 
 

@@ -121,14 +121,14 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> _Scored:
         """Score, and count how many splats lie in each view."""
-        forced_out, means, start = job.forced.removed, job.splats.means, time.perf_counter()
+        removed, means, start = job.forced.removed, job.splats.means, time.perf_counter()
         scores = score(
             job.splats, job.views, job.method,
-            protected=job.forced.protected, removed=forced_out,
+            protected=job.forced.protected, removed=removed,
             quality=job.quality, progress=part(progress, 0.0, _SCORED),
         )  # fmt: skip
         seconds = time.perf_counter() - start
-        means = means if forced_out is None else means[~forced_out]
+        means = means if removed is None else means[~removed]
         counts = frustum.census(means, job.views, progress=part(progress, _SCORED, 1.0))
         return _Scored(scores, counts, seconds)
 
@@ -159,11 +159,11 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _scored_in_words(group: splat_group.Members, scores: Scores, forced_out: int) -> str:
+def _scored_in_words(group: splat_group.Members, scores: Scores, removed: int) -> str:
     """Return how many splats were scored by how many views, and how many of them these miss."""
-    unseen = int((scores.seen == 0).sum()) - forced_out
+    unseen = int((scores.seen == 0).sum()) - removed
     return (
-        f"Scored {len(scores.values) - forced_out:,} splats{_of_objects(group)} by "
+        f"Scored {len(scores.values) - removed:,} splats{_of_objects(group)} by "
         f"{scores.views_used} of {counted(scores.views_given, 'view')}; {unseen:,} lie in none"
     )
 
@@ -216,7 +216,7 @@ class REFINE_OT_apply(OnThread, OnSplats, bpy.types.Operator):
         return super().invoke(context, event) if changes else self.execute(context)
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Applying:
-        """Gather the scores that decide; if survivors change, splats and views besides."""
+        """Gather the scores that decide; if kept splats change, splats and views besides."""
         group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_deletable(member.obj)

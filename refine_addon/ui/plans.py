@@ -484,7 +484,7 @@ def _way(settings: Any) -> Way:
 
 
 def _removed(known: _Known, budget: Budget, way: Way) -> tuple[int, bool]:
-    """Return how many splats a budget removes beside those forced out, and whether it is a guess.
+    """Return how many splats a budget removes beside those that must go, and whether it is a guess.
 
     Raise `RefineError` if the budget means nothing to the scores.
     """

@@ -163,9 +163,9 @@ class REFINE_OT_crop(Deleting, bpy.types.Operator):
 
     def going(self, context: bpy.types.Context, checked: SplatObject) -> NDArray[np.bool_]:
         """Return the splats that must go."""
-        forced_out = demands.Demands.of_scene(context.scene).forced(checked).removed
-        if forced_out is None or not forced_out.any():
+        removed = demands.Demands.of_scene(context.scene).forced(checked).removed
+        if removed is None or not removed.any():
             raise RefineError(
                 f"object '{checked.obj.name}': no volume says of any splat that it must go"
             )
-        return forced_out
+        return removed

@@ -349,7 +349,7 @@ def test_a_volume_that_moved_asks_for_new_scores(addon, room, crop):
 
 
 def test_the_best_splat_is_not_deleted_unscored_when_its_volume_moves(addon, room, room_cameras):
-    """Forced out at scoring it has no score; then the volume moves to one that cannot be drawn.
+    """Removed at scoring it has no score; then the volume moves to one that cannot be drawn.
 
     Now as many scores are 0 as there are splats that cannot be drawn, but not those.
     """

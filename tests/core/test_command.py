@@ -390,7 +390,7 @@ def test_rounds_and_views_between_out_of_range_are_refused(capsys, options, word
 
 @pytest.mark.usefixtures("folder")
 def test_the_summary_says_how_close_the_pictures_stay(capsys):
-    """As the report does, in whole decibels; and why not what absorbing would reach."""
+    """As the report does, in whole decibels; and why not what merging would reach."""
     for options, pattern in (
         (
             ["--method", "occlusion"],
@@ -456,7 +456,7 @@ def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
 @pytest.mark.parametrize(
     "options",
     [["--dry-run"], ["-o", "out.ply"], ["-o", "out.splat", "--method", "merge"]],
-    ids=["dry run", "written", "absorbed, rounded"],
+    ids=["dry run", "written", "merged, rounded"],
 )
 def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
     """Of five cameras along a line three are drawn: both ends and the middle; 100 x 75 px each."""

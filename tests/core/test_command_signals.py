@@ -108,7 +108,7 @@ def test_ctrl_c_at_any_moment_is_code_130_and_one_line(folder, moment):
 def test_ctrl_c_while_refitting_writes_what_that_has_reached(folder):
     """As many splats as asked for, in a whole file; the command ends all the same.
 
-    The signal comes in the first round: survivors have absorbed by then.
+    The signal comes in the first round: kept splats have merged by then.
     """
     words = [*PRUNE[:6], "--method", "refit", "--views", "8", "--keep", "100"]
 

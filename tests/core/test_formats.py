@@ -298,7 +298,7 @@ def test_a_size_is_refused_where_only_writing_tells_it(tmp_path, suffix, cameras
 
 
 @pytest.fixture(scope="module")
-def absorbed(tmp_path_factory, cameras):
+def merged(tmp_path_factory, cameras):
     """Return a folder with the test scene, what is asked of it, and 300 kept splats."""
     folder, asked = tmp_path_factory.mktemp("a"), (cameras, Budget(keep=300))
     (folder / "in.ply").write_bytes(ply_of(scene()))
@@ -307,9 +307,9 @@ def absorbed(tmp_path_factory, cameras):
 
 
 @pytest.mark.parametrize("suffix", SUFFIX)
-def test_survivors_that_absorbed_are_written_as_they_became(absorbed, suffix):
+def test_merged_splats_are_written_as_they_became(merged, suffix):
     """The same prune to a PLY and to the format: the same splats within the bounds."""
-    folder, asked = absorbed
+    folder, asked = merged
     prune_file(folder / "in.ply", folder / f"out{suffix}", *asked)
 
     kept = read_splats(folder / f"out{suffix}").splats()

@@ -177,7 +177,7 @@ def test_protected_splats_are_in_all_levels_unchanged(merges, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [Merge(), Occlusion()])
 def test_levels_by_psnr_lie_near_it(method):
-    """Deleting keeps at least it by the curve; absorbing comes as near as prune does, .7 dB.
+    """Deleting keeps at least it by the curve; merging comes as near as prune does, .7 dB.
 
     Between the shares of the curve, straight lines are off by some tenths on so small a scene.
     """

@@ -1,4 +1,4 @@
-"""Merging and absorbing: the moments by hand, the laws, and what must not happen."""
+"""Merging: the moments by hand, the laws, and what must not happen."""
 
 import itertools
 from dataclasses import replace
@@ -336,7 +336,7 @@ def test_what_went_into_splats_that_went_later_is_deleted():
     assert (result.merged, result.deleted) == (0, 400)
 
 
-def test_survivors_that_absorbed_nothing_are_the_same_to_the_bit():
+def test_kept_splats_that_others_were_not_merged_into_are_the_same_to_the_bit():
     splats = cloud(800)
 
     result = reduced_to(splats, around(), measure, 500)
@@ -360,7 +360,7 @@ def three_of_five(order=(0, 1, 2, 3, 4)):
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (2, 4, 1, 0, 3), (1, 3, 2, 0, 4)])
-def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(order):
+def test_a_kept_splat_has_the_colours_of_all_merged_into_it_by_what_is_seen_of_each(order):
     """Of those seen as 1, 2 and 5, harmonics included; the one that is seen most stays.
 
     Each as one more view may see it: of all that would be seen were nothing hidden, 26 were, and
@@ -374,8 +374,8 @@ def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(o
 
     assert (result.merged, result.deleted) == (2, 0)
     assert result.keep.tolist() == [index > 1 for index in order]
-    (survivor,) = np.flatnonzero(result.changed)
-    assert np.flatnonzero(result.keep)[survivor] == place[2]
+    (row,) = np.flatnonzero(result.changed)
+    assert np.flatnonzero(result.keep)[row] == place[2]
     viewed = viewing(splats.means[place], around())
     mass = 0.01 * (np.exp(-4.0) + 0.3 * viewed.pixel) / viewed.pixel
     bias = mass * 26 / (viewed.seen @ mass) / (viewed.seen + 1)
@@ -383,10 +383,10 @@ def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(o
     shares /= shares.sum()
     for name in ("sh_dc", "sh_rest"):
         expected = np.tensordot(shares, getattr(splats, name)[place[:3]].astype(float), 1)
-        np.testing.assert_allclose(getattr(result.splats, name)[survivor], expected, rtol=1e-5)
-    assert 0.0298 < opacity(result.splats.opacity_logits[survivor]) < 0.03
-    np.testing.assert_allclose(result.splats.log_scales[survivor], -2.0, atol=1e-4)
-    np.testing.assert_allclose(result.splats.means[survivor], [1e-6, 0, 0], atol=1e-9)
+        np.testing.assert_allclose(getattr(result.splats, name)[row], expected, rtol=1e-5)
+    assert 0.0298 < opacity(result.splats.opacity_logits[row]) < 0.03
+    np.testing.assert_allclose(result.splats.log_scales[row], -2.0, atol=1e-4)
+    np.testing.assert_allclose(result.splats.means[row], [1e-6, 0, 0], atol=1e-9)
 
 
 def test_each_stage_leaves_more_than_half_and_is_measured_anew():
@@ -421,7 +421,7 @@ def test_harmonics_follow_the_base_colour_through_all_stages():
 
 
 def test_later_stages_know_what_the_sums_before_let_expect():
-    """What a survivor is expected to contribute is what all that it stands for contributed.
+    """What a kept splat is expected to contribute is what all that it stands for contributed.
 
     But for the bias, a share of at most 1 / (1 + 12 views), and for what was deleted. Splats
     that did not change expect what was measured of them, to the bit.
@@ -571,7 +571,7 @@ def test_more_survive_where_more_are_protected():
     same(result.splats, splats.take(slice(0, 30)))
 
 
-def test_where_nothing_is_seen_absorbing_is_deleting_the_lowest_errors():
+def test_where_nothing_is_seen_merging_is_deleting_the_lowest_errors():
     """All are alike, and so are their floors."""
     splats = cloud(200, spread=1e-3)
     splats.log_scales[:], splats.opacity_logits[:] = -2.0, 0.0
@@ -680,7 +680,7 @@ def test_the_cheapest_of_all_operations_is_next_each_time(seed, penalty, monkeyp
     assert graph.deleted == sum(into is None for _, into in expected)
 
 
-def test_neighbours_of_what_is_absorbed_are_neighbours_of_what_absorbed_it(monkeypatch):
+def test_neighbours_of_what_is_merged_are_neighbours_of_what_it_is_merged_into(monkeypatch):
     """Each knows its nearest alone: 2 knows 1, which goes into 0, and so 2 follows."""
     monkeypatch.setattr(merge_graph, "NEIGHBOURS", 1)
     places = [0.0, 0.001, 1.5, 50, 100, 200, 400, 800]
@@ -873,8 +873,8 @@ def test_threads_change_nothing():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
-def test_moved_turned_and_scaled_scenes_absorb_alike(unit):
-    """Splats and views under one similarity: the same survivors, moved likewise."""
+def test_moved_turned_and_scaled_scenes_merge_alike(unit):
+    """Splats and views under one similarity: the same kept splats, moved likewise."""
     splats = cloud(400, degree=0)
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrices(np.array([0.3, -0.5, 0.7, 0.2])) * unit
@@ -920,12 +920,12 @@ def test_the_merge_penalty_falls_with_the_share_that_goes():
     assert np.isfinite(values).all()
 
 
-def test_absorbing_can_be_cancelled():
+def test_merging_can_be_cancelled():
     with pytest.raises(Cancelled):
         reduced_to(cloud(100), around(), measure, 50, progress=lambda fraction, _: fraction < 0.5)
 
 
-def test_what_absorbed_in_any_stage_is_said_to_have_changed():
+def test_what_was_merged_in_any_stage_is_said_to_have_changed():
     """From 500 to 50 in five stages: what is not said to have changed is the same to the bit."""
     splats = cloud(500)
 

@@ -460,8 +460,8 @@ def test_any_values_at_once_give_finite_scores_or_a_sentence(method, data):
     assert "no camera sees" in said or "can be drawn" in said
 
 
-def check_absorbed(splats, result, count):
-    """Assert what holds of survivors: they can be drawn, or are what they were."""
+def check_merged(splats, result, count):
+    """Assert what holds of kept splats: they can be drawn, or are what they were."""
     assert len(result.splats) == count == np.count_nonzero(result.keep)
     assert drawable(result.splats.take(result.changed)).all()
     alphas = opacity(result.splats.opacity_logits[result.changed])
@@ -478,8 +478,8 @@ def check_absorbed(splats, result, count):
 @pytest.mark.slow
 @examples(max_examples=25)
 @given(data=st.data(), count=st.integers(1, 8))
-def test_any_values_at_once_absorb_each_other_and_stay_splats(data, count):
-    """Extreme splats among good ones; survivors are as many as asked for."""
+def test_any_values_at_once_merge_and_stay_splats(data, count):
+    """Extreme splats among good ones; kept splats are as many as asked for."""
     some, good = drawn(data, 4), cloud(12, data.draw(st.integers(0, 99)))
     splats = Splats(
         **{item: np.concatenate([getattr(some, item), getattr(good, item)]) for item in ARRAYS}
@@ -491,12 +491,12 @@ def test_any_values_at_once_absorb_each_other_and_stay_splats(data, count):
         if "no camera sees the splats" not in str(error):
             raise
     else:
-        check_absorbed(splats, result, count)
+        check_merged(splats, result, count)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ARRAYS)
-def test_one_extreme_splat_among_good_ones_absorbs_and_is_absorbed(name):
+def test_one_extreme_splat_among_good_ones_merges(name):
     """Any attribute, any value; half of the splats go."""
     views = ViewSet((view(), view([0.1, 0, 0])))
     for value in EXTREME:
@@ -504,7 +504,7 @@ def test_one_extreme_splat_among_good_ones_absorbs_and_is_absorbed(name):
 
         result = merge_down(splats, views, 10, threads=1)
 
-        check_absorbed(splats, result, 10)
+        check_merged(splats, result, 10)
 
 
 # ----- what must not matter
@@ -558,7 +558,7 @@ def test_the_size_of_the_pieces_of_work_changes_nothing_with_occlusion(monkeypat
     splats, views = cloud(300), ViewSet(tuple(view([x, 0, 0]) for x in (-0.2, 0.0, 0.1, 0.3)))
     settings = Occlusion()
     expected = score(splats, views, settings, threads=1)
-    survivors = merge_down(splats, views, 100, threads=1)
+    kept = merge_down(splats, views, 100, threads=1)
     for module, name, size in (
         (points, "_BLOCK", 50),
         (projection, "_CHUNK", 7),
@@ -573,10 +573,10 @@ def test_the_size_of_the_pieces_of_work_changes_nothing_with_occlusion(monkeypat
 
         np.testing.assert_allclose(scores.values, expected.values, atol=1.5 / 300)
         np.testing.assert_array_equal(scores.seen, expected.seen)
-        np.testing.assert_array_equal(again.keep, survivors.keep)
+        np.testing.assert_array_equal(again.keep, kept.keep)
         for item in ARRAYS:
             np.testing.assert_allclose(
-                getattr(again.splats, item), getattr(survivors.splats, item), rtol=1e-5
+                getattr(again.splats, item), getattr(kept.splats, item), rtol=1e-5
             )
 
 

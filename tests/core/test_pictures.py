@@ -269,7 +269,7 @@ def test_a_picture_that_exists_is_refused_before_the_work(tmp_path):
         pass
 
 
-def test_what_absorbs_is_drawn_as_it_became():
+def test_what_merges_is_drawn_as_it_became():
     """After merging the kept splats are others than before."""
     splats, views = crowd(), ViewSet((view_of(60, 40),))
 

@@ -314,7 +314,7 @@ def small(file, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_absorbing_file_to_file_writes_the_changed_survivors_and_the_rest_bit_for_bit(
+def test_merging_file_to_file_writes_the_changed_splats_and_the_rest_bit_for_bit(
     small, views, tmp_path
 ):
     """The budget says how many survive; the report and a note say how many of them changed."""
@@ -336,10 +336,10 @@ def test_absorbing_file_to_file_writes_the_changed_survivors_and_the_rest_bit_fo
 
 
 @pytest.mark.slow
-def test_survivors_of_doubles_are_doubles(small, views, tmp_path):
-    """At an offset of 1e6, float32 knows steps of .0625: each survivor has a place of its own.
+def test_kept_splats_of_doubles_are_doubles(small, views, tmp_path):
+    """At an offset of 1e6, float32 knows steps of .0625: each kept splat has a place of its own.
 
-    Every number written is the one that absorbing came to, to the last of its 53 bits.
+    Every number written is the one that merging came to, to the last of its 53 bits.
     """
     rows = read_ply(small).rows
     columns = {name: rows[name].astype("f8") for name in rows.dtype.names}
@@ -366,7 +366,7 @@ def test_survivors_of_doubles_are_doubles(small, views, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small, views):
+def test_a_budget_that_only_scores_can_tell_says_how_many_kept_splats_merge(small, views):
     """The threshold is the median score: half survive, by whatever costs least."""
     splats = read_ply(small).splats()
     median = float(np.median(score(splats, views).values))
@@ -412,13 +412,13 @@ def test_known_scores_decide_where_merging_deletes(small, views, budget, monkeyp
 
 
 def test_splats_without_scores_need_views_to_decide(small):
-    """And absorbing needs both."""
+    """And merging needs both."""
     with pytest.raises(RefineError, match="need both"):
         prune(read_ply(small), None, Budget(ratio=0.5))
 
 
 @pytest.mark.slow
-def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
+def test_protected_splats_stay_as_they_are_while_others_merge(small, views):
     """Every third is protected, and six of ten go."""
     splats = read_ply(small).splats()
     protected = np.arange(len(splats)) % 3 == 0
@@ -431,7 +431,7 @@ def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
 
 
 @pytest.mark.slow
-def test_nothing_to_remove_leaves_absorbing_nothing_to_do(small, views):
+def test_nothing_to_remove_leaves_merging_nothing_to_do(small, views):
     """All stay, none changes."""
     result = prune(read_ply(small).splats(), views, Budget(ratio=0.0), Merge())
 

@@ -355,25 +355,25 @@ def test_among_splats_that_nearly_touch_means_move_only_where_it_is_worth_it(mon
     pytest.importorskip("numba", reason="what benchmarks need, which make the scene")
     capture = importlib.import_module("benchmarks.speed.capture")
     splats, views = capture.make(4_000), capture.cameras(8, 160)
-    survivors = core.prune(splats, views, core.Budget(ratio=0.5), methods.Merge(0)).splats
+    kept = core.prune(splats, views, core.Budget(ratio=0.5), methods.Merge(0)).splats
 
-    every = refit.refit(survivors, splats, views, 1)
+    every = refit.refit(kept, splats, views, 1)
     monkeypatch.setattr(refit, "LEAST_MOVE", 0.0)
-    moving = refit.refit(survivors, splats, views, 1)
+    moving = refit.refit(kept, splats, views, 1)
 
     assert every.psnr > max(moving.psnr + 0.2, every.psnr_before + 2.0)
 
 
 @pytest.mark.slow
-def test_refitted_survivors_are_nearer_to_what_the_views_see():
+def test_refitted_kept_splats_are_nearer_to_what_the_views_see():
     """Half of a cloud, colours and all: some dB on rays that nothing was fitted to."""
     splats, views = cloud(400), ring()
-    survivors = splats.take(np.arange(0, 400, 2))
+    kept = splats.take(np.arange(0, 400, 2))
 
-    every = refit.refit(survivors, splats, views)
+    every = refit.refit(kept, splats, views)
 
     assert every.psnr > every.psnr_before + 3.0
-    assert not np.array_equal(every.splats.sh_rest, survivors.sh_rest)
+    assert not np.array_equal(every.splats.sh_rest, kept.sh_rest)
 
 
 def test_harmonics_of_the_first_degree_are_learned_and_those_above_stay():
@@ -413,16 +413,14 @@ def test_harmonics_of_any_size_are_refitted_without_a_warning():
 def test_splats_of_other_models_gain_by_their_shapes_too(model):
     """Half of a cloud gains 1.5 dB at least in two rounds; colours and opacities alone, .7 or 1."""
     splats = with_model(cloud(300), model)
-    survivors = splats.take(np.arange(0, 300, 2))
+    kept = splats.take(np.arange(0, 300, 2))
 
-    found = refit.refit(survivors, splats, ring(), 2)
+    found = refit.refit(kept, splats, ring(), 2)
 
     assert found.psnr > found.psnr_before + 1.5
     assert found.splats.model == model
-    assert not np.array_equal(found.splats.means, survivors.means)
-    assert np.array_equal(found.splats.log_scales[:, 2], survivors.log_scales[:, 2]) == (
-        model == "2dgs"
-    )
+    assert not np.array_equal(found.splats.means, kept.means)
+    assert np.array_equal(found.splats.log_scales[:, 2], kept.log_scales[:, 2]) == (model == "2dgs")
 
 
 def test_a_round_that_loses_is_undone_and_the_next_damped_more(monkeypatch):
@@ -453,23 +451,23 @@ def test_a_round_that_loses_is_undone_and_the_next_damped_more(monkeypatch):
 
 
 @pytest.mark.slow
-def test_protected_and_unseen_survivors_keep_their_bits():
+def test_protected_and_unseen_kept_splats_keep_their_bits():
     """Also where their quaternions are not of length 1."""
     splats = cloud(400)
-    survivors = splats.take(np.arange(0, 400, 2))
-    means = survivors.means.copy()
+    kept = splats.take(np.arange(0, 400, 2))
+    means = kept.means.copy()
     means[100:120] += 1e4  # no view sees them
-    survivors = replace(survivors, means=means, quaternions=survivors.quaternions * np.float32(3.0))
+    kept = replace(kept, means=means, quaternions=kept.quaternions * np.float32(3.0))
     protected = np.arange(200) < 50
 
-    found = refit.refit(survivors, splats, ring(), protected=protected)
+    found = refit.refit(kept, splats, ring(), protected=protected)
 
     still = protected.copy()
     still[100:120] = True
     assert not found.changed[still].any()
     assert found.changed[~still].mean() > 0.9
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc"):
-        old, new = getattr(survivors, name), getattr(found.splats, name)
+        old, new = getattr(kept, name), getattr(found.splats, name)
         np.testing.assert_array_equal(new[~found.changed], old[~found.changed])
         assert new.dtype == old.dtype
 
@@ -499,8 +497,8 @@ def test_threads_change_no_bit(threads):
 def test_what_lies_in_a_file_changes_no_bit(monkeypatch):
     """Derivatives of all views but what stays in memory lie in a file, and two threads read it."""
     splats, views = cloud(3000), ring(5)
-    survivors = splats.take(slice(None, None, 2))
-    inside = refit.refit(survivors, splats, views, 1, threads=2)
+    kept = splats.take(slice(None, None, 2))
+    inside = refit.refit(kept, splats, views, 1, threads=2)
     files, make = [], round_rays.tempfile.TemporaryFile
 
     def opened(*given, **named):
@@ -510,7 +508,7 @@ def test_what_lies_in_a_file_changes_no_bit(monkeypatch):
     monkeypatch.setattr(round_rays, "HELD", 0)
     monkeypatch.setattr(round_rays.tempfile, "TemporaryFile", opened)
 
-    found = refit.refit(survivors, splats, views, 1, threads=2)
+    found = refit.refit(kept, splats, views, 1, threads=2)
 
     assert len(files) == 1
     assert files[0].closed
@@ -574,8 +572,8 @@ def test_rays_of_one_round_are_not_next_to_those_of_another():
         assert distance.min() > 25
 
 
-def test_rays_grow_with_survivors_and_hits_less_where_there_are_many():
-    """7 rays a survivor, at least 131,072; 112 hits, at least 6.3 million; of many, 64."""
+def test_rays_grow_with_kept_splats_and_hits_less_where_there_are_many():
+    """7 rays a kept splat, at least 131,072; 112 hits, at least 6.3 million; of many, 64."""
     assert round_rays.limits(100) == (1 << 17, 3 << 21)
     assert round_rays.limits(100_000) == (700_000, 11_200_000)
     assert round_rays.limits(200_000) == (1_400_000, 1 << 24)
@@ -797,20 +795,20 @@ def test_a_motion_of_the_scene_moves_what_was_learned(step):
     In doubles; a scene so far away keeps 1e-10 of 1e6 of a position.
     """
     splats, views = cloud(200), ring()
-    survivors = np.arange(100)
+    kept = np.arange(100)
     matrix = np.eye(4)
     there, from_there = moved(splats, views, rotation([3, -1, 2], 111.0), step)
     matrix[:3, :3], matrix[:3, 3] = rotation([3, -1, 2], 111.0), step
 
-    one = refit.refit(splats.take(survivors), splats, views, 1)
-    other = refit.refit(there.take(survivors), there, from_there, 1)
+    one = refit.refit(splats.take(kept), splats, views, 1)
+    other = refit.refit(there.take(kept), there, from_there, 1)
 
     assert one.psnr > one.psnr_before + 0.5
     assert other.psnr == pytest.approx(one.psnr, abs=0.05)
     expected = one.splats.means @ matrix[:3, :3].T + matrix[:3, 3]
     away = np.linalg.norm(other.splats.means - expected, axis=1)
     assert np.median(away) < 1e-4
-    learned = np.linalg.norm(one.splats.means - splats.means[survivors], axis=1)
+    learned = np.linalg.norm(one.splats.means - splats.means[kept], axis=1)
     assert np.median(learned) > 0.005
 
 

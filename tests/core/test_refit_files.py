@@ -1,4 +1,4 @@
-"""Survivors that are refitted: from file to file, with levels, and what is said of it."""
+"""Kept splats that are refitted: from file to file, with levels, and what is said of it."""
 
 from __future__ import annotations
 
@@ -43,24 +43,24 @@ def refitted(small, views, tmp_path_factory):
     return path, prune_file(small, path, views, HALF, REFIT)
 
 
-def test_refitting_comes_closer_than_absorbing_and_says_by_how_much(small, views, refitted):
+def test_refitting_comes_closer_than_merging_and_says_by_how_much(small, views, refitted):
     """The same rows stay; rays that neither went by say that the pictures are closer."""
     splats = read_ply(small).splats()
-    absorbed = prune(splats, views, HALF, FEW)
+    merged = prune(splats, views, HALF, FEW)
     result, facts = refitted[1], refitted[1].report["refitted"]
     used = views.spread(FEW.views)
     rays = validation_rays(splats, used)
 
-    found = [psnr_against(rays, each.splats, used) for each in (absorbed, result)]
+    found = [psnr_against(rays, each.splats, used) for each in (merged, result)]
 
-    assert np.array_equal(result.keep, absorbed.keep)
+    assert np.array_equal(result.keep, merged.keep)
     assert found[1] > found[0] + 1.0
     assert facts["psnr"] > facts["psnr_before"] + 1.0
     assert facts["rounds"] >= 1
     assert 0 < facts["changed"] <= np.count_nonzero(result.merged.changed)
     assert facts["seconds"] > 0.0
-    assert result.report["merged"] == absorbed.report["merged"]
-    assert any("survivors were refitted" in note for note in result.report["notes"])
+    assert result.report["merged"] == merged.report["merged"]
+    assert any("splats were refitted" in note for note in result.report["notes"])
 
 
 def test_rounds_are_as_many_as_asked_for_where_each_gains(small, views):
@@ -73,7 +73,7 @@ def test_rounds_are_as_many_as_asked_for_where_each_gains(small, views):
 
 
 def test_the_file_holds_what_was_refitted_and_the_rest_bit_for_bit(small, refitted):
-    """Only what makes a splat may change, and only of survivors that the result names."""
+    """Only what makes a splat may change, and only of kept splats that the result names."""
     path, result = refitted
     before, after = read_ply(small), read_ply(path)
 
@@ -86,7 +86,7 @@ def test_the_file_holds_what_was_refitted_and_the_rest_bit_for_bit(small, refitt
 
 
 def test_doubles_stay_doubles_and_what_is_not_of_a_splat_stays(small, views, tmp_path):
-    """At an offset of 1e6, float32 knows steps of .0625: each survivor has a place of its own."""
+    """At an offset of 1e6, float32 knows steps of .0625: each kept splat has a place of its own."""
     rows = read_ply(small).rows
     columns = {name: rows[name].astype("f8") for name in rows.dtype.names}
     columns["x"] += 1e6
@@ -130,17 +130,15 @@ def test_where_nothing_goes_nothing_is_refitted(small, views):
     assert "refitted" not in result.report
 
 
-def test_a_psnr_is_reached_with_fewer_splats_than_by_absorbing(small, views):
+def test_a_psnr_is_reached_with_fewer_splats_than_by_merging(small, views):
     """To a dB by the estimate; the curve of refitting is tried, then put right by what it gave."""
     splats = read_ply(small).splats()
 
-    absorbed, refitted = (
-        prune(splats, views, Budget(psnr=38.0), method) for method in (FEW, REFIT)
-    )
+    merged, refitted = (prune(splats, views, Budget(psnr=38.0), method) for method in (FEW, REFIT))
 
     assert refitted.report["estimated_psnr"] == pytest.approx(38.0, abs=1.0)
-    assert refitted.report["estimated_psnr"] > absorbed.report["estimated_psnr"]
-    assert np.count_nonzero(refitted.keep) < np.count_nonzero(absorbed.keep)
+    assert refitted.report["estimated_psnr"] > merged.report["estimated_psnr"]
+    assert np.count_nonzero(refitted.keep) < np.count_nonzero(merged.keep)
 
 
 def test_levels_are_refitted_to_the_original(small, views):
@@ -155,7 +153,7 @@ def test_levels_are_refitted_to_the_original(small, views):
 
 
 def test_progress_rises_and_can_end_while_refitting(small, views):
-    """Progress that refitting tells lies between those of absorbing and of the estimate."""
+    """Progress that refitting tells lies between those of merging and of the estimate."""
     splats, told = read_ply(small).splats(), []
 
     def listen(share, what):
@@ -168,7 +166,7 @@ def test_progress_rises_and_can_end_while_refitting(small, views):
     shares = [share for share, _ in told]
     assert shares == sorted(shares)
     assert told[-1][1] == "refitting"
-    assert 0.05 < told[-1][0] < 0.95  # by what absorbing 5,000 splats costs beside refitting
+    assert 0.05 < told[-1][0] < 0.95  # by what merging 5,000 splats costs beside refitting
 
 
 class Round:
@@ -196,7 +194,7 @@ class Round:
 def test_what_was_reached_is_the_result_where_refitting_is_cancelled(
     small, views, monkeypatch, rounds, became
 ):
-    """After a round what that reached, before it what absorbing left, each with its own PSNR."""
+    """After a round what that reached, before it what merging left, each with its own PSNR."""
     splats = read_ply(small).splats()
     listen = Round(monkeypatch, rounds)
 

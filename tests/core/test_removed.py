@@ -97,7 +97,7 @@ def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
 
 
 def test_a_share_counts_what_had_to_go(splats, views, removed):
-    """Half of 576 is 288, of which what is forced out is a part; a tenth of them is less."""
+    """Half of 576 is 288, of which what must go is a part; a tenth of them is less."""
     half = prune(splats, views, Budget(ratio=0.5), removed=removed).report["splats"]
     tenth = prune(splats, views, Budget(ratio=0.1), removed=removed).report["splats"]
 
@@ -106,7 +106,7 @@ def test_a_share_counts_what_had_to_go(splats, views, removed):
 
 
 def test_protection_wins_over_force(splats, views):
-    """The first hundred must go, the first ten stay: ninety are forced out."""
+    """The first hundred must go, the first ten stay: ninety must go."""
     rows = np.arange(COUNT)
 
     found = prune(
@@ -156,7 +156,7 @@ def test_the_curve_has_protected_splats_last_though_others_must_go(splats, views
     assert not np.array_equal(found, free)
 
 
-def test_what_was_forced_out_when_scored_and_is_no_more_has_no_score(splats, views, removed):
+def test_what_had_to_go_when_scored_and_need_not_now_has_no_score(splats, views, removed):
     """It might be worth most: nothing tells."""
     scores = score(splats, views, removed=removed)
     fewer = removed & (np.arange(COUNT) > 100)
@@ -167,7 +167,7 @@ def test_what_was_forced_out_when_scored_and_is_no_more_has_no_score(splats, vie
 
 @pytest.mark.parametrize("now", ["another", "none"])
 def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats, views, now):
-    """The best splat is forced out, one cannot be drawn; then that one is forced out, or none is.
+    """The best splat must go, one cannot be drawn; then that one must go, or none need.
 
     One zero is then that of a splat that was never scored, as many as there are undrawable ones.
     """
@@ -187,7 +187,7 @@ def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats,
     assert not again.keep[best]
 
 
-def test_more_than_was_forced_out_when_scored_goes_by_the_scores_there_are(splats, views, removed):
+def test_more_than_had_to_go_when_scored_goes_by_the_scores_there_are(splats, views, removed):
     """The others are ranked as they were."""
     scores = score(splats, views, removed=removed)
     more = removed | (np.arange(COUNT) < 50)
@@ -240,7 +240,7 @@ def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(
 
 @WAYS
 def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, method):
-    """Nothing is forced out then, and each level is made from the one before."""
+    """Nothing must go then, and each level is made from the one before."""
     levels = list(
         lod(splats, views, Levels((0.5, 0.3)), method, protected=removed, removed=removed)
     )
@@ -249,7 +249,7 @@ def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, me
     assert all(level.result.keep[removed].all() for level in levels)
 
 
-def test_cleaning_takes_what_is_forced_out_as_gone():
+def test_cleaning_takes_what_must_go_as_gone():
     """The wall before the floater is no surface then: of what no view sees past, nothing floats."""
     splats = joined(wall(), FLOATER)
     walls = np.arange(len(splats)) < len(splats) - 1
@@ -312,7 +312,7 @@ def test_a_file_is_pruned_by_volumes_as_by_masks(splats, views, tmp_path, cleani
 
 
 def test_levels_of_a_file_go_by_volumes(splats, views, tmp_path):
-    """No level holds what is forced out, and each holds what is protected."""
+    """No level holds what must go, and each holds what is protected."""
     path = scene(splats, tmp_path / "in.ply")
 
     told = lod_file(path, tmp_path / "out", views, Levels((0.5, 0.4)), zones=ZONES)

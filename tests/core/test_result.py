@@ -1,4 +1,4 @@
-"""Survivors among stored columns: what changed is put in, all else stays to the bit."""
+"""Kept splats among stored columns: what changed is put in, all else stays to the bit."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def file(tmp_path):
     return read_ply(tmp_path / "in.ply")
 
 
-def absorbed_of(splats, keep, changed, factor=2.0):
-    """Return survivors of which some have become `factor` times what they were."""
+def merged_of(splats, keep, changed, factor=2.0):
+    """Return kept splats of which some have become `factor` times what they were."""
     kept = splats.take(keep)
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
         getattr(kept, name)[changed] *= factor
@@ -53,7 +53,7 @@ def test_what_changed_is_put_in_and_all_else_stays_to_the_bit(file):
     """Rows 3 and 4 are doubled, in all 23 properties; the file's own rows are not touched."""
     before = file.rows.tobytes()
 
-    columns = changed_columns(file.rows, absorbed_of(file.splats(), KEEP, CHANGED))
+    columns = changed_columns(file.rows, merged_of(file.splats(), KEEP, CHANGED))
 
     assert set(columns) == set(file.rows.dtype.names)
     for name, values in columns.items():
@@ -63,22 +63,22 @@ def test_what_changed_is_put_in_and_all_else_stays_to_the_bit(file):
     assert before == file.rows.tobytes()
 
 
-def test_a_file_is_written_with_its_survivors_in_one_call(file, tmp_path):
+def test_a_file_is_written_with_its_kept_splats_in_one_call(file, tmp_path):
     """As the README says: rows 0 and 1 byte for byte, and then the changed ones."""
-    absorbed = absorbed_of(file.splats(), KEEP, CHANGED)
-    Result(KEEP, {}, merged=absorbed, source=file).write(tmp_path / "out.ply")
+    merged = merged_of(file.splats(), KEEP, CHANGED)
+    Result(KEEP, {}, merged=merged, source=file).write(tmp_path / "out.ply")
 
     written = read_ply(tmp_path / "out.ply")
 
     assert written.rows[:2].tobytes() == file.rows[:2].tobytes()
-    np.testing.assert_array_equal(written.splats().sh_rest, absorbed.splats.sh_rest)
-    np.testing.assert_array_equal(written.splats().means[2:], absorbed.splats.means[2:])
+    np.testing.assert_array_equal(written.splats().sh_rest, merged.splats.sh_rest)
+    np.testing.assert_array_equal(written.splats().means[2:], merged.splats.means[2:])
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("wide", [False, True])
 def test_rows_are_written_as_their_columns_say(tmp_path, monkeypatch, wide, threads):
-    """In chunks of 7 rows, some without a survivor that changed, also as doubles of big endian."""
+    """In chunks of 7 rows, some of which none changed, also as doubles of big endian."""
     generator, data = np.random.default_rng(0), plain_ply(100, 1)
     if wide:
         header, rows = data[: data.index(b"end_header\n") + 11], data[-100 * 23 * 4 :]
@@ -88,7 +88,7 @@ def test_rows_are_written_as_their_columns_say(tmp_path, monkeypatch, wide, thre
     file = read_ply(tmp_path / "in.ply")
     keep = generator.random(100) < 0.7
     changed = (generator.random(keep.sum()) < 0.4) & (np.flatnonzero(keep) > 30)
-    columns = changed_columns(file.rows, absorbed_of(file.splats(), keep, changed, 1 / 3))
+    columns = changed_columns(file.rows, merged_of(file.splats(), keep, changed, 1 / 3))
     file.write(tmp_path / "whole.ply", keep, columns=dict(columns))
 
     monkeypatch.setattr(ply, "_CHANGED_ROWS", 7)
@@ -104,11 +104,11 @@ def test_every_property_keeps_its_type_and_is_rounded_to_it_once(file, kind):
         rows = file.rows.astype([(name, kind) for name in file.rows.dtype.names])
         splats = file.splats()
         wide = Splats(**{name: getattr(splats, name).astype(np.float64) for name in ARRAYS})
-    absorbed = absorbed_of(wide, KEEP, CHANGED, factor=1 / 3)
+    merged = merged_of(wide, KEEP, CHANGED, factor=1 / 3)
 
-    columns = changed_columns(rows, absorbed)
+    columns = changed_columns(rows, merged)
 
-    for name, values in values_by_name(absorbed.splats).items():
+    for name, values in values_by_name(merged.splats).items():
         np.testing.assert_array_equal(columns[name][3:], values[2:].astype(kind))
         assert columns[name].dtype == np.dtype(kind)
 
@@ -116,12 +116,12 @@ def test_every_property_keeps_its_type_and_is_rounded_to_it_once(file, kind):
 def test_a_matrix_leads_the_changed_ones_to_the_frame_of_the_columns(file):
     """Turned by 90 degrees about z and moved along x; the unchanged ones are not taken along."""
     matrix = np.array([[0.0, -1, 0, 7], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    absorbed = absorbed_of(file.splats(), KEEP, CHANGED)
+    merged = merged_of(file.splats(), KEEP, CHANGED)
 
-    result = Result(KEEP, {}, merged=absorbed, matrix=np.linalg.inv(matrix))
+    result = Result(KEEP, {}, merged=merged, matrix=np.linalg.inv(matrix))
     columns = result.changed({n: file.rows[n] for n in file.rows.dtype.names})
 
-    wanted = values_by_name(transformed(absorbed.splats.take(CHANGED), matrix))
+    wanted = values_by_name(transformed(merged.splats.take(CHANGED), matrix))
     np.testing.assert_allclose(columns["x"][3:], 7 - 2 * file.rows["y"][3:], rtol=1e-6)
     for name, values in wanted.items():
         np.testing.assert_array_equal(columns[name][3:], values.astype(np.float32))
@@ -129,7 +129,7 @@ def test_a_matrix_leads_the_changed_ones_to_the_frame_of_the_columns(file):
 
 
 def test_a_format_knows_nothing_of_what_is_done_with_splats():
-    """The wall: files are read and written whatever scores, selects and absorbs."""
+    """The wall: files are read and written whatever scores, selects and merges."""
     above = {
         "merging", "scoring", "prune", "selection", "result", "scores", "operations",
 

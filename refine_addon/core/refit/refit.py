@@ -137,7 +137,7 @@ class Refitted:
     def note(self, seconds: float) -> str:
         """The same as a sentence, for the user."""
         told = (
-            "{changed:,} survivors were refitted in {rounds} rounds: {psnr_before:.1f} -> "
+            "{changed:,} kept splats were refitted in {rounds} rounds: {psnr_before:.1f} -> "
             "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s"
         )
         return told.format(**self.facts(seconds)) if self.rounds else self.why_not
