@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, read_splats
-from refine_addon.core.formats import glb
+from refine_addon.core.formats import glb, registry
 from refine_addon.core.spherical_harmonics import colors
 from refine_addon.core.splats import rotation_matrices
 
@@ -364,7 +364,7 @@ def test_negative_scales_are_logarithms(tmp_path):
     file = read_splats(tmp_path / "a.glb")
 
     assert file.splats().log_scales.tolist() == [[-3.0, -2.0, 0.5], [-1.0] * 3]
-    assert file.notes(np.ones(2, np.bool_)) == [
+    assert registry.notes(file, None, np.ones(2, np.bool_)) == [
         "a.glb has negative scales: its scales are read as logarithms"
     ]
 

@@ -72,16 +72,12 @@ def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
     if header.order == ply.TEXT:
         place.fail("a compressed PLY in ASCII, expected a binary one")
     body = data[len(header.raw) :]
-    ply.check_counts(header, len(body))
     elements: dict[str, NDArray[Any]] = {}
-    at = 0
-    for element, count in zip(header.elements, header.counts, strict=True):
+    for element, at in zip(header.elements, ply.row_ranges(header, len(body)), strict=True):
         if ply.has_lists(element):
             place.fail(f"element {ply.shown(element.name)} has a list, expected numbers")
-        kind = np.dtype(element.dtype(header.order))
-        end = at + count * kind.itemsize  # is there: `ply.check_counts` is exact without lists
-        elements[element.name] = body[at:end].view(kind) if count else np.empty(0, kind)
-        at = end
+        stored, kind = body[at], np.dtype(element.dtype(header.order))
+        elements[element.name] = stored.view(kind) if len(stored) else np.empty(0, kind)
 
     def rows_of(name: str, properties: tuple[str, ...], kind: str) -> NDArray[Any]:
         """Rows of an element that has these properties, all of one type."""

@@ -178,11 +178,6 @@ class SplatFile:
         header, row, count = self._layout(keep, columns or {})
         return len(header) + len(self.before) + count * row.itemsize + len(self.after)
 
-    def notes(self, keep: NDArray[np.bool_]) -> list[str]:
-        """What the user should know about a file of the kept rows, in sentences."""
-        said = "beside the splats is kept as it is; its indices may point past the end"
-        return [*self.remarks, *(f"element '{e}' {said}" for e in self.indexing if not keep.all())]
-
     def write(
         self,
         path: Path | str,
@@ -231,7 +226,7 @@ class SplatFile:
         """Header, row and splats of a file with these columns; refuse what none can be."""
         count = len(self) if keep is None else int(np.count_nonzero(keep))
         header, names = with_count(self.header, count), self.rows.dtype.names or ()
-        if isinstance(columns, ChangedColumns) and columns.keys() <= set(names):
+        if isinstance(columns, ChangedColumns):
             return header, self.rows.dtype, count  # they have the stored types: not made here
         declared, place = [], Place(self.path)
         for name, values in columns.items():
@@ -288,14 +283,13 @@ def read_ply(path: Path | str) -> SplatFile:
     except (OSError, ValueError) as error:
         raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error
     body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
-    check_counts(header, len(body))
+    at = row_ranges(header, len(body))[vertex]
     filled = [e.name for e, count in zip(header.elements, header.counts, strict=True) if count]
     if header.order == TEXT:
         return _text_file(header, vertex, filled, body.tobytes())
-    start, end = vertex_range(header, vertex)
-    rows = body[start:end].view(header.elements[vertex].dtype(header.order))
+    rows = body[at].view(header.elements[vertex].dtype(header.order))
     indexing = tuple(name for name in filled if name in INDEXING)
-    return SplatFile(path, rows, header.raw, body[:start], body[end:], indexing)
+    return SplatFile(path, rows, header.raw, body[: at.start], body[at.stop :], indexing)
 
 
 class Header(NamedTuple):
@@ -423,10 +417,10 @@ def has_lists(element: Any) -> bool:
     return any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties)
 
 
-def check_counts(header: Header, available: int) -> None:
-    """Refuse a header that announces more rows than the file can hold, before memory is allocated.
+def row_ranges(header: Header, available: int) -> list[slice]:
+    """Where in a binary body the rows of each element lie, up to the first that has lists.
 
-    Without lists, the bytes that are counted are exact.
+    A header that announces more rows than the file can hold is refused, before memory is allocated.
 
     Parameters
     ----------
@@ -439,24 +433,19 @@ def check_counts(header: Header, available: int) -> None:
     RefineError
         If that many rows would not fit even if each were as short as possible.
     """
-    least, text = 0, header.order == TEXT
+    ranges, least, text = [], 0, header.order == TEXT
     for element, count in zip(header.elements, header.counts, strict=True):
         kinds = (getattr(prop, "len_dtype", prop.val_dtype) for prop in element.properties)
         # Of text: one digit and one separator for each number; lists have a length.
         row = sum(2 if text else np.dtype(kind).itemsize for kind in kinds)
+        ranges.append(slice(least, least + row * count))
         least, name = least + row * count, shown(element.name)
         if not row and count:
             raise RefineError(f"{header.path}: element {name} has {count} rows and no property")
         if least > available + text:  # plus 1 for text, whose last line may lack its line end
             what = f"truncated: the header announces {count} rows of {name}, at least {least} bytes"
             raise RefineError(f"{header.path}: {what} so far, but only {available} bytes follow it")
-
-
-def vertex_range(header: Header, vertex: int) -> tuple[int, int]:
-    """Where in a binary body the rows of splats begin and end, of a header of `splat_header`."""
-    both = zip(header.elements[: vertex + 1], header.counts, strict=False)
-    sizes = [count * element.dtype(header.order).itemsize for element, count in both]
-    return sum(sizes[:-1]), sum(sizes)
+    return ranges
 
 
 def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> SplatFile:
@@ -479,13 +468,11 @@ def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> S
 
 def _numbers(path, dtype, lines):
     """Numbers in lines of text; the first line that is wrong is refused."""
-    rows, first, beyond = _parsed(lines, dtype), 0, len(lines)
-    if rows is not None:
+    if (rows := _parsed(lines, dtype)) is not None:
         return rows
-    while beyond - first > 1:  # the first wrong line is one of first..beyond - 1
-        middle = (first + beyond) // 2
-        wrong = _parsed(lines[first:middle], dtype) is None
-        first, beyond = (first, middle) if wrong else (middle, beyond)
+    wrong = next(part for part in chunks(len(lines), _ROWS) if _parsed(lines[part], dtype) is None)
+    numbers = range(wrong.start, wrong.stop)
+    first = next(number for number in numbers if _parsed([lines[number]], dtype) is None)
     words, names = lines[first].split(), dtype.names or ()
     problem = f"expected {len(names)} numbers, got {len(words)}"
     if len(words) == len(names):
@@ -627,8 +614,7 @@ def write_rows(
     """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended."""
     columns = columns or {}
     plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
-    inside = columns.keys() <= set(rows.dtype.names or ())
-    changed = columns if isinstance(columns, ChangedColumns) and inside else None
+    changed = columns if isinstance(columns, ChangedColumns) else None
     row = rows.dtype if changed is not None else _grown(rows.dtype, columns)
     at: Any = {"names": ["stored"], "formats": [plain.dtype], "itemsize": row.itemsize}
 

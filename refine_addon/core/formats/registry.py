@@ -221,7 +221,9 @@ def left_out(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> i
 def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list[str]:
     """What the user should know about a file of the kept splats in a format, in sentences."""
     if form is None:
-        return file.notes(keep)
+        kept = "beside the splats is kept as it is; its indices may point past the end"
+        indexing = () if keep.all() else file.indexing
+        return [*file.remarks, *(f"element '{name}' {kept}" for name in indexing)]
     suffix, degree, model = form.suffix, file.splats().sh_degree, file.model
     extra = other_properties(file.rows.dtype.names or ())
     lost = left_out(file, form, keep)

@@ -15,11 +15,10 @@ from ..execute import Progress, chunks, run
 from ..formats.ply import (
     HEADER_LIMIT,
     TEXT,
-    check_counts,
     format_of,
+    row_ranges,
     splat_header,
     stated_model,
-    vertex_range,
 )
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..mapped import on_disk
@@ -129,8 +128,7 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
             f"{place}: is {format_of(header.raw)}, expected a plain binary PLY as a tile, which "
             "'refine convert IN OUT.ply' makes of other formats"
         )
-    check_counts(header, size - len(header.raw))
-    begin, _ = vertex_range(header, vertex)
+    begin = row_ranges(header, size - len(header.raw))[vertex].start
     dtype = header.elements[vertex].dtype(header.order)
     stated = stated_model(header.raw, dtype) or "default"
     if model not in (None, stated) and THIRD_SCALE not in (dtype.names or ()):
