@@ -18,7 +18,7 @@ from .cleaning.clean import clean as clean_splats
 from .errors import RefineError
 from .execute import Cancelled, Progress, part, report, seconds, silent, stages
 from .formats import registry
-from .formats.format import Format, near_ones_together
+from .formats.format import Format, nearby_order
 from .formats.ply import SplatFile
 from .formats.ply_columns import other_properties
 from .formats.registry import format_named, read_splats, refuse_unknown_size, write_splats
@@ -526,7 +526,7 @@ def convert_files(
         if morton:  # what is not finite comes last
             finite = np.isfinite(splats.means).all(axis=1)
             rows = np.flatnonzero(finite)
-            order = near_ones_together(splats.means[rows]) if len(rows) else rows
+            order = nearby_order(splats.means[rows]) if len(rows) else rows
             splats = splats.take(np.concatenate([rows[order], np.flatnonzero(~finite)]))
         stored = sum(file.stored_bytes for file in files)
         file = file_of(splats, files[0].path, stored)

@@ -114,7 +114,7 @@ def test_bands_are_left_out(files):
     np.testing.assert_array_equal(after.means, before.means)
 
 
-def test_a_curve_puts_near_ones_together(tmp_path):
+def test_a_curve_puts_nearby_order(tmp_path):
     """Of 4 clumps of 30 in turn, 119 steps lead from clump to clump; sorted, few do.
 
     A row without a position comes last.

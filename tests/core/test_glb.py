@@ -13,7 +13,7 @@ import pytest
 from refine_addon.core import RefineError, read_splats
 from refine_addon.core.formats import glb, registry
 from refine_addon.core.spherical_harmonics import colors
-from refine_addon.core.splats import rotation_matrices
+from refine_addon.core.splats import opacity, rotation_matrices
 
 SPLATTING = "KHR_gaussian_splatting"
 FLOAT, SHORT, BYTE = 5126, 5122, 5121
@@ -162,6 +162,14 @@ def test_primitives_of_several_degrees_become_one(read):
     assert splats.sh_rest.shape == (4, 3, 3)
     assert not splats.sh_rest[:2].any()
     assert splats.sh_rest[2:].any()
+
+
+def test_an_opacity_of_0_stays_0_in_float32(read):
+    """Its logit is -104, as that of Blender's splats: float32 has nothing that small."""
+    splats = read(*document({**VALUES, f"{SPLATTING}:OPACITY": [[0.0], [-0.1]]}))
+
+    assert opacity(splats.opacity_logits).astype(np.float32).tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(splats.opacity_logits, -104.0, rtol=1e-6)
 
 
 def test_normalized_integers_stand_for_shares(read):

@@ -93,7 +93,7 @@ def test_version_4_says_what_is_missing(tmp_path, monkeypatch):
         (gzip.compress(header(3) + bytes(29))[:-2], "truncated: the gzip stream has no end"),
         (
             gzip.compress(header(3) + bytes(29))[:-8] + bytes(8),
-            "a damaged SPZ file: its gzip stream breaks at ",
+            "a damaged SPZ file: its gzip stream breaks behind ",
         ),
         (gzip.compress(header(4) + bytes(99)), "SPZ version 4 inside of gzip"),
         (
@@ -140,8 +140,8 @@ def test_a_file_whose_beginning_is_damaged_is_still_called_spz(tmp_path, data, e
         read_splats(path)
 
 
-@pytest.mark.parametrize("at", [5000, 9000])
-def test_the_byte_at_which_a_stream_breaks_is_named(tmp_path, at):
+@pytest.mark.parametrize(("at", "behind"), [(5000, 4096), (9000, 8192)])
+def test_where_a_stream_breaks_is_named_by_4096_bytes(tmp_path, at, behind):
     """A stream of stored blocks, cut within one and followed by a block of type 3."""
     stored = gzip.compress(header(3, 1000) + bytes(29_000), compresslevel=0)
     path = tmp_path / "a.spz"
@@ -151,7 +151,7 @@ def test_the_byte_at_which_a_stream_breaks_is_named(tmp_path, at):
     block = struct.pack("<BHH", 0, length, 0xFFFF ^ length) + stored[15 : 15 + length]
     path.write_bytes(stored[:10] + block + b"\x06" + bytes(20_000))
 
-    with pytest.raises(RefineError, match=f"breaks at byte {at} "):
+    with pytest.raises(RefineError, match=f"breaks behind byte {behind} "):
         read_splats(path)
 
 

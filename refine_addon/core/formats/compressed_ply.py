@@ -10,24 +10,13 @@ are near each other and their ranges small.
 from __future__ import annotations
 
 import io
-from pathlib import Path
-from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..place import Place
-from ..splats import (
-    MODELS,
-    SH_C0,
-    Splats,
-    above_constant,
-    opacity,
-    opacity_logits,
-    unit_quaternions,
-)
+from ..splats import MODELS, SH_C0, above_constant, opacity, unit_quaternions
 from . import ply
-from .format import Format, join_largest, near_ones_together, new_file, pieces, split_largest
+from .format import Format, join_largest, nearby_order, new_file, pieces, set_colors, split_largest
 from .ply_columns import REST_COUNTS
 
 NAME = "compressed PLY"
@@ -59,27 +48,27 @@ REST_RANGE = 8.0
 """Harmonics are written between -4 and 4, in 256 steps."""
 
 
-def _matches(_path: Path, head: bytes) -> bool:
+def _matches(_path, head):
     """Whether this is a PLY whose header has packed positions."""
     header = ply.raw_header(head) or b""
     words = (line.split() for line in header.splitlines())
     return any(line[:1] == [b"property"] and line[2:] == [b"packed_position"] for line in words)
 
 
-def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
+def _read(path, data):
     header = ply.read_header(path, io.BytesIO(data[: ply.HEADER_LIMIT].tobytes()))
     place = Place(path)
     if header.order == ply.TEXT:
         place.fail("a compressed PLY in ASCII, expected a binary one")
     body = data[len(header.raw) :]
-    elements: dict[str, NDArray[Any]] = {}
+    elements = {}
     for element, at in zip(header.elements, ply.row_ranges(header, len(body)), strict=True):
         if ply.has_lists(element):
             place.fail(f"element {ply.shown(element.name)} has a list, expected numbers")
         stored, kind = body[at], np.dtype(element.dtype(header.order))
         elements[element.name] = stored.view(kind) if len(stored) else np.empty(0, kind)
 
-    def rows_of(name: str, properties: tuple[str, ...], kind: str) -> NDArray[Any]:
+    def rows_of(name, properties, kind):
         """Rows of an element that has these properties, all of one type."""
         if name not in elements:
             place.fail(f"a compressed PLY without an element '{name}'")
@@ -109,7 +98,7 @@ def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
         order = [(held.dtype.names or ()).index(name) for name in names]
         rest = held.view(np.uint8).reshape(count, len(names))[:, order]
     model, degree = ply.model_of(header.raw) or "default", REST_COUNTS[rest.shape[1]]
-    file, splats = new_file(path, ply.Origin(NAME, len(data)), count, degree, model)
+    file, splats = new_file(path, (NAME, len(data)), count, degree, model)
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite
         for piece in pieces(count):
             rows, here = packed[piece], ranges[_chunks_of(piece)]
@@ -117,9 +106,9 @@ def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
             splats.means[piece] = _between(places, here, _POSITION)
             splats.log_scales[piece] = _between(sizes, here, _SCALE)
             shares = _unpacked(rows["packed_color"], _CHANNELS)
-            colors = _between(shares[:, :3], here, _COLOR) if colored else shares[:, :3]
-            splats.sh_dc[piece] = (colors - 0.5) / SH_C0
-            splats.opacity_logits[piece] = opacity_logits(shares[:, 3])
+            if colored:
+                _between(shares[:, :3], here, _COLOR)
+            set_colors(splats.take(piece), shares)
             turns = rows["packed_rotation"]
             others = (_unpacked(turns, _TURNS) - 0.5) * np.sqrt(2.0)
             largest = (turns >> np.uint32(30)).astype(np.intp)
@@ -129,12 +118,12 @@ def _read(path: Path, data: NDArray[np.uint8]) -> ply.SplatFile:
     return file
 
 
-def _chunks_of(piece: slice) -> slice:
+def _chunks_of(piece):
     """Which chunks the splats of a piece are in; pieces begin with a chunk."""
     return slice(piece.start // SPLATS, -(-piece.stop // SPLATS))
 
 
-def _unpacked(values: NDArray[Any], fields: tuple[tuple[int, int], ...]) -> NDArray[np.float64]:
+def _unpacked(values, fields):
     """Bit fields of 32-bit numbers (n,) as shares of their largest codes, (n, F)."""
     shares = np.empty((len(values), len(fields)))
     for index, (shift, largest) in enumerate(fields):
@@ -142,7 +131,7 @@ def _unpacked(values: NDArray[Any], fields: tuple[tuple[int, int], ...]) -> NDAr
     return shares
 
 
-def _packed(shares: NDArray[Any], fields: tuple[tuple[int, int], ...]) -> NDArray[np.uint32]:
+def _packed(shares, fields):
     """Shares (n, F) as 32-bit numbers (n,), the reverse of `_unpacked`."""
     packed = np.zeros(len(shares), np.uint32)
     for index, (shift, largest) in enumerate(fields):
@@ -151,8 +140,8 @@ def _packed(shares: NDArray[Any], fields: tuple[tuple[int, int], ...]) -> NDArra
     return packed
 
 
-def _between(shares: NDArray[Any], chunks: NDArray[Any], names: tuple[str, ...]):
-    """Vectors (n, 3) of shares of the ranges of their chunks."""
+def _between(shares, chunks, names):
+    """Vectors (n, 3) of shares of the ranges of their chunks, which replace the shares."""
     for axis, share in enumerate(shares.T):
         ends = (chunks[name].astype(np.float64) for name in (names[axis], names[axis + 3]))
         low, high = (np.repeat(end, SPLATS)[: len(shares)] for end in ends)
@@ -164,10 +153,10 @@ _REST = np.concatenate([[0.0], (np.arange(1, 255) + 0.5) / 256.0, [1.0]]) * REST
 """Code -> coefficient: the middle of its step, the ends of the range at either end."""
 
 
-def _write(stream: BinaryIO, splats: Splats) -> None:
+def _write(stream, splats):
     """Write splats as a compressed PLY, sorted so that neighbours in space share a chunk."""
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
-    order = near_ones_together(splats.means)
+    order = nearby_order(splats.means)
     stream.write(ply.with_model(_header(count, rest), splats.model))
     ranges = np.empty((-(-count // SPLATS), 18), "<f4")
     packed = np.empty((count, 4), "<u4")
@@ -183,8 +172,7 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
         packed[piece, 2] = _packed(_places(scales, ends[:, 6:12]), _PLACES)
         shares = np.empty((len(batch), 4))
         shares[:, :3] = _places(colors, ends[:, 12:])
-        with np.errstate(under="ignore"):
-            shares[:, 3] = opacity(batch.opacity_logits)
+        shares[:, 3] = opacity(batch.opacity_logits)
         packed[piece, 3] = _packed(shares, _CHANNELS)
         planes = np.asarray(batch.sh_rest, np.float64).transpose(0, 2, 1).reshape(len(batch), rest)
         # Each code stands for the middle of its step, so that it is the whole part, not rounded.
@@ -192,7 +180,7 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
     stream.writelines(part.data for part in (ranges, packed, harmonics))
 
 
-def _places(values: NDArray[Any], ranges: NDArray[np.float32]) -> NDArray[np.float64]:
+def _places(values, ranges):
     """Values (n, 3) as fractions of the ranges of their chunks; set `ranges` (C, 6)."""
     # Rounded once: of ends in float32, all values in between are in between.
     with np.errstate(under="ignore"):
@@ -202,10 +190,10 @@ def _places(values: NDArray[Any], ranges: NDArray[np.float32]) -> NDArray[np.flo
     ranges[:, 3:] = np.maximum.reduceat(values, starts, axis=0)
     each = np.repeat(ranges.astype(np.float64), SPLATS, axis=0)[: len(values)]
     low, extent = each[:, :3], each[:, 3:] - each[:, :3]
-    return np.asarray((values - low) / np.where(extent > 0.0, extent, 1.0))
+    return (values - low) / np.where(extent > 0.0, extent, 1.0)
 
 
-def _header(count: int, rest: int) -> bytes:
+def _header(count, rest):
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // SPLATS)}"]
     lines += [f"property float {name}" for name in (*_POSITION, *_SCALE, *_COLOR)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
@@ -215,7 +203,7 @@ def _header(count: int, rest: int) -> bytes:
     return "\n".join([*lines, "end_header", ""]).encode()
 
 
-def _sizes(count: int, degree: int) -> tuple[float, int]:
+def _sizes(count, degree):
     """How large a file is, at most: the last chunk may have fewer splats than the others.
 
     The header has a comment unless the splats are of the default model.

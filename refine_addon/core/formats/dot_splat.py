@@ -6,16 +6,11 @@ signature and are known by their name alone.
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import BinaryIO
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..splats import SH_C0, Splats, base_color, opacity, opacity_logits, scales, unit_quaternions
-from .format import Format, codes, named, new_file, pieces
-from .ply import Origin, SplatFile
+from ..splats import scales, unit_quaternions
+from .format import Format, color_codes, named, new_file, pieces, set_colors
 
 NAME = ".splat"
 
@@ -27,36 +22,33 @@ _ROW = np.dtype(
 _NO_TURN = 128.0  # code of 0 in a rotation, and the step from 0 to 1
 
 
-def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+def _read(path, data):
     size = _ROW.itemsize
     count, beyond = divmod(len(data), size)
     if beyond:
         where = f"splat {count} at byte {count * size}"
         raise RefineError(f"{path}: truncated: {where} has {beyond} bytes, expected {size}")
     stored = data.view(_ROW)
-    file, splats = new_file(path, Origin(NAME, len(data)), count, 0)
+    file, splats = new_file(path, (NAME, len(data)), count, 0)
     # Scales that are 0 or no sizes at all become logarithms that are not finite, as in a PLY.
     with np.errstate(divide="ignore", invalid="ignore"):
         for piece in pieces(count):
-            rows = stored[piece]
-            splats.means[piece] = rows["mean"]
-            splats.log_scales[piece] = np.log(rows["scale"])
-            shares = rows["color"] / 255.0  # (n, 4)
-            splats.sh_dc[piece] = (shares[:, :3] - 0.5) / SH_C0
-            splats.opacity_logits[piece] = opacity_logits(shares[:, 3])
-            splats.quaternions[piece] = unit_quaternions(rows["rotation"] / _NO_TURN - 1.0)
+            rows, target = stored[piece], splats.take(piece)
+            target.means[:] = rows["mean"]
+            target.log_scales[:] = np.log(rows["scale"])
+            set_colors(target, rows["color"] / 255.0)
+            target.quaternions[:] = unit_quaternions(rows["rotation"] / _NO_TURN - 1.0)
     return file
 
 
-def _write(stream: BinaryIO, splats: Splats) -> None:
+def _write(stream, splats):
     for piece in pieces(len(splats)):
         batch = splats.take(piece)
         rows = np.empty(len(batch), _ROW)
         rows["mean"] = batch.means
         with np.errstate(under="ignore"):
             rows["scale"] = scales(batch.log_scales)
-            rows["color"][:, :3] = codes(base_color(batch.sh_dc))
-            rows["color"][:, 3] = codes(opacity(batch.opacity_logits))
+        rows["color"] = color_codes(batch)
         turns = np.rint(unit_quaternions(batch.quaternions) * _NO_TURN + _NO_TURN)
         rows["rotation"] = np.clip(turns, 0.0, 255.0)
         stream.write(rows.data)

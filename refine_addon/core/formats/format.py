@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import chunks
-from ..splats import MODELS, Model, Splats
+from ..splats import MODELS, SH_C0, Model, Splats, base_color, opacity, opacity_logits
 from ..visibility.scene import spatial_order
 from .ply import Origin, SplatFile, new_header, with_model
 from .ply_columns import empty_rows
@@ -67,11 +67,18 @@ def named(suffix: str) -> Callable[[Path, bytes], bool]:
 
 
 def new_file(
-    path: Path, origin: Origin, count: int, degree: int, model: Model = "default"
+    path: Path, origin: tuple[str, int], count: int, degree: int, model: Model = "default"
 ) -> tuple[SplatFile, Splats]:
     """Make a file of `count` splats whose values are still to be set.
 
-    The splats have a third scale, whatever their model.
+    Parameters
+    ----------
+    path : Path
+    origin : str, int
+        See `Origin`.
+    count, degree : int
+    model : {"default", "antialiased", "2dgs"}
+        The splats have a third scale, whatever this is.
 
     Returns
     -------
@@ -82,7 +89,7 @@ def new_file(
     """
     rows, splats = empty_rows(count, degree)
     header = with_model(new_header(rows.dtype, count), model)
-    return SplatFile(path, rows, header, origin=origin), splats
+    return SplatFile(path, rows, header, origin=Origin(*origin)), splats
 
 
 def pieces(count: int) -> list[slice]:
@@ -93,6 +100,17 @@ def pieces(count: int) -> list[slice]:
 def codes(shares: NDArray[Any]) -> NDArray[np.uint8]:
     """Shares of 0..1 as the nearest of 0..255; those outside count as the nearer end."""
     return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * 255), np.uint8)
+
+
+def color_codes(splats: Splats) -> NDArray[np.uint8]:
+    """Colours and opacities of splats in 8 bits each, (N, 4)."""
+    return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
+
+
+def set_colors(splats: Splats, shares: NDArray[Any]) -> None:
+    """Set colours and opacities to these of 0..1, (N, 4)."""
+    splats.sh_dc[:] = (shares[:, :3] - 0.5) / SH_C0
+    splats.opacity_logits[:] = opacity_logits(shares[:, 3])
 
 
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
@@ -136,7 +154,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Left-out component -> the other three."""
 
 
-def near_ones_together(means: NDArray[Any]) -> NDArray[np.int64]:
+def nearby_order(means: NDArray[Any]) -> NDArray[np.int64]:
     """Order of finite positions (N, 3), (N,), in which neighbours in space follow."""
     sample = np.asarray(means[:: max(len(means) // _SAMPLE, 1)], np.float64)
     middle = np.median(sample, axis=0)

@@ -11,8 +11,7 @@ import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +19,8 @@ from numpy.typing import NDArray
 from ..affine import transformed
 from ..errors import RefineError
 from ..place import Place, described, is_whole
-from ..splats import (
-    ARRAYS,
-    SINGLE_MARGIN,
-    Splats,
-    base_color,
-    opacity,
-    opacity_logits,
-    rotation_matrices,
-    scales,
-    unit_quaternions,
-)
-from .format import Format, codes, new_file, pieces, refuse_short
-from .ply import Origin, SplatFile
+from ..splats import ARRAYS, opacity, rotation_matrices, scales, single_logits, unit_quaternions
+from .format import Format, color_codes, new_file, pieces, refuse_short
 
 NAME = "GLB"
 EXTENSION = "KHR_gaussian_splatting"
@@ -115,16 +103,10 @@ class _Part(NamedTuple):
     values: Callable[[str, slice], NDArray[Any]]  # of an attribute without its prefix
 
 
-def _matches(_path: Path, head: bytes) -> bool:
-    return head.startswith(_MAGIC)
-
-
-def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+def _read(path, data):
     """Read the splats of all nodes of a file's scene, each where the node puts it."""
     document = _opened(path, data)
-    meshes: dict[int, list[_Part]] = {}
-    shown: list[tuple[_Part, NDArray[np.float64], Place]] = []
-    every: list[_Part] = []
+    meshes, shown, every = {}, [], []
     left, visited, count, place = [], set(), 0, document.place.at("scene")
     if "scenes" in document.content:
         scene, place = document.item("scenes", document.content.get("scene", 0), place)
@@ -152,8 +134,8 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
             document.place.fail(f"its nodes show {count} splats or more, {wanted}")
     if not every:
         document.place.fail(f"no splats: no node of its scene shows a primitive with {EXTENSION}")
-    origin = Origin(f"{NAME} with {EXTENSION}", len(data))
-    file, splats = new_file(path, origin, count, max(part.degree for part in every))
+    origin, degree = (f"{NAME} with {EXTENSION}", len(data)), max(part.degree for part in every)
+    file, splats = new_file(path, origin, count, degree)
     start = 0
     with np.errstate(all="ignore"):  # any number may stand in a file
         for part, matrix, place in shown:
@@ -173,15 +155,14 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     return replace(file, remarks=(remark,)) if any(part.logs for part in every) else file
 
 
-def _opened(path: Path, data: NDArray[np.uint8]) -> _Document:
+def _opened(path, data):
     """Parse a file's chunks and its JSON."""
     refuse_short(path, _HEADER.size + _CHUNK.size, len(data), "the first bytes of a GLB file")
     _, version, length = _HEADER.unpack(data[: _HEADER.size].tobytes())
     if version != _VERSION:
         Place(path).fail(f"glTF version {version}, expected {_VERSION}")
     refuse_short(path, length, len(data), "all chunks")
-    chunks: dict[bytes, NDArray[np.uint8]] = {}
-    at = _HEADER.size
+    at, chunks = _HEADER.size, dict[bytes, NDArray[np.uint8]]()
     while at + _CHUNK.size <= length:
         size, kind = _CHUNK.unpack(data[at : at + _CHUNK.size].tobytes())
         at += _CHUNK.size
@@ -193,19 +174,19 @@ def _opened(path: Path, data: NDArray[np.uint8]) -> _Document:
     return _Document(Place(path), content, chunks.get(_BINARY, data[:0]))
 
 
-def _listed(holder: dict[str, Any], key: str, place: Place) -> list[Any]:
+def _listed(holder, key, place):
     """List, empty if it is not there."""
     return place.at(key).items(holder.get(key, []))
 
 
-def _moved(frame: NDArray[np.float64], node: dict[str, Any], place: Place) -> NDArray[np.float64]:
+def _moved(frame, node, place):
     """Frame of a node, (4, 4), in that of the scene; `frame` is that of the node above."""
     if "matrix" in node:
         return frame @ np.reshape(place.at("matrix").numbers(node["matrix"], 16), (4, 4)).T
     if node.keys().isdisjoint(("translation", "rotation", "scale")):
         return frame
 
-    def numbers(key: str, *default: float) -> list[float]:
+    def numbers(key, *default):
         return place.at(key).numbers(node.get(key, [*default]), len(default))
 
     turn, matrix = np.roll(numbers("rotation", 0.0, 0.0, 0.0, 1.0), 1), np.eye(4)
@@ -214,7 +195,7 @@ def _moved(frame: NDArray[np.float64], node: dict[str, Any], place: Place) -> ND
     return frame @ matrix
 
 
-def _parts(document: _Document, mesh: dict[str, Any], place: Place) -> list[_Part]:
+def _parts(document, mesh, place):
     """Primitives of splats of a mesh."""
     parts = []
     for number, item in enumerate(_listed(mesh, "primitives", place)):
@@ -235,7 +216,7 @@ def _parts(document: _Document, mesh: dict[str, Any], place: Place) -> list[_Par
     return parts
 
 
-def _part(document: _Document, attributes: Any, place: Place) -> _Part:
+def _part(document, attributes, place):
     """Look up the attributes of a primitive of splats."""
     attributes = place.members(attributes)
     degree, count, held = 0, 0, {}
@@ -251,7 +232,7 @@ def _part(document: _Document, attributes: Any, place: Place) -> _Part:
         if got != count:
             place.at(key).fail(f"{got} values, expected {count} as for POSITION")
 
-    def values(name: str, piece: slice) -> NDArray[Any]:
+    def values(name, piece):
         stored, unit = held[name]
         return stored[piece] if unit == 1.0 else np.maximum(stored[piece] / unit, -1.0)
 
@@ -259,20 +240,20 @@ def _part(document: _Document, attributes: Any, place: Place) -> _Part:
     return _Part(count, degree, logs, values)
 
 
-def _fill(target: Splats, part: _Part, piece: slice) -> None:
+def _fill(target, part, piece):
     """Set splats to those of a piece of a primitive; harmonics that are absent are 0."""
     target.means[:] = part.values("POSITION", piece)
     sizes = part.values("SCALE", piece)
     target.log_scales[:] = sizes if part.logs else np.log(sizes, dtype=np.float32)
     target.quaternions[:] = np.roll(part.values("ROTATION", piece), 1, axis=1)
-    target.opacity_logits[:] = opacity_logits(part.values("OPACITY", piece)[:, 0], SINGLE_MARGIN)
+    target.opacity_logits[:] = single_logits(part.values("OPACITY", piece)[:, 0])
     constant, *others = _harmonics(part.degree)
     target.sh_dc[:], target.sh_rest[:] = part.values(constant, piece), 0.0
     for index, name in enumerate(others):
         target.sh_rest[:, index] = part.values(name, piece)
 
 
-def _half_turned(splats: Splats) -> Splats:
+def _half_turned(splats):
     """Splats turned half about z, to the bit: see `_HALF_TURN`."""
     w, x, y, z = splats.quaternions.T
     # Half a turn multiplies the harmonic of order m by (-1)^m.
@@ -283,7 +264,7 @@ def _half_turned(splats: Splats) -> Splats:
     return replace(splats, means=means, quaternions=turns, sh_rest=splats.sh_rest * signs[:, None])
 
 
-def _harmonics(degree: int) -> list[str]:
+def _harmonics(degree):
     """Names of all coefficients up to a degree, the constant first."""
     bands = range(degree + 1)
     return [f"SH_DEGREE_{band}_COEF_{n}" for band in bands for n in range(2 * band + 1)]
@@ -298,7 +279,7 @@ def _attributes(degree):
     harmonics = [lambda splats, k=k: splats.sh_rest[:, k] for k in range(len(others))]
     return [
         ("POSITION", _FLOAT, 3, lambda splats: splats.means),
-        ("COLOR_0", _BYTE, 4, _colors),
+        ("COLOR_0", _BYTE, 4, color_codes),
         (f"{EXTENSION}:ROTATION", _FLOAT, 4, _rotations),
         (f"{EXTENSION}:SCALE", _FLOAT, 3, lambda splats: scales(splats.log_scales)),
         (f"{EXTENSION}:OPACITY", _FLOAT, 1, lambda splats: opacity(splats.opacity_logits)[:, None]),
@@ -307,15 +288,11 @@ def _attributes(degree):
     ]
 
 
-def _colors(splats):
-    return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
-
-
 def _rotations(splats):
     return np.roll(unit_quaternions(splats.quaternions), -1, axis=1)  # x y z w
 
 
-def _write(stream: BinaryIO, splats: Splats) -> None:
+def _write(stream, splats):
     """Write splats as a file with one node; refuse more than 4 GiB, which it cannot say."""
     attributes = _attributes(splats.sh_degree)
     with np.errstate(under="ignore", over="ignore"):  # doubles that are no floats
@@ -334,11 +311,9 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
                 stream.write(np.ascontiguousarray(written, _KINDS[kind]).data)
 
 
-def _json(attributes: list, count: int, low: list[float], high: list[float]):
+def _json(attributes, count, low, high):
     """JSON of a file, padded with spaces to a multiple of 4 bytes, and the bytes behind it."""
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    at = 0
+    views, accessors, at = [], [], 0
     for index, (_, kind, width, _) in enumerate(attributes):
         length = width * np.dtype(_KINDS[kind]).itemsize * count
         views.append({"buffer": 0, "byteOffset": at, "byteLength": length, "target": _VERTICES})
@@ -364,7 +339,7 @@ def _json(attributes: list, count: int, low: list[float], high: list[float]):
     return text + b" " * (-len(text) % 4), at
 
 
-def _sizes(count: int, degree: int) -> tuple[float, int]:
+def _sizes(count, degree):
     """Bytes of a splat and of the rest, at most: its JSON has numbers of unknown length."""
     longest = [-1.1754943508222875e-38] * 3
     text, _ = _json(_attributes(degree), count, longest, longest)
@@ -373,4 +348,6 @@ def _sizes(count: int, degree: int) -> tuple[float, int]:
 
 
 _LOSS = "holds activated values in single precision, with y up"
-FORMAT = Format(NAME, ".glb", _matches, _read, _write, _DEGREES, _LOSS, _sizes)
+FORMAT = Format(
+    NAME, ".glb", lambda _, head: head.startswith(_MAGIC), _read, _write, _DEGREES, _LOSS, _sizes
+)

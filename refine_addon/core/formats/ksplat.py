@@ -8,17 +8,13 @@ float16. The files have no signature and are known by their name alone.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..place import Place
-from ..splats import SH_C0, Splats, above_constant, opacity_logits, unit_quaternions
-from .format import Format, named, new_file, pieces, refuse_short
-from .ply import Origin, SplatFile
+from ..splats import above_constant, unit_quaternions
+from .format import Format, named, new_file, pieces, refuse_short, set_colors
 
 NAME = ".ksplat"
 
@@ -62,7 +58,7 @@ class _Section(NamedTuple):
         return self.start + 4 * self.partial + self.bucket_bytes * self.bucket_count
 
 
-def _row(level: int, degree: int) -> np.dtype[Any]:
+def _row(level, degree):
     """What is stored of a splat: rotation is w x y z, colour has opacity behind."""
     mean, number = ("<f4", "<f4") if level == 0 else ("<u2", "<f2")
     rest = ("<f4", "<f2", "u1")[level], 3 * above_constant(degree)
@@ -70,7 +66,7 @@ def _row(level: int, degree: int) -> np.dtype[Any]:
     return np.dtype([*fields, ("color", "u1", 4), ("rest", *rest)])
 
 
-def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+def _read(path, data):
     refuse_short(path, _HEADER_BYTES, len(data), "the first bytes of a .ksplat file")
     fields = _HEADER.unpack(data[: _HEADER.size].tobytes())
     major, minor, number, announced, level, least, largest = fields
@@ -83,7 +79,7 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     if count != announced:
         Place(path).fail(f"{announced} splats by byte 16, {count} by the sections")
     degree = max((section.degree for section in sections if section.splats), default=0)
-    file, splats = new_file(path, Origin(f"{NAME} level {level}", len(data)), count, degree)
+    file, splats = new_file(path, (f"{NAME} level {level}", len(data)), count, degree)
     splats.sh_rest[:] = 0.0
     limits = np.float32(least or -_HARMONICS), np.float32(largest or _HARMONICS)
     start = 0
@@ -95,7 +91,7 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     return file
 
 
-def _sections(path: Path, data: NDArray[np.uint8], count: int, level: int) -> Iterator[_Section]:
+def _sections(path, data, count, level):
     """Yield the sections; refuse those that reach beyond the end of the file."""
     start = _HEADER_BYTES + count * _SECTION_BYTES
     refuse_short(path, start, len(data), f"the headers of {count} sections")
@@ -116,35 +112,32 @@ def _sections(path: Path, data: NDArray[np.uint8], count: int, level: int) -> It
         yield section
 
 
-def _fill(splats: Splats, level: int, limits: tuple, section: _Section, data: NDArray[Any]):
+def _fill(splats, level, limits, section, data):
     """Set the splats of a section; `limits` are those of its harmonics in level 2."""
     dtype = _row(level, section.degree)
     stored = data[section.rows : section.rows + section.splats * dtype.itemsize].view(dtype)
-    centers, buckets = _buckets(section, data) if level else (None, None)
+    centers, buckets = _buckets(section, data) if level else np.empty((2, 0))
     step = section.block / 2.0 / section.middle
     for piece in pieces(section.splats):
-        rows = stored[piece]
-        if centers is None or buckets is None:
-            splats.means[piece] = rows["mean"]
-        else:
+        rows, target = stored[piece], splats.take(piece)
+        target.means[:] = rows["mean"]
+        if level:
             around = (rows["mean"] - float(section.middle)) * step
-            splats.means[piece] = around + centers[buckets[piece]]
-        splats.log_scales[piece] = np.log(rows["scale"].astype(np.float64))
-        splats.quaternions[piece] = unit_quaternions(rows["rotation"])
-        shares = rows["color"] / 255.0  # (n, 4)
-        splats.sh_dc[piece] = (shares[:, :3] - 0.5) / SH_C0
-        splats.opacity_logits[piece] = opacity_logits(shares[:, 3])
+            target.means[:] = around + centers[buckets[piece]]
+        target.log_scales[:] = np.log(rows["scale"].astype(np.float64))
+        target.quaternions[:] = unit_quaternions(rows["rotation"])
+        set_colors(target, rows["color"] / 255.0)
         values, at = rows["rest"].astype(np.float32), 0
         if level == 2:
             values = limits[0] + values / np.float32(255.0) * (limits[1] - limits[0])
         for band in range(1, section.degree + 1):  # each is red, then green, then blue
             width = 2 * band + 1
             one = values[:, 3 * at : 3 * (at + width)].reshape(-1, 3, width)
-            splats.sh_rest[piece, at : at + width] = one.swapaxes(1, 2)
+            target.sh_rest[:, at : at + width] = one.swapaxes(1, 2)
             at += width
 
 
-def _buckets(section: _Section, data: NDArray[np.uint8]):
+def _buckets(section, data):
     """Centres of the buckets (B, 3), and in which bucket each splat lies.
 
     Full buckets come first; the lengths of the others stand before the centres.

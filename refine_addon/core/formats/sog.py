@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, BinaryIO, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,18 +26,10 @@ from numpy.typing import NDArray
 from ..errors import RefineError, reason_of
 from ..images import codec_for
 from ..place import Place, described, is_sog
-from ..splats import (
-    MODELS,
-    Model,
-    Splats,
-    above_constant,
-    opacity,
-    opacity_logits,
-    unit_quaternions,
-)
+from ..splats import MODELS, Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from ..whole_file import mode_of
-from .format import Format, codes, join_largest, near_ones_together, new_file, pieces, split_largest
-from .ply import Origin, SplatFile
+from .format import Format, codes, join_largest, nearby_order, new_file, pieces, split_largest
+from .ply import SplatFile
 
 NAME, VERSION = "SOG", 2
 GENERATOR = "REFINE for Blender"
@@ -95,6 +87,9 @@ class Bundle:
             place.at("version").expected(str(VERSION), self.meta["version"])
         self.version = VERSION if "version" in self.meta else 1
         self.size = sum(files.values())
+        self.model = meta.get("model", MODELS[0])  # as splat-transform says how they are drawn
+        if self.model not in MODELS:
+            place.at("model").expected(f"one of {', '.join(MODELS)}", self.model)
         self._codec = codec_for(place.path)
 
     @property
@@ -105,14 +100,6 @@ class Bundle:
         section, place = self.section("means")
         shape = place.at("shape").items(section.get("shape"))
         return place.at("shape [0]").whole(shape[0] if shape else None, 1, self.size)
-
-    @property
-    def model(self) -> Model:
-        """How its splats are drawn, as splat-transform says it: a word beside the version."""
-        word = self.meta.get("model", MODELS[0])
-        if word not in MODELS:
-            self.place.at("model").expected(f"one of {', '.join(MODELS)}", word)
-        return word
 
     @property
     def degree(self) -> int:
@@ -176,7 +163,7 @@ class Bundle:
 
     def read(self) -> SplatFile:
         """Read its splats."""
-        origin = Origin(f"{NAME} version {self.version}", self.size)
+        origin = f"{NAME} version {self.version}", self.size
         file, splats = new_file(self.place.path, origin, self.count, self.degree, self.model)
         first, axes = self.version == 1, np.arange(3)
         low, high = (self.numbers("means", key, 3) for key in ("mins", "maxs"))
@@ -205,7 +192,7 @@ class Bundle:
                     splats.sh_rest[piece] = palette[labels[piece]]
         return file
 
-    def _harmonics(self) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    def _harmonics(self):
         """Palette of harmonics, (P, K, 3), and which entry each splat has."""
         coefficients, most = above_constant(self.degree), 1 << _LABEL_BITS
         width, (section, place) = _ACROSS * coefficients, self.section("shN")
@@ -229,7 +216,7 @@ class Bundle:
         return table.astype(np.float32)[places], labels
 
 
-def _held(place: Place, label: str, limit: int, opened: Callable[[], IO[bytes]]) -> bytes:
+def _held(place, label, limit, opened):
     """What a file holds; one that cannot be read, or has more bytes, is refused."""
     try:
         with opened() as stream:
@@ -241,7 +228,7 @@ def _held(place: Place, label: str, limit: int, opened: Callable[[], IO[bytes]])
     return content
 
 
-def _read_archive(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+def _read_archive(path, data):
     place = Place(path)
     try:
         archive = zipfile.ZipFile(io.BytesIO(data.tobytes()))
@@ -252,13 +239,13 @@ def _read_archive(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         place.fail(f"no {META} in the archive, which a SOG file has")
     folder = metas[0].removesuffix(META)
 
-    def member(name: str) -> IO[bytes]:
+    def member(name):
         info = archive.getinfo(folder + name)
         if info.compress_type not in _PACKED:
             raise NotImplementedError(f"compressed by method {info.compress_type}")
         return archive.open(info)
 
-    def opened(name: str, limit: int) -> bytes:
+    def opened(name, limit):
         label = f"{(folder + name)[:80]!r} in the archive"
         return _held(place, label, limit, lambda: member(name))
 
@@ -278,7 +265,7 @@ def bundle_beside(path: Path) -> Bundle:
     """
     place = Place(path)
 
-    def held(there: Path, limit: int) -> bytes:
+    def held(there, limit):
         return _held(place, repr(there.name[:80]), limit, lambda: there.open("rb"))
 
     meta = place.members(place.parsed(held(path, _META_LIMIT)))
@@ -315,12 +302,12 @@ def named_json(end: str) -> Callable[[Path, bytes], bool]:
     return lambda path, head: path.name.lower().endswith(end) and head.lstrip().startswith(b"{")
 
 
-def _write(stream: BinaryIO, splats: Splats) -> None:
+def _write(stream, splats):
     """Write splats, sorted so that neighbours in space are neighbours in images."""
     path = Path(str(getattr(stream, "name", NAME)))
     # A ZipInfo has no date of today, so a file is the same whenever it is made.
     with zipfile.ZipFile(stream, "w") as archive:
-        for name, data in contents(path, splats.take(near_ones_together(splats.means))):
+        for name, data in contents(path, splats.take(nearby_order(splats.means))):
             archive.writestr(zipfile.ZipInfo(name), data)
 
 
@@ -344,7 +331,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
     if across > _MOST_PIXELS:
         raise RefineError(f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}")
 
-    def image(values: NDArray[Any]) -> NDArray[np.uint8]:
+    def image(values):
         """Image of a pixel for each splat, of which `values`, (N, C), are the first channels."""
         pixels = np.zeros((-(-count // across), across, 4), np.uint8)
         pixels[..., 3] = 255
@@ -359,8 +346,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
     largest, others = split_largest(unit_quaternions(splats.quaternions))
     scale_table, scales = _tabulated(np.maximum(splats.log_scales, _NO_SIZE))
     color_table, colors = _tabulated(splats.sh_dc)
-    with np.errstate(under="ignore"):
-        alpha = codes(opacity(splats.opacity_logits))
+    alpha = codes(opacity(splats.opacity_logits))
     meta: dict[str, Any] = {
         "version": VERSION,
         "asset": {"generator": GENERATOR},
@@ -396,7 +382,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
         yield name, codec.encode(pixels)
 
 
-def _tabulated(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def _tabulated(values):
     """Table of 256 values, and the place of the nearest for each of `values`.
 
     Half of the table are equal steps from the least to the largest value, so that no value is off
@@ -412,7 +398,7 @@ def _tabulated(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.ui
     return table, np.searchsorted(bounds, values).astype(np.uint8)
 
 
-def _grouped(rows: NDArray[Any]) -> NDArray[np.int64]:
+def _grouped(rows):
     """Group for each of N rows (N, D): similar rows share one. Numbers start at 0.
 
     All rows are one group first; every group is halved at its mean along the axis in which it

@@ -6,31 +6,19 @@ attribute; it is read where a module for zstd is there, which Blender brings. Ve
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import io
 import math
 import struct
 import zlib
-from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..place import GZIP, SPZ, Place, is_spz
-from ..splats import (
-    MODELS,
-    Model,
-    Splats,
-    above_constant,
-    opacity,
-    opacity_logits,
-    unit_quaternions,
-)
+from ..splats import MODELS, above_constant, opacity, opacity_logits, unit_quaternions
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
-from .ply import Origin, SplatFile
 
 NAME, SUFFIX = "SPZ", ".spz"
 
@@ -66,7 +54,7 @@ not of splats that differ."""
 _PIECE = 1 << 20  # bytes that a zstd stream is unpacked to at a time
 
 _STEP = 1 << 12
-"""Bytes of a gzip stream that are unpacked at a time where what they hold is not used."""
+"""Bytes of a gzip stream that are unpacked at a time, to 4 MB at most."""
 
 
 class _Header(NamedTuple):
@@ -90,7 +78,7 @@ class _Header(NamedTuple):
         return self.splats * sum(self.widths().values())
 
 
-def _matches(path: Path, head: bytes) -> bool:
+def _matches(path, head):
     """Whether the signature stands in the open or in a gzip stream.
 
     A gzip stream of its name is one that may be damaged at its beginning.
@@ -98,7 +86,7 @@ def _matches(path: Path, head: bytes) -> bool:
     return is_spz(head) or (path.suffix.lower() == SUFFIX and head.startswith(GZIP))
 
 
-def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+def _read(path, data):
     """Read a file; version 4 needs a module for zstd."""
     if not data[: len(SPZ)].tobytes().startswith(SPZ):
         header, body = _unpacked(path, data)
@@ -110,8 +98,8 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     ends = header.splats * np.cumsum([*widths.values()])
     parts = zip(widths.items(), np.split(body, ends), strict=False)
     blocks = {name: part.reshape(header.splats, width) for (name, width), part in parts}
-    origin = Origin(f"{NAME} version {header.version}", len(data))
-    model: Model = "antialiased" if header.flags & _ANTIALIASED else "default"
+    origin = f"{NAME} version {header.version}", len(data)
+    model = MODELS[bool(header.flags & _ANTIALIASED)]  # default or antialiased
     file, splats = new_file(path, origin, header.splats, header.degree, model)
     for piece in pieces(header.splats):
         stored = {name: block[piece] for name, block in blocks.items()}
@@ -125,7 +113,7 @@ def _read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     return file
 
 
-def _parsed(path: Path, head: bytes, size: int) -> _Header:
+def _parsed(path, head, size):
     """What the first bytes of a file of `size` bytes say; refuse what it cannot hold."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
     header = _Header(*_HEADER.unpack(head))
@@ -146,43 +134,28 @@ def _parsed(path: Path, head: bytes, size: int) -> _Header:
     return header
 
 
-def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, NDArray[np.uint8]]:
+def _unpacked(path, data):
     """Header and attributes of a gzip stream."""
-    engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    engine, body, at = zlib.decompressobj(16 + zlib.MAX_WBITS), bytearray(), 0
     try:
-        header = _parsed(path, engine.decompress(data.data, _HEADER.size), len(data))
+        head = engine.copy().decompress(data.data, _HEADER.size)
+        header = _parsed(path, head, len(data))
         if header.version == _ZSTD:
             Place(path).fail("SPZ version 4 inside of gzip, expected its own header first")
-        needed = header.needed()
-        body = engine.decompress(engine.unconsumed_tail, needed) if needed else b""
-        # The rest, extensions that are not read, a step at a time: its end has the checksum. No
-        # bytes at last: what zlib still holds comes out.
-        rest = memoryview(engine.unconsumed_tail)
-        for at in range(0, len(rest) + 1, _STEP) if len(body) == needed else ():
+        needed = _HEADER.size + header.needed()
+        for at in range(0, len(data), _STEP):
             if not engine.eof:
-                engine.decompress(rest[at : at + _STEP])
+                body += engine.decompress(data[at : at + _STEP].data)
+                del body[needed:]  # extensions, which are not read
     except zlib.error as error:
-        at = _damaged_at(data)
-        Place(path).fail(f"a damaged SPZ file: its gzip stream breaks at byte {at} ({error})")
+        where = f"its gzip stream breaks behind byte {at} ({error})"
+        Place(path).fail(f"a damaged SPZ file: {where}")
     if len(body) == needed and not engine.eof:
         Place(path).fail("truncated: the gzip stream has no end")
-    return header, np.frombuffer(body, np.uint8)
+    return header, np.frombuffer(body, np.uint8)[_HEADER.size :]
 
 
-def _damaged_at(data: NDArray[np.uint8]) -> int:
-    """Byte of a gzip stream that zlib cannot go on from."""
-    engine, at = zlib.decompressobj(16 + zlib.MAX_WBITS), 0
-    for size in (_STEP, 1):  # the step with the damage, then the byte
-        with contextlib.suppress(zlib.error):
-            while at < len(data):
-                before = engine.copy()
-                engine.decompress(data[at : at + size].data)
-                at += size
-        engine = before
-    return at
-
-
-def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> NDArray[np.uint8]:
+def _streams(path, data, header):
     """Attributes of version 4, one behind the other."""
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
@@ -207,9 +180,8 @@ def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> NDArray[np
     return body
 
 
-def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
+def _zstd(path, name, packed, length):
     """What is in a zstd stream; refuse it if that has another length."""
-    module: Any
     try:
         try:
             module = importlib.import_module("compression.zstd")  # Python 3.14 and later
@@ -232,15 +204,15 @@ def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
     return content
 
 
-def _positions(block: NDArray[np.uint8], fraction: int) -> NDArray[np.float64]:
+def _positions(block, fraction):
     """Positions (n, 3) of 24-bit numbers, (n, 9) bytes."""
     parts = block.reshape(-1, 3, 3).astype(np.int32)
     whole = parts[..., 0] | (parts[..., 1] << 8) | (parts[..., 2] << 16)
     # Shifting up and down again repeats the sign.
-    return np.asarray(((whole << 8) >> 8) * math.ldexp(1.0, -fraction))
+    return ((whole << 8) >> 8) * math.ldexp(1.0, -fraction)
 
 
-def _rotations(block: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _rotations(block):
     """Quaternions w x y z; in the file they are x y z w."""
     if block.shape[1] == 3:
         return join_largest(np.zeros(len(block), np.intp), block / 127.5 - 1.0)
@@ -253,7 +225,7 @@ def _rotations(block: NDArray[np.uint8]) -> NDArray[np.float64]:
     return join_largest((packed >> np.uint32(30)).astype(np.intp), others)[:, [3, 0, 1, 2]]
 
 
-def _write(stream: BinaryIO, splats: Splats) -> None:
+def _write(stream, splats):
     """Write version 3; refuse coordinates beyond 8388607, the largest that it holds."""
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
     fraction = _fraction(splats)
@@ -264,8 +236,7 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
         batch = splats.take(piece)
         places = np.rint(np.ldexp(np.asarray(batch.means, np.float64), fraction)).astype("<i4")
         blocks["mean"][piece] = places.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9)
-        with np.errstate(under="ignore"):
-            blocks["opacity"][piece, 0] = codes(opacity(batch.opacity_logits))
+        blocks["opacity"][piece, 0] = codes(opacity(batch.opacity_logits))
         blocks["color"][piece] = codes(np.asarray(batch.sh_dc, np.float64) * _COLOR_STEP + 0.5)
         steps = (np.asarray(batch.log_scales, np.float64) - _LOWEST_SCALE) * _SCALE_STEPS
         blocks["scale"][piece] = np.rint(np.clip(steps, 0.0, 255.0))
@@ -282,7 +253,7 @@ def _write(stream: BinaryIO, splats: Splats) -> None:
     stream.write(engine.flush())
 
 
-def _fraction(splats: Splats) -> int:
+def _fraction(splats):
     """How many bits a position has behind the point.
 
     Usually 12, as other writers have it: 4096 steps a unit. Fewer where coordinates are too large
@@ -299,7 +270,7 @@ def _fraction(splats: Splats) -> int:
     return min(max(_USUAL_FRACTION, _LEAST_STEPS - bits), most, _LARGEST_CODE.bit_length())
 
 
-def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
+def _packed_rotations(quaternions):
     largest, others = split_largest(unit_quaternions(quaternions)[:, [1, 2, 3, 0]])
     packed = largest.astype("<u4")
     for index in range(3):

@@ -30,8 +30,8 @@ from ..execute import checkpoint
 from ..place import Place, described
 from ..splats import ARRAYS, Splats, rotation_matrices, scales
 from ..whole_file import mode_of, new_folder, refuse_existing, whole_file
-from .format import Format, near_ones_together, new_file, pieces
-from .ply import Origin, SplatFile
+from .format import Format, nearby_order, new_file, pieces
+from .ply import SplatFile
 from .sog import GENERATOR, IMAGES, META, Bundle, beside, bundle_beside, contents, named_json
 
 NAME, VERSION = "streamed SOG", 1
@@ -87,7 +87,7 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
     if count > size:  # many may share their images
         place.fail(f"{count} splats, expected at most {size}, the bytes of all files together")
     degree = max(bundle.degree for bundle, _ in units)
-    file, splats = new_file(path, Origin(f"{NAME}, level {level}", size), count, degree, model)
+    file, splats = new_file(path, (f"{NAME}, level {level}", size), count, degree, model)
     splats.sh_rest[:] = 0.0
     start = 0
     for bundle, spans in units:
@@ -212,7 +212,7 @@ class StreamedSog:
                 below = means[rows, axis] < value
                 left += [(sides[1], rows[~below]), (sides[0], rows[below])]
             elif len(rows):
-                rows = rows[near_ones_together(splats.means[rows])]
+                rows = rows[nearby_order(splats.means[rows])]
                 for piece in pieces(len(rows)):  # boxes around ellipsoids of one deviation
                     batch = splats.take(rows[piece])
                     turns = np.abs(rotation_matrices(batch.quaternions))
