@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .. import spherical_harmonics
 from ..execute import Progress, chunks, run_all, silent
 from ..splats import LOW_PASS, NEAR_RELATIVE, Model, Splats, opacity, rotation_matrices
-from ..views import View, ViewSet
+from ..views import ViewSet
 from ..visibility import frustum
 from ..visibility.scene import Scene
 
@@ -191,7 +191,7 @@ def measured_field(
             logs = np.asarray(some.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
             axes = rotation_matrices(some.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
             covariances = packed(axes @ np.swapaxes(axes, 1, 2))
-            direction, deviation, pixel, seen[piece] = viewing(means, weighted, closest)
+            direction, deviation, pixel, seen[piece] = _viewing(means, weighted, closest)
             color = spherical_harmonics.colors(direction, some.sh_dc, some.sh_rest)
             alpha, blur = opacity(some.opacity_logits), LOW_PASS * pixel
             # Antialiasing keeps the mass that splats have without the low-pass.
@@ -208,27 +208,11 @@ def measured_field(
     return MeasuredField(result, mass, seen)
 
 
-def viewing(
-    means: Array, views: list[tuple[View, float]], closest: float
-) -> tuple[Array, Array, Array, Array]:
-    """From where views see splats, hidden or not.
+def _viewing(means, views, closest):
+    """From where views, with their weights, see splats, hidden or not; all (M,) or (M, 3).
 
-    Parameters
-    ----------
-    means : (M, 3) float64
-    views : list of (View, float)
-        With their weights.
-    closest : float
-        A camera counts as at least so far away, world units.
-
-    Returns
-    -------
-    direction, deviation : (M, 3) float64
-        See `Field`.
-    pixel : (M,) float64
-        Area of a pixel at the splat, world units squared.
-    seen : (M,) float64
-        In how many of the views the centre lies.
+    Direction and deviation (`Field`), the area of a pixel at the splat, world units squared, and in
+    how many of the views the centre lies. A camera counts as at least `closest` away.
     """
     points = means.T
     rows, columns = np.triu_indices(3)

@@ -97,12 +97,7 @@ class MergeGraph:
     """
 
     def __init__(
-        self,
-        field: Field,
-        scene: Scene,
-        penalty: float,
-        *,
-        threads: int | None = None,
+        self, field: Field, scene: Scene, penalty: float, *, threads: int | None = None
     ) -> None:
         self.field, self.scene, self.threads = field, scene, threads
         self.penalty = penalty * (DISC_PENALTY if field.model == "2dgs" else 1.0)

@@ -21,24 +21,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import (
-    Progress,
-    chunks,
-    part,
-    report,
-    return_freed,
-    run_all,
-    seconds,
-    silent,
-    stages,
-)
+from ..execute import Progress, chunks, part, report, return_freed, run_all, seconds, silent, stages
 from ..mapped import divided, in_one, in_regions, look, new_folder, note, noted, on_disk, pieces
 from ..splats import ARRAYS, Splats, drawable
 from ..views import ViewSet
 from ..visibility.scene import Scene, scene_of, spatial_order, splat_fingerprint
 from .field import Array, measured_field
 from .graph import MergeGraph
-from .pairs import as_splats, blend, groups
+from .pairs import as_splats
 
 Measure = Callable[[Splats, Array, Progress], Array]
 """``measure(splats, expected, progress)`` returns the sums of the splats left, (2, n).
@@ -296,7 +286,13 @@ class _Stage:
         keep[undrawable] = False
         graph.reduce(max(len(rows) - (excess - len(undrawable)), 0), part(progress, 0.0, 0.95))
         keep[rows[~graph.alive]] = False
-        owner, share = groups(graph.merges, len(rows))
+        # The splat that each went into, or is, and its share of the colour of that one.
+        owner, share = np.arange(len(rows)), np.ones(len(rows))
+        # From the last round to the first: what one merges into may go into another in a later one.
+        for into, gone, kept_share in reversed(graph.merges):
+            owner[gone] = owner[into]
+            share[gone] = share[into] * (1.0 - kept_share)
+            share[into] *= kept_share
         changed = graph.alive & (np.bincount(owner, minlength=len(rows)) > 1)
         # Drop the rest of the field before the kept splats are copied, to save memory.
         field = graph.field = graph.field.take(np.flatnonzero(changed))
@@ -307,15 +303,33 @@ class _Stage:
             getattr(left, name)[target] = values
         inside = np.flatnonzero(changed[owner])
         order = inside[np.argsort(owner[inside], kind="stable")]
-        into, of_group, told = np.searchsorted(kept, rows[owner[order]]), rows[order], share[order]
-        for before, after in ((splats.sh_dc[:, None], left.sh_dc[:, None]),
-                              (splats.sh_rest, left.sh_rest)):  # fmt: skip
-            blend(before, of_group, told, after, into, part(progress, 0.97, 1.0), threads)
+        into = np.searchsorted(kept, rows[owner[order]])
+        blended = part(progress, 0.97, 1.0)
+        _blend(splats, rows[order], share[order], left, into, blended, threads)
         members = self.members.copy()
         members[rows] = np.bincount(owner, members[rows], len(rows))
         expected = self.sums[:, keep]
         expected[:, target] = field.contribution, field.error
         return left, keep, members[keep], expected
+
+
+def _blend(splats, members, share, left, into, progress, threads):
+    """Write the harmonics of merged splats: means of those of all that went into one, by shares.
+
+    `members`, (m,), are the rows of these, group by group; `into` are those of the merged splats in
+    `left`. Rounded to float32, whatever type they have, so that tiles and files give the same.
+    """
+    starts, largest = np.flatnonzero(np.diff(into, prepend=-1)), np.finfo(np.float32).max
+
+    def fill(harmonic):  # one at a time, to save memory; -1 is the constant one
+        name, of = ("sh_dc", ()) if harmonic < 0 else ("sh_rest", (harmonic,))
+        with np.errstate(under="ignore"):
+            weighted = getattr(splats, name)[(members, *of)] * share[:, None]  # (m, 3)
+            means = np.add.reduceat(weighted, starts).clip(-largest, largest)
+            getattr(left, name)[(into[starts], *of)] = means.astype(np.float32)
+
+    harmonics = range(-1, splats.sh_rest.shape[1]) if len(starts) else ()
+    run_all(fill, harmonics, progress=progress, what="merging", threads=threads)
 
 
 def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) -> Splats:

@@ -1,7 +1,7 @@
 """Where two splats become one: what it costs the pictures, and the merged splat, colours included.
 
-`price` and `costs` are the cost of a pair, `merge` is the merged splat, `blend` its harmonics, and
-`as_splats` what a file stores of it.
+`price` and `costs` are the cost of a pair, `merge` is the merged splat, and `as_splats` what a file
+stores of it; its harmonics are in `merge.py`.
 
 Splat i changes the picture by its footprint ``f_i = alpha_i exp(-q_i / 2)`` times the contrast
 ``s_i = c_i - B`` between its colour and the colour behind it. The views measure two sums over all
@@ -31,7 +31,6 @@ standard deviation of the viewing directions to either side of their mean (`cost
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -266,9 +265,7 @@ class _Signal(NamedTuple):
     mass: Real
 
 
-def _signal(
-    covariances: Real, opacity: Real, plane: tuple[Real, Real], blur: Real, model: Model
-) -> _Signal:
+def _signal(covariances, opacity, plane, blur, model):
     """Splats in a plane, spanned by unit vectors, with a low-pass of variance `blur`."""
     if model == "2dgs":
         ellipse = _disc_as_drawn(footprint(covariances.T, plane, np.zeros(len(blur))), blur)
@@ -349,68 +346,6 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
         pairs.color * one.blur + (1.0 - pairs.color) * two.blur,
         model=one.model,
     )
-
-
-def groups(merges: Sequence[tuple[Index, Index, Array]], count: int) -> tuple[Index, Array]:
-    """The splat that each of some went into, or is, and its share of the colour of that one.
-
-    Parameters
-    ----------
-    merges : list of (into, gone, share)
-        Of each round, see `graph.MergeGraph`.
-    count : int
-        Of the splats, N.
-
-    Returns
-    -------
-    owner, share : (N,) int64, (N,) float64
-    """
-    owner, share = np.arange(count), np.ones(count)
-    # From the last round to the first: what a round merges into may go into another in a later one.
-    for into, gone, kept_share in reversed(merges):
-        owner[gone] = owner[into]
-        share[gone] = share[into] * (1.0 - kept_share)
-        share[into] *= kept_share
-    return owner, share
-
-
-def blend(
-    values: NDArray[Any],
-    members: Index,
-    share: Array,
-    merged: NDArray[Any],
-    into: Index,
-    progress: Progress,
-    threads: int | None,
-) -> None:
-    """Write the harmonics of merged splats: means of those of all that went into one, by shares.
-
-    Rounded to float32, whatever type they have, so that tiles and files give the same.
-
-    Parameters
-    ----------
-    values : (N, n, 3) floating
-        Harmonics of the splats before.
-    members : (m,) int64
-        Rows of those that went into one, group by group.
-    share : (m,) float64
-        Of each in the colour of the merged splat, see `groups`.
-    merged : (K, n, 3) floating
-        Harmonics of the kept splats; changed.
-    into : (m,) int64
-        Row of the merged splat of each.
-    progress, threads
-    """
-    starts, largest = np.flatnonzero(np.diff(into, prepend=-1)), np.finfo(np.float32).max
-
-    def fill(harmonic: int) -> None:  # one at a time, to save memory
-        with np.errstate(under="ignore"):
-            weighted = values[members, harmonic] * share[:, None]  # (m, 3)
-            means = np.add.reduceat(weighted, starts).clip(-largest, largest)
-            merged[into[starts], harmonic] = means.astype(np.float32)
-
-    harmonics = values.shape[1] if len(starts) else 0
-    run_all(fill, range(harmonics), progress=progress, what="merging", threads=threads)
 
 
 def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[Array, Array, Array]:

@@ -46,6 +46,8 @@ from ..visibility.projection import Footprints, Gaussians
 from ..visibility.rays import LEAST_LEFT, Rays
 from ..visibility.scene import Scene
 
+Singles = NDArray[np.float32]
+
 COLOR, DEGREE_1, OPACITY, MEAN, SCALE, TURN = (
     slice(0, 3), slice(3, 12), slice(12, 13), slice(13, 16), slice(16, 19), slice(19, 22)
 )  # fmt: skip
@@ -84,8 +86,8 @@ class Shapes:
 
     gaussians: Gaussians
     scene: Scene
-    axes: NDArray[np.float32]
-    scales: NDArray[np.float32]
+    axes: Singles
+    scales: Singles
 
     @classmethod
     def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene) -> Shapes:
@@ -106,7 +108,7 @@ class Shapes:
         axes, scales = self.axes.take(hit, axis=2), self.scales.take(hit, axis=1)
         return Shapes(self.gaussians.take(hit), self.scene, axes, scales)
 
-    def in_scene(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
+    def in_scene(self, change: Singles) -> Singles:
         """Changed parameters, (22, M), as changes in the frame of the scene.
 
         Returns
@@ -127,7 +129,7 @@ class Shapes:
                 result[row] += by * (one[i] * other[k] + one[k] * other[i])
         return result
 
-    def by_parameter(self, sums: NDArray[np.float32]) -> NDArray[np.float32]:
+    def by_parameter(self, sums: Singles) -> Singles:
         """The transpose of `in_scene`: of such sums, see `LinearView.backward`, (22, M)."""
         result = np.zeros((COUNT, len(self)), np.float32)
         result[COLOR] = np.float32(SH_C0) * sums[COLOR]
@@ -187,7 +189,7 @@ class LinearView:
     """
 
     hit: NDArray[np.int64]
-    errors: NDArray[np.float32]
+    errors: Singles
     hitting: NDArray[np.int64]
     counts: NDArray[np.int64]
     owner: NDArray[Any]
@@ -195,12 +197,10 @@ class LinearView:
     by_log_alpha: NDArray[np.uint16]
     steepness: NDArray[np.uint16]
     unclipped: NDArray[np.bool_]
-    jacobian: NDArray[np.float32]
-    basis: NDArray[np.float32]
+    jacobian: Singles
+    basis: Singles
 
-    def forward(
-        self, change: NDArray[np.float32], hits: tuple[Any, ...] | None = None
-    ) -> NDArray[np.float32]:
+    def forward(self, change: Singles, hits: tuple[Any, ...] | None = None) -> Singles:
         """By how much the colours change, (3, P), to first order.
 
         Parameters
@@ -240,9 +240,7 @@ class LinearView:
             row[self.hitting] = np.add.reduceat(light, first)
         return result
 
-    def backward(
-        self, errors: NDArray[np.float32], hits: tuple[Any, ...] | None = None
-    ) -> NDArray[np.float32]:
+    def backward(self, errors: Singles, hits: tuple[Any, ...] | None = None) -> Singles:
         """The transpose of `forward` times some errors of the colours.
 
         Parameters
@@ -286,7 +284,7 @@ class LinearView:
                 result[row] *= np.float32(2.0)
         return result
 
-    def normal(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
+    def normal(self, change: Singles) -> Singles:
         """`backward` of `forward`."""
         hits = self.hits()
         return self.backward(self.forward(change, hits), hits)
@@ -296,7 +294,7 @@ class LinearView:
         halves = ([_floats(row) for row in rows] for rows in (self.by_log_alpha, self.steepness))
         return self.owner.astype(np.intp), _floats(self.weight), *halves
 
-    def _polynomials(self, change: list[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+    def _polynomials(self, change: list[Singles]) -> list[Singles]:
         """Coefficients of x, y, x^2, x y, y^2 of changed geometry, (u,) each."""
         xx, xy, xz, yy, yz, zz = change[SCALE.start :]
         one, other = self.jacobian
@@ -307,7 +305,7 @@ class LinearView:
             _dot(one, turned[0]), np.float32(2.0) * _dot(other, turned[0]), _dot(other, turned[1]),
         ]  # fmt: skip
 
-    def diagonal(self, shapes: Shapes) -> NDArray[np.float32]:
+    def diagonal(self, shapes: Shapes) -> Singles:
         """Squared length of each column, that is of each parameter, (22, u).
 
         Of the three harmonics of a degree the mean, which does not turn with the axes of the world.
@@ -352,9 +350,7 @@ class LinearView:
             result[TURN.start + axis] = _squared(turned, of_fourth)
         return result
 
-    def _sum(
-        self, values: NDArray[np.float32], owner: NDArray[np.intp], kind: Any = np.float32
-    ) -> NDArray[Any]:
+    def _sum(self, values, owner, kind=np.float32):
         """Sums of values of hits over the hits of each splat, (u,)."""
         return np.bincount(owner, values, len(self.hit)).astype(kind, copy=False)
 
@@ -364,7 +360,7 @@ def _of_channel(channel: int) -> slice:
     return slice(DEGREE_1.start + channel, DEGREE_1.stop, 3)
 
 
-def _basis(shapes: Shapes, view: View) -> NDArray[np.float32]:
+def _basis(shapes: Shapes, view: View) -> Singles:
     """Values of the harmonics of the first degree in the direction of view, (3, u)."""
     scene = shapes.scene
     from_view = shapes.gaussians.means.astype(np.float64)
@@ -379,9 +375,7 @@ def _dot(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> NDArray[
     return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
 
 
-def _squared(
-    polynomial: NDArray[np.float32], sums: Sequence[NDArray[np.float32]]
-) -> NDArray[np.float32]:
+def _squared(polynomial: Singles, sums: Sequence[Singles]) -> Singles:
     """Sums over hits of squared polynomials, (u,)."""
     a, b, c = polynomial
     result = a * a * sums[0] + (b * b + 2.0 * a * c) * sums[2] + c * c * sums[4]
@@ -390,10 +384,10 @@ def _squared(
 
 
 def linear_view(
-    visible: tuple[Rays, NDArray[np.float32]],
+    visible: tuple[Rays, Singles],
     footprints: Footprints,
-    truth: NDArray[np.float32],
-    colors: NDArray[np.float32],
+    truth: Singles,
+    colors: Singles,
     shapes: Shapes,
     view: View,
 ) -> tuple[LinearView, Shapes]:
@@ -449,7 +443,7 @@ def linear_view(
     return linear, shapes
 
 
-def _trust(errors: NDArray[np.float32]) -> NDArray[np.float32]:
+def _trust(errors: Singles) -> Singles:
     """How much the rays of a view count, of their errors, (3, P): roots of weights, (P,).
 
     Errors of more than `HUBER` times their root mean square count in proportion, not squared
@@ -461,19 +455,17 @@ def _trust(errors: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(most / np.maximum(np.sqrt(squared), most)), np.float32)
 
 
-def _halves(values: NDArray[np.float32]) -> NDArray[np.uint16]:
+def _halves(values: Singles) -> NDArray[np.uint16]:
     """The upper halves of the bits of some numbers, rounded: they keep them to 1 / 256."""
     return ((values.view(np.uint32) + np.uint32(1 << 15)) >> np.uint32(16)).astype(np.uint16)
 
 
-def _floats(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
+def _floats(halves: NDArray[np.uint16]) -> Singles:
     """The numbers of `_halves`."""
     return (halves.astype(np.uint32) << np.uint32(16)).view(np.float32)
 
 
-def _steepness_on_discs(
-    discs: NDArray[np.float32], step: list[NDArray[np.float32]]
-) -> NDArray[np.float32]:
+def _steepness_on_discs(discs: Singles, step: list[Singles]) -> Singles:
     """`_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
 
     With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian.
@@ -495,7 +487,7 @@ def _steepness_on_discs(
     return result
 
 
-def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> NDArray[np.float32]:
+def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> Singles:
     """`LinearView.steepness` of some hits, (2, h) or (3, h), as numbers."""
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
     place[footprints.index] = np.arange(len(footprints.index))

@@ -28,7 +28,7 @@ change.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -38,23 +38,13 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, part, run_all, seconds, silent, stages
-from ..mapped import (
-    divided,
-    folder_of,
-    in_one,
-    in_regions,
-    look,
-    new_folder,
-    note,
-    noted,
-    on_disk,
-)
+from ..mapped import divided, folder_of, in_one, in_regions, look, new_folder, note, noted, on_disk
 from ..splats import Splats, rotation_matrices, unit_quaternions
 from ..views import View, ViewSet
 from ..visibility import projection
 from ..visibility.projection import Footprints, Gaussians
-from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN
-from .round_rays import LARGEST, LinearRays, RoundRays, Target, Window, limits, steps_of
+from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, Singles
+from .round_rays import LARGEST, RoundRays, Target, Window, limits, steps_of
 
 STEPS = 8
 """Steps of conjugate gradients in a round."""
@@ -247,7 +237,7 @@ def refit_on(
         yield replace(best, why_not=ONE_PLACE)
         return
     yield best
-    before: Told = np.zeros((COUNT, count), np.float32), np.zeros((COUNT, count), np.float32)
+    before = np.zeros((2, COUNT, count), np.float32)
     more, undone = 1.0, False
     for number in range(1, (rounds or MAX_ROUNDS) + 1):
         start, done = done, done + (1.0 - done) / max(ahead - number + 1, 1)
@@ -278,20 +268,11 @@ def refit_on(
             more, undone = more * MORE_DAMPING, True
 
 
-Told = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""What rounds have told of the parameters of N splats, (22, N) each: K, and what is left of J'r."""
+def _solve(linear, movable, damping, before, *, progress, threads):
+    """By how much to change the parameters of N splats, (22, N), and what rays told.
 
-
-def _solve(
-    linear: LinearRays,
-    movable: NDArray[np.bool_],
-    damping: float,
-    before: Told,
-    *,
-    progress: Progress,
-    threads: int | None,
-) -> tuple[NDArray[np.float32], Told]:
-    """By how much to change the parameters of N splats, (22, N), and what rays told."""
+    Like what they told `before` that is K, (22, N), and what is left of J'r, (22, N).
+    """
     index = linear.shapes.gaussians.index
     moving = movable[:, index]
     steps = [part(progress, k / STEPS, (k + 1) / STEPS) for k in range(STEPS)]
@@ -306,7 +287,7 @@ def _solve(
         1.0, diagonal + damped, out=np.zeros_like(damped), where=diagonal > _NOTHING
     )
 
-    def product(direction: NDArray[np.float32], step: Progress) -> NDArray[np.float32]:
+    def product(direction, step):
         result = linear.normal(direction, step, threads)
         result *= moving
         result += damped * direction
@@ -324,12 +305,7 @@ def _solve(
     return result, told
 
 
-def _conjugate_gradients(
-    product: Callable[[NDArray[np.float32], Progress], NDArray[np.float32]],
-    residual: NDArray[np.float32],
-    inverse: NDArray[np.float32],
-    steps: list[Progress],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _conjugate_gradients(product, residual, inverse, steps):
     """About the solution x of ``product(x) = residual``, by a few steps from 0.
 
     And what it leaves of the residual.
@@ -353,12 +329,12 @@ def _conjugate_gradients(
     return solution, residual
 
 
-def _dot(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+def _dot(one: Singles, other: Singles) -> float:
     """The inner product of two arrays, (22, N), summed in float64."""
     return float(sum(np.sum(a * b, dtype=np.float64) for a, b in zip(one, other, strict=True)))
 
 
-def _worthwhile(change: NDArray[np.float32]) -> NDArray[np.float32]:
+def _worthwhile(change: Singles) -> Singles:
     """A change in which means move only where that is worth it, (22, N).
 
     Splats are drawn in the order of their means, and each move puts some behind others that were
@@ -486,7 +462,7 @@ class _Amid(Target):
         both = _Both(**vars(self.gaussians), every=self.every.gaussians, others=self.others)
         return projection.project(both, self.scene, window.view, window.part)
 
-    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
+    def colors(self, hit: NDArray[np.int64], view: View) -> Singles:
         """Colours in which a view sees some of the Gaussians, ascending, (3, u)."""
         count = len(self.gaussians)
         mine = int(np.searchsorted(hit, count))

@@ -34,9 +34,7 @@ from ..visibility.cast import cast_visible, depth_complexity, pixels
 from ..visibility.projection import Footprints, Gaussians
 from ..visibility.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, VALIDATION_VIEWS
 from ..visibility.scene import Scene
-from .linear import COUNT, LEAST_WEIGHT, LinearView, Shapes, linear_view
-
-Singles = NDArray[np.float32]
+from .linear import COUNT, LEAST_WEIGHT, LinearView, Shapes, Singles, linear_view
 
 RAYS_OF_SPLAT = 7.0
 """Rays of a round for each kept splat: with fewer, they are learned by heart, and two rounds of
@@ -175,12 +173,12 @@ class Target:
         """Footprints in a view that may reach into a window, with the rows of the Gaussians."""
         return projection.project(self.gaussians, self.scene, window.view, window.part)
 
-    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
+    def colors(self, hit: NDArray[np.int64], view: View) -> Singles:
         """Colours in which a view sees some of the Gaussians, (3, u)."""
         return colors_of(self.splats, self.gaussians.index[hit], view)
 
 
-def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float32]:
+def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> Singles:
     """Colours in which a view sees some splats, (3, u), as far as they can be drawn."""
     result = np.empty((3, len(rows)), np.float32)
     for piece in chunks(len(rows), _CHUNK):
@@ -212,7 +210,7 @@ class Truth(NamedTuple):
 
     columns: NDArray[np.int64]
     rows: NDArray[np.int64]
-    colors: NDArray[np.float32]
+    colors: Singles
     shown: float
 
 
@@ -244,12 +242,7 @@ class RoundRays:
 
     @classmethod
     def of(
-        cls,
-        original: Splats,
-        views: ViewSet,
-        count: int,
-        progress: Progress,
-        threads: int | None,
+        cls, original: Splats, views: ViewSet, count: int, progress: Progress, threads: int | None
     ) -> RoundRays:
         """Rays of all views into splats in memory.
 
