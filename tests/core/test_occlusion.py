@@ -12,7 +12,7 @@ from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, exe
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.splats import ARRAYS, SH_C0, rotation_matrices
-from refine_addon.core.visibility import froxels, lattices, measuring, projection
+from refine_addon.core.visibility import lattices, measuring, projection
 from refine_addon.core.visibility import points as points_module
 from refine_addon.core.visibility.measuring import Measured, Sampling
 
@@ -49,7 +49,7 @@ def measured(splats: Splats, *views: View, sampling: Sampling = SAMPLING) -> Mea
     gaussians, frame, _ = projection.prepare(splats, ViewSet(views), threads=1)
     total = Measured.zero(len(gaussians))
     for view in views:
-        total.add_view(measuring.measure_view(gaussians, frame, view, sampling)[1], 1.0)
+        total.add_view(measuring._measure_view(gaussians, frame, view, sampling)[1], 1.0)
     back = np.argsort(gaussians.index)
     return Measured(total.contribution[back], total.error[back], total.seen[back])
 
@@ -202,13 +202,13 @@ def test_transmittance_is_the_mean_of_exp_of_a_gamma_distributed_thickness():
 
     What is even before it takes its exact share of that.
     """
-    shape = froxels.GAMMA_SHAPE
+    shape = measuring.GAMMA_SHAPE
     draws = np.random.default_rng(1).gamma(shape, size=400_000) / shape
     mean = np.array([0.0, 0.5, 3.0], np.float32)
     even = np.array([0.0, 0.5, 1.0], np.float32)
 
-    loose = froxels.transmittance(mean, np.zeros_like(mean))
-    partly = froxels.transmittance(mean + even, even)
+    loose = measuring._transmittance(mean, np.zeros_like(mean))
+    partly = measuring._transmittance(mean + even, even)
 
     np.testing.assert_allclose(loose, [np.exp(-m * draws).mean() for m in mean], atol=2e-3)
     np.testing.assert_allclose(partly, loose * np.exp(-even), rtol=1e-5)
@@ -221,7 +221,7 @@ def test_a_splat_as_narrow_as_a_cell_is_half_even():
         np.arange(3), sigmas, sigmas, sigmas, sigmas, np.ones(3, bool), np.ones(3, np.float32)
     )
 
-    found = froxels.evenness(footprints, 16.0)
+    found = measuring._evenness(footprints, 16.0)
 
     np.testing.assert_allclose(found, [0.5, 0.1, 0.9], rtol=1e-6)
 
@@ -330,7 +330,7 @@ def test_a_splat_covers_no_more_of_a_cell_than_its_opacity():
     alone = measured(front.take(slice(1, 2)), square(), sampling=sampling)
 
     even = (2.0**2 + 0.3) / (2.0**2 + 0.3 + 16.0)
-    k = froxels.GAMMA_SHAPE
+    k = measuring.GAMMA_SHAPE
     passed = 2.0**-even * (1.0 + (1.0 - even) * math.log(2.0) / k) ** -k
     assert found.contribution[1] / alone.contribution[0] == pytest.approx(passed, rel=1e-3)
 

@@ -3,28 +3,38 @@
     contribution_i = sum over views of  integral of alpha_i  x  mean T        MesonGS, LightGaussian
     error_i        = sum over views of  integral of alpha_i^2  x  mean of T^2 |c_i - B_i|^2
 
-T is the transmittance in front of the splat, c_i its colour and B_i the colour behind it; T and B
-come from `froxels`. The error is the squared change of the pictures when this one splat is removed,
-which REFINE's Hessian approximates.
+T is the transmittance in front of the splat, c_i its colour and B_i the colour behind it. The error
+is the squared change of the pictures when this one splat is removed, which REFINE's Hessian
+approximates.
+
+T and B come from froxels: cells of the image times slabs of depth. Points sorted by depth within
+their cell (`points`) are slabs without thickness, so no grid of depths has to be chosen or stored:
+running sums down the column of points of a cell give the optical thickness in front of each point
+and the colour behind it. A point of mass m covers the share ``a = m / A`` of a cell of area A.
+Points that are independent of each other transmit ``prod (1 - a)``, so each has the optical
+thickness ``-log(1 - a)``.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, chunks, run, run_all, silent
+from ..execute import Progress, checkpoint, chunks, run, run_all, silent
+from ..splats import ALPHA_CUT, ALPHA_MAX
 from ..views import View
-from . import froxels, projection
-from .points import cell_size, scatter
-from .projection import Footprints, Gaussians
+from . import projection
+from .points import cell_size, runs, scatter
+from .projection import Gaussians
 from .ray_sample import RaySample, cast_view
+from .rays import contrasts, in_front, paired
 from .scene import Scene
 
 VIEW_GROUPS = 8
@@ -33,6 +43,18 @@ threads."""
 
 SECONDS = 1.2e-6
 """About how long one core takes to measure a splat in one view, to tell what is worth a process."""
+
+GAMMA_SHAPE = 2.3
+"""Shape of the gamma distribution of the thickness in front of a point. The larger it is, the
+narrower the distribution: `_transmittance` tends to exp(-mean)."""
+
+_MAX_THICKNESS = 60.0
+"""Behind a larger optical thickness nothing is seen; keeps exponentials in float32's range."""
+
+_LEAST_LEFT = 1e-4
+"""The colour behind a point is divided by the transmittance behind it, and at least by this: less
+cannot be seen. Thicknesses of cells are means, so hidden points are not left out before as those of
+rays are."""
 
 _ADDED = 1 << 16  # splats of a view that are added to the sums at a time
 
@@ -97,36 +119,19 @@ class Measured(NamedTuple):
             getattr(self, name)[:] += getattr(other, name)
 
     def add_view(
-        self, measurement: ViewMeasurement, weight: float, threads: int | None = 1
+        self, measured: tuple[NDArray[Any], ...], weight: float, threads: int | None = 1
     ) -> None:
-        """Add what one view sees, times its weight."""
+        """Add what one view sees, see `_measure_view`, times its weight."""
+        rows, inside, contribution, error = measured
 
         def add(piece):
-            rows = measurement.rows[piece]  # no row is there twice
-            self.seen[rows[measurement.inside[piece]]] += 1
+            some = rows[piece]  # no row is there twice
+            self.seen[some[inside[piece]]] += 1
             with np.errstate(under="ignore"):
-                self.contribution[rows] += weight * measurement.contribution[piece]
-                self.error[rows] += weight * measurement.error[piece]
+                self.contribution[some] += weight * contribution[piece]
+                self.error[some] += weight * error[piece]
 
-        run_all(add, chunks(len(measurement.rows), _ADDED), threads=threads)
-
-
-class ViewMeasurement(NamedTuple):
-    """What one view sees of n Gaussians.
-
-    Attributes
-    ----------
-    rows : (n,) int64
-    inside : (n,) bool
-        Which centres lie in the view's frustum.
-    contribution, error : (n,) float64
-        Integrals over its image, px^2; see the top of this file.
-    """
-
-    rows: NDArray[np.int64]
-    inside: NDArray[np.bool_]
-    contribution: NDArray[np.float64]
-    error: NDArray[np.float64]
+        run_all(add, chunks(len(rows), _ADDED), threads=threads)
 
 
 def view_groups(count: int) -> list[range]:
@@ -206,17 +211,19 @@ def measure(
 def _measure_and_cast(gaussians, scene, views, sampling, number_and_kinds):
     """What a view sees of the splats, and its scoring or validation rays; any process can."""
     number, kinds = number_and_kinds
-    footprints, measurement = measure_view(gaussians, scene, views[number][0], sampling)
+    footprints, measurement = _measure_view(gaussians, scene, views[number][0], sampling)
     with np.errstate(under="ignore"):
         return measurement, [
             cast_view(views, number, footprints, scoring=scoring) for scoring in kinds
         ]
 
 
-def measure_view(
-    gaussians: Gaussians, scene: Scene, view: View, sampling: Sampling
-) -> tuple[Footprints, ViewMeasurement]:
-    """Footprints in a view, and what it sees of them."""
+def _measure_view(gaussians, scene, view, sampling):
+    """Footprints in a view, and what it sees of the n Gaussians that they are of.
+
+    Their rows, which centres lie in the view's frustum, and contributions and errors: integrals
+    over its image, px^2, see the top of this file; (n,) each.
+    """
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         integrals = np.empty(0), np.empty(0)
@@ -224,5 +231,87 @@ def measure_view(
             side = cell_size(footprints, view, sampling.cell, sampling.density)
             points = scatter(footprints, view, side, sampling.density)
             colors = gaussians.colors[footprints.index]  # (n, 3)
-            integrals = froxels.integrals(footprints, colors, points)
-    return footprints, ViewMeasurement(footprints.index, footprints.inside, *integrals)
+            integrals = _integrals(footprints, colors, points)
+    return footprints, (footprints.index, footprints.inside, *integrals)
+
+
+def _integrals(footprints, colors, points):
+    """Integrals over the image of ``alpha T`` and of ``alpha^2 T^2 |c - B|^2``, (n,) each, px^2.
+
+    Of each the integral of alpha or alpha^2 over the whole footprint is exact, times the mean over
+    its points in the image, weighted alike. S is the product of the two sigmas, A the opacity, and
+    q the squared Mahalanobis distance. The footprint ends where alpha falls to `ALPHA_CUT`::
+
+        integral of A exp(-q / 2) = 2 pi S (A - cut)
+        integral of A^2 exp(-q)   =   pi S (A^2 - cut^2)
+    """
+    alphas, count = footprints.alphas, len(footprints.alphas)
+    area = np.float32(2.0 * math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
+    excess = alphas - np.float32(ALPHA_CUT)
+    mass = area * excess
+    mass_squared = np.float32(0.5) * area * excess * (alphas + np.float32(ALPHA_CUT))
+    # What points take from their splats, in one table: one look-up is faster than six.
+    traits = np.empty((count, 6), np.float32)
+    traits[:, :3] = colors
+    traits[:, 3] = mass / np.float32(points.area)
+    np.minimum(alphas, np.float32(ALPHA_MAX), out=traits[:, 4])
+    traits[:, 5] = _evenness(footprints, points.area)
+    visible, errors = np.empty((2, len(points.owners)))  # (m,) each
+    for cells, members in runs(points.counts):
+        shares, counts = points.shares[members], points.counts[cells]
+        of_points = traits.take(points.owners[members], axis=0)
+        covered = shares * of_points[:, 3]  # of the cell; at most the splat's opacity
+        np.minimum(covered, of_points[:, 4], out=covered)
+        thick = -np.log(np.float32(1.0) - covered)
+        sums = in_front(paired(thick, thick * of_points[:, 5]), counts)
+        front, even = sums.real.astype(np.float32), sums.imag.astype(np.float32)
+        weight = _transmittance(front, even)
+        weight *= shares
+        visible[members] = weight
+        weight *= weight
+        errors[members] = weight * _squared_contrast(front, covered, of_points[:, :3], counts)
+    checkpoint()
+    owners = points.owners.astype(np.int64)
+    error = np.bincount(owners, errors, count).astype(float)
+    # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
+    # footprint that lies in the image.
+    error *= points.share_inside / np.maximum(points.squares, 1e-30)
+    return mass * np.bincount(owners, visible, count), mass_squared * error
+
+
+def _evenness(footprints, area):
+    """Share of each splat's thickness that counts as uniform over the cell, (n,).
+
+    It is ``s^2 / (s^2 + area)``, with s the shorter sigma and the area of the cell: near 0 for a
+    splat much narrower than a cell, which leaves gaps, and near 1 for a much wider one.
+    """
+    narrow = footprints.sigmas[1] ** 2
+    return narrow / (narrow + np.float32(area))
+
+
+def _transmittance(front, even):
+    """Transmittance in front of each point, (m,), given the mean thickness in front.
+
+    Splats narrower than a cell leave gaps, so the thickness in front of a point differs from the
+    cell's mean. It is modelled as gamma distributed with shape k, and the transmittance is the
+    expectation ``E[exp(-tau)] = (1 + mean / k)^-k``. (With ``exp(-mean)``, splats that show through
+    foliage would count as hidden and be removed.) The even part, see `_evenness`, has no gaps:
+    ``exp(-even)``.
+    """
+    shape = np.float32(GAMMA_SHAPE)
+    gaps = np.maximum(front - even, np.float32(0.0))
+    return np.exp(-even) * (np.float32(1.0) + gaps / shape) ** -shape
+
+
+def _squared_contrast(front, covered, colors, counts):
+    """Squared contrast of each point, (m,), given the thickness in front and the share it covers.
+
+    Point j adds ``T_j a_j c_j`` to the picture; T_j is the transmittance in front of it and a_j the
+    share of the cell that it covers. The colour behind point k, over black, is
+    ``B_k = (sum over j > k of T_j a_j c_j) / T_{k+1}``. The contrast ``c_k - B_k`` is squared and
+    summed over the channels. `counts`, (C,), is how many points each column has.
+    """
+    weight = np.exp(-np.minimum(front, np.float32(_MAX_THICKNESS)))  # T_k
+    left = np.maximum(weight * (np.float32(1.0) - covered), np.float32(_LEAST_LEFT))  # T_{k+1}
+    weight *= covered  # T_k a_k
+    return sum(contrast * contrast for contrast in contrasts(weight, left, colors.T, counts))

@@ -2,7 +2,7 @@
 
 Each footprint is replaced by a lattice of points; each point has a share of the splat's mass, which
 is the integral of its alpha. The image is divided into square cells. Within a cell the points are
-sorted by depth: `froxels` tells what hides them.
+sorted by depth: `measuring` tells what hides them.
 """
 
 from __future__ import annotations

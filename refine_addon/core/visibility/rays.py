@@ -9,11 +9,12 @@ So the colours of these pixels are known with all splats and with any choice of 
 
 Values of all rays lie one after the other, those of each front to back. Running sums run over all
 of them at once and restart at each ray, which costs no loop over rays; likewise down the columns of
-points in the cells of an image (`froxels`).
+points in the cells of an image (`measuring`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -245,13 +246,8 @@ def _removal_errors(alpha, log_passed, colors, counts):
     transmittance[log_front < LOG_OPAQUE] = 0.0
     weight = transmittance * alpha
     left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))  # transmittance behind it
-    red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
-    blue = behind((weight * colors[2]).astype(np.float64), counts)
     error = np.zeros(len(alpha), np.float32)
-    for own, sum_behind in zip(colors, (red_green.real, red_green.imag, blue), strict=True):
-        change = sum_behind.astype(np.float32)
-        change /= left  # the colour behind
-        change -= own
+    for change in contrasts(weight, left, colors, counts):
         change *= weight
         change *= change
         error += change
@@ -303,3 +299,30 @@ def behind(values: NDArray[Any], counts: NDArray[np.int64]) -> NDArray[Any]:
     """
     sums = np.cumsum(values)
     return np.repeat(sums.take(np.cumsum(counts) - 1), counts) - sums
+
+
+def contrasts(
+    weight: NDArray[np.float32],
+    left: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    counts: NDArray[np.int64],
+) -> Iterator[NDArray[np.float32]]:
+    """Yield of each channel the colour behind each value less its own, (m,).
+
+    Parameters
+    ----------
+    weight : (m,) float32
+        Transmittance in front of each value times its alpha.
+    left : (m,) float32
+        Transmittance behind it, above 0.
+    colors : (3, m) float32
+    counts : (C,) int64
+        See `in_front`.
+    """
+    red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
+    blue = behind((weight * colors[2]).astype(np.float64), counts)
+    for own, light in zip(colors, (red_green.real, red_green.imag, blue), strict=True):
+        contrast = light.astype(np.float32)
+        contrast /= left  # the colour behind
+        contrast -= own
+        yield contrast
