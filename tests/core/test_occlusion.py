@@ -12,7 +12,7 @@ from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, exe
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.splats import ARRAYS, SH_C0, rotation_matrices
-from refine_addon.core.visibility import lattices, measuring, projection
+from refine_addon.core.visibility import measuring, projection
 from refine_addon.core.visibility import points as points_module
 from refine_addon.core.visibility.measuring import Measured, Sampling
 
@@ -228,7 +228,7 @@ def test_a_splat_as_narrow_as_a_cell_is_half_even():
 
 def lattice(kind: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the points and shares of a lattice."""
-    table = lattices.lattice_table()
+    table = points_module._lattices()
     patches = slice(table.first[kind], table.first[kind] + table.patches[kind])
     start = table.start[patches.start]
     members = slice(start, start + table.sizes[patches].sum())
@@ -237,7 +237,7 @@ def lattice(kind: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_every_lattice_has_the_moments_of_the_normal_distribution():
     """Shares sum to 1, means are 0, variances 1, or 0 of a single point."""
-    for kind in range(len(lattices.COUNTS) ** 2):
+    for kind in range(len(points_module.COUNTS) ** 2):
         points, shares = lattice(kind)
 
         assert shares.sum() == pytest.approx(1.0, abs=1e-5)

@@ -35,7 +35,7 @@ from refine_addon.core.scoring import closed_form, occlusion
 from refine_addon.core.scoring.closed_form import LUMA, lambdas
 from refine_addon.core.selection import rank
 from refine_addon.core.splats import ARRAYS
-from refine_addon.core.visibility import lattices, measuring, points, projection, rays
+from refine_addon.core.visibility import measuring, points, projection, rays
 from refine_addon.core.visibility.measuring import Measured
 from refine_addon.core.visibility.scene import principal_axes
 from tests.strategies import plain_header, ply_of
@@ -279,7 +279,7 @@ def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     """
     some = views.take(range(0, len(views), every))
     scores = occlusion.score(file.splats(), some, rounds=rounds)
-    for module in (projection, lattices, points, measuring, rays):
+    for module in (projection, points, measuring, rays):
         monkeypatch.setattr(module, "np", Doubles())
     monkeypatch.setattr(projection, "_by_depth", lambda depth: np.argsort(depth, kind="stable"))
     gaussians, frame, _ = projection.prepare(wide(file.splats()), some)

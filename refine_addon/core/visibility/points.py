@@ -1,24 +1,35 @@
 """Points over the footprints of one view, sorted by depth within the cells of the image.
 
-Each footprint is replaced by a lattice of points; each point has a share of the splat's mass, which
-is the integral of its alpha. The image is divided into square cells. Within a cell the points are
+Each footprint is replaced by a lattice of points that stands for the normal distribution, with more
+of them the more cells it covers. Each point has a share of the splat's mass, which is the integral
+of its alpha. The image is divided into square cells. Within a cell the points are
 sorted by depth: `measuring` tells what hides them.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import checkpoint
 from ..views import View
-from .lattices import COUNTS, FLAT, WIDE_EXTENT, lattice_table
 from .projection import Footprints
+
+COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+"""How many points a lattice may have along an axis."""
+
+FLAT = 16
+"""A splat much larger than the image gets this many points across and down the image instead."""
+
+WIDE_EXTENT = 3.0
+"""Standard deviations to which a lattice of many points reaches."""
 
 FEW_CELLS = 10_000
 """An image may always have this many cells, even with few footprints."""
@@ -38,6 +49,10 @@ LEAST_POINTS = 1.25
 """Point limit of a view: ``max(MAX_POINTS, LEAST_POINTS x footprints)``. A footprint has at least
 one point, however large the cells are."""
 
+_EXTENT = 2.4  # standard deviations, of lattices of fewer than `_WIDE` points along an axis
+_WIDE = 8
+_CORNER = 0.1  # standard deviations; points farther than that beyond the extent are left out
+_PATCH = 6  # points along a side of a patch, at most
 _GROWTH = 2.0**0.25  # factor by which the side of a cell grows in a step
 _SLACK = 1.01  # on the side of a cell: a column of cells may lie partly outside the image
 _OUTSIDE = MAX_CELLS  # the cell number of points outside the image
@@ -45,6 +60,21 @@ _MARGIN = 1e-2  # cells; far more than what rounding moves a point by
 _BLOCK = 1 << 15  # points processed at a time, which limits temporary memory
 _VAST = 8  # a lattice whose points lie an eighth of the image apart could miss the image
 _FAR = 15.0  # standard deviations; farther out a Gaussian is 0 in float32
+
+
+class _Lattices(NamedTuple):
+    """L lattices of P patches and K points: a patch that misses the image is not laid out."""
+
+    first: NDArray[np.int64]  # (L,), the first patch of each lattice
+    patches: NDArray[np.int64]  # (L,), how many patches it has
+    start: NDArray[np.int64]  # (P,), the first point of each patch
+    sizes: NDArray[np.int64]  # (P,), how many points it has
+    # Of the box around each patch, standard deviations along the major and the minor axis, (2, P).
+    middle: NDArray[np.float32]
+    half: NDArray[np.float32]
+    points: NDArray[np.float32]  # (2, K), along the major and the minor axis, standard deviations
+    shares: NDArray[np.float32]  # (K,), of the mass
+    sums: NDArray[np.float32]  # (2, P), of the shares of each patch, and of their squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +162,7 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     vast = kinds == len(COUNTS) ** 2  # (n,), the few footprints much larger than the image
     axes[:, vast] = 0.0  # nothing is cut off; `_flat_points` replaces their points
     rows, patches, whole = _patches(axes, size, kinds)  # (q,) each
-    sizes = lattice_table().sizes.take(patches)  # (q,)
+    sizes = _lattices().sizes.take(patches)  # (q,)
     owners = np.repeat(rows.astype(np.int32), sizes)  # (p,)
     cells, shares, sums = _lay_out(axes, size, rows, patches, whole)  # (p,), (p,), (2, q)
     replaced = np.flatnonzero(vast.take(rows))
@@ -169,7 +199,7 @@ def _patches(axes, size, kinds):
     Rows of their footprints and of the table, (q,) int64 each, and which lie in the image with all
     of their points, (q,).
     """
-    table = lattice_table()
+    table = _lattices()
     count = table.patches.take(kinds)  # (n,)
     rows = np.repeat(np.arange(len(kinds)), count)  # (q,), as all that follows
     before = np.cumsum(count) - count - table.first.take(kinds)  # (n,)
@@ -195,7 +225,7 @@ def _lay_out(axes, size, rows, patches, whole):
     the mass, (p,) float32, 0 there; of each patch the sums of the shares, and of their squares,
     (2, q).
     """
-    table = lattice_table()
+    table = _lattices()
     sizes = table.sizes.take(patches)  # (q,)
     first = np.cumsum(sizes) - sizes  # (q,), number of each patch's first point
     cells = np.empty(int(sizes.sum()), np.uint16)
@@ -267,7 +297,7 @@ def _flat_points(footprints, row, view, side):
 
     The share of a point is the density of the splat's mass there times the area around the point.
     """
-    points = lattice_table().points[:, -(FLAT**2) :]
+    points = _lattices().points[:, -(FLAT**2) :]
     u = np.float32(view.width / 2) * (points[0] + 1)
     v = np.float32(view.height / 2) * (points[1] + 1)
     squared = np.zeros((len(row), len(u)), np.float32)  # squared Mahalanobis distance
@@ -302,3 +332,66 @@ def _merge(owners, shares, squares, counts):
         squares += np.bincount(owners.take(firsts), total * total - apart, len(squares))
         shares[more] = 0.0
         shares[firsts] = total
+
+
+@functools.cache
+def _lattices():
+    """All lattices: number ``i len(COUNTS) + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points.
+
+    One more at the end has `FLAT` by `FLAT` points over the image; their coordinates are -1 to 1,
+    in half image sizes.
+    """
+    axes = [_axis(count) for count in COUNTS]
+    steps = (np.arange(FLAT) + 0.5) / FLAT * 2.0 - 1.0
+    flat = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)
+    grids = [_lattice(major, minor) for major in axes for minor in axes]
+    grids.append((flat, np.full(FLAT**2, 1.0 / FLAT**2), np.array([FLAT**2])))
+    every_points, every_shares, patches = zip(*grids, strict=True)
+    points = np.concatenate(every_points, axis=1).astype(np.float32)
+    shares = np.concatenate(every_shares).astype(np.float32)
+    count, sizes = np.array([len(each) for each in patches]), np.concatenate(patches)
+    start = np.cumsum(sizes) - sizes
+    low, high = np.minimum.reduceat(points, start, 1), np.maximum.reduceat(points, start, 1)
+    sums = np.add.reduceat([shares, shares * shares], start, 1)
+    first = np.cumsum(count) - count
+    return _Lattices(
+        first, count, start, sizes, (low + high) / 2, (high - low) / 2, points, shares, sums
+    )
+
+
+def _lattice(major, minor):
+    """Points, (2, k), shares, (k,), and sizes of the patches of a grid without its corners.
+
+    It is scaled to variance 1 again.
+    """
+    product = np.outer(major[1], minor[1])  # (k_major, k_minor), shares
+    place = np.broadcast_arrays(major[0][:, None], minor[0])  # (k_major, k_minor) each
+    extent = WIDE_EXTENT if max(product.shape) >= _WIDE else _EXTENT
+    keep = np.hypot(*place) <= extent + _CORNER
+    keep |= product.size <= 4
+    shares = product[keep] / product[keep].sum()  # (k,)
+    points = np.stack([axis[keep] for axis in place])  # (2, k)
+    variance = (points * points) @ shares
+    points /= np.sqrt(np.where(variance > 0.0, variance, 1.0))[:, None]
+    parts = [-(-count // _PATCH) for count in product.shape]
+    row, column = (
+        np.arange(count) * number // count
+        for count, number in zip(product.shape, parts, strict=True)
+    )
+    patch = np.add.outer(row * parts[1], column)[keep]  # (k,)
+    order = np.argsort(patch, kind="stable")
+    sizes = np.bincount(patch)
+    return points[:, order], shares[order], sizes[sizes > 0]
+
+
+def _axis(count):
+    """Places and shares of the normal distribution: its mean in bins of equal width, variance 1."""
+    if count == 1:
+        return np.zeros(1), np.ones(1)
+    extent = WIDE_EXTENT if count >= _WIDE else _EXTENT
+    edges = np.linspace(-extent, extent, count + 1)
+    mass = np.diff([math.erf(edge / math.sqrt(2.0)) for edge in edges]) / 2.0
+    density = np.exp(-edges * edges / 2.0) / math.sqrt(2.0 * math.pi)
+    place = -np.diff(density) / mass  # the mean of the normal distribution within each bin
+    mass /= mass.sum()
+    return place / np.sqrt(np.sum(mass * place * place)), mass
