@@ -52,8 +52,8 @@ from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.splats import SH_C0, Splats, joined, opacity
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
+from refine_addon.core.visibility.cast import validation_rays
 from refine_addon.core.visibility.projection import Gaussians
-from refine_addon.core.visibility.ray_sample import validation_rays
 
 from .evaluate import Evaluator, read_scene
 

@@ -30,8 +30,8 @@ from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View, ViewSet
-from refine_addon.core.visibility import cast, points, projection, ray_sample
-from refine_addon.core.visibility.ray_sample import RaySample
+from refine_addon.core.visibility import cast, points, projection
+from refine_addon.core.visibility.cast import RaySample
 
 from .evaluate import read_scene
 
@@ -44,13 +44,14 @@ WIDER = 0.01
 
 def other_pixels(turn: int) -> AbstractContextManager[Any]:
     """Let rays go through other pixels, those of turn 0 as always."""
+    usual = cast.pixels
 
     def pixels(
         view: View, number: float, count: float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        return cast.pixels(view, number + 1000.25 * turn, count)
+        return usual(view, number + 1000.25 * turn, count)
 
-    return mock.patch.object(ray_sample, "pixels", pixels)
+    return mock.patch.object(cast, "pixels", pixels)
 
 
 def other_cells(turn: int) -> AbstractContextManager[Any]:
@@ -67,7 +68,7 @@ def held_out(splats: Splats, views: ViewSet, turn: int) -> RaySample:
     """Return rays of the held-out views."""
     gaussians, scene, _ = projection.prepare(splats, views)
     sample = RaySample(views.by_distance(), gaussians, splats)
-    sample.share = RAYS / ray_sample.VALIDATION_RAYS
+    sample.share = RAYS / cast.VALIDATION_RAYS
     with other_pixels(turn):
         sample.cast_all(gaussians, scene, silent, None)
     return sample

@@ -27,9 +27,8 @@ from .quality.psnr import psnr_of
 from .splats import NEAR_RELATIVE, SH_C0, Splats
 from .views import View, ViewSet
 from .visibility import frustum, projection
-from .visibility.cast import hits
+from .visibility.cast import colors_from, hits
 from .visibility.projection import Gaussians
-from .visibility.ray_sample import colors_from
 from .visibility.rays import LOG_OPAQUE, in_front
 from .visibility.scene import Scene
 from .whole_file import new_folder, refuse_existing, whole_file

@@ -34,8 +34,8 @@ from .scoring import closed_form, occlusion
 from .selection import Budget, quality_of, select
 from .splats import Splats
 from .views import ViewSet, refuse_other
+from .visibility.cast import validation_rays
 from .visibility.measuring import Measured
-from .visibility.ray_sample import validation_rays
 from .volumes import Forced, must_go
 
 TRIES = 3

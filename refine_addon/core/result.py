@@ -21,7 +21,7 @@ from .formats.registry import write_splats
 from .merging.merge import Merged
 from .scores import Scores
 from .splats import ARRAYS, Splats, among_all
-from .visibility.ray_sample import RaySample
+from .visibility.cast import RaySample
 
 
 @dataclass(frozen=True, eq=False)

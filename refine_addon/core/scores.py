@@ -12,7 +12,7 @@ from .errors import RefineError
 from .quality.alignment import Alignment
 from .quality.curve import Quality
 from .splats import among_all
-from .visibility.ray_sample import RaySample
+from .visibility.cast import RaySample
 
 _DISTINCT = 1 << 24  # largest number of equal steps from 0 to 1 that are distinct in float32
 

@@ -26,8 +26,7 @@ from refine_addon.core.pictures import (
 )
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
-from refine_addon.core.visibility.cast import cast
-from refine_addon.core.visibility.ray_sample import colors_from
+from refine_addon.core.visibility.cast import cast, colors_from
 
 C0 = 0.28209479177387814
 

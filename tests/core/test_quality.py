@@ -28,8 +28,8 @@ from refine_addon.core.quality.curve import PSNR_CAP, SHARES, Quality, absorbed_
 from refine_addon.core.quality.psnr import psnr_against, psnr_kept, psnr_of, quality_curve
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.splats import opacity
-from refine_addon.core.visibility import cast, projection, ray_sample
-from refine_addon.core.visibility.ray_sample import validation_rays
+from refine_addon.core.visibility import cast, projection
+from refine_addon.core.visibility.cast import validation_rays
 from refine_addon.core.visibility.rays import Rays
 from tests.core.test_invariance import MOTIONS, moved
 from tests.core.test_levels import merges  # noqa: F401 - a fixture
@@ -92,7 +92,7 @@ def test_rays_through_all_pixels_tell_the_psnr_of_the_picture():
     """Five views of 80 x 60 have 24,000 pixels; with as many rays nothing is left to chance."""
     splats, views, keep = cloud(), ring(), half(300)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(ray_sample, "VALIDATION_RAYS", 1 << 20)
+        patched.setattr(cast, "VALIDATION_RAYS", 1 << 20)
         found = validation_rays(splats, views)
 
     assert [len(rays.columns) * len(rays.rows) for rays in found.rays] == [80 * 60] * 5
@@ -103,7 +103,7 @@ def test_rays_through_all_pixels_tell_the_psnr_of_the_picture():
 def test_a_third_of_the_pixels_tell_it_nearly(monkeypatch):
     """8,192 of 24,000 pixels, of an error that is smooth over many pixels: within a quarter dB."""
     splats, views, keep = cloud(), ring(), half(300)
-    monkeypatch.setattr(ray_sample, "VALIDATION_RAYS", 1 << 13)
+    monkeypatch.setattr(cast, "VALIDATION_RAYS", 1 << 13)
 
     found = validation_rays(splats, views)
 
@@ -198,7 +198,7 @@ def test_in_dense_scenes_there_are_fewer_rays(monkeypatch):
     """300 splats wider than the picture: each ray hits all of them."""
     splats = splats_of(np.tile([[0, 0, 2.0]], (300, 1)), scales=100.0)
     views = ViewSet((look_along_z(),))
-    monkeypatch.setattr(ray_sample, "MAX_VALIDATION_HITS", 300 * 500)
+    monkeypatch.setattr(cast, "MAX_VALIDATION_HITS", 300 * 500)
 
     (rays,) = validation_rays(splats, views).rays
 

@@ -23,8 +23,7 @@ from refine_addon.core.splats import (
 )
 from refine_addon.core.visibility import cast as casting
 from refine_addon.core.visibility import projection
-from refine_addon.core.visibility.cast import cast, cast_visible, pixels
-from refine_addon.core.visibility.ray_sample import colors_from
+from refine_addon.core.visibility.cast import cast, cast_visible, colors_from, pixels
 from tests.core.test_invariance import moved, rotation
 from tests.core.test_occlusion import cloud, ring
 
@@ -756,7 +755,7 @@ def test_processes_change_no_bit(monkeypatch):
     expected = refit.refit(splats.take(np.arange(100)), splats, ring(), 2)
     for name in ("WORTH", "WORTH_READY"):
         monkeypatch.setattr(execute, name, 0.0)
-    monkeypatch.setattr(round_rays, "cast_visible", lambda *some: here.append(some))
+    monkeypatch.setattr(casting, "cast_visible", lambda *some: here.append(some))
 
     found = refit.refit(splats.take(np.arange(100)), splats, ring(), 2, threads=2)
 

@@ -24,7 +24,7 @@ from refine_addon.core.execute import Cancelled
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.splats import ARRAYS
-from refine_addon.core.visibility.ray_sample import validation_rays
+from refine_addon.core.visibility.cast import validation_rays
 from tests.strategies import ply_of
 
 from .test_prune import file, small, views  # noqa: F401 - fixtures

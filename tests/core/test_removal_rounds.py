@@ -12,10 +12,10 @@ from refine_addon.core import ViewSet
 from refine_addon.core.execute import Cancelled, silent
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.scoring.occlusion import KNOWN, _RemovalRounds
-from refine_addon.core.visibility import cast, projection, ray_sample
+from refine_addon.core.visibility import cast, projection
 from refine_addon.core.visibility import rays as rays_module
+from refine_addon.core.visibility.cast import RaySample
 from refine_addon.core.visibility.measuring import Measured
-from refine_addon.core.visibility.ray_sample import RaySample
 from refine_addon.core.visibility.rays import Rays
 from tests.core.test_occlusion import cloud, ring
 
@@ -184,7 +184,7 @@ def test_scoring_rays_are_others_than_validation_rays():
     footprints = projection.project(gaussians, frame, view)
 
     judging, ordering = (
-        [ray_sample.cast_view(views, number, footprints, scoring=scoring) for number in (0, 1)]
+        [cast.cast_view(views, number, footprints, scoring=scoring) for number in (0, 1)]
         for scoring in (False, True)
     )
 
@@ -202,7 +202,7 @@ def test_equally_many_scoring_and_validation_rays_lie_apart(count, monkeypatch):
 
     By `number + len(views)` 16 views had their rays 1 to 2 pixels apart.
     """
-    monkeypatch.setattr(ray_sample, "SCORING_RAYS", ray_sample.VALIDATION_RAYS)
+    monkeypatch.setattr(cast, "SCORING_RAYS", cast.VALIDATION_RAYS)
     view = replace(ring()[0], width=480, height=320, fx=450.0, fy=450.0, cx=240.0, cy=160.0)
     views = [(view, 1.0 / count)] * count
     gaussians, frame, _ = projection.prepare(cloud(20), ViewSet((view,)))
@@ -210,8 +210,7 @@ def test_equally_many_scoring_and_validation_rays_lie_apart(count, monkeypatch):
 
     for number in (0, count // 2, count - 1):
         some, others = (
-            ray_sample.cast_view(views, number, footprints, scoring=scoring)
-            for scoring in (False, True)
+            cast.cast_view(views, number, footprints, scoring=scoring) for scoring in (False, True)
         )
         across, down = (
             np.abs(one[:, None] - other).min(axis=1)
@@ -225,7 +224,7 @@ def test_no_view_has_more_rays_than_numbers_of_16_bits_tell_apart():
     gaussians, frame, _ = projection.prepare(cloud(), ViewSet((view,)))
     footprints = projection.project(gaussians, frame, view)
 
-    rays = ray_sample.cast_view([(view, 1.0)], 0, footprints, scoring=True)
+    rays = cast.cast_view([(view, 1.0)], 0, footprints, scoring=True)
 
     assert 59_000 < rays.count < 1 << 16
 
@@ -245,11 +244,10 @@ def test_a_view_has_no_more_hits_than_memory_is_for(monkeypatch):
     gaussians, frame, _ = projection.prepare(cloud(), ViewSet((view,)))
     footprints = projection.project(gaussians, frame, view)
     crowd = cast.depth_complexity(footprints, view)
-    monkeypatch.setattr(ray_sample, "MAX_HITS_OF_VIEW", 10_000 * crowd)
+    monkeypatch.setattr(cast, "MAX_HITS_OF_VIEW", 10_000 * crowd)
 
     one, of_eight = (
-        ray_sample.cast_view([(view, 1.0)] * count, 0, footprints, scoring=True).count
-        for count in (1, 8)
+        cast.cast_view([(view, 1.0)] * count, 0, footprints, scoring=True).count for count in (1, 8)
     )
 
     assert one == pytest.approx(10_000, rel=0.02)

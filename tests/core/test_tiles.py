@@ -53,8 +53,7 @@ from refine_addon.core.tiles import cluster, source, storage, writing
 from refine_addon.core.tiles import prune as tiles_prune
 from refine_addon.core.views import ViewSet
 from refine_addon.core.visibility import projection
-from refine_addon.core.visibility.cast import cast
-from refine_addon.core.visibility.ray_sample import validation_rays
+from refine_addon.core.visibility.cast import cast, validation_rays
 from refine_addon.core.whole_file import Url
 from tests.strategies import plain_header, plain_ply, ply_of, splat_names
 from tests.tiles import COUNT, ROOM, cut, room_rows, rows_in, write

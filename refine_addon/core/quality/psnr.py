@@ -18,8 +18,7 @@ from ..execute import Progress, part, run_all, silent
 from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import projection
-from ..visibility.cast import cast
-from ..visibility.ray_sample import RaySample, colors_from
+from ..visibility.cast import RaySample, cast, colors_from
 from .curve import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
 
 MIN_RAYS_WITH_HITS = 256

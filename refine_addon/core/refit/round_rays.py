@@ -29,10 +29,8 @@ from ..quality.psnr import psnr_of
 from ..spherical_harmonics import single_colors
 from ..splats import ARRAYS, Splats
 from ..views import View, ViewSet
-from ..visibility import projection
-from ..visibility.cast import cast_visible, depth_complexity, pixels
+from ..visibility import cast, projection
 from ..visibility.projection import Footprints, Gaussians
-from ..visibility.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, VALIDATION_VIEWS
 from ..visibility.scene import Scene
 from .linear import COUNT, LEAST_WEIGHT, LinearView, Shapes, Singles, linear_view
 
@@ -130,8 +128,8 @@ class Window:
         number : int
             0 for validation rays, 1 for the first round.
         """
-        count = min(self.rays, self.hits / max(hits, 1.0), MAX_RAYS_OF_VIEW)
-        columns, rows = pixels(self.part, self.number + 1 + number, count)
+        count = min(self.rays, self.hits / max(hits, 1.0), cast.MAX_RAYS_OF_VIEW)
+        columns, rows = cast.pixels(self.part, self.number + 1 + number, count)
         if not number:
             rows = rows[::_EVERY]
         return columns + self.left, rows + self.top
@@ -236,7 +234,7 @@ class RoundRays:
         made: Callable[..., Target] = Target,
     ) -> None:
         self.windows, self.original, self._threads, self._made = windows, original, threads, made
-        step = -(-len(windows) // VALIDATION_VIEWS)
+        step = -(-len(windows) // cast.VALIDATION_VIEWS)
         self._validating = [window.moved(0) for window in windows[::step]] if step else []
         self._validation: list[Truth] = []
 
@@ -296,8 +294,8 @@ class RoundRays:
         """Mean PSNR of kept splats on validation rays, weighted as the views are, dB."""
         windows = self._validating
         if not self._validation:
-            cast = partial(cast_truth, self.original, windows, 0, None)
-            self._validation = [*self._each(cast, windows, splats, part(progress, 0.0, 0.5))]
+            truth = partial(cast_truth, self.original, windows, 0, None)
+            self._validation = [*self._each(truth, windows, splats, part(progress, 0.0, 0.5))]
         target = self.target(splats, part(progress, 0.5, 0.6))
         work = partial(_psnr, target, windows, self._validation)
         psnr = [*self._each(work, windows, splats, part(progress, 0.6, 1.0))]
@@ -358,11 +356,11 @@ def cast_truth(
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
         # Casting takes memory for all hits, also faint ones, but for one view at a time.
-        share = window.hits / MAX_HITS_OF_VIEW
-        predicted = depth_complexity(footprints, window.part)
+        share = window.hits / cast.MAX_HITS_OF_VIEW
+        predicted = cast.depth_complexity(footprints, window.part)
         each = (share if shown is None else shown) * predicted
         columns, rows = window.pixels(each, number)
-        rays, transmittance = cast_visible(footprints, columns, rows)
+        rays, transmittance = cast.cast_visible(footprints, columns, rows)
         most = share * len(rays.ray)
         weight = transmittance * rays.alpha
         colors = rays.composited(weight, target.colors(rays.hit, window.view))
@@ -375,18 +373,18 @@ def _psnr(target, windows, truths, place):
     window, truth = windows[place], truths[place]
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
-        rays, transmittance = cast_visible(footprints, truth.columns, truth.rows)
+        rays, transmittance = cast.cast_visible(footprints, truth.columns, truth.rows)
         colors = target.colors(rays.hit, window.view)
         seen = rays.composited(transmittance * rays.alpha, colors)
     return psnr_of(seen, truth.colors, window.part)
 
 
-def _linearized(cast, windows, target, shapes, place):
+def _linearized(truth_of, windows, target, shapes, place):
     """How the colours of a view's rays change with the kept splats, see `LinearRays`."""
-    window, truth = windows[place], cast(place)
+    window, truth = windows[place], truth_of(place)
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
-        seen = cast_visible(footprints, truth.columns, truth.rows)
+        seen = cast.cast_visible(footprints, truth.columns, truth.rows)
         colors = target.colors(seen[0].hit, window.view)
         view, mine = linear_view(seen, footprints, truth.colors, colors, shapes, window.view)
         del seen, footprints  # which take more memory than the view

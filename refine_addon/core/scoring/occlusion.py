@@ -14,7 +14,7 @@ rounds: a part of the splats goes, the rest is scored again, until a tenth is le
 one order of removal, so a larger budget also removes all that a smaller one does. Scoring for one
 budget ends with the round that removes the last of its splats.
 
-The views are measured once. Later, rays that were cast once (`ray_sample`) tell what the rest is
+The views are measured once. Later, rays that were cast once (`RaySample`) tell what the rest is
 worth: the hits of a ray are known, front to back, and so is what it would show without any one of
 them. Few rays hit a small splat, so what they tell is weighed against what the views measured of
 all splats::
@@ -40,8 +40,8 @@ from ..scores import Scores, shares_gone
 from ..splats import Splats, refuse_undrawable
 from ..views import ViewSet, views_between
 from ..visibility import projection
+from ..visibility.cast import RaySample
 from ..visibility.measuring import SECONDS, Measured, Sampling, measure, view_groups
-from ..visibility.ray_sample import RaySample
 from . import closed_form, coverage
 
 LEAST = 0.1
@@ -110,7 +110,7 @@ def score(
     bytes for each point of a view, per thread. A view has at most about 4 million points
     (`points.MAX_POINTS`); only a view that shows more than 3 million splats has more.
     Each hit of the scoring rays takes 16 bytes, of which there are at most about
-    `ray_sample.MAX_SCORING_HITS`.
+    `cast.MAX_SCORING_HITS`.
     """
     if rounds < 1:
         raise RefineError(f"rounds is {rounds}, expected 1 or more")

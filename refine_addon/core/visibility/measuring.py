@@ -31,9 +31,9 @@ from ..execute import Progress, checkpoint, chunks, run, run_all, silent
 from ..splats import ALPHA_CUT, ALPHA_MAX
 from ..views import View
 from . import projection
+from .cast import RaySample, cast_view
 from .points import cell_size, runs, scatter
 from .projection import Gaussians
-from .ray_sample import RaySample, cast_view
 from .rays import contrasts, in_front, paired
 from .scene import Scene
 
