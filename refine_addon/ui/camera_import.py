@@ -225,3 +225,6 @@ def _is_untouched(scene: bpy.types.Scene) -> bool:
     cameras = [obj for obj in scene.objects if obj.type == "CAMERA"]
     moved = any(obj.animation_data or SOURCE in obj for obj in cameras)
     return size == _DEFAULT_SIZE and len(cameras) <= 1 and not moved
+
+
+CLASSES = (REFINE_OT_import_cameras, REFINE_FH_cameras)

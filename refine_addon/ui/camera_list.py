@@ -118,3 +118,6 @@ def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     )
     if text := _changes_most(manager):
         label(layout, context, text, icon="SOLO_ON")
+
+
+CLASSES = (RefineCamera, REFINE_UL_cameras)

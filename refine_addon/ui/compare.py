@@ -171,3 +171,6 @@ def _fit(names: list[str]) -> None:
             region = next(each for each in area.regions if each.type == "WINDOW")
             with bpy.context.temp_override(window=window, area=area, region=region):
                 bpy.ops.image.view_all(fit_view=True)
+
+
+CLASSES = (REFINE_OT_compare,)

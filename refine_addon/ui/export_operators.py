@@ -227,3 +227,11 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
         """Say what was written."""
         what = f"Wrote {count} levels, the finest as it is, to {job.target}"
         return self.say(job.notes, what)
+
+
+def _draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    menu.layout.operator("refine.export_ply", text=f"Gaussian Splats ({', '.join(SUFFIXES)})")
+
+
+CLASSES = (REFINE_OT_export_ply, REFINE_OT_export_levels)
+MENUS = {"TOPBAR_MT_file_export": _draw_menu}

@@ -104,3 +104,6 @@ class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
             {"INFO"}, f"Deleted {outcome.removed:,} floaters, {outcome.kept:,} splats stay{spared}"
         )
         return {"FINISHED"}
+
+
+CLASSES = (REFINE_OT_find_floaters, REFINE_OT_delete_floaters)

@@ -226,3 +226,12 @@ def _read(path: Path, level: int, progress: Progress) -> SplatFile:
 
 def _joined(errors: list[Exception]) -> str:
     return "; ".join(described(error) for error in errors)
+
+
+def _draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    menu.layout.operator("refine.import_ply", text=f"Gaussian Splats ({', '.join(READ_SUFFIXES)})")
+    menu.layout.operator("refine.import_cameras", text="Splat Cameras (.json, COLMAP)")
+
+
+CLASSES = (REFINE_OT_import_ply, REFINE_FH_ply)
+MENUS = {"TOPBAR_MT_file_import": _draw_menu}

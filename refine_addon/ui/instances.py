@@ -68,3 +68,6 @@ class REFINE_PT_instances(bpy.types.Panel):
         text = f"{count:,} splats of collection '{context.object.instance_collection.name}'"
         wrapped.label(self.layout, context, text, icon="OUTLINER_OB_GROUP_INSTANCE")
         self.layout.operator("refine.make_real")
+
+
+CLASSES = (REFINE_OT_make_real,)

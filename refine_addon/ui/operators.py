@@ -381,3 +381,6 @@ class REFINE_OT_convert(OnThread, OnSplats, bpy.types.Operator):
         kind = "a point cloud" if obj.type == "POINTCLOUD" else "a mesh"
         self.report({"INFO"}, f"'{obj.name}' is {kind} now")
         return {"FINISHED"}
+
+
+CLASSES = (REFINE_OT_score, REFINE_OT_apply, REFINE_OT_levels, REFINE_OT_convert)

@@ -27,8 +27,10 @@ from . import (
     transforms,
     wrapped,
 )
+from .instances import REFINE_PT_instances
 from .panel_cache import cached
 from .properties import FLOATERS, RefineSettings
+from .select_panel import REFINE_PT_select
 from .view_operators import MODES
 from .volumes import ROLES, RefineVolume
 from .wrapped import counted
@@ -398,3 +400,19 @@ def _draw_warning(
         button = layout.operator(warning.remedy)
         for name, value in warning.options.items():
             setattr(button, name, value)
+
+
+CLASSES = (
+    REFINE_PT_splats,
+    REFINE_PT_instances,
+    REFINE_PT_cameras,
+    REFINE_PT_camera_list,
+    REFINE_PT_select,
+    REFINE_PT_floaters,
+    REFINE_PT_volumes,
+    REFINE_PT_score,
+    REFINE_PT_preview,
+    REFINE_PT_apply,
+    REFINE_PT_export,
+)
+"""In the order of the sidebar."""

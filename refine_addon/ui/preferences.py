@@ -66,3 +66,6 @@ def _chosen(context: bpy.types.Context) -> RefinePreferences | None:
     if addon is None:
         return None
     return addon.preferences
+
+
+CLASSES = (RefinePreferences,)

@@ -344,3 +344,6 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         if self.scene_frames:
             return range(scene.frame_start, scene.frame_end + 1, self.frame_step)
         return range(self.frame_start, self.frame_end + 1, self.frame_step)
+
+
+CLASSES = (RefineSettings,)

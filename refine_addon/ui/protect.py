@@ -117,3 +117,6 @@ def _mark_in_edit_mode(obj: bpy.types.Object, mode: str, name: str) -> None:
     finally:
         if before in mesh.attributes:
             mesh.attributes.active = mesh.attributes[before]
+
+
+CLASSES = (REFINE_OT_protect,)

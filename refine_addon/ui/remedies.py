@@ -295,3 +295,12 @@ def _join(context: bpy.types.Context, ring: bpy.types.Collection) -> None:
         for camera in CameraChoice(settings.source).cameras(context):
             ring.objects.link(camera)
     settings.collection, settings.source = ring, "COLLECTION"
+
+
+CLASSES = (
+    REFINE_OT_turn_cameras,
+    REFINE_OT_add_between,
+    REFINE_OT_add_ring,
+    REFINE_OT_leave_out,
+    REFINE_OT_keep_unseen,
+)

@@ -275,3 +275,7 @@ def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
     layout.operator("refine.render", icon="RENDER_STILL")
     text = "Render Animation with Splats"
     layout.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
+
+
+CLASSES = (REFINE_OT_render, REFINE_OT_watch_render)
+MENUS = {"TOPBAR_MT_render": draw_menu}

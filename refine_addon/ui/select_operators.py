@@ -261,3 +261,12 @@ def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]
     if not chosen.any():
         raise RefineError(f"object '{obj.name}': no splat is selected")
     return chosen
+
+
+CLASSES = (
+    REFINE_OT_select,
+    REFINE_OT_select_by,
+    REFINE_OT_grow_selection,
+    REFINE_OT_delete_selected,
+    REFINE_OT_separate_selected,
+)

@@ -293,3 +293,6 @@ def unregister() -> None:
     while _tools:
         bpy.utils.unregister_tool(_tools.pop())
     selecting.forget()
+
+
+CLASSES = (REFINE_OT_select_stroke, REFINE_OT_brush_radius)

@@ -282,3 +282,6 @@ def unregister() -> None:
     if bpy.app.timers.is_registered(_note):
         bpy.app.timers.unregister(_note)
     _known.clear()
+
+
+CLASSES = (REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend)

@@ -42,3 +42,6 @@ class REFINE_OT_view(bpy.types.Operator):
         """Draw, or stop it."""
         draw.show(self.mode)
         return {"FINISHED"}
+
+
+CLASSES = (REFINE_OT_view,)

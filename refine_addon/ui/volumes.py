@@ -169,3 +169,6 @@ class REFINE_OT_crop(Deleting, bpy.types.Operator):
                 f"object '{checked.obj.name}': no volume says of any splat that it must go"
             )
         return removed
+
+
+CLASSES = (RefineVolume, REFINE_OT_add_volume, REFINE_OT_drop_volume, REFINE_OT_crop)
