@@ -9,7 +9,7 @@ go in as those of a mesh.
 from __future__ import annotations
 
 import zlib
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from functools import partial
@@ -25,7 +25,6 @@ from ..core.formats.ply_columns import THIRD_SCALE, Columns
 from ..core.formats.registry import scene_name
 from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
-from .native import Place
 
 _GROUP = 16
 """Columns that are transposed together: float32 numbers in a cache line of 64 bytes."""
@@ -175,11 +174,6 @@ def stored_columns(checked: SplatObject) -> Columns:
     return _Reader(checked)
 
 
-def held_columns(checked: SplatObject, names: Iterable[str]) -> Columns:
-    """Return columns of a splat object by their names, all read now, for any thread."""
-    return _Held(checked, names)
-
-
 def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> None:
     """Store columns of a splat object in the attributes that hold them.
 
@@ -190,55 +184,25 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
         Properties of the PLY that the object has, of as many splats as there are by now.
     """
     mesh = checked.mesh
-    places = {column.name: column.place for column in checked.layout.columns}
-    kinds = {
-        place.attribute: mesh.attributes[place.attribute].data_type for place in places.values()
-    }
-    asked = {name: places[name] for name in columns}
-    for attribute in coded(columns, asked, kinds, partial(read_attribute, mesh)):
-        write_attribute(mesh, *attribute)
-    if columns:
-        updated(mesh)
-
-
-def coded(
-    columns: Columns | Mapping[str, NDArray[Any]],
-    places: Mapping[str, Place],
-    kinds: Mapping[str, str],
-    stored: Callable[[str], NDArray[Any]],
-) -> Iterator[tuple[str, str, NDArray[Any]]]:
-    """Yield the attributes that hold columns: name, type and values of each, one after another.
-
-    Parameters
-    ----------
-    columns : mapping of str to (N,)
-        Properties of the PLY.
-    places : mapping of str to Place
-        Where those go that are to be held.
-    kinds : mapping of str to str
-        Types of the attributes.
-    stored : callable
-        ``stored(name)``: values of an attribute of which some components alone are given.
-    """
-    given = Counter(place.attribute for place in places.values())
+    places = {c.name: c.place for c in checked.layout.columns if c.name in columns}
     vectors: dict[str, NDArray[Any]] = {}
     for name, place in places.items():
-        values, kind = columns[name], kinds[place.attribute]
+        values = columns[name]
         values = place.coding.to_attribute(values) if place.coding else values
-        width = KINDS[kind].width
-        if width == 1:
-            yield place.attribute, kind, values
+        kind = mesh.attributes[place.attribute].data_type
+        if KINDS[kind].width == 1:
+            write_attribute(mesh, place.attribute, kind, values)
             continue
-        if place.attribute not in vectors and given[place.attribute] == width:
-            vectors[place.attribute] = np.empty((len(values), width), np.float32)
-        elif place.attribute not in vectors:
-            vectors[place.attribute] = stored(place.attribute)
+        if place.attribute not in vectors:
+            vectors[place.attribute] = read_attribute(mesh, place.attribute)
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
             vectors[place.attribute][:, place.component] = values
     for attribute, values in vectors.items():
-        kind = kinds[attribute]
+        kind = mesh.attributes[attribute].data_type
         unit = single_unit_quaternions(values) if kind == "QUATERNION" else values
-        yield attribute, kind, unit
+        write_attribute(mesh, attribute, kind, unit)
+    if columns:
+        updated(mesh)
 
 
 def write_rows(
@@ -396,15 +360,6 @@ class _Reader:
             else:
                 row[:] = self.stored(name)
         return values
-
-
-class _Held(_Reader):
-    """Columns that were read at once, which can be asked for on any thread."""
-
-    def __init__(self, checked: SplatObject, names: Iterable[str]) -> None:
-        super().__init__(checked)
-        attributes = dict.fromkeys(self.columns[name].attribute for name in names)
-        self.vectors = {name: read_attribute(self.mesh, name) for name in attributes}
 
 
 def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -> None:

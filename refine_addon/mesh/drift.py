@@ -176,19 +176,6 @@ def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     mesh_attributes.write_attribute(mesh, SHAPE, "INT", codes.view(np.int32))
 
 
-def carry(
-    source: bpy.types.Mesh | bpy.types.PointCloud, target: bpy.types.Mesh | bpy.types.PointCloud
-) -> None:
-    """Give a mesh that holds the same splats in another form the notes of the first."""
-    if is_stamped(source):
-        codes = mesh_attributes.read_attribute(source, SHAPE).view(np.uint32)
-        # A checksum that was right is right again, and one that was not is not.
-        changed = (_checksums(_shapes(source)) ^ _checksums(_shapes(target))) << np.uint32(
-            _CHECKSUM
-        )
-        mesh_attributes.write_attribute(target, SHAPE, "INT", (codes ^ changed).view(np.int32))
-
-
 class _Notes:
     """What was noted of a mesh, beside what is."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import bpy
 import numpy as np
@@ -13,7 +14,6 @@ from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from . import attributes as mesh_attributes
 from .layout import splat_count
-from .node_trees import chain, named_attribute, new_tree
 
 REMOVE = "refine_remove"
 """Boolean point attribute: the splats that the budget removes."""
@@ -112,7 +112,7 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         return
     expected = len(remove) - int(np.count_nonzero(remove))
     mesh_attributes.write_attribute(obj.data, REMOVE, "BOOLEAN", remove)
-    tree = _deleting_tree()
+    tree, _ = _tree("GeometryNodeDeleteGeometry", REMOVE, "BOOLEAN", "Selection")
     modifier = obj.modifiers.new("REFINE delete", "NODES")
     name = modifier.name
     modifier.show_viewport = False  # or Blender runs it once more, before it applies it
@@ -179,9 +179,6 @@ def mark_forced(
 
 def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     """Return which splats are marked by `PROTECT`, and by an attribute or a vertex group.
-
-    A point cloud has no vertex groups; `convert` makes float attributes of them, which stay that
-    when it makes a mesh again.
 
     Parameters
     ----------
@@ -252,7 +249,8 @@ def mark_by_hand(obj: bpy.types.Object, marked: NDArray[np.bool_], name: str = P
 
 def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
     """Return the weights of a vertex group; geometry nodes read them all at once."""
-    tree = _storing_tree(name)
+    tree, storing = _tree("GeometryNodeStoreNamedAttribute", name, "FLOAT", "Value")
+    storing.inputs["Name"].default_value = _GROUP_VALUES
     # On a second object with the same mesh: the user's modifiers stay out of it.
     helper = bpy.data.objects.new("REFINE read", obj.data)
     try:
@@ -265,22 +263,24 @@ def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
         bpy.data.node_groups.remove(tree)
 
 
-def _deleting_tree() -> bpy.types.NodeTree:
-    """Return nodes that delete the points marked by `REMOVE`."""
-    tree = new_tree("REFINE delete")
-    node = tree.nodes.new("GeometryNodeDeleteGeometry")
-    node.domain = "POINT"
-    tree.links.new(named_attribute(tree, REMOVE, "BOOLEAN"), node.inputs["Selection"])
-    chain(tree, [node])
-    return tree
+def _tree(kind: str, name: str, data_type: str, target: str) -> tuple[Any, bpy.types.Node]:
+    """Geometry nodes: one of a kind, whose input `target` reads a named attribute; that one."""
+    tree = bpy.data.node_groups.new("REFINE", "GeometryNodeTree")
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
+    start, node, read, end = map(
+        tree.nodes.new,
+        ("NodeGroupInput", kind, "GeometryNodeInputNamedAttribute", "NodeGroupOutput"),
+    )
+    node.domain, read.data_type = "POINT", data_type
+    if hasattr(node, "data_type"):
+        node.data_type = data_type
+    read.inputs["Name"].default_value = name
 
+    def socket(sockets: Any, wanted: str) -> bpy.types.NodeSocket:
+        return next(each for each in sockets if each.name == wanted and each.enabled)
 
-def _storing_tree(group: str) -> bpy.types.NodeTree:
-    tree = new_tree("REFINE read")
-    node = tree.nodes.new("GeometryNodeStoreNamedAttribute")
-    node.data_type, node.domain = "FLOAT", "POINT"
-    node.inputs["Name"].default_value = _GROUP_VALUES
-    value = next(socket for socket in node.inputs if socket.name == "Value" and socket.enabled)
-    tree.links.new(named_attribute(tree, group, "FLOAT"), value)
-    chain(tree, [node])
-    return tree
+    tree.links.new(start.outputs[0], node.inputs[0])
+    tree.links.new(socket(read.outputs, "Attribute"), socket(node.inputs, target))
+    tree.links.new(node.outputs[0], end.inputs[0])
+    return tree, node

@@ -26,7 +26,6 @@ from ..mesh import floaters as mesh_floaters
 from ..mesh import heat_map
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.convert import converted
 from ..mesh.layout import SplatObject
 from . import demands
 from .splat_object import moved_columns, read_to_move, uneven_notes
@@ -274,8 +273,6 @@ def read_to_join(
         See `join`.
     """
     group = [active, *others]
-    for member in group:
-        mesh_edit.check_changeable(member.obj)
     matrices = _to_first(group)
     parts = [_read_to_move_all(*pair) for pair in zip(group, matrices, strict=True)]
 
@@ -329,8 +326,6 @@ def join(
         See `mesh.edit.check_changeable` and `splat_object.moved_columns`; also if Blender fails.
     """
     group = [active, *others]
-    for member in group:
-        mesh_edit.check_changeable(member.obj)
     matrices = _to_first(group)
     pairs = zip(group, matrices, strict=True)
     notes = [note for member, matrix in pairs for note in uneven_notes(member, matrix)]
@@ -342,8 +337,6 @@ def join(
             _move_all(mesh_layout.check(part), matrix, moved)
         notes += _made_alike([mesh_layout.check(part) for part in parts], group)
         whole = _as_one(parts)
-        if active.layout.native:
-            whole = converted(mesh_layout.check(whole))[0]
         mesh_drift.stamp(whole.data)
         _give(active.obj, whole)
     for other in others:
@@ -352,7 +345,14 @@ def join(
 
 
 def _to_first(group: Sequence[SplatObject]) -> list[NDArray[np.float64]]:
-    """Return the matrices from the frames of objects to that of the first."""
+    """The matrices from the frames of objects that can be joined to that of the first."""
+    for member in group:
+        mesh_edit.check_changeable(member.obj)
+        if member.obj.type != "MESH":
+            raise RefineError(
+                f"object '{member.obj.name}': is a point cloud, which Blender cannot join; export "
+                "it, and import the file as a mesh"
+            )
     graph = bpy.context.evaluated_depsgraph_get()
     worlds = [world_matrix(member.obj, graph) for member in group]
     for member, world in zip(group, worlds, strict=True):
@@ -393,7 +393,7 @@ def _copied(member: SplatObject, bench: bpy.types.Collection) -> bpy.types.Objec
         if record in obj.data:
             del obj.data[record]
     bpy.context.view_layer.update()
-    return converted(mesh_layout.check(obj))[0] if member.layout.native else obj
+    return obj
 
 
 def _made_alike(parts: Sequence[SplatObject], group: Sequence[SplatObject]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Operators that score, prune and convert splat objects.
+"""Operators that score and prune splat objects.
 
 Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* is clicked.
 """
@@ -6,7 +6,6 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -27,7 +26,6 @@ from ..core.splats import Splats
 from ..core.views import ViewSet
 from ..core.visibility import frustum
 from ..core.volumes import Forced
-from ..mesh import convert
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
@@ -347,40 +345,4 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_convert(OnThread, OnSplats, bpy.types.Operator):
-    """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
-
-    bl_idname = "refine.convert"
-    bl_label = "Convert Splats"
-    bl_options = {"REGISTER", "UNDO"}
-    doing = "Converting splats"
-
-    def prepare(
-        self, _context: bpy.types.Context, checked: SplatObject
-    ) -> Callable[[], convert.Attributes]:
-        """Read what makes the splats."""
-        return convert.read(checked)
-
-    @staticmethod
-    def work(job: Callable[[], convert.Attributes], _progress: Progress) -> convert.Attributes:
-        """Bring them into the other form."""
-        return job()
-
-    def finish(
-        self,
-        context: bpy.types.Context,
-        checked: SplatObject,
-        _job: object,
-        attributes: convert.Attributes,
-    ) -> Answer:
-        """Put the other form in the place of the object."""
-        obj, notes = convert.converted(checked, attributes)
-        plans.refresh(context)
-        for note in notes:
-            self.report({"WARNING"}, note)
-        kind = "a point cloud" if obj.type == "POINTCLOUD" else "a mesh"
-        self.report({"INFO"}, f"'{obj.name}' is {kind} now")
-        return {"FINISHED"}
-
-
-CLASSES = (REFINE_OT_score, REFINE_OT_apply, REFINE_OT_levels, REFINE_OT_convert)
+CLASSES = (REFINE_OT_score, REFINE_OT_apply, REFINE_OT_levels)

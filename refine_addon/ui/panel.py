@@ -13,7 +13,6 @@ from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.convert import other_form
 from ..objects import demands, level_objects, splat_group
 from ..viewport import draw as viewport_draw
 from . import (
@@ -285,8 +284,6 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         """Draw the buttons."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.operator("refine.export_ply", icon="EXPORT")
-        if mesh_layout.looks_like_splats(obj):
-            layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
         column = _named_column(layout)
         column.prop(settings, "levels")
         column.operator("refine.levels", icon="MOD_DECIM")

@@ -116,7 +116,7 @@ def test_undo_redo_and_save_are_refused_with_a_sentence(start, gate, held, word)
 
 def test_only_one_operation_works_at_a_time(start, gate, addon):
     """They come back when it is over."""
-    names = ["score", "apply", "levels", "find_floaters", "delete_floaters", "convert"]
+    names = ["score", "apply", "levels", "find_floaters", "delete_floaters"]
     names += ["export_ply", "import_ply", "import_cameras", "crop"]
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()

@@ -8,6 +8,8 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.e2e.inside.clouds import as_cloud
+
 MOVED = 60
 
 
@@ -59,8 +61,7 @@ def test_floaters_of_native_splats_are_those_of_the_mesh(addon, polluted):
     bpy.ops.refine.find_floaters()
     on_mesh = marked(addon, room)
 
-    bpy.ops.refine.convert()
-    cloud = bpy.context.object
+    cloud = as_cloud(addon, room)
     bpy.ops.refine.find_floaters()
     on_cloud = marked(addon, cloud)
 

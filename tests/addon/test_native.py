@@ -9,66 +9,12 @@ import mathutils
 import numpy as np
 import pytest
 
+from tests.e2e.inside.clouds import FOUR, as_blender_imports, point_cloud, store
 from tests.strategies import ply_of
 
 from .conftest import export, keep_mask
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
-TYPES = bpy.types.Attribute.bl_rna.properties["data_type"].enum_items.keys()
-FOUR = "FLOAT4" if "FLOAT4" in TYPES else "FLOAT_COLOR"
-
-
-def point_cloud(count, name="cloud"):
-    """Return a new object of `count` points, made by geometry nodes without the add-on."""
-    obj = bpy.data.objects.new(name, bpy.data.pointclouds.new(name))
-    bpy.context.scene.collection.objects.link(obj)
-    tree = bpy.data.node_groups.new("points", "GeometryNodeTree")
-    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    points = tree.nodes.new("GeometryNodePoints")
-    points.inputs["Count"].default_value = count
-    tree.links.new(points.outputs[0], tree.nodes.new("NodeGroupOutput").inputs[0])
-    obj.modifiers.new("points", "NODES").node_group = tree
-    with bpy.context.temp_override(object=obj, active_object=obj):
-        bpy.ops.object.modifier_apply(modifier="points")
-    bpy.data.node_groups.remove(tree)
-    obj.data.attributes.remove(obj.data.attributes["radius"])
-    bpy.context.view_layer.objects.active = obj
-    obj.select_set(True)
-    return obj
-
-
-def store(obj, name, kind, values):
-    """Set a point attribute, made where it is not there."""
-    attribute = obj.data.attributes.get(name) or obj.data.attributes.new(name, kind, "POINT")
-    field = {"FLOAT_COLOR": "color", "FLOAT_VECTOR": "vector", "FLOAT4": "vector"}.get(
-        kind, "value"
-    )
-    attribute.data.foreach_set(field, np.ascontiguousarray(values).ravel())
-
-
-def as_blender_imports(rows, name="cloud"):
-    """Return what Blender 5.3 makes of the rows of a file: its formulas, in float32.
-
-    See docs/conventions.md for where they stand in its sources.
-    """
-    obj = point_cloud(len(rows), name)
-    get = {field: rows[field].astype(np.float32) for field in rows.dtype.names}
-    one = np.float32(1)
-    with np.errstate(over="ignore", under="ignore"):
-        opaque = one / (one + np.exp(-get["opacity"]))
-        scale = np.exp(np.stack([get[f"scale_{i}"] for i in range(3)], 1))
-    turn = np.stack([get[f"rot_{i}"] for i in range(4)], 1)
-    turn /= np.sqrt((turn * turn).sum(axis=1, keepdims=True))
-    store(obj, "position", "FLOAT_VECTOR", np.stack([get[axis] for axis in "xyz"], 1))
-    base = np.stack([*(get[f"f_dc_{i}"] for i in range(3)), opaque], 1)
-    store(obj, "radiance:base", FOUR, base)
-    store(obj, "scale", "FLOAT_VECTOR", scale)
-    store(obj, "rotation", "QUATERNION", turn)
-    count = sum(name.startswith("f_rest_") for name in get) // 3
-    for k in range(count):
-        colors = [get[f"f_rest_{k + channel * count}"] for channel in range(3)]
-        store(obj, f"radiance:sh_{k}", "FLOAT_VECTOR", np.stack(colors, 1))
-    return obj
 
 
 def differences(core, got, expected):
@@ -321,172 +267,23 @@ def test_an_export_with_the_transform_turns_harmonics(addon, core, cloud, file, 
     assert np.abs(expected.sh_rest - file.splats().sh_rest).max() > 0.1
 
 
-def test_mesh_to_native_to_ply_keeps_activated_values(addon, core, room, file, tmp_path):
-    """Less than 1e-6 of each; the header, normals and all that is not activated are equal."""
-    bpy.ops.refine.convert()
-    cloud = bpy.data.objects["room"]
-    export(addon, addon.mesh.layout.check(cloud), tmp_path / "out.ply")
-    made = core.read_ply(tmp_path / "out.ply")
-    found = differences(core, made.splats(), file.splats())
-
-    assert cloud.type == "POINTCLOUD"
-    assert made.header == file.header
-    assert found["means"] == found["harmonics"] == 0.0
-    assert max(found.values()) < 1e-6
-    for axis in "xyz":
-        assert np.array_equal(made.rows[f"n{axis}"], file.rows[f"n{axis}"])
-
-
-def test_extreme_values_come_back_from_a_conversion(core, make_splats, tmp_path):
+def test_extreme_values_come_back_from_a_point_cloud(addon, core, make_splats, tmp_path):
     """Opacities next to 0 and 1, scales from 1e-37 to 1e37, quaternions of any length."""
     columns = make_splats(count=400)
     ramp = np.linspace(-85.0, 85.0, 400).astype(np.float32)
     columns |= {"opacity": ramp, "scale_0": ramp, "scale_1": -ramp}
     columns["rot_1"] *= np.float32(1e6)
     (tmp_path / "in.ply").write_bytes(ply_of(columns))
-    bpy.ops.refine.import_ply(filepath=str(tmp_path / "in.ply"))
-    bpy.ops.refine.convert()
-    bpy.ops.refine.export_ply(filepath=str(tmp_path / "out.ply"))
-    found = differences(
-        core,
-        core.read_ply(tmp_path / "out.ply").splats(),
-        core.read_ply(tmp_path / "in.ply").splats(),
+    source = core.read_ply(tmp_path / "in.ply")
+    cloud = addon.mesh.layout.check(as_blender_imports(source.rows))
+    splats = addon.mesh.attributes.splats_from_object(cloud)
+    addon.mesh.attributes.write_columns(
+        cloud, addon.core.formats.ply_columns.values_by_name(splats)
     )
+    export(addon, cloud, tmp_path / "out.ply")
+    found = differences(core, core.read_ply(tmp_path / "out.ply").splats(), source.splats())
 
     assert max(found.values()) < 1e-6
-
-
-def test_a_conversion_keeps_what_belongs_to_the_object(addon, core, room, room_cameras, tmp_path):
-    """Place, parent, children, collections, scores, weights, materials, and who refers to it."""
-    bpy.ops.refine.score()
-    parent, child = bpy.data.objects.new("parent", None), bpy.data.objects.new("child", None)
-    for obj in (parent, child):
-        bpy.context.scene.collection.objects.link(obj)
-    room.parent, child.parent = parent, room
-    room.location, room.rotation_euler, room.scale = (1, 2, 3), (0.1, 0.2, 0.3), (2, 2, 2)
-    room.matrix_parent_inverse = mathutils.Matrix.Translation((5, 0, 0))
-    room.vertex_groups.new(name="some").add([3, 5], 0.25, "REPLACE")
-    room.data.materials.append(bpy.data.materials.new("paint"))
-    room["mine"], room.data["mine"] = [1.0, 2.0], "kept"
-    follow = room_cameras.objects[0].constraints.new("TRACK_TO")
-    follow.target = room
-    room.keyframe_insert("location", frame=1)
-    store(room, "mark", "BOOLEAN", np.arange(39755) == 7)
-    bpy.context.view_layer.update()
-    before, home = contents(addon, room), [c.name for c in room.users_collection]
-    scores = addon.mesh.scores.stored_scores(addon.mesh.layout.check(room)).values
-    action = room.animation_data.action
-    bpy.ops.refine.convert()
-    cloud = bpy.data.objects["room"]
-    weights = addon.mesh.attributes.read_attribute(cloud.data, "some")
-    here = contents(addon, cloud)
-    again = addon.mesh.scores.stored_scores(addon.mesh.layout.check(cloud)).values
-
-    assert here["matrix"] == before["matrix"]
-    assert (cloud.parent, child.parent, follow.target) == (parent, cloud, cloud)
-    assert [c.name for c in cloud.users_collection] == home
-    assert cloud.animation_data.action == action
-    assert np.array_equal(again, scores)
-    assert weights[[3, 4, 5]].tolist() == [0.25, 0.0, 0.25]
-    assert [m.name for m in cloud.data.materials] == ["paint"]
-    assert (list(cloud["mine"]), cloud.data["mine"]) == ([1.0, 2.0], "kept")
-    assert here["mark"] == before["mark"]
-    assert bpy.context.object == cloud
-    assert cloud.select_get()
-    assert len(bpy.data.meshes) == 0
-
-    bpy.ops.refine.convert()
-    mesh = bpy.data.objects["room"]
-    there = contents(addon, mesh)
-    assert there["matrix"] == before["matrix"]
-    assert (mesh.type, mesh.parent, child.parent) == ("MESH", parent, mesh)
-    for name in before.keys() - {"type", "matrix"}:
-        if not name.startswith(("scale_", "rot_", "opacity")):
-            assert there[name] == before[name], name
-    export(addon, addon.mesh.layout.check(mesh), tmp_path / "out.ply")
-    source = core.read_ply(ROOM / "point_cloud.ply").splats()
-    found = differences(core, core.read_ply(tmp_path / "out.ply").splats(), source)
-    assert max(found.values()) < 1e-6
-
-
-def test_a_vertex_group_protects_on_after_conversions_there_and_back(addon, room):
-    """It is a float attribute then, which counts where it is above 0, as the weight did."""
-    room.vertex_groups.new(name="some").add([3, 5], 0.25, "REPLACE")
-    protected = []
-
-    for _ in range(3):
-        mask = addon.mesh.edit.protected_mask(bpy.data.objects["room"], "some")
-        protected.append(np.flatnonzero(mask).tolist())
-        bpy.ops.refine.convert()
-
-    assert protected == [[3, 5]] * 3
-
-
-def test_a_conversion_names_what_stays_behind(addon, room):
-    """Modifiers and edges have no place on a point cloud."""
-    room.modifiers.new("Bend", "SIMPLE_DEFORM")
-    room.data.edges.add(2)
-    _, notes = addon.mesh.convert.converted(addon.mesh.layout.check(room))
-
-    assert notes == [
-        "object 'room': its modifiers (Bend) were left behind",
-        "object 'room': its 2 edges and 0 faces were left behind",
-    ]
-
-
-def _keyed(room):
-    room.shape_key_add(name="Basis")
-
-
-def _painting(room):
-    bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
-
-
-def _named_scale(room):
-    store(room, "scale", "FLOAT", np.ones(39755, np.float32))
-
-
-@pytest.mark.parametrize(
-    ("prepare", "sentence"),
-    [
-        (_keyed, "has shape keys"),
-        (_painting, "weight paint mode"),
-        (_named_scale, "has an attribute 'scale', a name that the splats of a point cloud need"),
-    ],
-)
-def test_a_conversion_that_would_lose_something_is_refused(room, unchanged, prepare, sentence):
-    """The sentence says what to do; nothing is changed."""
-    prepare(room)
-    unchanged.start()
-    with pytest.raises(RuntimeError, match=sentence):
-        bpy.ops.refine.convert()
-    unchanged()
-
-
-def test_a_shared_mesh_stays_with_its_other_user(addon, room):
-    """One of two objects becomes a point cloud."""
-    other = bpy.data.objects.new("other", room.data)
-    bpy.context.scene.collection.objects.link(other)
-    bpy.ops.refine.convert()
-
-    assert bpy.data.objects["room"].type == "POINTCLOUD"
-    assert len(addon.mesh.layout.check(other)) == 39755
-
-
-def test_a_conversion_that_fails_changes_nothing(addon, room, unchanged, monkeypatch):
-    """Not even a data-block is left over."""
-
-    def refuse(*_arguments):
-        raise addon.core.RefineError("refused")
-
-    monkeypatch.setattr(addon.mesh.drift, "carry", refuse)
-    unchanged.start()
-    with pytest.raises(RuntimeError, match="refused"):
-        bpy.ops.refine.convert()
-
-    unchanged()
-    assert len(bpy.data.pointclouds) == 0
-    assert room.name == "room"
 
 
 def test_point_clouds_that_are_no_splats_are_refused_in_a_sentence(addon, core):
@@ -534,13 +331,11 @@ def test_a_point_cloud_with_the_names_of_a_file_holds_splats(addon, room, tmp_pa
     export(addon, checked, tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (ROOM / "point_cloud.ply").read_bytes()
-    with pytest.raises(addon.core.RefineError, match="nothing to convert"):
-        addon.mesh.convert.converted(checked)
 
 
 @pytest.mark.skipif(bpy.app.version < (5, 3), reason="Blender imports splats since 5.3")
 def test_blenders_own_import_is_what_these_tests_build(addon, core, file, tmp_path):
-    """Same attributes, types and values, and the type that a conversion sets."""
+    """Same attributes, types and values."""
     bpy.ops.wm.ply_import(filepath=str(ROOM / "point_cloud.ply"), forward_axis="Y", up_axis="Z")
     native, built = bpy.context.object, as_blender_imports(file.rows)
     export(addon, addon.mesh.layout.check(native), tmp_path / "out.ply")
@@ -553,9 +348,6 @@ def test_blenders_own_import_is_what_these_tests_build(addon, core, file, tmp_pa
     assert native.data.type == "GAUSSIAN_SPLAT"
     assert kinds[0] == kinds[1]
     assert max(found.values()) < 1e-6
-    bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"))
-    bpy.ops.refine.convert()
-    assert bpy.context.object.data.type == "GAUSSIAN_SPLAT"
 
 
 @pytest.mark.parametrize("method", ["closed-form", "merge", "refit"])

@@ -176,9 +176,7 @@ def test_apply_is_one_undo_step(room, room_cameras):
     assert bpy.ops.refine.apply.poll()
 
 
-@pytest.mark.parametrize(
-    "name", ["score", "apply", "import_ply", "import_cameras", "levels", "convert"]
-)
+@pytest.mark.parametrize("name", ["score", "apply", "import_ply", "import_cameras", "levels"])
 def test_operators_that_change_the_scene_can_be_undone(name):
     """Blender pushes an undo step for operators with UNDO."""
     cls = getattr(bpy.types, f"REFINE_OT_{name}")

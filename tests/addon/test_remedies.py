@@ -7,6 +7,8 @@ import mathutils
 import numpy as np
 import pytest
 
+from tests.e2e.inside.clouds import as_cloud
+
 from .conftest import ROOM
 
 
@@ -378,7 +380,7 @@ def test_what_is_unseen_stays_with_what_was_protected(addon, room, room_cameras,
     settings = bpy.context.scene.refine
     settings.protect, settings.percent = "mine", 10.0
     if native:
-        bpy.ops.refine.convert()
+        as_cloud(addon, room)
     obj = bpy.context.object
     found = warned()
     unseen = read(addon, obj, "refine_seen") == 0

@@ -11,6 +11,7 @@ import pytest
 from mathutils import Matrix, Vector
 
 from benchmarks.renderer.rasterizer import render
+from tests.e2e.inside.clouds import as_cloud
 
 IMAGE = "Render with Splats"
 
@@ -484,7 +485,7 @@ def test_splats_that_blender_draws_are_left_to_it(
     F12 shows them and says nothing, and among others they are rendered with the meshes.
     """
     other = bpy.data.objects.new("other", quarter.data.copy())
-    cloud, _ = addon.mesh.convert.converted(addon.mesh.layout.check(quarter))
+    cloud = as_cloud(addon, quarter)
     monkeypatch.setattr(addon.mesh.native, "TYPE", getattr(cloud.data, "type", ""))
     bpy.ops.render.render()
     said = capfd.readouterr().err

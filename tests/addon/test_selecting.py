@@ -6,6 +6,8 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.e2e.inside.clouds import as_cloud
+
 COUNT = 39_755
 
 
@@ -26,11 +28,9 @@ def chosen(addon):
 
 
 @pytest.fixture(params=["MESH", "POINTCLOUD"])
-def either(request, room):
+def either(request, addon, room):
     """Give the room as a mesh, and as a point cloud."""
-    if request.param == "POINTCLOUD":
-        bpy.ops.refine.convert()
-    return bpy.context.object if request.param == "POINTCLOUD" else room
+    return as_cloud(addon, room) if request.param == "POINTCLOUD" else room
 
 
 def test_an_import_selects_nothing(addon, room):

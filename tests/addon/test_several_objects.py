@@ -8,6 +8,8 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.e2e.inside.clouds import as_cloud
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 COUNT = 39_755
 
@@ -85,9 +87,7 @@ def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, m
 
 def test_a_mesh_and_a_point_cloud_share_a_budget(addon, halves, room_views):
     """The second becomes a point cloud of Blender's own splats; 50 % of both together go."""
-    bpy.context.view_layer.objects.active = halves[1]
-    bpy.ops.refine.convert()
-    clouds = [halves[0], bpy.context.object]
+    clouds = [halves[0], as_cloud(addon, halves[1])]
     halves[0].select_set(True)
     bpy.ops.refine.score()
     bpy.ops.refine.apply()

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from benchmarks.renderer.rasterizer import render
+from tests.e2e.inside.clouds import as_blender_imports
 from tests.strategies import ply_of
 from tests.windows import event, started_in_a_window, until_over
 
 from .conftest import export
-from .test_native import as_blender_imports
 
 TURN = mathutils.Euler((0.4, -0.7, 1.1)).to_matrix().to_4x4()
 NOWHERE = mathutils.Matrix()
@@ -277,25 +277,16 @@ def test_files_of_several_degrees_and_properties_become_one(addon, make_splats, 
     np.testing.assert_array_equal(got.rows["id"], np.concatenate([ids[index] for index in order]))
 
 
-def test_point_clouds_and_meshes_are_joined_as_what_the_active_one_is(addon, seen, quarter_file):
-    """Blender's own splats keep what they look like, beside a mesh that was turned."""
-    bpy.ops.refine.import_ply(filepath=str(quarter_file))
-    mesh = bpy.context.object
-    rows = addon.core.read_ply(quarter_file).rows
-    cloud = as_blender_imports(rows, "cloud")
-    addon.mesh.drift.stamp(cloud.data)
-    mesh.matrix_world = SOMEWHERE
-    bpy.context.view_layer.update()
-    before = seen()
-    select(cloud, mesh)
+def test_point_clouds_are_not_joined(imported, quarter_file, addon, unchanged):
+    """Blender joins meshes alone; the sentence says what to do."""
+    cloud = as_blender_imports(addon.core.read_ply(quarter_file).rows)
+    select(imported, cloud)
+    unchanged.start()
 
-    assert bpy.ops.refine.join() == {"FINISHED"}
+    with pytest.raises(RuntimeError, match=r"is a point cloud, .* import the file as a mesh"):
+        bpy.ops.refine.join()
 
-    joined = bpy.context.object
-    assert (joined.type, joined.name) == ("POINTCLOUD", "cloud")
-    assert len(joined.data.attributes["position"].data) == 2 * len(rows)
-    assert psnr(seen(), before) > 55.0
-    assert addon.mesh.drift.found(joined.data) is None
+    unchanged()
 
 
 def test_a_join_that_fails_leaves_the_scene_as_it_was(addon, imported, monkeypatch, unchanged):
@@ -509,24 +500,27 @@ def test_who_turns_sizes_and_rotations_as_well_is_left_alone(addon, imported):
     assert told_of(addon, imported) == []
 
 
-def test_merging_and_conversion_are_no_drift(addon, imported, room_cameras):
-    """Splats move and grow; a point cloud holds other numbers. A drift from before stays one."""
+def test_merging_is_no_drift(addon, imported, room_cameras):
+    """Splats move and grow together."""
     select(imported)
     bpy.context.scene.refine.method = "merge"
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     assert addon.mesh.drift.found(imported.data) is None
-    bpy.ops.refine.convert()
-    assert addon.mesh.drift.found(bpy.context.object.data) is None
-    bpy.ops.refine.convert()
-    imported = bpy.context.object
-    imported.matrix_world = SOMEWHERE
+
+
+def test_a_point_cloud_is_mended(addon, quarter_file, seen):
+    """Blender's own splats, turned, scaled and moved, then Ctrl+A."""
+    cloud = as_blender_imports(addon.core.read_ply(quarter_file).rows)
+    addon.mesh.drift.stamp(cloud.data)
+    cloud.matrix_world = SOMEWHERE
+    before = seen(SOMEWHERE)
     bpy.ops.object.transform_apply()
-    bpy.ops.refine.convert()
 
-    drift = addon.mesh.drift.found(bpy.context.object.data)
+    assert bpy.ops.refine.mend() == {"FINISHED"}
 
-    assert drift.turned == len(bpy.context.object.data.attributes["position"].data)
+    assert psnr(seen(SOMEWHERE), before) > 55.0
+    assert told_of(addon, cloud) == []
 
 
 def test_score_apply_and_export_say_what_was_done(

@@ -10,6 +10,8 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.e2e.inside.clouds import as_cloud
+
 CLOSED = ["--method", "closed-form"]
 
 CORNERS = list(itertools.product((-1.0, 1.0), repeat=3))
@@ -308,8 +310,7 @@ def test_native_point_clouds_go_by_volumes_and_marks_as_meshes_do(addon, room, c
     protected, removed = crop
     select(room, [1, 2, 3])
     bpy.ops.refine.protect(mode="ADD")
-    bpy.ops.refine.convert()
-    cloud = bpy.context.object
+    cloud = as_cloud(addon, room)
     came = np.flatnonzero(mask(addon, cloud, "refine_protect")).tolist()
     rows = np.arange(39_755)
     addon.mesh.attributes.write_attribute(

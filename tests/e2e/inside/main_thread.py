@@ -127,11 +127,9 @@ def selecting(clock: Clock, scored: Scored) -> None:
 
 
 def changing(clock: Clock, scored: Scored, path: str) -> None:
-    """Convert, export, bake and mend splats."""
+    """Export, bake and mend splats."""
     refine = bpy.ops.refine
     scored.again()
-    clock.time("convert to points", refine.convert)
-    clock.time("convert back", refine.convert)
     clock.time("export", refine.export_ply, filepath=path, overwrite=True)
     obj = scored.again()
     obj.rotation_euler.x, obj.location.x = 0.3, 1.0

@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 import bpy
+import clouds
 import extension
 import mathutils
 import numpy as np
@@ -26,24 +27,23 @@ def main(cloud: str) -> dict[str, Any]:
     """
     found = {}
     for form in ("MESH", "POINTCLOUD"):
-        for step in (blenders_apply, blenders_join, ours):
+        for step in (blenders_apply, *((blenders_join, ours) if form == "MESH" else ())):
             bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
             extension.enable()
             objects = [imported(cloud, form, place) for place in PLACES]
             before = seen(objects)
             said = step(objects)
-            if said is not None:
-                left = [obj for obj in bpy.context.scene.objects if obj.type == form]
-                found[f"{form} {step.__name__}"] = [said, apart(before, seen(left))]
+            left = [obj for obj in bpy.context.scene.objects if obj.type == form]
+            found[f"{form} {step.__name__}"] = [said, apart(before, seen(left))]
     return found
 
 
 def imported(cloud: str, form: str, place: mathutils.Matrix) -> bpy.types.Object:
     """Import a file into an object of a type that stands somewhere."""
     bpy.ops.refine.import_ply(filepath=cloud)
-    bpy.context.object.matrix_world = place
     if form == "POINTCLOUD":
-        bpy.ops.refine.convert()
+        clouds.as_cloud(importlib.import_module(extension.MODULE), bpy.context.object)
+    bpy.context.object.matrix_world = place
     bpy.context.view_layer.update()
     return bpy.context.object
 
@@ -55,15 +55,10 @@ def blenders_apply(objects: list[bpy.types.Object]) -> list[str]:
     return mended(objects)
 
 
-def blenders_join(objects: list[bpy.types.Object]) -> list[str] | None:
-    """Ctrl+J, where this Blender joins such objects."""
+def blenders_join(objects: list[bpy.types.Object]) -> list[str]:
+    """Ctrl+J."""
     select(objects)
-    if not bpy.ops.object.join.poll():
-        return None
-    try:
-        bpy.ops.object.join()
-    except RuntimeError:
-        return None
+    bpy.ops.object.join()
     return mended([bpy.context.object])
 
 

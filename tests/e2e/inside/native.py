@@ -1,20 +1,22 @@
-"""Convert splats to a point cloud, prune that, reload the file, and convert what is left back."""
+"""Prune a point cloud of Blender's own splats, reload the file, and export what is left."""
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import bpy
-from extension import enable
+import clouds
+import extension
 
 
-def main(cloud: str, cameras: str, blend: str, output: str, back: str) -> dict[str, Any]:
-    """Write what stays as the point cloud and as the mesh export it; return what was found."""
+def main(cloud: str, cameras: str, blend: str, output: str) -> dict[str, Any]:
+    """Write what stays; return what was found."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
-    enable()
+    extension.enable()
     bpy.ops.refine.import_ply(filepath=cloud)
-    bpy.ops.refine.convert()
-    splats = bpy.context.object
+    package = importlib.import_module(extension.MODULE)
+    splats = clouds.as_cloud(package, bpy.context.object)
     bpy.ops.refine.import_cameras(filepath=cameras)
     bpy.context.view_layer.objects.active = splats
     found = {"type": splats.type, "points": len(splats.data.points)}
@@ -28,7 +30,4 @@ def main(cloud: str, cameras: str, blend: str, output: str, back: str) -> dict[s
     bpy.context.view_layer.objects.active = splats
     found["kept"] = len(splats.data.points)
     bpy.ops.refine.export_ply(filepath=output)
-    bpy.ops.refine.convert()
-    found["back"] = len(bpy.context.object.data.vertices)
-    bpy.ops.refine.export_ply(filepath=back)
     return found
