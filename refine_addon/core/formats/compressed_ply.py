@@ -9,8 +9,6 @@ are near each other and their ranges small.
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 
 from ..place import Place
@@ -56,7 +54,7 @@ def _matches(_path, head):
 
 
 def _read(path, data):
-    header = ply.read_header(path, io.BytesIO(data[: ply.HEADER_LIMIT].tobytes()))
+    header = ply.read_header(path, data[: ply.HEADER_LIMIT].tobytes())
     place = Place(path)
     if header.order == ply.TEXT:
         place.fail("a compressed PLY in ASCII, expected a binary one")

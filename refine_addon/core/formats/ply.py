@@ -273,16 +273,34 @@ def read_ply(path: Path | str) -> SplatFile:
         names the file, the place, what was found and what was expected.
     """
     path = expanded(path)
+    return read_plain(path, file_bytes(path))
+
+
+def file_bytes(path: Path) -> NDArray[np.uint8]:
+    """Bytes of a file of splats, which are read when they are used.
+
+    Raises
+    ------
+    RefineError
+        If it does not exist, is no file or may not be read.
+    """
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for a writer
+        state = path.stat()
+        if not stat.S_ISREG(state.st_mode):  # opening a pipe would wait for a writer
             kind = "folder" if path.is_dir() else "device"
             raise RefineError(f"{path}: is a {kind}, expected a PLY file")
         with path.open("rb") as stream:
-            header, vertex = splat_header(path, stream)
-            whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+            if not state.st_size:
+                return np.empty(0, np.uint8)
+            return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
     except (OSError, ValueError) as error:
         raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error
-    body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
+
+
+def read_plain(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+    """Read a file that `file_bytes` has opened; see `read_ply`."""
+    header, vertex = splat_header(path, data[:HEADER_LIMIT].tobytes())
+    body = data[len(header.raw) :]
     at = row_ranges(header, len(body))[vertex]
     filled = [e.name for e, count in zip(header.elements, header.counts, strict=True) if count]
     if header.order == TEXT:
@@ -302,15 +320,15 @@ class Header(NamedTuple):
     order: str  # byte order of the body, "<", ">" or `TEXT`
 
 
-def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
-    """Read the header of an open file of splats, and say which element they are.
+def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
+    """Header of a file of splats that begins so, and which element they are.
 
     Raises
     ------
     RefineError
         See `read_ply`.
     """
-    header = read_header(path, stream)
+    header = read_header(path, head)
     names = [element.name for element in header.elements]
     if "vertex" not in names:
         wanted = f"expected an element 'vertex', got {_listed(names) or 'none'}"
@@ -347,15 +365,14 @@ def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
     return header, vertex
 
 
-def read_header(path: Path | Url, stream: BinaryIO) -> Header:
-    """Read the header of an open file.
+def read_header(path: Path | Url, head: bytes) -> Header:
+    """Header of a file that begins so; `HEADER_LIMIT` bytes are enough.
 
     Raises
     ------
     RefineError
         If the file has no header, or the header is wrong; with the line.
     """
-    head = stream.read(HEADER_LIMIT)
     raw, problem = raw_header(head), ""
     if not head:
         problem = "the file is empty, expected a PLY"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import mmap
-import stat
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from ..splats import Model, Splats, drawable, with_model
 from ..whole_file import Url, expanded, whole_file
 from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
 from .format import Format
-from .ply import SplatFile, read_ply
+from .ply import SplatFile, file_bytes, read_plain
 from .ply_columns import Changes, Keep, other_properties, splats_from_columns
 
 # ``.splat`` is known by its name alone, if a file is none of the others.
@@ -68,21 +66,15 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
         If the file does not exist, is of no known format, or is damaged; the message names the
         file, the place, what was found and what was expected. See also `SplatFile.drawn_as`.
     """
-    path, head, whole = expanded(path), b"", None
-    try:
-        if stat.S_ISREG(path.stat().st_mode):
-            with path.open("rb") as stream:
-                head = stream.read(_HEAD)
-                whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError):
-        pass  # `read_ply` says why it cannot be read
+    path = expanded(path)
+    data = file_bytes(path)
+    head = data[:_HEAD].tobytes()
     refuse_pointer(path, head)
     form = next((form for form in READERS if form.matches(path, head)), None)
     if level and form is not streamed_sog.READER:
         raise RefineError(f"{path}: has no level {level}: only {streamed_sog.INDEX} has levels")
-    if form is None or whole is None:
-        return read_ply(path).drawn_as(model)
-    data = np.frombuffer(whole, np.uint8)
+    if form is None:
+        return read_plain(path, data).drawn_as(model)
     file = streamed_sog.read(path, data, level) if level else form.read(path, data)
     return file.drawn_as(model).without_third_scale()
 

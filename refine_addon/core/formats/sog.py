@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +61,6 @@ _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How files of an archive may be compressed: the other ways take any memory, raise anything."""
 
 
-_Opened: TypeAlias = Callable[[str, int], bytes]
-
-
 class Bundle:
     """A ``meta.json``, what it says and the files that it names.
 
@@ -80,7 +77,7 @@ class Bundle:
     """
 
     def __init__(
-        self, place: Place, meta: dict[str, Any], opened: _Opened, files: dict[Path, int]
+        self, place: Place, meta: dict[str, Any], opened: Callable, files: dict[Path, int]
     ) -> None:
         self.place, self.meta, self.files, self._opened = place, meta, files, opened
         if self.meta.get("version", VERSION) != VERSION:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Hashable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,14 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, chunks, run
-from ..formats.ply import (
-    HEADER_LIMIT,
-    TEXT,
-    format_of,
-    row_ranges,
-    splat_header,
-    stated_model,
-)
+from ..formats.ply import HEADER_LIMIT, TEXT, format_of, row_ranges, splat_header, stated_model
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..mapped import on_disk
 from ..splats import Model, Splats, joined, with_model
@@ -122,7 +114,7 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
     head = storage.beginning(place, _HEADER, size)
     if b"end_header" not in head:
         head = storage.beginning(place, HEADER_LIMIT, size)
-    header, vertex = splat_header(place, io.BytesIO(head))
+    header, vertex = splat_header(place, head)
     if header.order == TEXT:
         raise RefineError(
             f"{place}: is {format_of(header.raw)}, expected a plain binary PLY as a tile, which "
