@@ -376,7 +376,7 @@ def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, 
 def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, monkeypatch):
     """Packing does not listen; what it wrote is not put in place afterwards, a second file is."""
     begun, free = threading.Event(), threading.Event()
-    form = addon.core.formats.dot_splat.FORMAT
+    form = addon.core.formats.by_name.SPLAT
     registry = addon.core.formats.registry
 
     def write(stream, _splats):

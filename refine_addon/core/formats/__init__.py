@@ -1,1 +1,1 @@
-"""Splat files: reading and writing; one module a format."""
+"""Splat files: reading and writing; one module a format, or for those that only a name tells."""

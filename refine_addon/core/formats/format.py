@@ -59,13 +59,6 @@ class Format:
     models: tuple[Model, ...] = MODELS[:1]
 
 
-def named(suffix: str) -> Callable[[Path, bytes], bool]:
-    """`Format.matches` of files without a signature: by their name, unless they are PLY."""
-    return lambda path, head: (
-        path.suffix.lower() == suffix and bool(head) and not head.startswith(b"ply")
-    )
-
-
 def new_file(
     path: Path, origin: tuple[str, int], count: int, degree: int, model: Model = "default"
 ) -> tuple[SplatFile, Splats]:

@@ -13,17 +13,17 @@ from ..errors import RefineError
 from ..place import LARGEST_NUMBER, Place, refuse_pointer
 from ..splats import Model, Splats, drawable, with_model
 from ..whole_file import Url, expanded, whole_file
-from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
+from . import by_name, compressed_ply, glb, sog, spz, streamed_sog
 from .format import Format
 from .ply import SplatFile, file_bytes, read_plain
 from .ply_columns import Changes, Keep, other_properties, splats_from_columns
 
 # ``.splat`` is known by its name alone, if a file is none of the others.
-FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, dot_splat.FORMAT)
+FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, by_name.SPLAT)
 """Every format that is written, but plain PLY."""
 
 # Streamed SOG before SOG, whose name its own ends in.
-READERS = (*FORMATS, ksplat.READER, streamed_sog.READER, sog.META_READER)
+READERS = (*FORMATS, by_name.KSPLAT, streamed_sog.READER, sog.META_READER)
 """Every format that is read, but plain PLY, in the order in which an input is tried."""
 
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))

@@ -1,8 +1,11 @@
-"""``.ksplat`` files of GaussianSplats3D (mkkellogg), which are read: levels 0 to 2, degrees 0 to 2.
+"""Formats without a signature, which only the name of a file tells: ``.splat`` and ``.ksplat``.
 
-A header, a header for each section, then the sections. In levels 1 and 2 the splats of a section
-lie in buckets: a coordinate is 16 bits around the centre of the bucket, scales and rotations are
-float16. The files have no signature and are known by their name alone.
+``.splat`` by antimatter15 is 32 bytes a splat and nothing else: mean and linear scale are float32,
+colour, opacity and rotation 8 bits each.
+
+``.ksplat`` of GaussianSplats3D (mkkellogg) is read: levels 0 to 2, degrees 0 to 2. A header, a
+header for each section, then the sections. In levels 1 and 2 the splats of a section lie in
+buckets: a coordinate is 16 bits around the centre of the bucket, scales and rotations are float16.
 """
 
 from __future__ import annotations
@@ -13,13 +16,19 @@ from typing import NamedTuple
 import numpy as np
 
 from ..place import Place
-from ..splats import above_constant, unit_quaternions
-from .format import Format, named, new_file, pieces, refuse_short, set_colors
+from ..splats import above_constant, scales, unit_quaternions
+from .format import Format, color_codes, new_file, pieces, refuse_short, set_colors
 
-NAME = ".ksplat"
+_SPLAT = np.dtype(
+    [("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
+)
+"""What a ``.splat`` holds of one: colour is red, green, blue and opacity, rotation is w x y z."""
+
+_NO_TURN = 128.0  # code of 0 in its rotation, and the step from 0 to 1
 
 _HEADER = struct.Struct("<BBxxI4x4xIHxx12xff")
-"""Version in two parts, section headers, splats, level; least and largest harmonic of level 2."""
+"""Of a ``.ksplat``: version in two parts, section headers, splats, level; least and largest
+harmonic of level 2."""
 
 _SECTION = struct.Struct("<IIIIfHxxI4xIIH")
 """See `_Section`, but for its place and start."""
@@ -34,6 +43,38 @@ _HARMONICS = 1.5
 
 _MIDDLE = 32767
 """Levels 1 and 2: code of the middle of a bucket where a section says nothing."""
+
+
+def _read_splat(path, data):
+    size = _SPLAT.itemsize
+    count, beyond = divmod(len(data), size)
+    if beyond:
+        where = f"splat {count} at byte {count * size}"
+        Place(path).fail(f"truncated: {where} has {beyond} bytes, expected {size}")
+    stored = data.view(_SPLAT)
+    file, splats = new_file(path, (".splat", len(data)), count, 0)
+    # Scales that are 0 or no sizes at all become logarithms that are not finite, as in a PLY.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for piece in pieces(count):
+            rows, target = stored[piece], splats.take(piece)
+            target.means[:] = rows["mean"]
+            target.log_scales[:] = np.log(rows["scale"])
+            set_colors(target, rows["color"] / 255.0)
+            target.quaternions[:] = unit_quaternions(rows["rotation"] / _NO_TURN - 1.0)
+    return file
+
+
+def _write_splat(stream, splats):
+    for piece in pieces(len(splats)):
+        batch = splats.take(piece)
+        rows = np.empty(len(batch), _SPLAT)
+        rows["mean"] = batch.means
+        with np.errstate(under="ignore"):
+            rows["scale"] = scales(batch.log_scales)
+            rows["color"] = color_codes(batch)
+        turns = np.rint(unit_quaternions(batch.quaternions) * _NO_TURN + _NO_TURN)
+        rows["rotation"] = np.clip(turns, 0.0, 255.0)
+        stream.write(rows.data)
 
 
 class _Section(NamedTuple):
@@ -66,7 +107,7 @@ def _row(level, degree):
     return np.dtype([*fields, ("color", "u1", 4), ("rest", *rest)])
 
 
-def _read(path, data):
+def _read_ksplat(path, data):
     refuse_short(path, _HEADER_BYTES, len(data), "the first bytes of a .ksplat file")
     fields = _HEADER.unpack(data[: _HEADER.size].tobytes())
     major, minor, number, announced, level, least, largest = fields
@@ -79,7 +120,7 @@ def _read(path, data):
     if count != announced:
         Place(path).fail(f"{announced} splats by byte 16, {count} by the sections")
     degree = max((section.degree for section in sections if section.splats), default=0)
-    file, splats = new_file(path, (f"{NAME} level {level}", len(data)), count, degree)
+    file, splats = new_file(path, (f".ksplat level {level}", len(data)), count, degree)
     splats.sh_rest[:] = 0.0
     limits = np.float32(least or -_HARMONICS), np.float32(largest or _HARMONICS)
     start = 0
@@ -156,4 +197,16 @@ def _buckets(section, data):
     return centers, bucket
 
 
-READER = Format(NAME, NAME, named(NAME), _read)
+def _named(suffix):
+    """`Format.matches` of files of this name, unless they are PLY."""
+    return lambda path, head: (
+        path.suffix.lower() == suffix and bool(head) and not head.startswith(b"ply")
+    )
+
+
+_LOSS = "holds colour, opacity and rotation in 8 bits each"
+_BYTES = _SPLAT.itemsize, 0
+SPLAT = Format(
+    ".splat", ".splat", _named(".splat"), _read_splat, _write_splat, 0, _LOSS, lambda *_: _BYTES
+)
+KSPLAT = Format(".ksplat", ".ksplat", _named(".ksplat"), _read_ksplat)
