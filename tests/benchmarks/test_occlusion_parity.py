@@ -40,7 +40,7 @@ def measured(splats: Splats, side: float) -> Measured:
     gaussians, frame, _ = projection.prepare(splats, views, threads=1)
     total = Measured.zero(len(gaussians))
     settings = Sampling(cell=side, density=8.0)
-    total.add_view(measuring._measure_view(gaussians, frame, view(), settings)[1], 1.0)
+    total._add_view(measuring._measure_view(gaussians, frame, view(), settings)[1], 1.0)
     back = np.argsort(gaussians.index)
     return Measured(total.contribution[back], total.error[back], total.seen[back])
 

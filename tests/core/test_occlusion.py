@@ -49,7 +49,7 @@ def measured(splats: Splats, *views: View, sampling: Sampling = SAMPLING) -> Mea
     gaussians, frame, _ = projection.prepare(splats, ViewSet(views), threads=1)
     total = Measured.zero(len(gaussians))
     for view in views:
-        total.add_view(measuring._measure_view(gaussians, frame, view, sampling)[1], 1.0)
+        total._add_view(measuring._measure_view(gaussians, frame, view, sampling)[1], 1.0)
     back = np.argsort(gaussians.index)
     return Measured(total.contribution[back], total.error[back], total.seen[back])
 
@@ -584,7 +584,7 @@ def test_the_floor_falls_with_the_views_that_might_have_shown_a_splat():
 
     np.testing.assert_allclose(floors, np.array([1.0, 0.25, 2.0]) * 0.75)
     np.testing.assert_allclose(
-        coverage.with_floor(np.array([2.0, 4, 6]), floors, 2.0),
+        coverage._with_floor(np.array([2.0, 4, 6]), floors, 2.0),
         np.array([0.5, 1, 1.5]) + 2 * floors,
     )
 
@@ -601,7 +601,7 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     errors = np.stack([right * rng.uniform(0.9, 1.1, 200) for _ in range(4)])
 
     found = coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])
-    tenth = np.argsort(coverage.with_floor(right, wrong, found[0]))[:20]
+    tenth = np.argsort(coverage._with_floor(right, wrong, found[0]))[:20]
     np.testing.assert_array_equal(np.sort(tenth), np.sort(np.argsort(right)[:20]))
     assert found[2:] == list(coverage.LEAST_FLOOR_WEIGHTS)[2:]
     most = coverage.floor_weights([(wrong, right, errors)])

@@ -194,7 +194,7 @@ def psnr_against(
 
 def _enough(sample):
     """Whether enough rays of all views hit a splat."""
-    return sum(rays.hitting for rays in sample.rays if rays) >= MIN_RAYS_WITH_HITS
+    return sum(len(rays.counts()) for rays in sample.rays if rays) >= MIN_RAYS_WITH_HITS
 
 
 def _removing(sample, place, counts):

@@ -207,9 +207,7 @@ def score(
     )  # fmt: skip
 
 
-def lambdas(
-    anisotropy: float, luma_variance: float, translucency: float
-) -> tuple[float, float, float]:
+def lambdas(anisotropy: float, luma_variance: float, translucency: float) -> list[float]:
     """Lambda of geometry, colour and opacity: each in [0, 1], their sum 1 (REFINE, Eq. 17-20).
 
     ``ln(F_gem) / 10.73``, ``100 F_col / 56.06`` and ``100 F_opa / 100.67``, divided by their sum,
@@ -233,9 +231,7 @@ def lambdas(
     terms = [value / usual for value, usual in zip(raw, CALIBRATION, strict=True)]
     terms = [term if term > _NOISE else 0.0 for term in terms]
     total = sum(terms)
-    return (
-        (terms[0] / total, terms[1] / total, terms[2] / total) if total else (1 / 3, 1 / 3, 1 / 3)
-    )
+    return [term / total for term in terms] if total else [1 / 3] * 3
 
 
 def _read(splats, origin, spread, progress, threads):

@@ -69,9 +69,7 @@ def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> 
     return np.asarray(_unit(prior**power) / (1.0 + seen))
 
 
-def with_floor(
-    scores: NDArray[np.float64], floors: NDArray[np.float64], weight: float
-) -> NDArray[np.float64]:
+def _with_floor(scores, floors, weight):
     """``scores / mean(scores) + weight floors``, (n,)."""
     return _unit(scores) + weight * floors
 
@@ -94,7 +92,9 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
     for scores, floors, errors in folds:
         views = errors[errors.any(axis=1)]  # (v, n)
         if scores.any() and len(views):
-            tried = [_losses(with_floor(scores, floors, weight), views) for weight in FLOOR_WEIGHTS]
+            tried = [
+                _losses(_with_floor(scores, floors, weight), views) for weight in FLOOR_WEIGHTS
+            ]
             losses.append(np.stack(tried, axis=1))  # (v, weights, shares)
     if not losses:
         return [1.0] * len(SHARES)
@@ -148,7 +148,7 @@ def order(
     left, going = np.arange(len(scores)), [np.arange(0)]
     for weight, count in zip(floor_weights, np.diff(stops, prepend=0), strict=True):
         if count > 0:
-            values = with_floor(scores, floors, weight)[left]
+            values = _with_floor(scores, floors, weight)[left]
             # Only those that may go need to be sorted.
             low = values <= np.partition(values, count - 1)[count - 1]
             rows, values = left[low], values[low]

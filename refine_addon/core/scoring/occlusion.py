@@ -235,8 +235,7 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
     if not measured.contribution.any():
         raise RefineError(
             f"no camera sees the splats: none of {count} reaches into the image of any of "
-            f"{len(ordered)} views; check that cameras and splats share their frame and "
-            "unit"
+            f"{len(ordered)} views; check that cameras and splats share their frame and unit"
         )
     index = np.asarray(gaussians.index)
     weights = coverage.floor_weights(
@@ -330,8 +329,8 @@ class _RemovalRounds:
 
     def remove_and_measure(self, left, progress):
         """Remove all Gaussians but some, (n,) rows, ascending; what each of these is worth now."""
-        nothing_gone = len(left) == len(self._rays_hitting)
-        now = self._first if nothing_gone else self._sums(left, progress)
+        all_left = len(left) == len(self._rays_hitting)
+        now = self._first if all_left else self._sums(left, progress)
         measured = self._measured.error[left], self._measured.contribution[left]
         count = self._rays_hitting[left]  # (n,)
         error, contribution = (
@@ -345,13 +344,11 @@ class _RemovalRounds:
         """Error and contribution of Gaussians that are left, (n,) each, by the rays."""
         keep = np.zeros(len(self._rays_hitting), np.bool_)
         keep[left] = True
-        nothing_gone = len(left) == len(keep)
 
         def removal_errors(number):
             rays, colors, area = self._views[number]
-            if not nothing_gone:
-                rays = rays.keeping(keep.take(rays.hit))
-                self._views[number] = rays, colors, area
+            rays = rays.keeping(keep.take(rays.hit))
+            self._views[number] = rays, colors, area
             with np.errstate(under="ignore"):
                 error, contribution = rays.removal_errors(colors)
                 return area * error, area * contribution
@@ -383,10 +380,8 @@ def _grown(measured, before, now, known):
     scene_growth = float(now.sum()) / total if total > 0.0 else 1.0
     prior = known * measured
     both = before + prior
-    growth = np.divide(
-        now + scene_growth * prior, both, out=np.ones_like(measured), where=both > 0.0
-    )
-    return measured * growth
+    grown = now + scene_growth * prior
+    return measured * np.divide(grown, both, out=np.ones_like(both), where=both > 0.0)
 
 
 def _kept_after_rounds(count, rounds, settled):

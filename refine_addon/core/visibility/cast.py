@@ -322,9 +322,8 @@ def cast(
     aims : (2, P) int64, optional
         See `aimed`.
     """
-    return _front_to_back(
-        footprints, columns, rows, aims, hits(footprints, columns, rows, _PAIRS, aims=aims)
-    )
+    found = hits(footprints, columns, rows, _PAIRS, aims=aims)
+    return _front_to_back(footprints, columns, rows, aims, found)
 
 
 def cast_visible(

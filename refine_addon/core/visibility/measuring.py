@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,9 +118,7 @@ class Measured(NamedTuple):
         for name in self._fields:
             getattr(self, name)[:] += getattr(other, name)
 
-    def add_view(
-        self, measured: tuple[NDArray[Any], ...], weight: float, threads: int | None = 1
-    ) -> None:
+    def _add_view(self, measured, weight, threads=1):
         """Add what one view sees, see `_measure_view`, times its weight."""
         rows, inside, contribution, error = measured
 
@@ -197,7 +195,7 @@ def measure(
         sums, of_views = Measured.zero(len(gaussians)), []
         for number, ((measurement, cast), some) in zip(group, each, strict=False):
             before = sums.error[rows]  # (m,)
-            sums.add_view(measurement, views[number][1], threads)
+            sums._add_view(measurement, views[number][1], threads)
             of_views.append(sums.error[rows] - before)
             for ray_sample, rays in zip(some, cast, strict=True):
                 ray_sample.rays[number] = rays

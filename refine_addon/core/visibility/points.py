@@ -11,7 +11,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -77,8 +76,7 @@ class _Lattices(NamedTuple):
     sums: NDArray[np.float32]  # (2, P), of the shares of each patch, and of their squares
 
 
-@dataclass(frozen=True, eq=False)
-class Points:
+class Points(NamedTuple):
     """The m points inside the image, cell by cell, and front to back in each cell.
 
     Of several points of one splat in one cell the first has the shares of all, so that a splat does

@@ -329,12 +329,13 @@ def project(
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
             covariances = np.take(chunk.covariances[:, piece], touching, axis=1)
             shape, rows = _product(rotation, covariances), touching + start  # (6, n), (n,)
-            alphas = chunk.alphas.take(rows)
+            alphas, (across, down) = chunk.alphas.take(rows), local[:2] / local[2]
+            centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
             if chunk.normals is not None:
                 normals = _product(turned, np.take(chunk.normals, rows, axis=1))
-                centers, axes, *hit = _discs(local, shape, normals, view, planes[0])
+                axes, *hit = _discs(across, down, local[2], shape, normals, view, planes[0])
             else:
-                centers, axes, kept = _ellipses(local, shape, view)
+                axes, kept = _ellipses(across, down, local[2], shape, view)
                 if gaussians.model == "antialiased":
                     alphas *= kept
             inside = frustum.contains(view, local, planes)
@@ -456,20 +457,17 @@ def _rotation6(r):
     )
 
 
-def _ellipses(local, shape, view):
-    """Footprints of Gaussians: centres, axes, and how much of their opacity antialiasing keeps.
+def _ellipses(across, down, z, shape, view):
+    """Footprints of Gaussians: their axes, and how much of their opacity antialiasing keeps.
 
     For a centre far outside the image, J is computed at the edge that `_BEYOND` sets, because J
     grows without bound.
     """
-    x, y, z = local
-    across, down = x / z, y / z
-    centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
     across, down = _near_image(across, down, view)
     variances, direction = _principal(across, down, z, shape, view)
     sigmas = np.sqrt(variances + LOW_PASS)
     kept = np.sqrt(variances[0] * variances[1]) / (sigmas[0] * sigmas[1])
-    return centers, _half_axes(sigmas, direction), kept
+    return _half_axes(sigmas, direction), kept
 
 
 def _near_image(across, down, view):
@@ -535,8 +533,8 @@ def _half_axes(sigmas, direction):
     return sigmas[0] * direction, sigmas[1] * np.stack([-s, c]), sigmas
 
 
-def _discs(local, shape, normals, view, near):
-    """Footprints of discs: centres, axes, and what rays hit.
+def _discs(across, down, z, shape, normals, view, near):
+    """Footprints of discs: their axes, and what rays hit.
 
     The ray through a pixel hits the plane of a disc at ``(u, v)``, in units of its two scales, and
     its alpha there is ``o exp(-(u^2 + v^2) / 2)``, at least ``o exp(-|d|^2 / (2 DISC_LOW_PASS))``,
@@ -546,9 +544,6 @@ def _discs(local, shape, normals, view, near):
 
         u^2 + v^2 = d' C^-1 d / (1 + g d)^2        g = (n_x / fx, n_y / fy) / (n r)
     """
-    x, y, z = local
-    across, down = x / z, y / z
-    centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
     variances, direction = _principal(across, down, z, shape, view)
     sigmas = np.sqrt(np.maximum(variances, _THINNEST_DISC**2))
     c, s = direction
@@ -562,7 +557,7 @@ def _discs(local, shape, normals, view, near):
             z / np.float32(near),
         ]
     )
-    return centers, _half_axes(disc_axes(variances), direction), discs.astype(np.float32)
+    return _half_axes(disc_axes(variances), direction), discs.astype(np.float32)
 
 
 def disc_axes(variances: NDArray[FloatT]) -> NDArray[FloatT]:

@@ -68,11 +68,6 @@ class Rays:
         """How many rays there are."""
         return len(self.columns) * len(self.rows)
 
-    @property
-    def hitting(self) -> int:
-        """How many of the rays hit a splat."""
-        return len(self._first_hits())
-
     def pixels_of(
         self, ray: NDArray[np.integer[Any]]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
