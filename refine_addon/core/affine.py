@@ -253,8 +253,8 @@ def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
     Returns
     -------
     list of Move
-        Each point is in one of them at most: none explains those that were moved one by one, and
-        those that are not finite.
+        Each point is in one of them at most: none explains those that were moved one by one, or
+        into a plane, and those that are not finite.
     """
     before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
     finite = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
@@ -263,63 +263,49 @@ def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
     left = np.flatnonzero(finite & ~same)
     random = np.random.default_rng(0)
     while len(left) >= LEAST and len(moves) <= _MOST:
-        some = slice(None) if len(left) == len(before) else left
-        matrix, fits = _best(before[some], after[some], random)
+        matrix = _agreed(before[left], after[left], random)
         if matrix is None:
             break
+        fits = _fits(matrix, before[left], after[left])
         moves.append(Move(left[fits], matrix))
         left = left[~fits]
     return moves
 
 
-def _best(before, after, random):
-    """Map that most points agree with, (4, 4), None where hardly any, and which do."""
-    whole = _refined(before, after, np.arange(len(before)))
-    if whole is not None and (fits := _fits(whole, before, after)).all():
-        return whole, fits
-    some = _spread(np.arange(len(before)), _SAMPLE)
+def _agreed(before, after, random):
+    """Map that most points agree with, (4, 4), None where hardly any do."""
+    everything = np.arange(len(before))
+    some = _spread(everything, _SAMPLE)
+    start, end = before[some], after[some]
     best, most = None, LEAST - 1
-    for number in range(_TRIES):
-        share = int(len(before) * _BLOCKS[number % len(_BLOCKS)])
-        size = max(min(len(before), 2 * _DRAWN), share)
-        start = random.integers(0, len(before) - size + 1)
-        drawn = start + random.choice(size, min(size, _DRAWN), replace=False)
+    for number in range(-1, _TRIES):
+        drawn = some  # one map of all
+        if number >= 0:
+            size = max(min(len(before), 8), int(len(before) * _BLOCKS[number % len(_BLOCKS)]))
+            first = random.integers(0, len(before) - size + 1)
+            drawn = first + random.choice(size, min(size, _DRAWN), replace=False)
         matrix = _fitted(before[drawn], after[drawn])
         if matrix is None:
             continue
         # Few points tell a map less exactly than all that agree with it.
-        agree = _fits(matrix, before[some], after[some], slack=100.0)
+        agree = _fits(matrix, start, end, slack=100.0)
         if np.count_nonzero(agree) >= LEAST:
-            better = _fitted(before[some][agree], after[some][agree])
+            better = _fitted(start[agree], end[agree])
             matrix = matrix if better is None else better
-        agreeing = int(np.count_nonzero(_fits(matrix, before[some], after[some])))
+        agreeing = int(np.count_nonzero(_fits(matrix, start, end)))
         if agreeing > most:
             best, most = matrix, agreeing
         if most > len(some) // 2:
             break
-    if best is not None:
-        best = _refined(before, after, np.flatnonzero(_fits(best, before, after)))
     if best is None:
-        return None, np.zeros(len(before), np.bool_)
-    return best, _fits(best, before, after)
+        return None
+    rows = _spread(np.flatnonzero(_fits(best, before, after)), _FITTED)
+    return _fitted(before[rows], after[rows])
 
 
 def _spread(rows, most):
     """At most so many of some rows, evenly spread."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]
-
-
-def _refined(before, after, agree):
-    """Map of points that agree, (4, 4); a translation where that explains them."""
-    if len(agree) < LEAST:
-        return None
-    rows = _spread(agree, _FITTED)
-    before, after = before[rows], after[rows]
-    shift = np.eye(4)
-    shift[:3, 3] = (after - before).mean(axis=0)
-    if _fits(shift, before, after).all():
-        return shift
-    return _fitted(before, after)
 
 
 def _fits(matrix, before, after, *, slack=1.0):
@@ -334,11 +320,16 @@ def _fits(matrix, before, after, *, slack=1.0):
 
 
 def _fitted(before, after):
-    """Affine map of least squares between points, (4, 4).
+    """Affine map of least squares between points, (4, 4); a translation where that explains them.
 
     Points in a plane say nothing of the direction across it. It is mapped across the plane that
-    they lie in now, by the mean scale within it, and not mirrored. None for points on a line.
+    they lie in now, by the mean scale within it, and not mirrored. None for points on a line,
+    and where they lie in a plane only now, as what Blender's *Mirror* merges.
     """
+    shift = np.eye(4)
+    shift[:3, 3] = (after - before).mean(axis=0)
+    if _fits(shift, before, after).all():
+        return shift
     # Relative to their size: far points are rounded more coarsely.
     extents = np.abs(before).max(axis=1) + np.abs(after).max(axis=1)
     weights = 1.0 / (extents + (np.median(extents) or 1.0))
@@ -357,4 +348,5 @@ def _fitted(before, after):
     matrix = np.eye(4)
     matrix[:3, :3] = (axes.T @ images).T
     matrix[:3, 3] = target - matrix[:3, :3] @ middle
-    return matrix
+    scales = scales_of(matrix)
+    return matrix if scales[2] > _PLANAR * scales[0] else None

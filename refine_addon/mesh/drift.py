@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import bpy
@@ -20,7 +19,7 @@ from ..core.affine import Move, affine_moves
 from ..core.formats.ply_columns import THIRD_SCALE
 from . import attributes as mesh_attributes
 from . import native
-from .layout import sh_degree, unlisted
+from .layout import sh_degree
 
 HOME = "refine_home"
 """Vector on points: where the splat was when its scales, rotation and harmonics were written."""
@@ -43,69 +42,26 @@ _SHOWN = 1 << 15
 """Splats that are looked at, evenly spread, for what the panel says."""
 
 
-@dataclass(frozen=True)
-class Drift:
-    """What was found that others did to splats.
+class Drift(NamedTuple):
+    """What was found that others did to splats: sentences, and whether Mend Splats is of use."""
+
+    told: list[str]
+    mendable: bool
+
+
+class Mending(NamedTuple):
+    """What it takes to have splats follow what others did to them.
 
     Attributes
     ----------
-    turned : int
-        Splats that were turned, scaled or mirrored without their scales, rotations and harmonics.
-    mirrored : bool
-        Whether some of them were mirrored.
-    sources : int
-        Objects that the splats came from; more than one after *Join*.
-    regrouped : int
-        Splats whose harmonics stand under the names of another degree.
-    unlisted : tuple of str
-        Properties of joined splats that an export would leave out.
-    bent : int
-        Splats that were moved each by itself, as by a modifier; 0 for a few, moved by hand.
-    strangers : int
-        Vertices of which nothing was noted, among others of which it was.
+    moves : list of Move
+        By what maps which splats were moved that did not follow, but in their positions.
+    regrouped : (N,) int
+        Of each splat whose harmonics stand under the names of another degree, that degree; else 0.
     """
 
-    turned: int
-    mirrored: bool
-    sources: int
-    regrouped: int
-    unlisted: tuple[str, ...]
-    bent: int
-    strangers: int
-
-    @property
-    def mendable(self) -> bool:
-        """Whether anything can be put right, or has to be taken as it is."""
-        return bool(self.turned or self.regrouped or self.unlisted or self.bent)
-
-    def sentences(self) -> list[str]:
-        """Return what was done, each in a sentence."""
-        told = []
-        if self.turned:
-            how = "joined" if self.sources > 1 else "mirrored" if self.mirrored else "transformed"
-            told.append(
-                f"{self.turned:,} splats were {how} without their sizes, rotations and colours, "
-                "as Blender's own tools do"
-            )
-        if self.regrouped:
-            told.append(
-                f"{self.regrouped:,} splats were joined with others of another SH degree: their "
-                "colours are mixed up"
-            )
-        if self.unlisted:
-            names = ", ".join(self.unlisted)
-            told.append(f"Joined splats have properties that an export leaves out: {names}")
-        if self.bent:
-            told.append(
-                f"{self.bent:,} splats were moved each by itself, as by a modifier, without their "
-                "sizes and rotations: undo that, or Mend Splats takes it as it is"
-            )
-        if self.strangers:
-            told.append(
-                f"{self.strangers:,} vertices that are no splats, or of an object never seen here, "
-                "were joined: undo that"
-            )
-        return told
+    moves: list[Move]
+    regrouped: NDArray[np.int64]
 
 
 def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
@@ -125,50 +81,60 @@ def is_stamped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
 
 
 def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
-    """Return what others did to the splats of a mesh, None if nothing, or nothing was noted.
+    """What others did to the splats of a mesh, None if nothing, or nothing was noted.
 
     Quick where nothing was done: 10 ms at a million splats. Else counts are estimated by some.
     """
-    if not is_stamped(mesh):
+    if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
         return None
-    notes = _Notes(mesh)
-    if notes.undisturbed():
+    moves, looked, loose = notes.moves(max(1, len(notes.codes) // _SHOWN))
+    share = len(notes.codes) / max(looked, 1)
+    turned, bent = (round(share * n) for n in (sum(len(move.rows) for move in moves), loose))
+    strangers = int(np.count_nonzero(notes.codes == 0))
+    regrouped = int(np.count_nonzero(notes.regrouped()))
+    told = []
+    if turned:
+        mirrored = any(np.linalg.det(move.matrix[:3, :3]) < 0.0 for move in moves)
+        joined = len(notes.objects()) > 1
+        how = "joined" if joined else "mirrored" if mirrored else "transformed"
+        told.append(
+            f"{turned:,} splats were {how} without their sizes, rotations and colours, "
+            "as Blender's own tools do"
+        )
+    if regrouped:
+        told.append(
+            f"{regrouped:,} splats were joined with others of another SH degree: their "
+            "colours are mixed up"
+        )
+    if bent > max(_FEW, _FEW_SHARE * len(notes.codes)):
+        told.append(
+            f"{bent:,} splats were moved each by itself, as by a modifier, without their "
+            "sizes and rotations: undo that, or Mend Splats takes it as it is"
+        )
+    mendable = bool(told)
+    if strangers:
+        told.append(
+            f"{strangers:,} vertices that are no splats, or of an object never seen here, "
+            "were joined: undo that"
+        )
+    return Drift(told, mendable) if told else None
+
+
+def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Callable[[], Mending] | None:
+    """Read what was noted of a mesh; what finds out on any thread what it takes to mend it.
+
+    None where nothing was done to it.
+    """
+    if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
         return None
-    step = max(1, len(notes.codes) // _SHOWN)
-    return notes.drift(*notes.moves(step), step)
-
-
-class Mending(NamedTuple):
-    """What it takes to have splats follow what others did to them.
-
-    Attributes
-    ----------
-    moves : list of Move
-        By what maps which splats were moved that did not follow, but in their positions.
-    regrouped : list of (int, (M,) int64)
-        Which splats have their harmonics under the names of which other degree.
-    """
-
-    moves: list[Move]
-    regrouped: list[tuple[int, NDArray[np.int64]]]
-
-
-def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Callable[[], Mending | None]:
-    """Read what was noted of a mesh; return what finds out what it takes to mend it.
-
-    That may run on any thread. None comes of it if nothing was found that others did to the mesh.
-    """
-    if not is_stamped(mesh):
-        return lambda: None
-    return _Notes(mesh).held().mending
+    return lambda: Mending(notes.moves()[0], notes.regrouped())
 
 
 def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     """Note anew the splats whose scales and rotations were just written, as by merging."""
     if not is_stamped(mesh):
         return
-    notes = _Notes(mesh)
-    checksums = _checksums(_shapes(mesh))
+    notes, checksums = _Notes(mesh), _checksums(_shapes(mesh))
     rows = notes.codes >> _CHECKSUM != checksums
     notes.home[rows] = notes.position[rows]
     codes = np.where(rows, checksums << _CHECKSUM | notes.codes & _ORIGIN, notes.codes)
@@ -177,107 +143,55 @@ def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
 
 
 class _Notes:
-    """What was noted of a mesh, beside what is."""
+    """What was noted of a mesh, beside what is, for any thread."""
 
     def __init__(self, mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-        self.mesh = mesh
-        self.home: NDArray[np.float32] = mesh_attributes.read_attribute(mesh, HOME)
-        self.position: NDArray[np.float32] = mesh_attributes.read_attribute(mesh, "position")
-        self.codes = mesh_attributes.read_attribute(mesh, SHAPE).view(np.uint32)
-        self.native, self.degree = native.is_native(mesh), sh_degree(mesh)
-        self.unlisted = tuple(unlisted(mesh))
-        self._shapes: list[NDArray[np.float32]] | None = None
-
-    def held(self) -> _Notes:
-        """Read the rest, so that any thread can go on; return self."""
-        self._shapes = _shapes(self.mesh)
-        return self
-
-    def mending(self) -> Mending | None:
-        """Return what `mending` says."""
-        if self.undisturbed():
-            return None
-        moves, loose = self.moves()
-        if self.drift(moves, loose) is None:
-            return None
-        rows = self.regrouped()
-        degrees = self.codes[rows] & _DEGREE
-        regrouped = [(int(degree), rows[degrees == degree]) for degree in np.unique(degrees)]
-        return Mending(moves, regrouped)
-
-    def undisturbed(self) -> bool:
-        """Tell whether all splats are where they were, of one object of that degree."""
+        self.home, self.position, codes = (
+            mesh_attributes.read_attribute(mesh, name) for name in (HOME, "position", SHAPE)
+        )
+        self.codes = codes.view(np.uint32)
+        # Names of harmonics in Blender's own splats do not depend on the degree.
+        self.degree = None if native.is_native(mesh) else sh_degree(mesh)
         origins = self.codes & _ORIGIN
-        return bool(
+        self.undisturbed = bool(
             np.array_equal(self.home.view(np.uint32), self.position.view(np.uint32))
             and (origins == origins[0]).all()
-            and (self.native or origins[0] & _DEGREE == self.degree)
+            and self.degree in (None, origins[0] & _DEGREE)
         )
-
-    def drift(self, moves: list[Move], loose: int, step: int = 1) -> Drift | None:
-        """Return what `found` does, of what `moves` has found."""
-        bent, objects = step * loose, self.objects()
-        drift = Drift(
-            turned=min(step * sum(len(move.rows) for move in moves), len(self.codes)),
-            bent=bent if bent > max(_FEW, _FEW_SHARE * len(self.codes)) else 0,
-            mirrored=any(np.linalg.det(move.matrix[:3, :3]) < 0.0 for move in moves),
-            sources=len(objects),
-            regrouped=len(self.regrouped()),
-            unlisted=self.unlisted if len(objects) > 1 else (),
-            strangers=int(np.count_nonzero(self.codes == 0)),
-        )
-        return drift if drift.mendable or drift.strangers else None
+        self.shapes = [] if self.undisturbed else _shapes(mesh)
 
     def objects(self) -> list[int]:
-        """Return the numbers of the objects that the splats came from."""
+        """The numbers of the objects that the splats came from."""
         return [int(number) for number in np.unique(self.codes & _OBJECT) if number]
 
-    def moves(self, step: int = 1) -> tuple[list[Move], int]:
-        """Return the maps that splats did not follow, and how many were moved each by itself.
+    def moves(self, step: int = 1) -> tuple[list[Move], int, int]:
+        """The maps that splats did not follow; how many were looked at, and moved by themselves.
 
-        One splat of `step` is looked at.
+        One splat of `step` is looked at. What was moved by itself goes with most of its object.
         """
         rows = np.arange(0, len(self.codes), step)
-        codes = self.codes[rows]
-        shapes = _shapes(self.mesh) if self._shapes is None else self._shapes
-        rows = rows[(codes >> _CHECKSUM == _checksums(shapes, step)) & (codes != 0)]
-        moves, loose = [], 0
+        looked, codes = len(rows), self.codes[rows]
+        rows = rows[(codes >> _CHECKSUM == _checksums(self.shapes, step)) & (codes != 0)]
+        found, lost = [], 0
         for number in self.objects():
             own = rows[self.codes[rows] & _OBJECT == number]
             home, position = self.home[own], self.position[own]
-            of_object = affine_moves(home, position)
+            moves = affine_moves(home, position)
             finite = np.isfinite(home + position).all(axis=1)
-            loose += int(np.count_nonzero(finite)) - sum(len(move.rows) for move in of_object)
-            moves += _followed(own, of_object)
+            lost += int(np.count_nonzero(finite)) - sum(len(move.rows) for move in moves)
+            most = np.argmax([len(move.rows) for move in moves]) if moves else 0
+            labels = np.full(len(own), most)
+            for label, move in enumerate(moves):
+                labels[move.rows] = label
+            found += [Move(own[labels == label], m.matrix) for label, m in enumerate(moves)]
         still = np.eye(3)  # or shifted alike
-        return [m for m in moves if not np.array_equal(m.matrix[:3, :3], still)], loose
+        return [m for m in found if not np.array_equal(m.matrix[:3, :3], still)], looked, lost
 
     def regrouped(self) -> NDArray[np.int64]:
-        """Return the splats whose harmonics stand under the names of another degree."""
-        if self.native:  # names of harmonics do not depend on the degree
-            return np.empty(0, np.int64)
-        degrees = self.codes & _DEGREE
-        other = (self.codes != 0) & (degrees != self.degree) & (degrees != 0)
-        return np.flatnonzero(other)
-
-
-def _followed(rows: NDArray[np.int64], moves: list[Move]) -> list[Move]:
-    """Return maps of some rows as maps of the mesh's rows.
-
-    What was moved by itself besides went with most others.
-    """
-    if not moves:
-        return []
-    loose = np.ones(len(rows), np.bool_)
-    for move in moves:
-        loose[move.rows] = False
-    most = max(moves, key=lambda move: len(move.rows))
-    return [
-        Move(rows[np.concatenate([move.rows, np.flatnonzero(loose)])], move.matrix)
-        if move is most
-        else Move(rows[move.rows], move.matrix)
-        for move in moves
-    ]
+        """Of each splat whose harmonics stand under names of another degree that degree, else 0."""
+        degrees = np.asarray(self.codes & _DEGREE, np.int64)
+        degrees[degrees == self.degree] = 0
+        return degrees if self.degree is not None else np.zeros_like(degrees)
 
 
 def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.float32]]:

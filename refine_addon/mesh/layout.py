@@ -286,32 +286,6 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
     return layout if described else None
 
 
-def unlisted(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[str]:
-    """Return the attributes that the layout which the import noted does not know, by name.
-
-    Harmonics are not among them, which a file always gets.
-    """
-    layout = _remembered(mesh)
-    if layout is None:
-        return []
-    taken = {column.attribute for column in layout.columns} | {c.name for c in layout.columns}
-    taken |= {place.attribute for place in _native_places(mesh).values()}
-    return [column.name for column in _further_columns(mesh, taken)]
-
-
-def list_all(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Have a file of a mesh hold all attributes that it can, harmonics and what `unlisted` names.
-
-    To be called where splats of several files came together.
-    """
-    layout = _remembered(mesh)
-    if layout is None:
-        return  # all of them are listed
-    names = set(unlisted(mesh))
-    more = [column for column in _further_columns(mesh, set()) if column.name in names]
-    note(mesh, _with(layout, splat_count(mesh), more) if more else layout)
-
-
 def merged(layouts: Sequence[Layout]) -> Layout:
     """Return the layout of meshes that are joined: all columns of each, those of the first first.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import bpy
@@ -18,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.objects import world_matrix
-from ..core.affine import Move, baked, check_affine, is_uniform, transformed
+from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
-from ..core.execute import chunks, run_all
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
 from ..core.merging.merge import Merged
@@ -37,11 +35,7 @@ from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from ..mesh.scores import RECORD, stored_scores
-
-_NORMALS = ("nx", "ny", "nz")
-
-_ROWS = 1 << 14
-"""Splats that are moved at a time, on one thread."""
+from .transforms import read_to_move, uneven_notes
 
 
 @dataclass(frozen=True)
@@ -131,7 +125,7 @@ def drift_notes(checked: SplatObject) -> list[str]:
     if drift is None:
         return []
     remedy = "; Mend Splats in the panel puts that right" if drift.mendable else ""
-    return [f"object '{checked.obj.name}': {told}{remedy}" for told in drift.sentences()]
+    return [f"object '{checked.obj.name}': {told}{remedy}" for told in drift.told]
 
 
 def stored_arguments(
@@ -323,11 +317,8 @@ def read_for_export(
     """
     if apply_transform:
         matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
-        if not np.array_equal(matrix, np.eye(4)):
-            check_affine(matrix)
-            move, names = _read_to_move(checked)
-            everything = [Move(np.arange(len(checked)), matrix)]
-            return mesh_attributes.read_for_file(checked, names, partial(move, everything))
+        names, move = read_to_move(checked, matrix)
+        return mesh_attributes.read_for_file(checked, names, lambda: move()[0])
     return mesh_attributes.read_for_file(checked)
 
 
@@ -340,95 +331,9 @@ def export_notes(checked: SplatObject, *, apply_transform: bool = False) -> list
     return notes
 
 
-def uneven_notes(checked: SplatObject, matrix: NDArray[np.float64]) -> list[str]:
-    """Return a sentence if colours cannot follow a matrix, (4, 4), exactly."""
-    if is_uniform(matrix) or not mesh_layout.sh_degree(checked.mesh):
-        return []
-    note = (
-        f"object '{checked.obj.name}': the scale is uneven, which harmonics cannot follow exactly: "
-        "colours that change with the direction became the nearest"
-    )
-    return [note]
-
-
 def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     kept = int(np.count_nonzero(keep))
     return Outcome.of(len(keep), kept, *mesh_attributes.file_size(checked))
-
-
-def moved_columns(checked: SplatObject, moves: Sequence[Move]) -> dict[str, NDArray[Any]]:
-    """Return an object's columns as they are once some splats were moved as a whole.
-
-    Parameters
-    ----------
-    checked : SplatObject
-    moves : sequence of Move
-        Which splats, and by which maps in the object's frame.
-
-    Returns
-    -------
-    dict of str to (N,) float32
-        Those that change: positions, scales, rotations, harmonics and normals.
-
-    Raises
-    ------
-    RefineError
-        See `refine_addon.core.affine.baked`.
-    """
-    return read_to_move(checked)(moves)
-
-
-def read_to_move(checked: SplatObject) -> Callable[[Sequence[Move]], dict[str, NDArray[Any]]]:
-    """Read a splat object; return what does as `moved_columns` on any thread, given the moves."""
-    return _read_to_move(checked)[0]
-
-
-def _read_to_move(
-    checked: SplatObject,
-) -> tuple[Callable[[Sequence[Move]], dict[str, NDArray[Any]]], set[str]]:
-    """Return that, and the properties that it returns."""
-    splats = mesh_attributes.splats_from_object(checked)
-    with_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
-    names = {*values_by_name(splats), *(_NORMALS if with_normals else ())} - {"opacity"}
-    normals = mesh_attributes.normals(checked) if with_normals else None
-    return partial(_moved, splats, normals), names
-
-
-def _moved(
-    splats: Splats, normals: NDArray[np.float32] | None, moves: Sequence[Move]
-) -> dict[str, NDArray[Any]]:
-    stored = {name: row for name, row in values_by_name(splats).items() if name != "opacity"}
-    copied = np.empty_like if any(len(move.rows) == len(splats) for move in moves) else np.array
-    columns = {name: copied(column) for name, column in stored.items()}
-    for move in moves:
-        _move_rows(splats, columns, move)
-    if normals is not None:
-        for move in moves:
-            normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
-        columns.update(zip(_NORMALS, normals.T, strict=True))
-    return columns
-
-
-def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> None:
-    """Write into columns what some splats become."""
-
-    def move_some(part: slice) -> None:
-        rows = part if len(move.rows) == len(splats) else move.rows[part]
-        values = values_by_name(baked(splats.take(rows), move.matrix))
-        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
-            for name, column in columns.items():
-                column[rows] = values[name]
-
-    run_all(move_some, chunks(len(move.rows), _ROWS))
-
-
-def _turned_normals(normals: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[Any]:
-    """Return normals, (M, 3), of surfaces that a matrix moved; zeros, as most files have, stay."""
-    if not normals.any():
-        return normals
-    turned = normals @ np.linalg.inv(matrix[:3, :3])
-    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
-    return np.asarray(turned / np.where(lengths > 0.0, lengths, 1.0))
 
 
 def find(name: str) -> bpy.types.Object:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import bpy
@@ -14,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.objects import snapped, world_matrix
-from ..core.affine import Move, is_flat
+from ..core.affine import Move, baked, check_affine, is_flat, is_uniform, moved
 from ..core.errors import RefineError
-from ..core.execute import Progress, report
-from ..core.formats.ply import REST_COUNTS
-from ..core.splats import above_constant, refuse_mixed
+from ..core.execute import Progress, chunks, report, run_all, silent
+from ..core.formats.ply_columns import values_by_name
+from ..core.splats import Splats, above_constant, refuse_mixed
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -28,7 +30,11 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 from . import demands
-from .splat_object import moved_columns, read_to_move, uneven_notes
+
+_NORMALS = ("nx", "ny", "nz")
+
+_ROWS = 1 << 14
+"""Splats that are moved at a time, on one thread."""
 
 _UNMOVED = {
     "location": (0.0, 0.0, 0.0),
@@ -55,98 +61,142 @@ _OF_ALL = (
 """Attributes that say something of a splat among all others of its scene."""
 
 
-class Mended(NamedTuple):
-    """What an object's splats become: what it takes, and columns, where nothing else changes."""
-
-    mending: mesh_drift.Mending | None
-    columns: dict[str, NDArray[Any]]
-
-
-def read_to_mend(checked: SplatObject) -> Callable[[], Mended]:
-    """Read an object; return what finds out how its splats are put right, on any thread.
-
-    Raises
-    ------
-    RefineError
-        See `mesh.edit.check_changeable`; the callable raises it if a map is flat.
-    """
-    mesh_edit.check_changeable(checked.obj)
-    find, move = mesh_drift.mending(checked.mesh), read_to_move(checked)
-
-    def work() -> Mended:
-        mending = find()
-        whole = mending is not None and mending.moves and not mending.regrouped
-        return Mended(mending, move(mending.moves) if mending and whole else {})
-
-    return work
-
-
-def mend(group: Sequence[SplatObject], found: Sequence[Mended] | None = None) -> int:
-    """Have splats follow what others did to their positions: see `mesh.drift`.
-
-    Positions stay. Scales, rotations, harmonics and normals are moved by the maps that the
-    positions tell, and properties of joined splats become part of a file.
+def read_to_move(
+    checked: SplatObject,
+    matrix: NDArray[np.float64] | None = None,
+    *,
+    mend: bool = False,
+    harmonics: int = 0,
+) -> tuple[set[str], Callable[[], tuple[dict[str, NDArray[Any]], int]]]:
+    """Read a splat object to move its splats as a whole.
 
     Parameters
     ----------
-    group : sequence of SplatObject
-    found : sequence of Mended, optional
-        What the callables of `read_to_mend` have returned; None to do that now.
+    checked : SplatObject
+    matrix : (4, 4) float64, optional
+        By what; in the object's frame.
+    mend : bool
+        Whether scales, rotations, harmonics and normals are first to follow what others did to the
+        positions: see `mesh.drift`.
+    harmonics : int
+        How many beyond the constant there are to be at least, zeros behind the splats' own.
 
     Returns
     -------
-    int
-        How many splats were put right.
+    names : set of str
+        Properties that change; none where nothing is to be done.
+    work : callable
+        On any thread: what they become, (N,) each, and how many splats were mended.
 
     Raises
     ------
     RefineError
-        See `mesh.edit.check_changeable`; also if a map is flat.
+        See `core.affine.check_affine`.
     """
-    for checked in group:
+    matrix = np.eye(4) if matrix is None else matrix
+    check_affine(matrix)
+    find = mesh_drift.mending(checked.mesh) if mend else None
+    more = harmonics - mesh_layout.rest_count(checked.mesh) // 3
+    if find is None and more <= 0 and np.array_equal(matrix, np.eye(4)):
+        return set(), lambda: ({}, 0)
+    splats = mesh_attributes.splats_from_object(checked)
+    if more > 0:
+        splats = replace(splats, sh_rest=np.pad(splats.sh_rest, ((0, 0), (0, more), (0, 0))))
+    has_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
+    names = {*values_by_name(splats), *(_NORMALS if has_normals else ())} - {"opacity"}
+    normals = mesh_attributes.normals(checked) if has_normals else None
+    return names, partial(_moved, splats, normals, matrix, find)
+
+
+def _moved(
+    splats: Splats,
+    normals: NDArray[np.float32] | None,
+    matrix: NDArray[np.float64],
+    find: Callable[[], mesh_drift.Mending] | None,
+) -> tuple[dict[str, NDArray[Any]], int]:
+    moves, regrouped = find() if find else ([], np.zeros(len(splats), np.int64))
+    if regrouped.any():
+        splats = replace(splats, sh_rest=_regrouped(splats.sh_rest, regrouped))
+    mended = regrouped > 0
+    still = np.ones(len(splats), np.bool_)
+    for move in moves:
+        mended[move.rows], still[move.rows] = True, False
+    stays = np.array_equal(matrix, np.eye(4))
+    everything = [Move(move.rows, matrix @ move.matrix) for move in moves]
+    everything += [] if stays else [Move(np.flatnonzero(still), matrix)]
+    values = values_by_name(splats)
+    columns = {name: np.array(values[name]) for name in values if name != "opacity"}
+    for move in everything:
+        _move_rows(splats, columns, move)
+        if normals is not None:
+            normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
+        means = splats.means if stays else np.float32(moved(splats.means, matrix))
+    columns |= dict(zip("xyz", means.T, strict=True))
+    if normals is not None:
+        columns |= dict(zip(_NORMALS, normals.T, strict=True))
+    return columns, int(np.count_nonzero(mended))
+
+
+def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> None:
+    """Write into columns what some splats become."""
+
+    def move_some(part: slice) -> None:
+        rows = move.rows[part]
+        values = values_by_name(baked(splats.take(rows), move.matrix))
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
+            for name, column in columns.items():
+                column[rows] = values[name]
+
+    run_all(move_some, chunks(len(move.rows), _ROWS))
+
+
+def _regrouped(rest: NDArray[Any], degrees: NDArray[np.int64]) -> NDArray[Any]:
+    """Harmonics, (N, K, 3), of which some stand under the names of a lower degree; 0 for none."""
+    rest = np.array(rest)
+    for degree in np.unique(degrees[degrees > 0]).tolist():
+        rows, own = degrees == degree, above_constant(degree)
+        in_file = rest[rows].transpose(0, 2, 1).reshape(-1, 3 * rest.shape[1])
+        rest[rows] = 0.0
+        rest[rows, :own] = in_file[:, : 3 * own].reshape(-1, 3, own).transpose(0, 2, 1)
+    return rest
+
+
+def _turned_normals(normals: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[Any]:
+    """Return normals, (M, 3), of surfaces that a matrix moved; zeros, as most files have, stay."""
+    if not normals.any():
+        return normals
+    turned = normals @ np.linalg.inv(matrix[:3, :3])
+    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.asarray(turned / np.where(lengths > 0.0, lengths, 1.0))
+
+
+def uneven_notes(checked: SplatObject, matrix: NDArray[np.float64]) -> list[str]:
+    """Return a sentence if colours cannot follow a matrix, (4, 4), exactly."""
+    if is_uniform(matrix) or not mesh_layout.sh_degree(checked.mesh):
+        return []
+    note = (
+        f"object '{checked.obj.name}': the scale is uneven, which harmonics cannot follow exactly: "
+        "colours that change with the direction became the nearest"
+    )
+    return [note]
+
+
+def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) -> None:
+    """Store what the splats of objects became by `read_to_move`: in all of them or none.
+
+    Raises
+    ------
+    RefineError
+        See `mesh.edit.check_changeable`.
+    """
+    for checked, _ in parts:
         mesh_edit.check_changeable(checked.obj)
     with ExitStack() as stack:
-        for checked in group:
+        for checked, columns in parts:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
-        each = [None] * len(group) if found is None else found
-        return sum(map(_mend, group, each))
-
-
-def _mend(checked: SplatObject, found: Mended | None = None) -> int:
-    """Do what `mend` says to one object, without a net."""
-    mesh = checked.mesh
-    mending = mesh_drift.mending(mesh)() if found is None else found.mending
-    if mending is None:
-        return 0
-    moves, regrouped = mending
-    names = [column.name for column in checked.layout.columns]
-    mesh_layout.list_all(mesh)
-    checked = mesh_layout.check(checked.obj)
-    for degree, rows in regrouped:
-        _regroup(checked, degree, rows)
-    if moves:
-        columns = found.columns if found else {}
-        if not columns or names != [column.name for column in checked.layout.columns]:
-            columns = moved_columns(checked, moves)
-        mesh_attributes.write_columns(
-            checked, {name: values for name, values in columns.items() if name not in "xyz"}
-        )
-    mesh_drift.stamp(mesh)
-    mended = [move.rows for move in moves] + [rows for _, rows in regrouped]
-    return len(np.unique(np.concatenate(mended))) if mended else 0
-
-
-def _regroup(checked: SplatObject, degree: int, rows: NDArray[np.int64]) -> None:
-    """Put harmonics of a lower degree under the names that they have in that of the object."""
-    own, all_of = above_constant(degree), mesh_layout.rest_count(checked.mesh) // 3
-    stored = mesh_attributes.stored_columns(checked)
-    values = np.stack([stored[f"f_rest_{index}"][rows] for index in range(3 * own)])
-    columns = {}
-    for index in range(3 * all_of):
-        channel, harmonic = divmod(index, all_of)
-        columns[f"f_rest_{index}"] = column = stored[f"f_rest_{index}"].copy()
-        column[rows] = values[channel * own + harmonic] if harmonic < own else 0.0
-    mesh_attributes.write_columns(checked, columns)
+            mesh_attributes.write_columns(checked, columns)
+            mesh_drift.stamp(checked.mesh)
 
 
 def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:
@@ -169,20 +219,17 @@ def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:
     Raises
     ------
     RefineError
-        See `mesh.edit.check_deletable`, `mend` and `splat_object.moved_columns`; also if an object
-        is animated or constrained.
+        See `mesh.edit.check_deletable` and `read_to_move`; also if an object is animated or
+        constrained.
     """
-    notes = []
+    notes, parts = [], []
     for checked in group:
         mesh_edit.check_deletable(checked.obj)
         _check_still(checked.obj)
-        notes += uneven_notes(checked, _own_matrix(checked.obj, location=location))
-    with ExitStack() as stack:
-        for checked in group:
-            stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
-        for checked in group:
-            matrix = _own_matrix(checked.obj, location=location)
-            _move_all(checked, matrix)
+        matrix = _own_matrix(checked.obj, location=location)
+        notes += uneven_notes(checked, matrix)
+        parts.append((checked, read_to_move(checked, matrix, mend=True)[1]()[0]))
+    write_moved(parts)
     for checked in group:  # nothing fails from here on
         _take_away(checked.obj, location=location)
     return notes
@@ -211,25 +258,6 @@ def _own_matrix(obj: bpy.types.Object, *, location: bool) -> NDArray[np.float64]
     return matrix
 
 
-def _move_all(
-    checked: SplatObject,
-    matrix: NDArray[np.float64],
-    columns: dict[str, NDArray[Any]] | None = None,
-) -> None:
-    """Move all splats of an object's data, after what others did to them was mended.
-
-    What they become may be known: then there is nothing to mend.
-    """
-    if columns is None:
-        if _mend(checked):
-            checked = mesh_layout.check(checked.obj)
-        stays = np.array_equal(matrix, np.eye(4))
-        everything = Move(np.arange(len(checked)), matrix)
-        columns = {} if stays else moved_columns(checked, [everything])
-    mesh_attributes.write_columns(checked, columns)
-    mesh_drift.stamp(checked.mesh)
-
-
 def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
     """Take away an object's own transform; children stay where they are, and scores hold."""
     bpy.context.view_layer.update()
@@ -248,57 +276,37 @@ def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
 
 
 class Joined(NamedTuple):
-    """What the splats of several objects become in the frame of the first.
-
-    Attributes
-    ----------
-    matrices : list of (4, 4) float64
-        From the frames of the objects to that of the first.
-    columns : list of dict of str to (N,) float32
-        What changes of each object; None where something is to be mended before.
-    """
+    """By what matrices splats are in the frame of the first object, and their columns there."""
 
     matrices: list[NDArray[np.float64]]
-    columns: list[dict[str, NDArray[Any]] | None]
+    columns: list[dict[str, NDArray[Any]]]
 
 
-def read_to_join(
-    active: SplatObject, others: Sequence[SplatObject]
-) -> Callable[[Progress], Joined]:
-    """Read objects; return what moves their splats into the frame of the first, on any thread.
+def read_to_join(group: Sequence[SplatObject]) -> Callable[[Progress], Joined]:
+    """Read objects; what moves their splats into the frame of the first, on any thread.
 
     Raises
     ------
     RefineError
         See `join`.
     """
-    group = [active, *others]
-    matrices = _to_first(group)
-    parts = [_read_to_move_all(*pair) for pair in zip(group, matrices, strict=True)]
+    matrices, most = _to_first(group), max(mesh_layout.rest_count(m.mesh) for m in group)
+    parts = [
+        read_to_move(member, matrix, mend=True, harmonics=most // 3)[1]
+        for member, matrix in zip(group, matrices, strict=True)
+    ]
 
     def work(progress: Progress) -> Joined:
         columns = []
         for number, part in enumerate(parts):
             report(progress, number / len(parts), "")
-            columns.append(part())
+            columns.append(part()[0])
         return Joined(matrices, columns)
 
     return work
 
 
-def _read_to_move_all(
-    member: SplatObject, matrix: NDArray[np.float64]
-) -> Callable[[], dict[str, NDArray[Any]] | None]:
-    """Read an object; return what moves all of its splats, None if they are to be mended first."""
-    find, stays = mesh_drift.mending(member.mesh), np.array_equal(matrix, np.eye(4))
-    everything = [] if stays else [Move(np.arange(len(member)), matrix)]
-    move = None if stays else read_to_move(member)
-    return lambda: None if find() else move(everything) if move else {}
-
-
-def join(
-    active: SplatObject, others: Sequence[SplatObject], found: Joined | None = None
-) -> list[str]:
+def join(group: Sequence[SplatObject], found: Joined | None = None) -> list[str]:
     """Put the splats of several objects into one, which keep what they look like and all they have.
 
     The others go; their children are parented to the one. Marks, vertex groups and properties come
@@ -307,10 +315,8 @@ def join(
 
     Parameters
     ----------
-    active : SplatObject
-        Which has the splats afterwards; it keeps its place, name and type.
-    others : sequence of SplatObject
-        One at least.
+    group : sequence of SplatObject
+        Meshes. The first has the splats afterwards; it keeps its place and name.
     found : Joined, optional
         What the callable of `read_to_join` has returned; None to do that now. It does not count if
         an object was moved since.
@@ -323,24 +329,25 @@ def join(
     Raises
     ------
     RefineError
-        See `mesh.edit.check_changeable` and `splat_object.moved_columns`; also if Blender fails.
+        See `mesh.edit.check_changeable` and `read_to_move`; also if one is a point cloud, or
+        Blender fails.
     """
-    group = [active, *others]
-    matrices = _to_first(group)
+    matrices, most = _to_first(group), max(mesh_layout.rest_count(m.mesh) for m in group)
+    refuse_mixed([member.layout.model for member in group])
     pairs = zip(group, matrices, strict=True)
     notes = [note for member, matrix in pairs for note in uneven_notes(member, matrix)]
+    if found is None or not np.array_equal(found.matrices, matrices):
+        found = read_to_join(group)(silent)
     with _workbench() as bench:
-        parts = [_copied(member, bench) for member in group]
-        holds = found is not None and np.array_equal(found.matrices, matrices)
-        columns = found.columns if found and holds else [None] * len(parts)
-        for part, matrix, moved in zip(parts, matrices, columns, strict=True):
-            _move_all(mesh_layout.check(part), matrix, moved)
+        parts = [_copied(member, bench, most) for member in group]
+        for part, columns in zip(parts, found.columns, strict=True):
+            mesh_attributes.write_columns(mesh_layout.check(part), columns)
         notes += _made_alike([mesh_layout.check(part) for part in parts], group)
         whole = _as_one(parts)
         mesh_drift.stamp(whole.data)
-        _give(active.obj, whole)
-    for other in others:
-        _replace(other.obj, active.obj)
+        _give(group[0].obj, whole)
+    for other in group[1:]:
+        _replace(other.obj, group[0].obj)
     return notes
 
 
@@ -382,8 +389,8 @@ def _remove(obj: bpy.types.Object) -> None:
         bpy.data.batch_remove([data])
 
 
-def _copied(member: SplatObject, bench: bpy.types.Collection) -> bpy.types.Object:
-    """Return a mesh object with a copy of an object's splats, without transform and scores."""
+def _copied(member: SplatObject, bench: bpy.types.Collection, rest: int) -> bpy.types.Object:
+    """A mesh object with a copy of an object's splats, with so many harmonics, without scores."""
     obj = bpy.data.objects.new("REFINE join", member.mesh.copy())
     bench.objects.link(obj)
     for name in _OF_ALL:
@@ -392,6 +399,8 @@ def _copied(member: SplatObject, bench: bpy.types.Collection) -> bpy.types.Objec
     for record in (mesh_scores.RECORD, demands.FACTS):
         if record in obj.data:
             del obj.data[record]
+    for index in range(mesh_layout.rest_count(obj.data), rest):
+        obj.data.attributes.new(f"f_rest_{index}", "FLOAT", "POINT")
     bpy.context.view_layer.update()
     return obj
 
@@ -399,31 +408,17 @@ def _copied(member: SplatObject, bench: bpy.types.Collection) -> bpy.types.Objec
 def _made_alike(parts: Sequence[SplatObject], group: Sequence[SplatObject]) -> list[str]:
     """Have objects hold the same columns in the same attributes; tell what some lack, in notes."""
     notes = []
-    most = max(mesh_layout.rest_count(part.mesh) for part in parts)
-    refuse_mixed([member.layout.model for member in group])
     layout = mesh_layout.merged([part.layout for part in parts])
     for part, member in zip(parts, group, strict=True):
-        own = {column.name: column for column in part.layout.columns}
-        missing = [c.name for c in layout.columns if c.name not in own]
-        if missing := [name for name in missing if not name.startswith("f_rest_")]:
+        own = {column.name for column in part.layout.columns}
+        if missing := [c.name for c in layout.columns if c.name not in own]:
             notes.append(
                 f"object '{member.obj.name}': has no {', '.join(missing)}, which became 0 for its "
                 f"{len(member):,} splats"
             )
-        _raise_degree(part, most)
         mesh_attributes.move_columns(part, layout)
     mesh_layout.note(parts[0].mesh, layout)
     return notes
-
-
-def _raise_degree(checked: SplatObject, count: int) -> None:
-    """Add harmonics that are 0 until there are as many of all channels."""
-    mesh, own = checked.mesh, mesh_layout.rest_count(checked.mesh)
-    for index in range(own, count):
-        mesh.attributes.new(f"f_rest_{index}", "FLOAT", "POINT")
-    if 0 < own < count:
-        everything = np.arange(len(checked))
-        _regroup(mesh_layout.check(checked.obj), REST_COUNTS[own], everything)
 
 
 def _as_one(parts: Sequence[bpy.types.Object]) -> bpy.types.Object:

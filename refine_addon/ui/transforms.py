@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import Any
 
 import bpy
 import mathutils
@@ -11,8 +11,9 @@ from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 
 from ..core.errors import RefineError
-from ..core.execute import Progress, report
+from ..core.execute import Progress, run_all
 from ..mesh import drift as mesh_drift
+from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh.drift import Drift
 from ..mesh.layout import SplatObject
@@ -60,14 +61,6 @@ def _several(context: bpy.types.Context) -> str:
     return "" if len(chosen) > 1 else "Select several objects that hold splats"
 
 
-@dataclass(frozen=True, eq=False)
-class _Joining:
-    """What moves splats into one frame, and of which objects, the active one first."""
-
-    uids: tuple[int, ...]
-    move: Callable[[Progress], transforms.Joined]
-
-
 class REFINE_OT_join(OnThread, OnSplats, bpy.types.Operator):
     """Put the splats of the selected objects into the active one; they keep what they look like"""
 
@@ -77,46 +70,31 @@ class REFINE_OT_join(OnThread, OnSplats, bpy.types.Operator):
     needs = (*OnSplats.needs, in_object_mode, _several)
     doing = "Joining splats"
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Joining:
-        """Read the selected objects."""
-        group = self.written(context, checked)
-        return _Joining(splat_group.uids_of(group), transforms.read_to_join(group[0], group[1:]))
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> Any:
+        """Read the selected objects, the active one first."""
+        group = splat_group.active_first(context.view_layer, checked)
+        return splat_group.uids_of(group), transforms.read_to_join(group)
 
     def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
-        """Return the selected objects, the active one first."""
-        if checked is None:
-            return []
-        chosen = splat_group.chosen(context.view_layer, checked.obj)
-        return [checked, *(mesh_layout.check(obj) for obj in chosen if obj != checked.obj)]
+        """The selected objects, the active one first."""
+        return splat_group.active_first(context.view_layer, checked)
 
     @staticmethod
-    def work(job: _Joining, progress: Progress) -> transforms.Joined:
+    def work(job: Any, progress: Progress) -> transforms.Joined:
         """Move splats, sizes, rotations and harmonics into the frame of the active object."""
-        return job.move(progress)
+        return job[1](progress)
 
     def finish(
-        self,
-        context: bpy.types.Context,
-        checked: SplatObject,
-        job: _Joining,
-        found: transforms.Joined,
+        self, context: bpy.types.Context, checked: SplatObject, job: Any, found: transforms.Joined
     ) -> Answer:
         """Join them."""
-        active, *others = splat_group.by_uids(job.uids, checked)
-        for note in transforms.join(active, others, found):
+        group = splat_group.by_uids(job[0], checked)
+        for note in transforms.join(group, found):
             self.report({"WARNING"}, note)
         plans.refresh(context)
-        count = mesh_layout.splat_count(active.obj.data)
-        self.report({"INFO"}, f"Joined {1 + len(others)} objects: {count:,} splats; score again")
+        count = mesh_layout.splat_count(group[0].obj.data)
+        self.report({"INFO"}, f"Joined {len(group)} objects: {count:,} splats; score again")
         return {"FINISHED"}
-
-
-@dataclass(frozen=True, eq=False)
-class _Mending:
-    """What finds out how splats are put right, and of which objects."""
-
-    uids: tuple[int, ...]
-    find: list[Callable[[], transforms.Mended]]
 
 
 class REFINE_OT_mend(OnThread, OnSplats, bpy.types.Operator):
@@ -128,40 +106,37 @@ class REFINE_OT_mend(OnThread, OnSplats, bpy.types.Operator):
     needs = (*OnSplats.needs, in_object_mode)
     doing = "Mending splats"
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Mending:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> Any:
         """Read the selected objects, and what was noted of them."""
         group = self.written(context, checked)
-        return _Mending(splat_group.uids_of(group), [transforms.read_to_mend(m) for m in group])
+        for each in group:
+            mesh_edit.check_changeable(each.obj)
+        reads = [transforms.read_to_move(each, mend=True)[1] for each in group]
+        return splat_group.uids_of(group), reads
 
     def written(
         self, context: bpy.types.Context, _checked: SplatObject | None
     ) -> list[SplatObject]:
-        """Return the selected objects to which something was done."""
+        """The selected objects to which something was done."""
         chosen = splat_group.chosen(context.view_layer, context.object)
         drifted = {obj.data: obj for obj in chosen if of(obj)}
         return [mesh_layout.check(obj) for obj in drifted.values()]
 
     @staticmethod
-    def work(job: _Mending, progress: Progress) -> list[transforms.Mended]:
+    def work(job: Any, progress: Progress) -> Any:
         """Find the maps by which others moved splats, and move the rest of each splat by them."""
-        found = []
-        for number, find in enumerate(job.find):
-            report(progress, number / len(job.find), "")
-            found.append(find())
-        return found
+        return run_all(lambda move: move(), job[1], progress=progress, threads=1)
 
     def finish(
-        self,
-        context: bpy.types.Context,
-        checked: SplatObject | None,
-        job: _Mending,
-        found: list[transforms.Mended],
+        self, context: bpy.types.Context, checked: SplatObject | None, job: Any, found: Any
     ) -> Answer:
         """Mend the objects."""
-        group = splat_group.by_uids(job.uids, checked) if checked else []
-        count = transforms.mend(group, found)
+        group = splat_group.by_uids(job[0], checked) if checked else []
+        transforms.write_moved(
+            [(one, columns) for one, (columns, _) in zip(group, found, strict=True)]
+        )
         plans.refresh(context)
-        self.report({"INFO"}, f"Mended {counted(count, 'splat')}")
+        self.report({"INFO"}, f"Mended {counted(sum(count for _, count in found), 'splat')}")
         return {"FINISHED"}
 
 
@@ -192,7 +167,7 @@ def draw(
 ) -> None:
     """Draw what others did to the splats of objects, and the buttons that move splats."""
     drifts = [drift for drift in map(of, objects) if drift]
-    for sentence in dict.fromkeys(s for drift in drifts for s in drift.sentences()):
+    for sentence in dict.fromkeys(s for drift in drifts for s in drift.told):
         wrapped.label(layout, context, sentence, icon="ERROR")
     if any(drift.mendable for drift in drifts):
         layout.operator("refine.mend", icon="MODIFIER")

@@ -105,6 +105,6 @@ def test_objects_of_different_models_are_no_scene_and_are_not_joined(
     unchanged.start()
 
     with pytest.raises(addon.core.RefineError, match="different models"):
-        addon.objects.transforms.join(group[0], group[1:])
+        addon.objects.transforms.join(group)
 
     unchanged()

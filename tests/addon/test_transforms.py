@@ -69,7 +69,7 @@ def psnr(one, other):
 def told_of(addon, obj):
     """Return what the panel says that others did to an object's splats."""
     drift = addon.ui.transforms.of(obj)
-    return drift.sentences() if drift else []
+    return drift.told if drift else []
 
 
 def select(*objects):
@@ -256,9 +256,7 @@ def test_files_of_several_degrees_and_properties_become_one(addon, make_splats, 
     ]  # fmt: skip
     (first, one), (second, other) = (made[index] for index in order)
     select(first, second)
-    notes = addon.objects.transforms.join(
-        addon.mesh.layout.check(first), [addon.mesh.layout.check(second)]
-    )
+    notes = addon.objects.transforms.join([addon.mesh.layout.check(obj) for obj in (first, second)])
 
     export(addon, addon.mesh.layout.check(first), tmp_path / "joined.ply")
     got = addon.core.read_ply(tmp_path / "joined.ply")
@@ -315,8 +313,8 @@ def held_join(addon, imported, monkeypatch):
     select(imported, second)
     bpy.context.view_layer.update()
 
-    def held(*group):
-        move = joined(*group)
+    def held(group):
+        move = joined(group)
 
         def work(progress):
             while not go.wait(0.01):
@@ -449,6 +447,36 @@ def test_an_applied_mirror_is_mended(addon, imported, seen):
     assert "9,939 splats were mirrored" in told
     assert len(imported.data.vertices) == 2 * 9939
     assert psnr(seen(), expected) > 60.0
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_mirror_that_merges_in_the_middle_of_the_scene_is_mended(addon, imported, seen, turned):
+    """Blender's default *Merge* puts what is near the mirror into it; these splats stay."""
+    middle = float(np.median(addon.mesh.attributes.read_attribute(imported.data, "position")[:, 0]))
+    for vertex in imported.data.vertices:
+        vertex.co.x -= middle
+    addon.mesh.drift.stamp(imported.data)
+    twin = parted(imported)
+    twin.matrix_world = mathutils.Matrix.Diagonal((-1.0, 1.0, 1.0, 1.0))
+    expected = seen()
+    bpy.data.objects.remove(twin)
+    modifier = imported.modifiers.new("Mirror", "MIRROR")
+    modifier.merge_threshold = 0.005  # of .001, for a fourth of the splats
+    if turned:  # a plane that is none of the axes' own
+        modifier.mirror_object = bpy.data.objects.new("plane", None)
+        modifier.mirror_object.rotation_euler = (0.0, 0.0, 1e-3)
+        bpy.context.scene.collection.objects.link(modifier.mirror_object)
+    select(imported)
+    bpy.ops.object.modifier_apply(modifier="Mirror")
+    merged = 2 * 9939 - len(imported.data.vertices)
+    (told,) = told_of(addon, imported)
+
+    assert bpy.ops.refine.mend() == {"FINISHED"}
+
+    assert merged >= 6
+    assert "splats were mirrored" in told
+    assert psnr(seen(), expected) > 40.0
+    assert told_of(addon, imported) == []
 
 
 @pytest.mark.parametrize(("share", "said"), [(0.005, False), (0.5, True)])

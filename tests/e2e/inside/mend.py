@@ -74,7 +74,7 @@ def ours(objects: list[bpy.types.Object]) -> list[str]:
 def mended(objects: list[bpy.types.Object]) -> list[str]:
     """Mend objects; return what was said before, and what is said still."""
     drift = importlib.import_module(f"{extension.MODULE}.ui.transforms")
-    said = [sentence for obj in objects if drift.of(obj) for sentence in drift.of(obj).sentences()]
+    said = [sentence for obj in objects if drift.of(obj) for sentence in drift.of(obj).told]
     if said:
         select(objects)
         bpy.ops.refine.mend()

@@ -245,7 +245,7 @@ class Steps:
     def said(self) -> list[str]:
         """Return what the panel says of the splats."""
         drift = self.transforms.of(splats())
-        return drift.sentences() if drift else []
+        return drift.told if drift else []
 
     def look(self, name: str) -> Generator[float, None, None]:
         """Take a picture of what is drawn; note what is said."""
