@@ -2,21 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
+
+from ..core.execute import Cancelled
 
 MARK = "refine_render"
 """Custom property of such a copy: the scene that it is of."""
 
 
-def copied(scene: bpy.types.Scene, name: str) -> bpy.types.Scene:
-    """Return a copy that renders what the scene does, without compositing and sequencer.
+class Step(NamedTuple):
+    """A render to be done by Blender.
 
-    Of several view layers it renders the first that the scene does.
+    Attributes
+    ----------
+    scene : str
+        Name of the scene to be rendered.
+    animation : bool
+        Whether as an animation, which writes files.
+    what : str
+        What is rendered, in a few words.
+    """
+
+    scene: str
+    animation: bool
+    what: str
+
+
+def copied(scene: bpy.types.Scene, what: str) -> bpy.types.Scene:
+    """A copy that renders what the scene does, without compositing and sequencer.
+
+    Of several view layers it renders the first that the scene does. Menus of scenes leave it out,
+    as all names that begin with a dot.
     """
     copy = scene.copy()
-    copy.name = name
+    copy.name = f".REFINE {what}"
     copy[MARK] = scene
     render = copy.render
     render.use_compositing = render.use_sequencer = render.use_multiview = False
@@ -24,6 +47,30 @@ def copied(scene: bpy.types.Scene, name: str) -> bpy.types.Scene:
     for layer in copy.view_layers:
         layer.use = layer == rendered
     return copy
+
+
+def existing(name: str) -> bpy.types.Scene:
+    """A copy by its name; an undo may have removed it.
+
+    Raises
+    ------
+    Cancelled
+        If it is not there.
+    """
+    scene = bpy.data.scenes.get(name)
+    if scene is None:
+        raise Cancelled
+    return scene
+
+
+def set_frames(name: str, frames: Sequence[int]) -> bpy.types.Scene:
+    """Have a copy render some frames, evenly apart, and go to the first of them."""
+    scene = existing(name)
+    scene.frame_start, scene.frame_end = frames[0], frames[-1]
+    scene.frame_step = frames[1] - frames[0] if frames[1:] else 1
+    if scene.frame_current != frames[0]:
+        scene.frame_set(frames[0])
+    return scene
 
 
 def remove_all() -> None:

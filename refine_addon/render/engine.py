@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple, cast
+from typing import cast
 
 import bpy
 import numpy as np
@@ -76,28 +75,10 @@ class Shared:
     error: BaseException | None = None
     stopped: bool = False
 
-
-_now: list[Shared] = []
-
-
-def begin(shared: Shared) -> None:
-    """Render with this from now on."""
-    _now[:] = [shared]
-
-
-def end() -> None:
-    """Forget what was rendered with."""
-    _now.clear()
-
-
-def save(folder: Path, frame: int, picture: NDArray[np.float64]) -> None:
-    """Keep a picture of a frame, in 16 bits."""
-    np.save(folder / f"{frame}.npy", np.rint(picture * 65535.0).astype(np.uint16))
-
-
-def load(folder: Path, frame: int) -> NDArray[np.float64]:
-    """Return what `save` has kept."""
-    return np.asarray(np.load(folder / f"{frame}.npy") / 65535.0)
+    def save(self, folder: Path, frame: int) -> None:
+        """Keep the last picture for a movie, in 16 bits."""
+        if self.picture is not None:
+            np.save(folder / f"{frame}.npy", np.rint(self.picture * 65535.0).astype(np.uint16))
 
 
 class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -106,13 +87,14 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
     bl_idname = "REFINE_SPLATS"
     bl_label = "Splats"
     bl_use_preview = False
+    shared: Shared | None = None
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
         """Draw a frame; called by Blender."""
-        if not _now:
-            self.error_set("Use Render > Render Image with Splats: this engine is a part of it")
+        shared = self.shared
+        if shared is None:
+            self.error_set("Use Render > Render with Splats: this engine is a part of it")
             return
-        shared = _now[0]
         try:
             self._render(depsgraph, shared)
         except Cancelled:
@@ -124,7 +106,7 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
     def _render(self, depsgraph: bpy.types.Depsgraph, shared: Shared) -> None:
         frame = depsgraph.scene.frame_current
         if shared.finished:
-            picture = load(shared.finished, frame)
+            picture = np.load(shared.finished / f"{frame}.npy") / 65535.0
         else:
             picture = self._picture(depsgraph, shared)
         _, height, width = picture.shape
@@ -135,22 +117,23 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
         shared.frames.append(frame)
 
     def _picture(self, depsgraph: bpy.types.Depsgraph, shared: Shared) -> NDArray[np.float64]:
-        """Return what the camera sees, as `draw` does."""
+        """What the camera sees, as `draw` does."""
         scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
-        place = _place(depsgraph, self.camera_override or scene.camera, size)
-        splats = _splats(depsgraph, place.view.center)
-        view = _cropped(place.view, _border(scene, size))
+        view, away = _place(depsgraph, self.camera_override or scene.camera, size)
+        splats = _splats(depsgraph, view.center)
+        camera = ViewSet((replace(view, center=view.center + away * view.rotation[2]),))
+        view = _cropped(view, scene.render)
         layers = shared.layers() if shared.layers else None
-        if layers is not None and place.away:
-            depths = np.where(layers.depths > 0.0, layers.depths + place.away, 0.0)
+        if layers is not None and away:
+            depths = np.where(layers.depths > 0.0, layers.depths + away, 0.0)
             layers = replace(layers, depths=depths)
         shared.splats = len(splats)
-        if shared.card and not place.away and len(splats):
-            sheet = card.prepare(splats, view, layers)
+        if shared.card and not away and len(splats):
+            paint = card.painter(splats, view, layers)
             with checked_by(self._check):
-                picture = main_thread.call(partial(card.paint, sheet, layers))
+                picture = main_thread.call(paint)
         else:
-            frame = scene_of(splats.means, drawable(splats), ViewSet((place.near,)))
+            frame = scene_of(splats.means, drawable(splats), camera)
             picture = draw(splats, view, layers, frame, progress=self._progress)
         if not shared.transparent:
             picture[3] = 1.0
@@ -166,21 +149,16 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
         return not self._is_stopped()
 
     def _is_stopped(self) -> bool:
-        return bool(self.test_break()) or (bool(_now) and _now[0].stopped)
-
-
-class _Place(NamedTuple):
-    """How a camera sees."""
-
-    view: View
-    near: View
-    away: float = 0.0
+        return bool(self.test_break()) or self.shared is None or self.shared.stopped
 
 
 def _place(
     depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, size: tuple[int, int]
-) -> _Place:
-    """Return how a camera sees; a view is a pinhole, so one without perspective stands far away."""
+) -> tuple[View, float]:
+    """How a camera sees, and how far behind it the view stands.
+
+    A view is a pinhole, so that of a camera without perspective stands far away.
+    """
     data, render = camera.data, depsgraph.scene.render
     if data.type not in {"PERSP", "ORTHO"}:
         raise RefineError(
@@ -195,32 +173,24 @@ def _place(
     away = _FAR * data.ortho_scale if parallel else 0.0
     view = view_through(np.array(projection, np.float64), looking, size, (0.0, away))
     near, far = away + data.clip_start, away + data.clip_end
-    view = replace(view, near=near, far=far, name=camera.name)
-    return _Place(view, replace(view, center=looking[1]), away)
+    return replace(view, near=near, far=far, name=camera.name), away
 
 
-def _border(scene: bpy.types.Scene, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the columns and rows that are rendered: left, top, right, bottom."""
-    render, (width, height) = scene.render, size
+def _cropped(view: View, render: bpy.types.RenderSettings) -> View:
+    """A view cut to the border that is rendered."""
     if not render.use_border:
-        return 0, 0, width, height
+        return view
     # In the precision of Blender: .7 of 240 columns are 168, and 167 with more digits.
-    shares = np.array([render.border_min_x, render.border_max_x], np.float32)
-    left, right = (shares * np.float32(width)).astype(int).tolist()
-    shares = np.array([render.border_min_y, render.border_max_y], np.float32)
-    low, high = (shares * np.float32(height)).astype(int).tolist()
-    return left, height - high, right, height - low
-
-
-def _cropped(view: View, border: tuple[int, int, int, int]) -> View:
-    left, top, right, bottom = border
-    return replace(
-        view, cx=view.cx - left, cy=view.cy - top, width=right - left, height=bottom - top
-    )
+    across = np.array([render.border_min_x, render.border_max_x], np.float32)
+    left, right = (across * np.float32(view.width)).astype(int).tolist()
+    up = np.array([render.border_max_y, render.border_min_y], np.float32)
+    top, bottom = (view.height - (up * np.float32(view.height)).astype(int)).tolist()
+    cx, cy = view.cx - left, view.cy - top
+    return replace(view, cx=cx, cy=cy, width=right - left, height=bottom - top)
 
 
 def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
-    """Return all splats that a render shows, in the world, in the colours that they show to an eye.
+    """All splats that a render shows, in the world, in the colours that they show to an eye.
 
     Instances are among them. Modifiers are not looked at, as in the 3D views.
     """
@@ -253,7 +223,7 @@ _NOTHING = Splats(
 
 
 def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return a picture, (4, H, W) display-referred, as linear pixels, (H * W, 4), lowest row first.
+    """A picture, (4, H, W) display-referred, as linear pixels, (H * W, 4), lowest row first.
 
     By the curve of sRGB (IEC 61966-2-1), which the view transform of the copy takes back.
     """

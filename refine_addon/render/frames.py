@@ -1,47 +1,21 @@
-"""From a scene to rendered frames: which copies are rendered, one after another."""
+"""From a scene to rendered frames: what Blender renders, one after another."""
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
 
 import bpy
 
 from ..core.errors import RefineError
 from ..core.execute import Cancelled
-from . import copies, engine
-from .engine import Shared
+from . import copies
+from .copies import Step
+from .engine import REFINE_engine, Shared
 from .meshes import Meshes, drawn_by_us
-from .passes import Rendered
-
-Answer = TypeVar("Answer")
-
-_MOMENT = 0.01
-"""Seconds that Blender may stand still."""
-
-
-class Step(NamedTuple):
-    """A render to be done by Blender.
-
-    Attributes
-    ----------
-    scene : str
-        Name of the scene to be rendered.
-    animation : bool
-        Whether as an animation, which writes files.
-    what : str
-        What is rendered, in a few words.
-    """
-
-    scene: str
-    animation: bool
-    what: str
 
 
 def refuse(scene: bpy.types.Scene) -> None:
@@ -58,17 +32,10 @@ def refuse(scene: bpy.types.Scene) -> None:
 
 
 def left_out(scene: bpy.types.Scene) -> list[str]:
-    """Return what the scene asks for and a render with splats does without, in sentences."""
+    """What the scene asks for and a render with splats does without, in sentences."""
     render, told = scene.render, []
-    blurred = [
-        name
-        for name, asked in (
-            ("depth of field", scene.camera.data.dof.use_dof),
-            ("motion blur", render.use_motion_blur),
-        )
-        if asked
-    ]
-    if blurred:
+    asked = {"depth of field": scene.camera.data.dof.use_dof, "motion blur": render.use_motion_blur}
+    if blurred := [name for name, is_asked in asked.items() if is_asked]:
         told.append(f"Splats are drawn without {' and '.join(blurred)}")
     if hasattr(scene, "compositing_node_group"):  # since 5.0
         nodes = scene.compositing_node_group
@@ -109,61 +76,33 @@ def steps(
     """
     refuse(scene)
     with _made(shared) as folder:
-        meshes = Meshes(scene, folder)
-        whole = _whole(scene, "REFINE whole")
+        meshes, whole = Meshes(scene, folder), _whole(scene, "whole")
         shared.engine, shared.transparent = meshes.engine, scene.render.film_transparent
         movie = write and scene.render.is_movie_format
         kept = not scene.render.use_overwrite, scene.render.use_placeholder
         if movie:  # it is written as one, when all frames are drawn
-            written = _whole(scene, "REFINE movie")
-            copies.write_exr(_scene(whole), folder / "whole_######")
+            written = _whole(scene, "movie")
+            copies.write_exr(copies.existing(whole), folder / "whole_######")
         for frame in frames:
             if write and not movie and _is_there(whole, frame, *kept):
                 continue
-            rendered = yield from _one_by_one(meshes, frame)
-            light = yield from _on_thread(rendered.read)
-            shown = yield from meshes.shown(light.pictures)
-            shared.layers = partial(light.layers, shown)
-            _set_frames(whole, [frame])
+            shared.layers = yield from meshes.layers(frame)
+            copies.set_frames(whole, [frame])
             yield Step(whole, animation=write, what="splats")
             _check(shared, frame)
-            if movie and shared.picture is not None:
-                engine.save(folder, frame, shared.picture)
+            if movie:
+                shared.save(folder, frame)
         if movie:
             shared.finished = folder
-            _set_frames(written, frames)
+            copies.set_frames(written, frames)
             yield Step(written, animation=True, what="movie")
             _check(shared, frames[-1])
 
 
-def _one_by_one(meshes: Meshes, frame: int) -> Generator[Step, None, Rendered]:
-    """Yield what has to be rendered besides splats; return what was."""
-    names = meshes.steps(frame)
-    try:
-        while True:
-            name = next(names)
-            _set_frames(name, [frame])
-            yield Step(name, animation=True, what="meshes")
-    except StopIteration as end:
-        rendered: Rendered = end.value
-        return rendered
-    finally:
-        names.close()
-
-
-def _on_thread(work: Callable[[], Answer]) -> Generator[None, None, Answer]:
-    """Return what work returns that touches nothing of Blender's; yield until it is done."""
-    with ThreadPoolExecutor(1, "refine-render") as pool:
-        future = pool.submit(work)
-        while not wait([future], _MOMENT).done:
-            yield
-        return future.result()
-
-
-def _whole(scene: bpy.types.Scene, name: str) -> str:
-    """Make a copy that our engine renders."""
-    copy = copies.copied(scene, name)
-    copy.render.engine = engine.REFINE_engine.bl_idname
+def _whole(scene: bpy.types.Scene, what: str) -> str:
+    """Make a copy that our engine renders; its name."""
+    copy = copies.copied(scene, what)
+    copy.render.engine = REFINE_engine.bl_idname
     copy.render.use_overwrite, copy.render.use_placeholder = True, False  # see `_is_there`
     copies.show_as_stored(copy)
     return str(copy.name)
@@ -179,7 +118,7 @@ def _check(shared: Shared, frame: int) -> None:
 
 def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
     """Tell whether the file of a frame is there and stays; else make one in its place if wanted."""
-    path = Path(bpy.path.abspath(_scene(name).render.frame_path(frame=frame)))
+    path = Path(bpy.path.abspath(copies.existing(name).render.frame_path(frame=frame)))
     if stays and path.exists():
         return True
     if placeholder and not path.exists():
@@ -188,33 +127,17 @@ def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
     return False
 
 
-def _set_frames(name: str, frames: Sequence[int]) -> None:
-    scene = _scene(name)
-    scene.frame_start, scene.frame_end = frames[0], frames[-1]
-    scene.frame_step = frames[1] - frames[0] if frames[1:] else 1
-    if scene.frame_current != frames[0]:
-        scene.frame_set(frames[0])
-
-
-def _scene(name: str) -> bpy.types.Scene:
-    """Return a copy, which an undo may have removed."""
-    scene = bpy.data.scenes.get(name)
-    if scene is None:
-        raise Cancelled
-    return scene
-
-
 @contextmanager
 def _made(shared: Shared) -> Iterator[Path]:
     """Yield a folder; afterwards remove it, and all else that a render made."""
     folder = Path(tempfile.mkdtemp(prefix="refine-"))
     copies.remove_all()
-    bpy.utils.register_class(engine.REFINE_engine)
-    engine.begin(shared)
+    bpy.utils.register_class(REFINE_engine)
+    REFINE_engine.shared = shared
     try:
         yield folder
     finally:
-        engine.end()
+        REFINE_engine.shared = None
         copies.remove_all()
-        bpy.utils.unregister_class(engine.REFINE_engine)
+        bpy.utils.unregister_class(REFINE_engine)
         shutil.rmtree(folder, ignore_errors=True)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.execute import Cancelled
+from ..core.pictures import Layers
 from ..mesh import native
 from ..mesh.layout import looks_like_splats
-from . import copies, see_through
+from . import copies, passes
+from .copies import Step
 from .out_of_sight import out_of_sight
-from .passes import Rendered
+from .see_through import lets_through
 
 _RENDERED = {
     *("MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES", "POINTCLOUD", "GREASEPENCIL"),
@@ -38,6 +41,9 @@ _INFINITE = 1e9
 _PIXELS = 1 << 18
 """Pixels that the view transform is applied to at a time."""
 
+_MOMENT = 0.01
+"""Seconds that Blender may stand still."""
+
 
 def drawn_by_us(obj: bpy.types.Object) -> bool:
     """Tell whether an object holds splats that Blender does not draw itself."""
@@ -46,29 +52,11 @@ def drawn_by_us(obj: bpy.types.Object) -> bool:
     )
 
 
-class _Apart(NamedTuple):
-    """Objects that are rendered together."""
-
-    others: list[bpy.types.Object]
-    blended: bool = False
-
-
-def _divided(scene: bpy.types.Scene, objects: list[bpy.types.Object]) -> list[_Apart]:
-    """Return which objects of a copy are rendered together, the opaque ones last."""
-    eevee = scene.render.engine.startswith("BLENDER_EEVEE")
-    glass = scene.render.engine == "CYCLES" and scene.cycles.film_transparent_glass
-    opaque, apart = see_through.groups(objects, glass=glass)
-    parts = [_Apart([obj for obj in objects if obj not in group], eevee) for group in apart]
-    if opaque:
-        parts.append(_Apart([obj for obj in objects if obj not in opaque]))
-    return parts
-
-
 class Meshes:
     """What a scene shows besides splats, rendered frame by frame.
 
-    What lets light through is rendered apart, object by object, so that splats between it and what
-    stands behind it are seen.
+    What lets light through is rendered apart, so that splats between it and what stands behind it
+    are seen.
 
     Parameters
     ----------
@@ -85,87 +73,109 @@ class Meshes:
     def __init__(self, scene: bpy.types.Scene, folder: Path) -> None:
         self._folder = folder
         self._meshes = self._depths = self._world = ""  # names of copies
-        self._hidden: list[bpy.types.Object] = []
-        self._apart: list[_Apart] = [_Apart([])]
-        self.engine = ""
         layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
         objects = [obj for obj in layer.objects if obj.type in _RENDERED and not obj.hide_render]
         shown = [obj for obj in objects if not drawn_by_us(obj)]
+        # Older Blenders show the points of point clouds as balls.
+        self._hidden = [o for o in objects if drawn_by_us(o) and o.type == "POINTCLOUD"]
+        self._clear = self._opaque = []
         if shown:
-            meshes = self._copy(scene, "REFINE meshes", transparent=True)
-            self._meshes = meshes.name
-            # Older Blenders show the points of point clouds as balls.
-            self._hidden = [o for o in objects if drawn_by_us(o) and o.type == "POINTCLOUD"]
-            self._apart = _divided(meshes, shown)
-            if any(part.blended for part in self._apart) and hasattr(meshes, "cycles"):
-                depths = self._copy(scene, "REFINE depths", transparent=True)
-                depths.render.engine = "CYCLES"
-                depths.cycles.samples, depths.cycles.use_denoising = 1, False
-                depths.cycles.device = "CPU"  # whose kernels are there already
-                self._depths = depths.name
+            self._meshes = self._copy(scene, "meshes").name
+            meshes = bpy.data.scenes[self._meshes]
+            engine = meshes.render.engine
+            glass = engine == "CYCLES" and meshes.cycles.film_transparent_glass
+            self._clear = [obj for obj in shown if lets_through(obj, glass=glass)]
+            self._opaque = [obj for obj in shown if obj not in self._clear]
+            if self._clear and engine != "CYCLES" and hasattr(meshes, "cycles"):
+                # EEVEE knows no depth of what it blends.
+                self._depths = self._copy(scene, "depths", cycles=True, samples=1).name
         if not scene.render.film_transparent and scene.world is not None:
-            world = self._copy(scene, "REFINE world", transparent=False)
+            # Cycles is quicker to begin, and needs no graphics card.
+            world = self._copy(scene, "world", cycles=not shown, samples=_WORLD_SAMPLES)
+            world.render.film_transparent, self._world = False, world.name
             for linked in (world.collection.children, world.collection.objects):
                 for item in [*linked]:
                     linked.unlink(item)
-            if not self._meshes and hasattr(bpy.types.Scene, "cycles"):
-                world.render.engine = "CYCLES"  # quicker to begin, and needs no graphics card
-            _limit_samples(world)
-            self._world = world.name
-        if self._meshes or self._world:
-            self.engine = bpy.data.scenes[self._meshes or self._world].render.engine
+        self._any = self._meshes or self._world
+        self.engine = bpy.data.scenes[self._any].render.engine if self._any else ""
 
-    def steps(self, frame: int) -> Generator[str, None, Rendered]:
-        """Give the names of the scenes to be rendered for a frame, one after another.
+    def layers(
+        self, frame: int
+    ) -> Generator[Step | None, None, Callable[[], Layers | None] | None]:
+        """Yield what has to be rendered of a frame; return what gives it as layers, on any thread.
 
-        The next is asked for when one is rendered; afterwards it returns what was.
+        Where None is yielded Blender may do something else.
         """
-        camera = bpy.data.scenes[self._meshes or self._world].camera.data if self.engine else None
-        far = min(_FARTHEST * camera.clip_end, _INFINITE) if camera else _INFINITE
-        rendered = Rendered(far)
-        for number, part in enumerate(self._apart if self._meshes else ()):
-            with out_of_sight([*self._hidden, *part.others]):
-                yield self._meshes
-                colors = depths = self._kept(self._meshes, frame, f"colors_{number}")
-                if part.blended and self._depths:
-                    yield self._depths
-                    depths = self._kept(self._depths, frame, f"depths_{number}")
-            rendered.parts.append((colors, depths))
-        if self._world:
-            yield self._world
-            rendered.world = self._kept(self._world, frame, "world")
-        return rendered
+        if not self._any:
+            return None
+        files = []
+        if self._clear:
+            with out_of_sight([*self._hidden, *self._opaque]):
+                colors = depths = yield from self._rendered(self._meshes, frame, "clear")
+                if self._depths:
+                    depths = yield from self._rendered(self._depths, frame, "depths")
+            files.append((colors, depths))
+        if self._opaque:
+            with out_of_sight([*self._hidden, *self._clear]):
+                opaque = yield from self._rendered(self._meshes, frame, "opaque")
+            files.append((opaque, opaque))
+        world = (yield from self._rendered(self._world, frame, "world")) if self._world else None
+        far = min(_FARTHEST * copies.existing(self._any).camera.data.clip_end, _INFINITE)
+        with ThreadPoolExecutor(1, "refine-render") as pool:
+            future = pool.submit(passes.read, files, world, far)
+            while not wait([future], _MOMENT).done:
+                yield None
+        light = future.result()
+        shown = yield from self._shown(light.pictures)
+        return partial(light.layers, shown)
 
-    def _kept(self, name: str, frame: int, label: str) -> Path:
-        """Return the file that was just written, under another name.
+    def _rendered(self, name: str, frame: int, label: str) -> Generator[Step, None, Path]:
+        """Render a frame of a copy; return the file, under another name.
 
         Blender takes Esc for itself, and writes nothing of what it has not finished.
         """
+        copies.set_frames(name, [frame])
+        yield Step(name, animation=True, what="meshes")
         try:
             written = Path(bpy.data.scenes[name].render.frame_path(frame=frame))
             return written.replace(self._folder / f"{label}.exr")
         except FileNotFoundError:
             raise Cancelled from None
 
-    def _copy(self, scene: bpy.types.Scene, name: str, *, transparent: bool) -> bpy.types.Scene:
-        copy = copies.copied(scene, name)
-        copy.render.film_transparent = transparent
+    def _copy(
+        self, scene: bpy.types.Scene, what: str, *, cycles: bool = False, samples: int = 0
+    ) -> bpy.types.Scene:
+        """Make a copy; by Cycles if there is no other way, or told so; with few rays if told so."""
+        copy = copies.copied(scene, what)
+        copies.write_exr(copy, self._folder / f"{what}_######")
+        copy.render.film_transparent = True
         for layer in copy.view_layers:
             layer.use_pass_combined = layer.use_pass_z = True
             # Cycles: the depth of what is nearest, seen through or not.
             layer.pass_alpha_threshold = 0.0
-        if copy.render.engine.startswith("BLENDER_EEVEE") and not _has_card():
+        eevee = copy.render.engine.startswith("BLENDER_EEVEE")
+        few = min(samples or copy.eevee.taa_render_samples, copy.eevee.taa_render_samples)
+        copy.eevee.taa_render_samples = few
+        settings = getattr(copy, "cycles", None)
+        if settings is None:
+            return copy
+        if eevee and not _has_card():
+            copy.render.engine, settings.samples, settings.use_denoising = "CYCLES", few, False
+        if cycles:
             copy.render.engine = "CYCLES"
-            copy.cycles.samples = copy.eevee.taa_render_samples
-            copy.cycles.use_denoising = False
-        _small_tiles(copy)
-        copies.write_exr(copy, self._folder / f"{name.rsplit(maxsplit=1)[-1]}_######")
+        if samples:
+            settings.samples, settings.use_denoising = min(settings.samples, samples), False
+        if samples == 1:
+            settings.device = "CPU"  # whose kernels are there already
+        if settings.device == "CPU":  # Cycles looks for Esc between tiles
+            tile = settings.tile_size if settings.use_auto_tile else _TILE
+            settings.use_auto_tile, settings.tile_size = True, min(tile, _TILE)
         return copy
 
-    def shown(
+    def _shown(
         self, pictures: Sequence[NDArray[np.float32]]
     ) -> Generator[None, None, list[NDArray[np.float32]]]:
-        """Return linear colours, (3, H, W) each, as the view transform of the scene shows them.
+        """Linear colours, (3, H, W) each, as the view transform of the scene shows them.
 
         Only Blender knows the transform, and applies it where it saves an image. So much is done
         between two yields that Blender stands still for a tenth of a second.
@@ -181,8 +191,8 @@ class Meshes:
         return np.split(np.concatenate(bands, axis=1), len(pictures), axis=1)
 
     def _band_shown(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return some rows of linear colours, (3, R, W), as they are shown."""
-        scene = bpy.data.scenes[self._meshes or self._world]
+        """Some rows of linear colours, (3, R, W), as they are shown."""
+        scene = copies.existing(self._any)
         path = self._folder / "shown.png"
         height, width = band.shape[1:]
         pixels = np.ones((height, width, 4), np.float32)
@@ -204,22 +214,6 @@ class Meshes:
             bpy.data.images.remove(shown)
             path.unlink()
         return np.moveaxis(pixels[..., :3], -1, 0)
-
-
-def _small_tiles(scene: bpy.types.Scene) -> None:
-    """Have Cycles look for Esc often where the processor renders: it does so between tiles."""
-    cycles = getattr(scene, "cycles", None)
-    if cycles is not None and cycles.device == "CPU":
-        cycles.tile_size = min(cycles.tile_size, _TILE) if cycles.use_auto_tile else _TILE
-        cycles.use_auto_tile = True
-
-
-def _limit_samples(scene: bpy.types.Scene) -> None:
-    """Render a world with few samples: there is little to be sampled."""
-    scene.eevee.taa_render_samples = min(scene.eevee.taa_render_samples, _WORLD_SAMPLES)
-    if hasattr(scene, "cycles"):
-        scene.cycles.samples = min(scene.cycles.samples, _WORLD_SAMPLES)
-        scene.cycles.use_denoising = False
 
 
 def _has_card() -> bool:

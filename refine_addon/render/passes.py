@@ -1,14 +1,13 @@
 """What engines have rendered, from files to layers: arrays alone, for any thread.
 
 Layers are blended as splats are, in the colours that are shown, which only Blender makes of light.
-So there are three steps: `Rendered.read`, Blender's view transform of `Light.pictures`,
-`Light.layers`.
+So there are three steps: `read`, Blender's view transform of `Light.pictures`, `Light.layers`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,48 +29,14 @@ class Pass(NamedTuple):
     depths: NDArray[np.float32]
 
 
-@dataclass
-class Rendered:
-    """What was rendered of a frame, in files of all passes.
-
-    Attributes
-    ----------
-    far : float
-        Depths from which on there is nothing.
-    parts : list of (Path, Path)
-        For each group of objects the file with its colours, and the one with its depths.
-    world : Path or None
-        What is behind all of them.
-    """
-
-    far: float
-    parts: list[tuple[Path, Path]] = field(default_factory=list)
-    world: Path | None = None
-
-    def read(self) -> Light:
-        """Read the files.
-
-        Raises
-        ------
-        RefineError
-            See `read_exr`.
-        """
-        found = []
-        for colors, depths in self.parts:
-            passes = _read(colors)
-            combined, away = passes["Combined"], passes if depths == colors else _read(depths)
-            alphas = combined[3].clip(0.0, 1.0)
-            found.append(Pass(combined[:3], alphas, _known(away["Depth"][0], alphas, self.far)))
-        return Light(found, _read(self.world)["Combined"][:3] if self.world else None)
-
-
 class Light:
     """What was rendered, as light.
 
     Parameters
     ----------
-    found : sequence of Pass
+    passes : sequence of Pass
     world : (3, H, W) float32, optional
+        What is behind all of them.
 
     Attributes
     ----------
@@ -80,23 +45,21 @@ class Light:
         they are seen without splats.
     """
 
-    def __init__(self, found: Sequence[Pass], world: NDArray[np.float32] | None) -> None:
-        self._found, self._world = found, world
-        self._left = np.ones(())
-        self.pictures = [each.colors / np.maximum(each.alphas, 1e-6) for each in found]
-        if not found:
-            self.pictures += [world] if world is not None else []
+    def __init__(self, passes: Sequence[Pass], world: NDArray[np.float32] | None) -> None:
+        self._passes = passes
+        self.pictures = [each.colors / np.maximum(each.alphas, 1e-6) for each in passes]
+        if not passes:
+            self.pictures += [] if world is None else [world]
+            self._seen = np.ones(())
             return
-        stacked = in_order(found)
-        over, self._left = stacked.over_nothing(), stacked.left()[-1]
-        if world is not None:
-            over += self._left * world
-        else:
-            over /= np.maximum(1.0 - self._left, 1e-6)
+        stacked = in_order(passes)
+        over, left = stacked.over_nothing(), stacked.left()[-1]
+        self._seen = 1.0 - left if world is None else np.ones(())
+        over = over / np.maximum(self._seen, 1e-6) if world is None else over + left * world
         self.pictures.append(over.astype(np.float32))
 
     def layers(self, shown: Sequence[NDArray[np.float32]]) -> Layers | None:
-        """Return layers by what `pictures` are shown as, None if there are none.
+        """Layers by what `pictures` are shown as, None if there are none.
 
         Where there are no splats they show what Blender does: the background makes up for what
         blending shown colours does not.
@@ -104,35 +67,44 @@ class Light:
         if not shown:
             return None
         *opaque, whole = shown
-        if not opaque:
-            nothing = np.zeros((1, *whole.shape[1:]), np.float32)
-            return Layers(np.zeros_like(whole)[None], nothing, nothing, whole)
-        pairs = zip(opaque, self._found, strict=True)
-        layers = in_order([each._replace(colors=each.alphas * colors) for colors, each in pairs])
-        seen = 1.0 if self._world is not None else 1.0 - self._left
-        return replace(layers, background=seen * whole - layers.over_nothing())
+        pairs = zip(opaque, self._passes, strict=True)
+        passes = [each._replace(colors=each.alphas * colors) for colors, each in pairs]
+        nothing = np.zeros_like(whole[0])
+        layers = in_order(passes or [Pass(np.zeros_like(whole), nothing, nothing)])
+        return replace(layers, background=self._seen * whole - layers.over_nothing())
 
 
-def _read(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Return the passes of a file, (channels, H, W) each, and remove it."""
-    channels = read_exr(path)
+def read(files: Sequence[tuple[Path, Path]], world: Path | None, far: float) -> Light:
+    """Read and remove files of what was rendered: colours and depths of each pass, and the world.
+
+    Depths from `far` on are those of nothing.
+
+    Raises
+    ------
+    RefineError
+        See `read_exr`.
+    """
+    found = []
+    for colors, depths in files:
+        one = _read(colors)
+        away = one.depths if depths == colors else _read(depths).depths
+        found.append(one._replace(depths=_known(away, one.alphas, far)))
+    return Light(found, _read(world).colors if world else None)
+
+
+def _read(path: Path) -> Pass:
+    """Colours, alphas and depths of a file, which is removed."""
+    channels = {name.split(".", 1)[-1]: values for name, values in read_exr(path).items()}
     path.unlink()
-    found: dict[str, NDArray[np.float32]] = {}
-    for kind, letters in (("Combined", "RGBA"), ("Depth", "ZV")):
-        rows = [
-            values
-            for letter in letters
-            for channel, values in channels.items()
-            if channel.endswith(f".{kind}.{letter}")
-        ]
-        found[kind] = np.stack(rows) if rows else np.empty((0, 0, 0), np.float32)
-    return found
+    colors = np.stack([channels[f"Combined.{letter}"] for letter in "RGB"])
+    depths = channels["Depth.Z"] if "Depth.Z" in channels else channels["Depth.V"]
+    return Pass(colors, channels["Combined.A"].clip(0.0, 1.0), depths)
 
 
 def _known(
     depths: NDArray[np.float32], alphas: NDArray[np.float32], far: float
 ) -> NDArray[np.float32]:
-    """Return the depth of what is seen in each pixel, (H, W), 0 where it has none.
+    """Depth of what is seen in each pixel, (H, W), 0 where it has none.
 
     Engines write that of one ray a pixel, which may miss what others hit: at an edge the nearest
     depth beside it is taken. What is seen and has no depth anywhere near is taken to be in front.

@@ -12,7 +12,7 @@ from bpy.app.handlers import persistent
 from ..render import copies, out_of_sight
 from ..render.meshes import drawn_by_us
 
-NOTICE = "Splats are not in this render: use Render > Render Image with Splats"
+NOTICE = "Splats are not in this render: use Render > Render with Splats"
 """What is said."""
 
 IN_BACKGROUND = "refine: splats are not in this render; use --command refine render"

@@ -88,7 +88,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     """Render what the camera sees with the splats as the 3D view shows them, among meshes that the scene's engine renders; an animation is written where Output says"""  # noqa: E501
 
     bl_idname = "refine.render"
-    bl_label = "Render Image with Splats"
+    bl_label = "Render with Splats"
     bl_options = {"REGISTER"}
     needs = (idle, no_render)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
-from . import background, legend, outlines, placing, points, shader, veils
+from . import background, legend, overlays, placing, points, shader
 from .content import Content
 from .view import Camera, View
 
@@ -51,7 +51,6 @@ class _State:
         self.handles: list[Any] = []
         self.edited_at = 0.0
         self.reads = False
-        self.updates = 0
 
 
 _state = _State()
@@ -107,7 +106,6 @@ def stop() -> None:
     background.stop()
     _forget()
     shader.forget()
-    veils.forget()
     points.show()
     _redraw()
 
@@ -195,15 +193,10 @@ def _draw() -> None:
         np.array(region_3d.window_matrix, np.float64),
         (region.width, region.height),
     )
-    solid = not all(looks_like_splats(obj) for obj in context.visible_objects)
-    meshes = veils.seen_through(context.visible_objects, space.shading)
-    layer = None
-    if meshes:
-        matrices = camera.view, camera.projection
-        work = partial(veils.draw, meshes, context.evaluated_depsgraph_get(), matrices, camera.size)
-        layer = (_state.updates, repr(meshes)), work
-    view.draw(_state.content, placed, camera, _state.mode, solid=solid, veils=layer)
-    outlines.draw(context)
+    solid = not overlays.is_xray(space.shading)
+    solid = solid and not all(looks_like_splats(obj) for obj in context.visible_objects)
+    view.draw(_state.content, placed, camera, _state.mode, solid=solid)
+    overlays.draw(context)
     if view.waits() and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)
 
@@ -288,7 +281,6 @@ def _opened(*_: object) -> None:
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     if depsgraph is None:
         return
-    _state.updates += 1
     for update in depsgraph.updates:
         if update.is_updated_geometry:
             data = getattr(update.id.original, "data", update.id.original)

@@ -26,7 +26,6 @@ _CONSTANTS = f"""
 #define ALPHA_MAX {ALPHA_MAX}
 #define ALPHA_CUT {ALPHA_CUT}
 #define BEYOND 0.3
-#define SAME_DEPTH 1e-5
 #define SELECTED vec3{SELECTED}
 #define SELECTED_SHARE {SELECTED_SHARE}
 """
@@ -39,7 +38,7 @@ struct ViewData {
 };
 """
 """size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, whether
-depth is tested, whether there are veils, whether what is before the depths of veils is left out."""
+depth is tested, whether what lies before `near_depths` is left out."""
 
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
@@ -195,29 +194,17 @@ void main()
   if (view_data.choices.y > 0.5) {
     ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
     float occluder = texelFetch(depths, min(texel, textureSize(depths, 0) - 1), 0).r;
-    if (view_data.choices.z > 0.5) {
-      float veil = texelFetch(veil_depths, min(texel, textureSize(veil_depths, 0) - 1), 0).r;
-      /* Blender 5 gives meshes a depth that X-ray shows transparent. */
-      occluder = abs(occluder - veil) < SAME_DEPTH ? 1.0 : occluder;
-    }
     if (gl_FragCoord.z > occluder) {
       discard;
     }
   }
-  if (view_data.choices.w > 0.5) {
+  if (view_data.choices.z > 0.5) {
     ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
-    if (gl_FragCoord.z <= texelFetch(veil_depths, texel, 0).r) {
+    if (gl_FragCoord.z <= texelFetch(near_depths, texel, 0).r) {
       discard;
     }
   }
-  vec3 shown = paint.rgb;
-  if (view_data.choices.z > 0.5) {
-    ivec2 texel = min(ivec2(gl_FragCoord.xy * view_data.size.w), textureSize(veil_depths, 0) - 1);
-    vec4 veil = texelFetch(veils, texel, 0);
-    float before = step(texelFetch(veil_depths, texel, 0).r, gl_FragCoord.z);
-    shown = mix(shown, veil.rgb, veil.a * before);
-  }
-  color = vec4(shown * alpha, alpha);
+  color = vec4(paint.rgb * alpha, alpha);
 }
 """
 
@@ -257,7 +244,7 @@ def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
     info.uniform_buf(0, "ViewData", "view_data")
     names = (
         *("order", "means", "covariances", "more_covariances", "colors", "selection"),
-        *("matrices", "depths", "veils", "veil_depths"),
+        *("matrices", "depths", "near_depths"),
     )
     for slot, name in enumerate(names):
         info.sampler(slot, "FLOAT_2D", name)

@@ -7,7 +7,7 @@ them are sorted and coloured on the thread, and drawn when that is done.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -32,7 +32,6 @@ from .arrays import (
     tinted,
 )
 from .content import Atlas, Content, Slot
-from .veils import Veils
 
 REST = 0.2
 """Seconds without a change after which a view rests."""
@@ -154,7 +153,6 @@ class View:
         mode: str,
         *,
         solid: bool,
-        veils: tuple[object, Callable[[], Veils]] | None = None,
     ) -> None:
         """Draw some objects into the framebuffer of the view.
 
@@ -167,10 +165,7 @@ class View:
         mode : str
             One of `draw.MODES`.
         solid : bool
-            Whether anything but splats is in the view.
-        veils : (object, callable), optional
-            Draws the meshes that are seen through, if there are any, and what tells them from what
-            they were.
+            Whether anything but splats is in the view that hides what is behind it.
         """
         atlas = content.atlas
         if atlas is None or not places:
@@ -193,7 +188,7 @@ class View:
             return
         self.count = self._order.count
         pixels = 1 if self.complete else least.pixels
-        self._paint(content, shown, camera, pixels, solid=solid, veils=veils)
+        self._paint(content, shown, camera, pixels, solid=solid)
         _put(self._picture)
 
     def _moves(self, key: bytes) -> bool:
@@ -255,17 +250,14 @@ class View:
         pixels: int,
         *,
         solid: bool,
-        veils: tuple[object, Callable[[], Veils]] | None,
     ) -> None:
         """Draw the splats into the picture, unless it shows them already."""
         depths = _depths(camera.size) if solid else None
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
         look = (self._order.key, self._colors_key, self._camera_key, size)
-        wanted = (*look, content.selections, veils and veils[0])
+        wanted = (*look, content.selections)
         if self._picture and wanted == self._drawn and same(depths, self._depths):
             return
-        nothing = shader.texture(np.ones((1, 4), np.float32), 4, "RGBA16F")
-        layer = veils[1]() if veils else Veils(nothing, nothing)
         self._drawn, self._depths = wanted, depths
         if not self._picture or (self._picture.width, self._picture.height) != size:
             self._picture = gpu.types.GPUTexture(size, format="RGBA16F")
@@ -279,11 +271,10 @@ class View:
             "colors": self._colors,
             "selection": content.selection(),
             "matrices": shader.texture(_matrix_rows(shown), 4, "RGBA32F"),
-            "depths": shader.texture(occluders, 1, "R32F"),
-            "veils": layer.colors,
-            "veil_depths": layer.depths,
+            "depths": (farthest := shader.texture(occluders, 1, "R32F")),
+            "near_depths": farthest,
         }  # held until they are drawn: the shader does not keep what it is given
-        numbers = _view_data(camera, size, solid=depths is not None, veiled=veils is not None)
+        numbers = _view_data(camera, size, solid=depths is not None)
         frame = gpu.types.GPUFrameBuffer(color_slots=self._picture)
         shader.blend(frame, textures, numbers, self._order.count)
 
@@ -296,14 +287,12 @@ def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
     return rows
 
 
-def _view_data(
-    camera: Camera, size: tuple[int, int], *, solid: bool, veiled: bool
-) -> NDArray[np.float32]:
+def _view_data(camera: Camera, size: tuple[int, int], *, solid: bool) -> NDArray[np.float32]:
     """Return what the shader knows of a view as ``ViewData``, for a picture of this size."""
     numbers = np.zeros(24, np.float32)
     numbers[:16] = camera.projection.T.reshape(-1)
     numbers[16:20] = (*size, camera.near, camera.size[0] / size[0])
-    numbers[20:23] = (camera.perspective, solid, veiled)
+    numbers[20:22] = (camera.perspective, solid)
     return numbers
 
 

@@ -56,8 +56,8 @@ def drawn(addon, scene, obj, **changes):
     return np.moveaxis(picture, 0, -1).clip(0.0, 1.0)
 
 
-def plane(scene, depth, color, alpha, *, width=9.0):
-    """Put a plane that shines in a colour before the camera; return it."""
+def plane(scene, depth, color, alpha=None, *, width=9.0):
+    """Put a plane that shines in a colour before the camera, opaque by default; return it."""
     matrix = scene.camera.matrix_world @ Matrix.Translation((0.0, 0.0, -depth))
     bpy.ops.mesh.primitive_plane_add(size=width)
     obj = bpy.context.object
@@ -71,10 +71,12 @@ def plane(scene, depth, color, alpha, *, width=9.0):
         for kind in ("Emission", "BsdfTransparent", "MixShader", "OutputMaterial")
     )
     light.inputs[0].default_value = (*color, 1.0)
-    mix.inputs[0].default_value = alpha
+    mix.inputs[0].default_value = alpha or 0.0
     for number, node in ((1, clear), (2, light)):
         tree.links.new(node.outputs[0], mix.inputs[number])
-    tree.links.new(mix.outputs[0], end.inputs[0])
+    tree.links.new((light if alpha is None else mix).outputs[0], end.inputs[0])
+    if alpha is None:
+        tree.nodes.remove(clear)
     obj.data.materials.append(material)
     return obj
 
@@ -162,7 +164,7 @@ def test_splats_between_glass_and_a_wall_are_seen(addon, shot, quarter):
     )
     depths = (depths - view.center) @ view.rotation[2]
     far = float(np.median(depths[depths > 0.2]))
-    plane(shot, far, (0.0, 0.0, 0.0), 1.0, width=90.0).name = "wall"
+    plane(shot, far, (0.0, 0.0, 0.0), width=90.0).name = "wall"
     plain = rendered()
     pane = plane(shot, 0.2, (0.0, 0.0, 0.0), 0.3)
     before = settings(shot)
@@ -197,8 +199,8 @@ def test_splats_among_glass_and_walls_are_those_of_the_reference_renderer(addon,
     compared = np.ones((80, 120), np.bool_)
     for share, alpha, color, (columns, rows) in (
         (0.1, 0.4, (0.0, 1.0, 0.0), ((0, 60), (0, 80))),
-        (0.3, 1.0, (1.0, 0.0, 0.0), ((40, 100), (30, 50))),
-        (0.8, 1.0, (0.0, 0.0, 1.0), ((-60, 180), (-40, 120))),
+        (0.3, None, (1.0, 0.0, 0.0), ((40, 100), (30, 50))),
+        (0.8, None, (0.0, 0.0, 1.0), ((-60, 180), (-40, 120))),
     ):
         far = float(np.quantile(depths[depths > 0.2], share))
         obj = plane(shot, far, color, alpha, width=1.0)
@@ -207,7 +209,7 @@ def test_splats_among_glass_and_walls_are_those_of_the_reference_renderer(addon,
         obj.matrix_world @= Matrix.Translation((x * far, -y * far, 0.0))
         obj.matrix_world @= Matrix.Diagonal((wide * far, high * far, 1.0, 1.0))
         mask = np.zeros((80, 120, 1))
-        mask[max(rows[0], 0) : rows[1], max(columns[0], 0) : columns[1]] = alpha
+        mask[max(rows[0], 0) : rows[1], max(columns[0], 0) : columns[1]] = alpha or 1.0
         for column, row in zip(columns, rows, strict=True):
             compared[:, max(column - 3, 0) : max(column + 3, 0)] = False
             compared[max(row - 3, 0) : max(row + 3, 0)] = False
@@ -376,7 +378,7 @@ def test_the_processor_renders_small_tiles_between_which_esc_is_heard(
 
     addon.render.meshes.Meshes(shot, tmp_path)
 
-    copy = bpy.data.scenes["REFINE meshes"].cycles
+    copy = bpy.data.scenes[".REFINE meshes"].cycles
     assert (copy.use_auto_tile, copy.tile_size) == (True, used)
     assert (cycles.device, cycles.use_auto_tile, cycles.tile_size) == asked
     addon.render.copies.remove_all()
@@ -423,7 +425,7 @@ def test_an_esc_that_blender_forgets_ends_the_drawing_of_splats(addon, shot, mon
     before, draw, asked = settings(shot), addon.render.engine.draw, []
 
     def pressed(*arguments, progress, **named):
-        addon.render.engine._now[0].stopped = True
+        addon.render.engine.REFINE_engine.shared.stopped = True
 
         def noted(fraction, what):
             asked.append(progress(fraction, what))

@@ -43,7 +43,7 @@ def main(cloud: str, blend: str, picture: str) -> Generator[float, None, dict[st
     found: dict[str, Any] = show.numbers()
     yield from show.picture("plain")
     yield from overlays(show)
-    yield from veils(show)
+    yield from glass(show)
     yield from instances(show, splats, blend)
     show.call(bpy.ops.refine.make_real)
     found["real"] = len(bpy.context.object.data.vertices)
@@ -75,8 +75,8 @@ def overlays(show: Show) -> Generator[float, None, None]:
     overlay.show_overlays = False
 
 
-def veils(show: Show) -> Generator[float, None, None]:
-    """Show a ball before the splats, and far behind them, by X-ray and blended."""
+def glass(show: Show) -> Generator[float, None, None]:
+    """Show a ball before the splats, and behind them, by X-ray and blended."""
     space = show.area.spaces.active
     show.call(bpy.ops.mesh.primitive_ico_sphere_add, radius=0.4, subdivisions=3)
     ball = bpy.context.object
@@ -89,7 +89,7 @@ def veils(show: Show) -> Generator[float, None, None]:
     ball.data.materials.append(material)
     toward = space.region_3d.view_rotation @ Vector((0.0, 0.0, 1.0))
     space.shading.show_xray = True
-    for name, distance in (("front", 6.5), ("behind", -12.0)):
+    for name, distance in (("front", 6.5), ("behind", -2.0)):
         ball.location = space.region_3d.view_location + toward * distance
         yield from show.picture(f"xray-{name}")
     space.shading.show_xray, space.shading.type = False, "MATERIAL"
