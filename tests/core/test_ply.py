@@ -244,6 +244,17 @@ def test_a_new_property_comes_last_and_all_else_stays(folder, case, data, kind):
     assert written.endswith(case.after)
 
 
+def test_a_property_may_have_any_name_where_another_is_appended(tmp_path):
+    """NumPy hands out no buffer of rows with a colon in a name."""
+    tag = np.arange(3, dtype=np.float32)
+    (tmp_path / "in.ply").write_bytes(ply_of(dict.fromkeys([*splat_names(0), "t:ag"], tag)))
+
+    read_ply(tmp_path / "in.ply").write(tmp_path / "out.ply", columns={"more": 2 * tag})
+
+    again = read_ply(tmp_path / "out.ply").rows
+    assert (again["t:ag"].tolist(), again["more"].tolist()) == ([0, 1, 2], [0, 2, 4])
+
+
 @given(case=ply_files(least=1, forms=BINARY))
 def test_a_property_that_is_there_is_set_in_place(folder, case):
     """Opacity becomes 1/3 in its own type; the header and every other property stay."""

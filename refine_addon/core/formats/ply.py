@@ -648,7 +648,8 @@ def write_rows(
             with np.errstate(over="ignore", under="ignore", invalid="ignore"):
                 for name, values in columns.items():
                     chunk[name] = values[piece][kept]
-        return np.ascontiguousarray(chunk)
+        # As bytes: NumPy hands out no buffer of rows with a name such as a:b.
+        return np.ascontiguousarray(chunk).view(np.dtype((np.void, row.itemsize)))
 
     pieces = chunks(len(plain), _CHANGED_ROWS if columns else _ROWS)
     for batch in chunks(len(pieces), _AHEAD):
