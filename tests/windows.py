@@ -60,13 +60,13 @@ class Context:
 
 def started_in_a_window(addon, cls, **properties):
     """Start an operator; return it, its context and what it reports."""
-    skipped = {"__dict__", "__weakref__", "__annotations__", "bl_rna", "execute", "invoke", "ask"}
+    skipped = {"__dict__", "__weakref__", "__annotations__", "bl_rna", "execute", "invoke"}
     kinds = [kind for kind in reversed(cls.__mro__) if kind.__module__.startswith(addon.__name__)]
     body = {name: value for kind in kinds for name, value in vars(kind).items()}
     body = {name: value for name, value in body.items() if name not in skipped}
     said = []
     body |= {"report": lambda _self, _kind, text: said.append(text), **properties}
-    operator, context = type(cls.__name__, (addon.ui.on_thread.OnThread,), body)(), Context()
+    operator, context = type(cls.__name__, (addon.ui.operator_bases.Job,), body)(), Context()
     assert operator.launch(context) == {"RUNNING_MODAL"}
     return operator, context, said
 

@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 import numpy as np
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
+from bpy.types import Context
 from bpy_extras.io_utils import ImportHelper
 
 from ..cameras.objects import SHEAR, SOURCE, UPRIGHT
@@ -20,9 +21,9 @@ from ..core.formats.registry import INDEX_NAMES
 from ..core.quality.alignment import Alignment
 from ..core.views import ViewSet
 from ..mesh import layout as mesh_layout
+from ..mesh.layout import SplatObject
 from . import preferences
-from .on_thread import AskedFirst
-from .operator_bases import Answer, Needing, idle, in_object_mode
+from .operator_bases import Answer, Job, Needing, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
@@ -46,7 +47,7 @@ _OF_MODELS = {".bin", ".txt"}  # several files of one folder are a COLMAP model
 _USUAL_NAMES = {"cameras", "images", "transforms", "transforms_train"}  # of any capture
 
 
-class REFINE_OT_import_cameras(AskedFirst, Needing, bpy.types.Operator, ImportHelper):
+class REFINE_OT_import_cameras(Job, Needing, bpy.types.Operator, ImportHelper):
     """Import cameras as objects: Inria cameras.json, nerfstudio transforms.json or COLMAP"""
 
     # On a thread not for its time alone. What the file browser calls is put down as the last
@@ -70,13 +71,13 @@ class REFINE_OT_import_cameras(AskedFirst, Needing, bpy.types.Operator, ImportHe
     set_resolution: BoolProperty(**SET_RESOLUTION)
 
     doing = "Reading cameras"
-    reads_object = False
 
-    def ask(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+    def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Ask for the file; upright by default where the splats are.
 
         A JSON file that was dropped may hold splats: then it is theirs to ask.
         """
+        self.by_hand = True
         path = self.properties.filepath
         if path.lower().endswith(INDEX_NAMES):
             return bpy.ops.refine.import_ply("INVOKE_DEFAULT", filepath=path)
@@ -93,27 +94,24 @@ class REFINE_OT_import_cameras(AskedFirst, Needing, bpy.types.Operator, ImportHe
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def prepare(self, _context: bpy.types.Context, _checked: None) -> Path:
-        """Note which file to read."""
+    def gather(self, _context: Context) -> tuple[list[SplatObject], Path]:
+        """The file to read."""
         path = Path(bpy.path.abspath(self.filepath))
         if len(self.files) > 1 and path.suffix not in _OF_MODELS:
             raise RefineError(f"got {len(self.files)} files, expected one of cameras")
-        return path
+        return [], path
 
     @staticmethod
-    def work(path: Path, _progress: Progress) -> ViewSet:
-        """Read the file, or of a COLMAP model all of its folder."""
+    def compute(path: Path, _progress: Progress) -> ViewSet:
+        """What the file holds, or of a COLMAP model all of its folder."""
         return read_cameras(path.parent if path.suffix in _OF_MODELS else path)
 
-    def finish(
-        self, context: bpy.types.Context, _checked: None, path: Path, views: ViewSet
-    ) -> Answer:
+    def put(self, context: Context, _group: list[SplatObject], path: Path, views: ViewSet) -> None:
         """Import the cameras into a collection of their own."""
         collection = add_cameras(self, context, views, path)
         if (splats := _imported_splats(context)) is not None:
             warn_of_turn(self, context, splats)
         self.report({"INFO"}, f"Imported {counted(len(views), 'camera')} into '{collection.name}'")
-        return {"FINISHED"}
 
 
 class REFINE_FH_cameras(bpy.types.FileHandler):
@@ -125,14 +123,14 @@ class REFINE_FH_cameras(bpy.types.FileHandler):
     bl_file_extensions = ".json;.bin;.txt"
 
     @classmethod
-    def poll_drop(cls, context: bpy.types.Context) -> bool:
+    def poll_drop(cls, context: Context) -> bool:
         """Tell whether files can be dropped here."""
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
 def add_cameras(
     operator: Any,
-    context: bpy.types.Context,
+    context: Context,
     views: ViewSet,
     path: Path,
 ) -> bpy.types.Collection:
@@ -142,7 +140,7 @@ def add_cameras(
     ----------
     operator : bpy.types.Operator
         With the properties ``upright`` and ``set_resolution``.
-    context : bpy.types.Context
+    context : Context
     views : ViewSet
     path : Path
         Where they come from.
@@ -165,22 +163,20 @@ def add_cameras(
     return collection
 
 
-def suggest_resolution(operator: Any, context: bpy.types.Context) -> None:
+def suggest_resolution(operator: Any, context: Context) -> None:
     """Have an operator that asks set the render size where nobody has chosen size or camera."""
     if not operator.properties.is_property_set("set_resolution"):
         operator.set_resolution = _is_untouched(context.scene)
 
 
-def warn_of_turn(
-    operator: bpy.types.Operator, context: bpy.types.Context, splats: bpy.types.Object
-) -> None:
+def warn_of_turn(operator: bpy.types.Operator, context: Context, splats: bpy.types.Object) -> None:
     """Report if only one of splats and the cameras that decide was imported upright."""
     context.view_layer.update()  # or what was just made stands at the origin
     if turn := known_turn(context, splats):
         operator.report({"WARNING"}, Alignment(turn, known=True).turned())
 
 
-def target_collection(context: bpy.types.Context) -> bpy.types.Collection:
+def target_collection(context: Context) -> bpy.types.Collection:
     """Return the active collection, or the scene's where that one belongs to a library."""
     active = context.collection
     return context.scene.collection if active is None or active.library else active
@@ -205,7 +201,7 @@ def capture_folder(obj: bpy.types.Object | None) -> Path | None:
     return Path(stored) if found is None else found if found.is_dir() else found.parent
 
 
-def _imported_splats(context: bpy.types.Context) -> bpy.types.Object | None:
+def _imported_splats(context: Context) -> bpy.types.Object | None:
     """Return the splats that cameras are imported for: the active ones, else any imported ones."""
     if mesh_layout.looks_like_splats(context.object):
         return context.object

@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import json
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import bpy
 import numpy as np
+from bpy.types import Context
 
 from ..cameras.sets import CameraChoice
 from ..core.execute import Progress, part
 from ..core.pictures import AMPLIFIED, KINDS, Comparison, compare
 from ..core.prune import prune
 from ..core.quality.curve import in_words
-from ..core.splats import Splats
 from ..core.views import ViewSet
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject
 from ..mesh.records import parsed
 from ..objects import splat_group
+from ..objects.splat_group import Members
 from . import plans
 from .images import put
-from .on_thread import OnThread
-from .operator_bases import Answer, OnScored
-from .operators import apply_arguments
+from .operator_bases import Job, OnScored
+from .operators import apply_arguments, selected
 
 NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 """The pictures as images of the file, made anew by each comparison."""
@@ -35,16 +34,7 @@ MEASURED = "refine_measured"
 """Custom property of the mesh: what was measured last, and of which plan, as JSON."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Comparing:
-    """What is to be decided of which splats, and the view of them."""
-
-    arguments: dict[str, Any]
-    splats: Splats
-    view: ViewSet
-
-
-class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
+class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
     """Draw what the active camera sees before and after Apply, and say how close both are in dB"""
 
     bl_idname = "refine.compare"
@@ -52,37 +42,26 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
     bl_options = {"REGISTER"}
     doing = "Comparing"
 
-    def written(
-        self, _context: bpy.types.Context, _checked: SplatObject | None
-    ) -> list[SplatObject]:
-        """Return nothing: the splats are not changed."""
-        return []
-
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Comparing:
-        """Gather what Apply would decide by, the splats and the view of the active camera."""
-        view = CameraChoice("ACTIVE").views(context, checked.obj)[0]
-        group = splat_group.members(context.view_layer, checked)
+    def gather(self, context: Context) -> tuple[Members, Any]:
+        """What Apply would decide by, the splats, and the view of the active camera."""
+        view = CameraChoice("ACTIVE").views(context, context.object)[0]
+        group = selected(context)
         forced = splat_group.forced_of_each(context.scene, group)
         arguments = apply_arguments(context, group, forced)
         splats = arguments["splats"] or splat_group.gather(group, whole=None)
-        return _Comparing(arguments, splats, ViewSet((replace(view, weight=1.0),)))
+        return [], (arguments, splats, ViewSet((replace(view, weight=1.0),)))
 
     @staticmethod
-    def work(job: _Comparing, progress: Progress) -> tuple[Comparison, float | None]:
-        """Decide which splats stay, draw both states; return them and the estimated PSNR, dB."""
-        decided = 0.6 if job.arguments["method"].changes else 0.1  # of the time, by then
-        result = prune(**job.arguments, partial=True, progress=part(progress, 0.0, decided))
-        kept = result.merged.splats if result.merged else job.splats.take(result.keep)
-        (comparison,) = compare(job.splats, kept, job.view, progress=part(progress, decided, 1.0))
+    def compute(job: Any, progress: Progress) -> tuple[Comparison, float | None]:
+        """Both states, drawn, of the splats that stay; the estimated PSNR, dB."""
+        arguments, splats, view = job
+        decided = 0.6 if arguments["method"].changes else 0.1  # of the time, by then
+        result = prune(**arguments, partial=True, progress=part(progress, 0.0, decided))
+        kept = result.merged.splats if result.merged else splats.take(result.keep)
+        (comparison,) = compare(splats, kept, view, progress=part(progress, decided, 1.0))
         return comparison, result.report["estimated_psnr"]
 
-    def finish(
-        self,
-        context: bpy.types.Context,
-        _checked: SplatObject,
-        _job: _Comparing,
-        result: tuple[Comparison, float | None],
-    ) -> Answer:
+    def put(self, context: Context, _group: Members, _job: Any, result: Any) -> None:
         """Put the pictures into images, show them, and say how close they are."""
         comparison, estimated = result
         _note(context, comparison)
@@ -95,7 +74,6 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
             f"{comparison.psnr:.1f} dB measured in '{comparison.view.name}'{about}. "
             f"The difference is shown {AMPLIFIED} times as large",
         )
-        return {"FINISHED"}
 
 
 def measured(obj: bpy.types.Object, settings: Any) -> str:
@@ -110,7 +88,7 @@ def measured(obj: bpy.types.Object, settings: Any) -> str:
     return ""
 
 
-def _note(context: bpy.types.Context, comparison: Comparison) -> None:
+def _note(context: Context, comparison: Comparison) -> None:
     """Keep what was measured, for the panel to show as long as the plan is this one."""
     obj = context.object
     plan = plans.stored(obj, context.scene.refine)
@@ -125,7 +103,7 @@ def _identity(obj: bpy.types.Object, plan: dict[str, Any]) -> list[Any]:
     return [plan["key"], plan["splats"], scoring]
 
 
-def _show(context: bpy.types.Context, images: list[bpy.types.Image]) -> None:
+def _show(context: Context, images: list[bpy.types.Image]) -> None:
     """Show images side by side in a window of their own, unless all are shown already."""
     manager = context.window_manager
     shown = [
@@ -148,9 +126,7 @@ def _show(context: bpy.types.Context, images: list[bpy.types.Image]) -> None:
     bpy.app.timers.register(partial(_fit, [image.name for image in images]), first_interval=0.2)
 
 
-def _split(
-    context: bpy.types.Context, window: bpy.types.Window, count: int
-) -> list[bpy.types.Area]:
+def _split(context: Context, window: bpy.types.Window, count: int) -> list[bpy.types.Area]:
     """Split a window of one area into several of one width; return them from left to right."""
     (rest,) = window.screen.areas
     areas: list[bpy.types.Area] = []

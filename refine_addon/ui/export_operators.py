@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy.types import Context
 from bpy_extras.io_utils import ExportHelper
 
 from ..core.execute import Progress, report
@@ -30,8 +30,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 from ..objects import level_objects, splat_object
-from .on_thread import AskedFirst
-from .operator_bases import Answer, OnSplats
+from .operator_bases import Answer, Job, OnSplats
 
 _FORMATS = (
     (".ply", ".ply", "In the layout that was imported"),
@@ -40,17 +39,7 @@ _FORMATS = (
 """The formats of an export as Blender lists them, with tooltips."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Export:
-    """What is to be written where."""
-
-    file: Callable[[], SplatFile]
-    target: Path
-    overwrite: bool
-    notes: list[str]
-
-
-class Exporting(AskedFirst, OnSplats, ExportHelper):
+class Exporting(Job, OnSplats, ExportHelper):
     """An operator that writes what the active object holds, and only reads it."""
 
     apply_transform: BoolProperty(
@@ -69,25 +58,18 @@ class Exporting(AskedFirst, OnSplats, ExportHelper):
         """Return the name that the file browser proposes."""
         raise NotImplementedError
 
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+    def invoke(self, context: Context, event: bpy.types.Event) -> Answer:
         """Ask where; whoever picks what exists in the browser means to replace it."""
+        self.by_hand = self.overwrite = True
         if not self.filepath:
             self.filepath = self.new_name(context.object)
-        self.overwrite = True
         return ExportHelper.invoke(self, context, event)
 
-    def written(
-        self, _context: bpy.types.Context, _checked: SplatObject | None
-    ) -> list[SplatObject]:
-        """Return none: the objects are only read."""
-        return []
-
-    def say(self, notes: list[str], what: str) -> Answer:
+    def say(self, notes: list[str], what: str) -> None:
         """Say what was written, and what of it to mind."""
         for note in notes:
             self.report({"WARNING"}, note)
         self.report({"INFO"}, what)
-        return {"FINISHED"}
 
 
 class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
@@ -118,7 +100,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         folder = Path(bpy.path.abspath("//"))  # where the file browser starts
         return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
 
-    def check(self, _context: bpy.types.Context) -> bool:
+    def check(self, _context: Context) -> bool:
         """Bring name and format together, whichever was changed; return whether either changed."""
         before = self.filepath, self.suffix
         name = without_suffix(self.filepath)
@@ -129,45 +111,30 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         self.settled = self.suffix
         return before != (self.filepath, self.suffix)
 
-    def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
-        """Refuse what cannot be written, and gather what is."""
+    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
+        """What is written where, and what of it to mind; or what cannot be written."""
+        checked, moved = mesh_layout.check(context.object), self.apply_transform
         target = expanded(bpy.path.abspath(self.filepath))
         refuse_existing(target, overwrite=self.overwrite)
-        file = splat_object.read_for_export(checked, apply_transform=self.apply_transform)
-        notes = splat_object.export_notes(checked, apply_transform=self.apply_transform)
-        return _Export(file, target, self.overwrite, notes)
+        file = splat_object.read_for_export(checked, apply_transform=moved)
+        notes = splat_object.export_notes(checked, apply_transform=moved)
+        return [], (file, target, self.overwrite, notes)
 
     @staticmethod
-    def work(job: _Export, progress: Progress) -> SplatFile:
-        """Write the file."""
-        report(progress, 0.0, job.target.name)
-        file = job.file()
-        write_splats(job.target, file, overwrite=job.overwrite)
+    def compute(job: Any, progress: Progress) -> SplatFile:
+        """The file, written."""
+        read, target, overwrite, _ = job
+        report(progress, 0.0, target.name)
+        file = read()
+        write_splats(target, file, overwrite=overwrite)
         return file
 
-    def finish(
-        self,
-        _context: bpy.types.Context,
-        _checked: SplatObject | None,
-        job: _Export,
-        file: SplatFile,
-    ) -> Answer:
+    def put(self, _context: Context, _group: list[SplatObject], job: Any, file: SplatFile) -> None:
         """Say what was written."""
-        form = format_named(job.target)
-        if form is not None:
+        _, target, _, to_mind = job
+        if (form := format_named(target)) is not None:
             self.report({"INFO"}, "; ".join(notes(file, form, np.ones(len(file), np.bool_))))
-        return self.say(job.notes, f"Wrote the splats to {self.filepath}")
-
-
-@dataclass(frozen=True, eq=False)
-class _LevelExport:
-    """What is to be written where: the finest level first."""
-
-    files: list[Callable[[], SplatFile]]
-    width: float
-    target: Path
-    overwrite: bool
-    notes: list[str]
+        self.say(to_mind, f"Wrote the splats to {self.filepath}")
 
 
 class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
@@ -187,9 +154,9 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
         """Return the name of a folder; it is made."""
         return f"{level_objects.levels_of(obj)[0].name}_levels"
 
-    def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _LevelExport:
-        """Gather what is written."""
-        objects = level_objects.levels_of(checked.obj)
+    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
+        """What is written where, the finest level first, and what of it to mind."""
+        objects = level_objects.levels_of(mesh_layout.check(context.object).obj)
         moved = self.apply_transform
         each = [mesh_layout.check(obj) for obj in objects]
         files = [splat_object.read_for_export(one, apply_transform=moved) for one in each]
@@ -201,35 +168,30 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
             width /= np.cbrt(abs(objects[0].matrix_world.to_3x3().determinant())) or 1.0
         path = expanded(bpy.path.abspath(self.filepath))
         target = path if path.name == INDEX else path / INDEX
-        return _LevelExport(files, float(width), target, self.overwrite, list(dict.fromkeys(notes)))
+        return [], (files, float(width), target, self.overwrite, list(dict.fromkeys(notes)))
 
     @staticmethod
-    def work(job: _LevelExport, progress: Progress) -> int:
-        """Write the levels; return how many."""
-        with folder_for(job.target, overwrite=job.overwrite) as made:
+    def compute(job: Any, progress: Progress) -> int:
+        """How many levels were written."""
+        files, width, target, overwrite, _ = job
+        with folder_for(target, overwrite=overwrite) as made:
             scene = None
-            for number, file in enumerate(job.files):
-                report(progress, number / len(job.files), f"level {number}")
-                splats = held_splats(job.target, sog.FORMAT, file(), None, {})
-                scene = scene or StreamedSog(splats.means, job.width, made)
+            for number, file in enumerate(files):
+                report(progress, number / len(files), f"level {number}")
+                splats = held_splats(target, sog.FORMAT, file(), None, {})
+                scene = scene or StreamedSog(splats.means, width, made)
                 scene.add(splats)
             assert scene is not None
-            scene.publish(job.target, overwrite=job.overwrite)
-        return len(job.files)
+            scene.publish(target, overwrite=overwrite)
+        return len(files)
 
-    def finish(
-        self,
-        _context: bpy.types.Context,
-        _checked: SplatObject | None,
-        job: _LevelExport,
-        count: int,
-    ) -> Answer:
+    def put(self, _context: Context, _group: list[SplatObject], job: Any, count: int) -> None:
         """Say what was written."""
-        what = f"Wrote {count} levels, the finest as it is, to {job.target}"
-        return self.say(job.notes, what)
+        _, _, target, _, notes = job
+        self.say(notes, f"Wrote {count} levels, the finest as it is, to {target}")
 
 
-def _draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+def _draw_menu(menu: bpy.types.Menu, _context: Context) -> None:
     menu.layout.operator("refine.export_ply", text=f"Gaussian Splats ({', '.join(SUFFIXES)})")
 
 

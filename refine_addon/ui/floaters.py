@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import bpy
 import numpy as np
+from bpy.types import Context
 
 from ..core.cleaning.clean import Cleaned, Cleaning, clean
 from ..core.execute import Progress
-from ..core.splats import Splats
-from ..core.views import ViewSet
-from ..core.volumes import Forced
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
@@ -19,22 +17,11 @@ from ..mesh.layout import SplatObject
 from ..objects import splat_object
 from ..objects.demands import Demands
 from . import plans
-from .on_thread import OnThread
-from .operator_bases import Answer, AtOnce, OnSplats
+from .operator_bases import Answer, AtOnce, Job, OnSplats
 from .operators import chosen_views
 
 
-@dataclass(frozen=True, eq=False)
-class _Searching:
-    """Where to search for floaters: splats and views as they stand in the world."""
-
-    splats: Splats
-    views: ViewSet
-    settings: Cleaning
-    forced: Forced
-
-
-class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
+class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
     """Find splats that float where the cameras see empty space; nothing is deleted (Esc cancels)"""
 
     bl_idname = "refine.find_floaters"
@@ -42,36 +29,29 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     doing = "Looking for floaters"
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Searching:
-        """Gather splats and views."""
-        settings = context.scene.refine
+    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
+        """The arguments of `clean`, in the world."""
+        checked, settings = mesh_layout.check(context.object), context.scene.refine
         mesh_edit.check_writable(checked.obj)
-        return _Searching(
-            splat_object.gather(checked),
-            chosen_views(context),
-            Cleaning(tuple(settings.reasons), settings.views),
-            Demands.of_scene(context.scene).forced(checked),
-        )
+        cleaning = Cleaning(tuple(settings.reasons), settings.views)
+        forced = Demands.of_scene(context.scene).forced(checked)
+        masks = {"protected": forced.protected, "removed": forced.removed}
+        return [checked], ((splat_object.gather(checked), chosen_views(context), cleaning), masks)
 
     @staticmethod
-    def work(job: _Searching, progress: Progress) -> Cleaned:
-        """Search."""
-        return clean(
-            job.splats, job.views, job.settings,
-            protected=job.forced.protected, removed=job.forced.removed, progress=progress,
-        )  # fmt: skip
+    def compute(job: Any, progress: Progress) -> Cleaned:
+        """What floats."""
+        arguments, masks = job
+        return clean(*arguments, **masks, progress=progress)
 
-    def finish(
-        self, context: bpy.types.Context, checked: SplatObject, _job: _Searching, cleaned: Cleaned
-    ) -> Answer:
+    def put(self, context: Context, group: list[SplatObject], _job: Any, cleaned: Any) -> None:
         """Store what was found, mark it as what goes, and say it."""
-        floaters.store(checked, cleaned)
-        floaters.mark(checked, context.scene.refine.reasons)
+        floaters.store(group[0], cleaned)
+        floaters.mark(group[0], context.scene.refine.reasons)
         self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")
-        return {"FINISHED"}
 
 
-def _searched(context: bpy.types.Context) -> str:
+def _searched(context: Context) -> str:
     """Return that floaters are to be looked for, "" if they were."""
     return "Find floaters first" if floaters.counts(context.object.data) is None else ""
 
@@ -85,7 +65,7 @@ class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
 
     needs = (*OnSplats.needs, _searched)
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: Context) -> Answer:
         """Delete them, but for those that must stay by now."""
         checked = mesh_layout.check(context.object)
         floating = floaters.mask(checked, context.scene.refine.reasons)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import bpy
 import mathutils
 from bpy.props import BoolProperty, CollectionProperty, IntProperty, StringProperty
+from bpy.types import Context
 from bpy_extras.io_utils import ImportHelper
 
 from ..cameras.objects import SOURCE, UPRIGHT
@@ -21,6 +22,7 @@ from ..core.formats.streamed_sog import INDEX
 from ..core.views import ViewSet
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
+from ..mesh.layout import SplatObject
 from ..viewport import draw
 from . import preferences
 from .camera_import import (
@@ -32,8 +34,7 @@ from .camera_import import (
     target_collection,
     warn_of_turn,
 )
-from .on_thread import AskedFirst
-from .operator_bases import FAILURES, Answer, Needing, described, fail, idle, in_object_mode
+from .operator_bases import FAILURES, Answer, Job, Needing, described, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
@@ -44,25 +45,7 @@ FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)
 """What a file browser shows."""
 
 
-@dataclass(frozen=True)
-class _Files:
-    """Files of splats, and that of the cameras found beside them if it is to be read too."""
-
-    splats: list[Path]
-    cameras: Path | None
-    level: int
-
-
-@dataclass
-class _Read:
-    """What files hold, and what is wrong with those that cannot be read."""
-
-    files: list[SplatFile]
-    errors: list[Exception]
-    views: ViewSet | None = None
-
-
-class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper):
+class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
     """Import files of splats, of any format: a vertex a splat, a point attribute a property"""
 
     bl_idname = "refine.import_ply"
@@ -91,17 +74,17 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
     )
 
     doing = "Reading splats"
-    reads_object = False
 
-    def ask(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+    def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Ask for the files, or only for the options where files were dropped."""
+        self.by_hand = True
         preferences.suggest(self, context, "upright")
         if not self.properties.is_property_set("cameras"):
             self.cameras = not any(SOURCE in obj for obj in context.scene.objects)
         suggest_resolution(self, context)
         return self.invoke_popup(context)
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw(self, context: Context) -> None:
         """Draw the options, and name the cameras that would be taken before they are."""
         layout, browser = self.layout, context.space_data
         layout.prop(self, "upright")
@@ -121,41 +104,39 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
         column.label(text=os.path.relpath(found, folder), icon="CAMERA_DATA")
         column.prop(self, "set_resolution")
 
-    def prepare(self, _context: bpy.types.Context, _checked: None) -> _Files:
-        """Note which files to read."""
+    def gather(self, _context: Context) -> tuple[list[SplatObject], Any]:
+        """The files to read, and that of the cameras beside them if it is to be read too."""
         paths = self._paths()
         cameras = cameras_beside(paths[0].parent) if self.cameras else None
-        return _Files(paths, cameras, self.level)
+        return [], (paths, cameras, self.level)
 
     @staticmethod
-    def work(files: _Files, progress: Progress) -> _Read:
-        """Read the files; one that cannot be read does not stop the others."""
-        read, paths = _Read([], []), files.splats
+    def compute(job: Any, progress: Progress) -> tuple[list[SplatFile], ViewSet | None, list[Any]]:
+        """Files, views, and what is wrong with those that cannot be read; these stop no others."""
+        (paths, cameras, level), files, views, errors = job, [], None, []
         for index, path in enumerate(paths):
             progress_of_file = part(progress, index / len(paths), (index + 1) / len(paths))
             try:
-                read.files.append(_read(path, files.level, progress_of_file))
+                files.append(_read(path, level, progress_of_file))
             except FAILURES as error:
-                read.errors.append(error)
-        if files.cameras is not None and read.files:
+                errors.append(error)
+        if cameras is not None and files:
             try:
-                read.views = read_cameras(files.cameras)
+                views = read_cameras(cameras)
             except FAILURES as error:
-                read.errors.append(error)
-        return read
+                errors.append(error)
+        return files, views, errors
 
-    def finish(
-        self, context: bpy.types.Context, _checked: None, files: _Files, read: _Read
-    ) -> Answer:
+    def put(self, context: Context, _group: list[SplatObject], job: Any, read: Any) -> None:
         """Make an object of each file, and of each camera."""
-        errors, imported = read.errors, []
-        for file in read.files:
+        (paths, cameras, _), (files, views, errors), imported = job, read, []
+        for file in files:
             try:
                 imported.append(self._import(context, file))
             except FAILURES as error:
                 errors.append(error)
         if not imported:
-            return fail(self, errors[0] if len(errors) == 1 else RefineError(_joined(errors)))
+            raise RefineError("; ".join(map(described, errors)))
         for error in errors:
             self.report({"WARNING"}, described(error))
         for obj in context.selected_objects:
@@ -168,13 +149,12 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
             draw.show("SCENE")
         count = sum(len(obj.data.vertices) for obj in imported)
         told = f"Imported {count:,} splats from {counted(len(imported), 'file')}"
-        if read.views is not None and files.cameras is not None:
-            add_cameras(self, context, read.views, files.cameras)
-            beside = os.path.relpath(files.cameras, files.splats[0].parent)
-            told += f", and {counted(len(read.views), 'camera')} from {beside}"
+        if views is not None:
+            add_cameras(self, context, views, cameras)
+            beside = os.path.relpath(cameras, paths[0].parent)
+            told += f", and {counted(len(views), 'camera')} from {beside}"
         warn_of_turn(self, context, imported[-1])
         self.report({"INFO"}, told)
-        return {"FINISHED"}
 
     def _paths(self) -> list[Path]:
         names = [item.name for item in self.files if item.name]
@@ -182,7 +162,7 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
             return [Path(bpy.path.abspath(self.directory)) / name for name in names]
         return [Path(bpy.path.abspath(self.filepath))]
 
-    def _import(self, context: bpy.types.Context, file: SplatFile) -> bpy.types.Object:
+    def _import(self, context: Context, file: SplatFile) -> bpy.types.Object:
         mesh = mesh_attributes.mesh_from_file(file)
         mesh_drift.stamp(mesh)
         obj = bpy.data.objects.new(mesh.name, mesh)
@@ -207,7 +187,7 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     )
 
     @classmethod
-    def poll_drop(cls, context: bpy.types.Context) -> bool:
+    def poll_drop(cls, context: Context) -> bool:
         """Tell whether files can be dropped here."""
         return context.area is not None and context.area.type == "VIEW_3D"
 
@@ -224,11 +204,7 @@ def _read(path: Path, level: int, progress: Progress) -> SplatFile:
     return file
 
 
-def _joined(errors: list[Exception]) -> str:
-    return "; ".join(described(error) for error in errors)
-
-
-def _draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+def _draw_menu(menu: bpy.types.Menu, _context: Context) -> None:
     menu.layout.operator("refine.import_ply", text=f"Gaussian Splats ({', '.join(READ_SUFFIXES)})")
     menu.layout.operator("refine.import_cameras", text="Splat Cameras (.json, COLMAP)")
 

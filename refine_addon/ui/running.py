@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import bpy
 from bpy.app.handlers import persistent
 
-from ..core.execute import TimeLeft, in_time
+from ..core.errors import RefineError
+from ..core.execute import Cancelled, TimeLeft, in_time
+from ..mesh import attributes as mesh_attributes
+from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
-from .target import Target
 from .worker import Worker
+
+_STEP = 0.05
+"""Seconds between two events of the timer, at each of which the thread is looked at."""
 
 _UNDO, _SAVE = "Undo", "Save"
 _WAIT = {
@@ -29,7 +34,22 @@ _LONG = 5.0
 """Seconds for which a refusal stays in the status bar."""
 
 
-@dataclass(eq=False)
+class Target(NamedTuple):
+    """An object as it was read: known by its number in this session, which an undo keeps."""
+
+    name: str
+    uid: int
+    mode: str
+    splats: tuple[int, ...]
+
+    @classmethod
+    def of(cls, checked: SplatObject) -> Target:
+        """What an object is now."""
+        obj, mesh = checked.obj, checked.mesh
+        splats = mesh.session_uid, len(checked), mesh_attributes.digest(checked)
+        return cls(obj.name, obj.session_uid, obj.mode, splats)
+
+
 class Running:
     """An operation while it runs: all that an operator holds of it, dropped when it is over.
 
@@ -39,51 +59,63 @@ class Running:
     ----------
     operator : str
         Name of the operator, as a button has it.
-    doing : str
-        What it does.
-    escape : str
-        What Esc does, but for the part of the work that offers something; see `at_escape`.
     job
         What was gathered from the scene.
-    targets : list of Target
-        The objects that are to be written to.
     worker : Worker
-    timer : bpy.types.Timer
     waits : str
         What has to happen before the result can be written, "" if nothing.
-    offers : str
-        See `OnThread.offers`.
     """
 
-    operator: str
-    doing: str
-    escape: str
-    job: Any
-    targets: list[Target]
-    worker: Worker[Any]
-    timer: bpy.types.Timer
-    waits: str = ""
-    offers: str = ""
-    _said: tuple[str, float] = ("", 0.0)
-    _left: TimeLeft = field(default_factory=TimeLeft)
-    _told: str = ""
+    def __init__(
+        self, operator: Any, context: bpy.types.Context, group: list[SplatObject], job: Any
+    ) -> None:
+        self.operator, self.doing = type(operator).bl_idname, operator.doing
+        self.job, self.waits = job, ""
+        self._offers, self._targets = operator.offers, [Target.of(each) for each in group]
+        self._said, self._left, self._told = ("", 0.0), TimeLeft(), ""
+        self.worker = Worker(partial(operator.compute, job))
+        self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
+        _now[:] = [self]
+        self.tell(context)
 
-    def target(self) -> SplatObject | None:
-        """Return the first object that is to be written to, None if none is.
+    def objects(self) -> list[bpy.types.Object]:
+        """The objects that are to be written to; raises `RefineError` once one was deleted."""
+        there = {obj.session_uid: obj for obj in bpy.data.objects}
+        found = [there.get(target.uid) for target in self._targets]
+        for obj, target in zip(found, self._targets, strict=True):
+            if obj is None or not obj.users_scene:
+                raise RefineError(
+                    f"object '{target.name}': was deleted; {self.doing.lower()} has ended"
+                )
+        return found
 
-        Raises
-        ------
-        RefineError
-            If one is no longer as it was read; see `Target.unchanged`.
-        """
-        return next(iter([target.unchanged() for target in self.targets]), None)
+    def done(self) -> bool:
+        """Whether the thread has ended and its result can be written; see `waits`."""
+        pairs = zip(self.objects(), self._targets, strict=True)
+        if self.worker.running():
+            return False
+        modes = (target.mode for obj, target in pairs if obj.mode != target.mode)
+        mode = next(modes, "").replace("_", " ").lower()
+        self.waits = f"go back to {mode} mode for the result" if mode else ""
+        if self.waits and self.worker.cancelled:
+            raise Cancelled
+        return not self.waits
+
+    def unchanged(self) -> list[SplatObject]:
+        """The objects, whose splats are still those that were read; raises `RefineError` else."""
+        group = [mesh_layout.check(obj) for obj in self.objects()]
+        for checked, target in zip(group, self._targets, strict=True):
+            if Target.of(checked).splats != target.splats:
+                raise RefineError(
+                    f"object '{target.name}': its splats were changed meanwhile; start again"
+                )
+        return group
 
     @property
     def at_escape(self) -> str:
         """What Esc does at this moment."""
-        if self.offers and self.worker.what == self.offers and not self.waits:
-            return "keeps what that has reached"
-        return self.escape
+        keeps = self._offers and self.worker.what == self._offers and not self.waits
+        return "keeps what that has reached" if keeps else "cancels"
 
     @property
     def factor(self) -> float:
@@ -106,9 +138,10 @@ class Running:
         what = f" ({self.worker.what})" if self.worker.what else ""
         return f"{self.doing}{what}; Esc {self.at_escape}"
 
-    def say(self, text: str) -> None:
-        """Say something in the status bar for `_LONG`."""
-        self._said = text, time.monotonic() + _LONG
+    def refuse(self, context: bpy.types.Context, why: str) -> None:
+        """Say in the status bar for `_LONG` why something has to wait."""
+        self._said = why, time.monotonic() + _LONG
+        self.tell(context)
 
     def tell(self, context: bpy.types.Context) -> None:
         """Say in status bar and panels how far it is, if there is news."""
@@ -119,6 +152,16 @@ class Running:
             context.workspace.status_text_set(text)
             redraw_panels(context)
 
+    def over(self, context: bpy.types.Context) -> None:
+        """Stop what still works, and clear the bars."""
+        self.worker.cancel()
+        if self in _now:
+            _now.clear()
+        context.window_manager.event_timer_remove(self._timer)
+        for workspace in bpy.data.workspaces:  # work goes on where another one is chosen meanwhile
+            workspace.status_text_set(None)
+        redraw_panels(context)
+
 
 _now: list[Running] = []
 
@@ -126,21 +169,6 @@ _now: list[Running] = []
 def now() -> Running | None:
     """Return what runs, if anything does."""
     return _now[0] if _now else None
-
-
-def begin(running: Running) -> None:
-    """Let others know what runs."""
-    _now[:] = [running]
-
-
-def over(context: bpy.types.Context, running: Running) -> None:
-    """Clear the bars of what ran."""
-    if running in _now:
-        _now.clear()
-    context.window_manager.event_timer_remove(running.timer)
-    for workspace in bpy.data.workspaces:  # work goes on where another one is chosen meanwhile
-        workspace.status_text_set(None)
-    redraw_panels(context)
 
 
 def refusal() -> str:
@@ -195,7 +223,7 @@ def unregister() -> None:
     running = now()
     if running is not None:
         _end()
-        over(bpy.context, running)
+        running.over(bpy.context)
     bpy.app.handlers.load_pre.remove(_end)
     bpy.types.TOPBAR_MT_file.remove(_draw_file)
     bpy.types.TOPBAR_MT_edit.remove(_draw_edit)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from bpy.types import Context
 from numpy.typing import NDArray
 
 from ..core import picking
@@ -24,8 +25,7 @@ from ..objects import splat_object
 from ..objects.demands import Demands
 from . import plans
 from .deleting import Deleting
-from .on_thread import OnThread
-from .operator_bases import Answer, AtOnce, OnSplats
+from .operator_bases import Answer, AtOnce, Job, OnSplats
 from .select_tools import MODES
 
 ACTIONS = (
@@ -69,11 +69,11 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
     action: EnumProperty(name="Action", description="What is done", items=ACTIONS)
 
     @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
+    def description(cls, _context: Context, properties: bpy.types.AnyType) -> str:
         """Return the tooltip of a button."""
         return next(text for name, _, text in ACTIONS if name == properties.action)
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: Context) -> Answer:
         """Do it."""
         obj = context.object
         mesh_edit.check_writable(obj)
@@ -105,11 +105,11 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
     high: FloatProperty(name="To", description="Place on the axis", min=0.0, max=1.0, default=1.0)
 
     @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
+    def description(cls, _context: Context, properties: bpy.types.AnyType) -> str:
         """Return the tooltip of a button."""
         return next(text for name, _, text in SETS if name == properties.what)
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: Context) -> Answer:
         """Select them."""
         checked = mesh_layout.check(context.object)
         taken = self._taken(context, checked) & ~selection.hidden(checked.obj)
@@ -118,7 +118,7 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
         self.report({"INFO"}, f"{selection.count(checked.obj):,} splats are selected")
         return {"FINISHED"}
 
-    def _taken(self, context: bpy.types.Context, checked: SplatObject) -> NDArray[np.bool_]:
+    def _taken(self, context: Context, checked: SplatObject) -> NDArray[np.bool_]:
         """Return which splats are taken, (N,)."""
         if self.what == "RANGE":
             values, axis = quantity(checked, self.quantity)
@@ -169,7 +169,7 @@ def in_range(places: NDArray[np.float64], low: float, high: float) -> NDArray[np
     return np.asarray((rounded >= ends[0]) & (rounded <= ends[1]))
 
 
-class REFINE_OT_grow_selection(OnThread, OnSplats, bpy.types.Operator):
+class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
     """Select the neighbours of the selected splats too, or leave out those at the edge (Esc cancels)"""  # noqa: E501
 
     bl_idname = "refine.grow_selection"
@@ -179,33 +179,24 @@ class REFINE_OT_grow_selection(OnThread, OnSplats, bpy.types.Operator):
 
     shrink: BoolProperty(name="Shrink", description="Leave out those at the edge")
 
-    def prepare(
-        self, _context: bpy.types.Context, checked: SplatObject
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], bool]:
-        """Read places and what is selected."""
+    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
+        """Places, and what is selected."""
+        checked = mesh_layout.check(context.object)
         mesh_edit.check_writable(checked.obj)
         chosen = _some(checked.obj, selection.selected(checked.obj))
-        return mesh_attributes.read_attribute(checked.mesh, "position"), chosen, self.shrink
+        means = mesh_attributes.read_attribute(checked.mesh, "position")
+        return [checked], (means, chosen, self.shrink)
 
     @staticmethod
-    def work(
-        job: tuple[NDArray[np.float32], NDArray[np.bool_], bool], progress: Progress
-    ) -> NDArray[np.bool_]:
-        """Find the neighbours."""
+    def compute(job: Any, progress: Progress) -> NDArray[np.bool_]:
+        """The wider or narrower selection, (N,)."""
         means, chosen, shrink = job
         neighbours = picking.neighbours_of(means, progress=progress)
         return (picking.shrunk if shrink else picking.grown)(neighbours, chosen)
 
-    def finish(
-        self,
-        _context: bpy.types.Context,
-        checked: SplatObject,
-        _job: object,
-        wanted: NDArray[np.bool_],
-    ) -> Answer:
-        """Select them."""
-        selection.select(checked.obj, wanted)
-        return {"FINISHED"}
+    def put(self, _context: Context, group: list[SplatObject], _job: Any, wanted: Any) -> None:
+        """Select it."""
+        selection.select(group[0].obj, wanted)
 
 
 class REFINE_OT_delete_selected(Deleting, bpy.types.Operator):
@@ -215,7 +206,7 @@ class REFINE_OT_delete_selected(Deleting, bpy.types.Operator):
     bl_label = "Delete Selected"
     bl_options = {"REGISTER", "UNDO"}
 
-    def going(self, context: bpy.types.Context, checked: SplatObject) -> NDArray[np.bool_]:
+    def going(self, context: Context, checked: SplatObject) -> NDArray[np.bool_]:
         """Return the selected splats that need not stay."""
         going = _some(checked.obj, selection.selected(checked.obj))
         protected = Demands.of_scene(context.scene).forced(checked).protected
@@ -229,7 +220,7 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
     bl_label = "Separate Selected"
     bl_options = {"REGISTER", "UNDO"}
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: Context) -> Answer:
         """Copy the object, and delete from each what the other holds."""
         checked = mesh_layout.check(context.object)
         chosen = _some(checked.obj, selection.selected(checked.obj))

@@ -158,7 +158,7 @@ class Stroke:
     path: list[tuple[float, float]]
     before: NDArray[np.bool_]
     size: tuple[int, int]
-    worker: Worker[_Kept]
+    worker: Worker
     released: bool = False
     selected: NDArray[np.bool_] | None = None
     _sight: Sight | None = None

@@ -9,6 +9,7 @@ import bpy
 import mathutils
 from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
+from bpy.types import Context
 
 from ..core.errors import RefineError
 from ..core.execute import Progress, run_all
@@ -20,8 +21,7 @@ from ..mesh.layout import SplatObject
 from ..objects import splat_group, transforms
 from ..viewport import draw as viewport_draw
 from . import plans, wrapped
-from .on_thread import OnThread
-from .operator_bases import Answer, AtOnce, OnSplats, in_object_mode
+from .operator_bases import Answer, AtOnce, Job, OnSplats, in_object_mode
 from .wrapped import counted
 
 _SOON = 0.1
@@ -45,7 +45,7 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
         default=True,
     )
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: Context) -> Answer:
         """Bake the transforms of the selected objects."""
         group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
         for note in transforms.bake(group, location=self.location):
@@ -55,13 +55,13 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _several(context: bpy.types.Context) -> str:
+def _several(context: Context) -> str:
     """Return that several objects are needed, "" if they are selected."""
     chosen = splat_group.chosen(context.view_layer, context.object)
     return "" if len(chosen) > 1 else "Select several objects that hold splats"
 
 
-class REFINE_OT_join(OnThread, OnSplats, bpy.types.Operator):
+class REFINE_OT_join(Job, OnSplats, bpy.types.Operator):
     """Put the splats of the selected objects into the active one; they keep what they look like"""
 
     bl_idname = "refine.join"
@@ -70,34 +70,27 @@ class REFINE_OT_join(OnThread, OnSplats, bpy.types.Operator):
     needs = (*OnSplats.needs, in_object_mode, _several)
     doing = "Joining splats"
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> Any:
-        """Read the selected objects, the active one first."""
-        group = splat_group.active_first(context.view_layer, checked)
-        return splat_group.uids_of(group), transforms.read_to_join(group)
-
-    def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
-        """The selected objects, the active one first."""
-        return splat_group.active_first(context.view_layer, checked)
+    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
+        """The selected objects, the active one first, and what moves their splats."""
+        active = mesh_layout.check(context.object)
+        group = splat_group.active_first(context.view_layer, active)
+        return group, transforms.read_to_join(group)
 
     @staticmethod
-    def work(job: Any, progress: Progress) -> transforms.Joined:
-        """Move splats, sizes, rotations and harmonics into the frame of the active object."""
-        return job[1](progress)
+    def compute(move: Any, progress: Progress) -> transforms.Joined:
+        """Splats, sizes, rotations and harmonics in the frame of the active object."""
+        return move(progress)
 
-    def finish(
-        self, context: bpy.types.Context, checked: SplatObject, job: Any, found: transforms.Joined
-    ) -> Answer:
+    def put(self, context: Context, group: list[SplatObject], _job: Any, found: Any) -> None:
         """Join them."""
-        group = splat_group.by_uids(job[0], checked)
         for note in transforms.join(group, found):
             self.report({"WARNING"}, note)
         plans.refresh(context)
         count = mesh_layout.splat_count(group[0].obj.data)
         self.report({"INFO"}, f"Joined {len(group)} objects: {count:,} splats; score again")
-        return {"FINISHED"}
 
 
-class REFINE_OT_mend(OnThread, OnSplats, bpy.types.Operator):
+class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
     """Have sizes, rotations and colours follow what Blender's own tools did to the positions"""
 
     bl_idname = "refine.mend"
@@ -106,38 +99,28 @@ class REFINE_OT_mend(OnThread, OnSplats, bpy.types.Operator):
     needs = (*OnSplats.needs, in_object_mode)
     doing = "Mending splats"
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> Any:
-        """Read the selected objects, and what was noted of them."""
-        group = self.written(context, checked)
-        for each in group:
-            mesh_edit.check_changeable(each.obj)
-        reads = [transforms.read_to_move(each, mend=True)[1] for each in group]
-        return splat_group.uids_of(group), reads
-
-    def written(
-        self, context: bpy.types.Context, _checked: SplatObject | None
-    ) -> list[SplatObject]:
-        """The selected objects to which something was done."""
+    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
+        """The selected objects to which something was done, and what was noted of them."""
+        mesh_layout.check(context.object)
         chosen = splat_group.chosen(context.view_layer, context.object)
         drifted = {obj.data: obj for obj in chosen if of(obj)}
-        return [mesh_layout.check(obj) for obj in drifted.values()]
+        group = [mesh_layout.check(obj) for obj in drifted.values()]
+        for each in group:
+            mesh_edit.check_changeable(each.obj)
+        return group, [transforms.read_to_move(each, mend=True)[1] for each in group]
 
     @staticmethod
-    def work(job: Any, progress: Progress) -> Any:
-        """Find the maps by which others moved splats, and move the rest of each splat by them."""
-        return run_all(lambda move: move(), job[1], progress=progress, threads=1)
+    def compute(moves: Any, progress: Progress) -> Any:
+        """The maps by which others moved splats, and the rest of each splat moved by them."""
+        return run_all(lambda move: move(), moves, progress=progress, threads=1)
 
-    def finish(
-        self, context: bpy.types.Context, checked: SplatObject | None, job: Any, found: Any
-    ) -> Answer:
+    def put(self, context: Context, group: list[SplatObject], _job: Any, found: Any) -> None:
         """Mend the objects."""
-        group = splat_group.by_uids(job[0], checked) if checked else []
         transforms.write_moved(
             [(one, columns) for one, (columns, _) in zip(group, found, strict=True)]
         )
         plans.refresh(context)
         self.report({"INFO"}, f"Mended {counted(sum(count for _, count in found), 'splat')}")
-        return {"FINISHED"}
 
 
 def of(obj: bpy.types.Object) -> Drift | None:
@@ -153,7 +136,7 @@ def of(obj: bpy.types.Object) -> Drift | None:
     return _known[key]
 
 
-def _in_view(context: bpy.types.Context) -> list[str]:
+def _in_view(context: Context) -> list[str]:
     """Return a line for each object in a view that is to be mended: the panel may be closed."""
     return [
         f"'{obj.name}' was transformed by Blender's own tools: Mend Splats in the tab REFINE"
@@ -162,9 +145,7 @@ def _in_view(context: bpy.types.Context) -> list[str]:
     ]
 
 
-def draw(
-    layout: bpy.types.UILayout, context: bpy.types.Context, objects: Sequence[bpy.types.Object]
-) -> None:
+def draw(layout: bpy.types.UILayout, context: Context, objects: Sequence[bpy.types.Object]) -> None:
     """Draw what others did to the splats of objects, and the buttons that move splats."""
     drifts = [drift for drift in map(of, objects) if drift]
     for sentence in dict.fromkeys(s for drift in drifts for s in drift.told):
@@ -177,13 +158,13 @@ def draw(
         layout.operator("refine.bake_transform", icon="OBJECT_ORIGIN")
 
 
-def _draw_apply(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+def _draw_apply(menu: bpy.types.Menu, context: Context) -> None:
     if mesh_layout.looks_like_splats(context.object):
         menu.layout.separator()
         menu.layout.operator("refine.bake_transform", text="Bake Transform of Splats")
 
 
-def _draw_object(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+def _draw_object(menu: bpy.types.Menu, context: Context) -> None:
     if mesh_layout.looks_like_splats(context.object):
         menu.layout.separator()
         menu.layout.operator("refine.join")

@@ -5,23 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from concurrent.futures import Future
+from typing import Any
 
 from ..core.execute import Cancelled, Progress, checked_by
-
-Result = TypeVar("Result")
 
 PATIENCE = 0.7
 """Seconds that a thread has to end once it was cancelled; then it is left to itself."""
 
 
-class Worker(Generic[Result]):
-    """A call that runs while the window stays alive; it keeps nothing once `result` was asked.
-
-    Parameters
-    ----------
-    work : callable
-        ``work(progress)``; its result, or what it raises, is handed out by `result`.
+class Worker:
+    """A call, ``work(progress)``, that runs while the window stays alive.
 
     Attributes
     ----------
@@ -31,23 +25,21 @@ class Worker(Generic[Result]):
         What is being done, in a word or two.
     """
 
-    def __init__(self, work: Callable[[Progress], Result]) -> None:
+    def __init__(self, work: Callable[[Progress], Any]) -> None:
         self.fraction, self.what = 0.0, ""
         self._cancelled: float | None = None  # when
-        self._outcome: list[Result] = []  # one, once the work ended well
-        self._error: BaseException | None = None
+        self._outcome: Future[Any] = Future()
         self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
         self._thread.start()
 
     def running(self) -> bool:
-        """Tell whether there is still something to wait for.
+        """Whether there is still something to wait for.
 
         Work that has not ended `PATIENCE` after it was cancelled, such as the packing of a file, is
         not: it ends by itself at its next checkpoint, and what comes of it is dropped.
         """
-        if self._cancelled is not None and time.monotonic() - self._cancelled > PATIENCE:
-            return False
-        return self._thread.is_alive()
+        late = self.cancelled and time.monotonic() - self._cancelled > PATIENCE
+        return not late and self._thread.is_alive()
 
     @property
     def cancelled(self) -> bool:
@@ -56,7 +48,7 @@ class Worker(Generic[Result]):
 
     def cancel(self) -> None:
         """Ask it to stop; `result` raises `Cancelled` then, unless the work offers one."""
-        if self._cancelled is None:
+        if not self.cancelled:
             self._cancelled = time.monotonic()
 
     def end(self) -> None:
@@ -64,36 +56,24 @@ class Worker(Generic[Result]):
         self.cancel()
         self._thread.join(PATIENCE)
 
-    def result(self) -> Result:
-        """Wait for the result and return it.
-
-        Raises
-        ------
-        RefineError, Cancelled
-            What the work raised.
-        """
+    def result(self) -> Any:
+        """What the work came to, or raises what it raised; keeps neither."""
         if self.cancelled and self._thread.is_alive():
             raise Cancelled
         self._thread.join()
-        outcome, self._outcome = self._outcome, []
-        error, self._error = self._error, None
-        if error is None:
-            return outcome[0]
-        try:
-            raise error
-        finally:
-            del error  # its traceback holds this frame, which would hold it in turn
+        outcome, self._outcome = self._outcome, Future()
+        return outcome.result()
 
-    def _run(self, work: Callable[[Progress], Result]) -> None:
+    def _run(self, work: Callable[[Progress], Any]) -> None:
         try:
             with checked_by(self._check):
                 result = work(self._progress)
             if getattr(result, "stopped", None) is None:  # see `Result.stopped`
                 self._check()  # nobody may be left to ask for the result
-            self._outcome.append(result)
+            self._outcome.set_result(result)
         except BaseException as error:
             # Whoever cancels asks for no reason, and a traceback would keep what was worked on.
-            self._error = Cancelled() if self.cancelled else error
+            self._outcome.set_exception(Cancelled() if self.cancelled else error)
 
     def _check(self) -> None:
         if self.cancelled:

@@ -146,13 +146,13 @@ def test_camera_files_have_a_handler(addon):
 
 def test_several_files_of_cameras_are_refused_but_those_of_one_model(addon, tmp_path):
     """Of a COLMAP model any files can be dropped together; of others all but one would be lost."""
-    prepare = addon.ui.camera_import.REFINE_OT_import_cameras.prepare
+    gather = addon.ui.camera_import.REFINE_OT_import_cameras.gather
     several = [None, None]
     model, other = (str(tmp_path / name) for name in ("images.bin", "a.json"))
 
-    assert prepare(SimpleNamespace(filepath=model, files=several), None, None).name == "images.bin"
+    assert gather(SimpleNamespace(filepath=model, files=several), None)[1].name == "images.bin"
     with pytest.raises(addon.core.RefineError, match="got 2 files, expected one"):
-        prepare(SimpleNamespace(filepath=other, files=several), None, None)
+        gather(SimpleNamespace(filepath=other, files=several), None)
 
 
 @pytest.mark.parametrize("upright", [False, True])

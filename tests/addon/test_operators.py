@@ -154,8 +154,8 @@ def test_apply_asks_for_new_scores_before_it_removes_more(room, room_cameras):
     bpy.ops.refine.apply()
     count = len(room.data.vertices)
 
-    assert bpy.ops.refine.apply.poll()
-    with pytest.raises(RuntimeError, match="has no scores; score it first"):
+    assert not bpy.ops.refine.apply.poll()
+    with pytest.raises(RuntimeError, match="Score the splats first"):
         bpy.ops.refine.apply()
     assert len(room.data.vertices) == count
 
@@ -180,7 +180,7 @@ def test_apply_is_one_undo_step(room, room_cameras):
 def test_operators_that_change_the_scene_can_be_undone(name):
     """Blender pushes an undo step for operators with UNDO."""
     cls = getattr(bpy.types, f"REFINE_OT_{name}")
-    assert {"REGISTER", "UNDO"} <= cls.bl_options
+    assert "UNDO" in cls.bl_options
 
 
 def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):

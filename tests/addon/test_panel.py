@@ -308,7 +308,10 @@ def at_work(addon):
 
     def at_work(operator, doing):
         worker = SimpleNamespace(fraction=0.43, what="looking")
-        running.begin(running.Running(operator, doing, "cancels", None, [], worker, None))
+        now = running.Running.__new__(running.Running)
+        now.operator, now.doing, now.waits, now._offers = operator, doing, "", ""
+        now.worker, now._left = worker, running.TimeLeft()
+        running._now[:] = [now]
 
     yield at_work
     running._now.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from pathlib import Path
 
 import bpy
@@ -202,13 +203,20 @@ def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, quart
         lambda progress: core.score(splats, room_views, progress=progress)
     )
     scores = worker.result()
-    cancelled = addon.ui.worker.Worker.__new__(addon.ui.worker.Worker)
-    cancelled._cancelled, cancelled._outcome, cancelled._error = 0.0, [], None
-    cancelled._run(lambda progress: core.score(splats, room_views, progress=progress))
+    begun = threading.Event()
+
+    def slow(progress):
+        begun.set()
+        return core.score(splats, room_views, progress=progress)
+
+    cancelled = addon.ui.worker.Worker(slow)
+    begun.wait(60.0)
+    cancelled.cancel()
 
     assert np.array_equal(scores.values, core.score(splats, room_views).values)
     assert worker.fraction > 0.5
-    assert isinstance(cancelled._error, core.Cancelled)
+    with pytest.raises(core.Cancelled):
+        cancelled.result()
 
 
 def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras, tmp_path):

@@ -146,9 +146,9 @@ def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Pat
 def test_the_window_lives_while_splats_are_scored(binary: Binary, blend: Path, cloud: Path):
     """The view orbits and zooms, and is not drawn for the bar; undo, redo and save are refused.
 
-    Esc keeps the scores of before, and one Ctrl+Z takes those back. Loading a file, closing the
-    window, switching the extension off and quitting end the thread; a file is imported by a thread
-    that a dialog starts.
+    Esc keeps the scores of before, and one Ctrl+Z takes those back. Deleting the object, loading a
+    file, closing the window, switching the extension off and quitting end the thread; a file is
+    imported by a thread that a dialog starts.
     """
     found = binary.window_step(
         "alive", blend, size=(1200, 900), blend=blend, cloud=cloud, pictures=binary.work
@@ -161,6 +161,7 @@ def test_the_window_lives_while_splats_are_scored(binary: Binary, blend: Path, c
     assert found["zoomed"] < 0.95
     assert [found[what] for what in ("saved", "undone", "apply", "still")] == [False] * 3 + [True]
     assert found["esc_s"] < 10.0  # at once, on a machine that may be busy
+    assert found["deleted"] == [True, True]
     assert found["ended by"] == {how: [True, 0] for how in ("load", "close_window", "disable")}
     assert found["imported"] == 39_755
 

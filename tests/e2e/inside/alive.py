@@ -65,6 +65,15 @@ def main(blend: str, cloud: str, pictures: str) -> Generator[float, None, dict[s
     yield from hand.undo()
     yield from window.until(lambda: not record(), "the scores are gone")
 
+    with scoring(hand.window, gate):
+        yield from window.until(gate.held, "it is held back")
+        bpy.ops.object.delete()
+        yield 1.0
+        found["deleted"] = [gate.idle(), bpy.ops.refine.import_ply.poll()]
+        yield from window.picture(pictures, "alive-3-deleted")
+    yield from load(blend)
+    hand = window.Hand()
+
     found["ended by"] = {}
     for how in (load, close_window, disable):
         with scoring(hand.window, gate):

@@ -71,10 +71,10 @@ def main(
         Whether splats are refitted, too: minutes at a million of them.
     """
     extension.enable()
-    on_thread = importlib.import_module(f"{extension.MODULE}.ui.on_thread")
+    bases = importlib.import_module(f"{extension.MODULE}.ui.operator_bases")
     clock, refine = Clock(), bpy.ops.refine
-    at_once = on_thread.OnThread.execute
-    on_thread.OnThread.execute = threaded = on_a_thread(clock, on_thread)
+    at_once = bases.Job.execute
+    bases.Job.execute = threaded = on_a_thread(clock)
     bpy.data.batch_remove(bpy.data.objects)
     clock.time("import with cameras", refine.import_ply, filepath=cloud, cameras=True)
     settings = bpy.context.scene.refine
@@ -87,10 +87,10 @@ def main(
     selecting(clock, scored)
     changing(clock, scored, f"{folder}/out.ply")
     scored.again()
-    on_thread.OnThread.execute = at_once  # as in a window
+    bases.Job.execute = at_once  # as in a window
     clock.time("apply", refine.apply)
     clock.time("undo of apply", bpy.ops.ed.undo)
-    on_thread.OnThread.execute = threaded
+    bases.Job.execute = threaded
     for method in ("merge", "refit")[: 1 + refit]:
         scored.again()
         bpy.context.scene.refine.method = method
@@ -144,13 +144,14 @@ def changing(clock: Clock, scored: Scored, path: str) -> None:
     clock.time("mend after Ctrl+A", refine.mend)
 
 
-def on_a_thread(clock: Clock, on_thread: Any) -> Callable[..., set[str]]:
-    """Return what runs an operator as `OnThread` does in a window, and waits for its thread."""
+def on_a_thread(clock: Clock) -> Callable[..., set[str]]:
+    """Return what runs an operator as `Job` does in a window, and waits for its thread."""
     main_thread = importlib.import_module(f"{extension.MODULE}.main_thread")
+    running = importlib.import_module(f"{extension.MODULE}.ui.running")
 
     def waited(work: Callable[..., Any]) -> Any:
         clock.cut()
-        worker = on_thread.Worker(work)
+        worker = running.Worker(work)
         while worker.running():
             time.sleep(_POLL)
             main_thread.serve()
@@ -158,12 +159,13 @@ def on_a_thread(clock: Clock, on_thread: Any) -> Callable[..., set[str]]:
         return worker.result()
 
     def execute(self: Any, context: bpy.types.Context) -> set[str]:
-        checked = self._checked(context)
-        job = self.prepare(context, checked)
-        targets = [on_thread.Target.of(each) for each in self.written(context, checked)]
-        result = waited(partial(self.work, job))
-        first = next(iter([target.unchanged() for target in targets]), None)
-        return self.finish(context, first, job, result)
+        group, job = self.gather(context)
+        targets = [running.Target.of(each) for each in group]
+        result = waited(partial(self.compute, job))
+        for each, target in zip(group, targets, strict=True):
+            assert running.Target.of(each) == target
+        self.put(context, group, job, result)
+        return {"FINISHED"}
 
     return execute
 
