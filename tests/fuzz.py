@@ -37,7 +37,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from refine_addon.command.info import describe
+from refine_addon.command.subcommands import describe
 from refine_addon.core import (
     ClosedForm,
     RefineError,

@@ -50,7 +50,7 @@ def batch(folder: Path) -> None:
     start = time.perf_counter()
     for part in (inputs[:100], inputs):  # the first hundred fill what stays
         names = [str(path) for path in part]
-        assert refine(["prune", *names, "--output-dir", str(folder / "out"), *common]) == 0
+        assert refine(["prune", *names, "-o", str(folder / "out"), *common]) == 0
         used.append((_resident(), len(list(Path("/proc/self/fd").iterdir()))))
     seconds = time.perf_counter() - start
     (before, open_before), (after, open_after) = used

@@ -174,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         commands = [("copy", copy)]
         for workers in options.workers:
             more = ["--workers", str(workers)] if workers else []
-            commands.append((f"{workers} workers", [*prune, "--output-dir", output, *more]))
+            commands.append((f"{workers} workers", [*prune, "-o", output, *more]))
         for name, command in commands:
             cost = run(command)
             shutil.rmtree(output, ignore_errors=True)

@@ -1,99 +1,107 @@
-"""What is refused before anything is read or written, beyond what argparse refuses."""
+"""What is refused before anything is read or written, beyond what single values show."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..core import RefineError
-from ..core.formats.registry import SUFFIXES, format_named, without_suffix
+from ..core.formats.registry import SUFFIXES, format_named, names_file, without_suffix
 from ..core.lod import is_streamed, level_paths
 from ..core.whole_file import Url, refuse_url
-from . import zones
-from .options import DEFAULT_LEVELS, arrangement, budget, cleaning, levels, method
+from .options import BLENDER
 from .report import is_report
 from .zones import ROLES
 
 
-def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Refuse what cannot go together, and outputs that would replace something else.
-
-    Wrong usage leaves through ``parser.error``, code 2.
+def check(options: argparse.Namespace) -> None:
+    """Refuse what does not go together, and outputs that would replace something else.
 
     Raises
     ------
     RefineError
-        If a file that would be replaced cannot be looked into.
+        It is wrong usage.
+    OSError
+        If a report that would be replaced cannot be looked into.
     """
-    if options.command == "render":
-        _check_render(parser, options)
-    else:
-        _check_splats(parser, options)
-    if options.command == "convert":
-        _check_convert(parser, options)
+    together = options.together and ("inputs", "output")
+    for option in ("inputs", "output", "cameras", "report", "pictures"):
+        values = getattr(options, option)
+        for value in values if option == "inputs" else [values]:
+            if value and option not in (together or ()):
+                refuse_url(value)
+    for wrong, why in _rules(options):
+        if wrong:
+            raise RefineError(why)
+    made = _outputs(options)
+    for path in made:
+        if not format_named(path) and path.suffix.lower() != ".ply":
+            raise RefineError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
+    if options.command in ("prune", "score", "clean"):
+        advice = "rename one of them" if together else "call the command for each, with its own -o"
+        _refuse_doubles(options.inputs, made, advice)
+        if options.pictures:
+            names = [without_suffix(path.name) for path in options.inputs]
+            pictures = [options.pictures / f"{name}-CAMERA-after.png" for name in names]
+            _refuse_doubles(options.inputs, pictures, "call the command for each")
+        if not together and len(made) > 1:
+            _refuse_replaced(options.inputs, made)
+    if options.report:
+        _check_report(options, made)
 
 
-def _check_convert(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Refuse to move what cannot be moved so."""
-    try:
-        arrangement(options)
-    except RefineError as error:
-        parser.error(str(error))
-
-
-def _check_render(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    if not options.scene:
-        parser.error("render needs Blender: blender -b scene.blend --command refine render")
-
-
-def _check_splats(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Do what `check` does for subcommands that go from splats to splats."""
-    if options.command == "prune" and not options.together:
-        _refuse_urls(parser, options)
-    _check_report(parser, options)
-    for path in _outputs(options):
-        _check_output(parser, path)
-    if options.command == "lod" and options.format and is_streamed(options.output_dir):
-        parser.error(f"--format goes with a folder, not with {options.output_dir.name}")
-    if options.command in ("info", "convert"):
-        return
-    try:
-        _check_settings(options)
-    except RefineError as error:
-        parser.error(str(error))
-    zones.check(parser, options)
-    if options.command == "prune":
-        _check_prune(parser, options)
-    elif options.command == "clean":
-        _check_files(parser, options)
-    elif options.command == "score":
-        _check_score(parser, options)
-    if options.cameras is None and not (options.scene and open_blend()):
-        parser.error("no cameras: give --cameras, or open a .blend that has some")
-
-
-def _refuse_urls(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Refuse URLs where each input is pruned by itself."""
-    try:
-        for path in filter(None, [*options.inputs, options.output_dir]):
-            refuse_url(path)
-    except RefineError as error:
-        parser.error(str(error))
-
-
-def _check_settings(options: argparse.Namespace) -> None:
-    """Refuse values that cannot be, and a budget that means nothing to the method."""
-    if options.command == "clean":
-        cleaning(options)
-        return
-    if options.command == "lod":
-        levels(options)
-    method(options)
-    if options.command == "prune":
-        budget(options)
+def _rules(options: argparse.Namespace) -> Iterator[tuple[object, str]]:
+    """What does not go together, with what is said of it."""
+    name, one = options.command, options.object
+    needs = f"needs Blender: {BLENDER} {name}"
+    decides = name in ("prune", "score", "clean", "lod")
+    yield name == "render" and not options.scene, f"render {needs}"
+    if name in ("prune", "score"):
+        yield bool(options.inputs) == bool(one), "expected INPUT files or --object NAME, not both"
+        yield (
+            one and options.model,
+            ("--model goes with INPUT files; an object has it in the panel, under Splats"),
+        )
+        yield one and options.clean, "--clean goes with INPUT files, not with --object"
+        yield one and not options.scene, f"--object {needs} ..."
+        yield options.save and not one, "--save goes with --object"
+        yield options.workers and not options.together, "--workers goes with --together"
+    for option in ("object", "clean", "pictures", *ROLES) if options.together else ():
+        flag = f"--{option.replace('_', '-')}"
+        yield getattr(options, option), f"{flag} does not go with --together"
+    yield name == "lod" and len(options.inputs) > 1, "lod takes one INPUT"
+    output = options.output
+    yield (
+        name in ("prune", "score", "lod") and not (output or options.save or options.dry_run),
+        "expected -o OUT" + ", --save or --dry-run" * (name == "prune"),
+    )
+    if decides and output:
+        file, many = names_file(output), len(options.inputs) > 1 or options.together
+        yield one and not file, f"-o {output}: expected the name of a file for --object"
+        yield file and many, f"-o {output} is one file, expected a folder for the inputs"
+        yield (
+            name == "score" and file and format_named(output),
+            (f"-o {output}: only a .ply holds scores"),
+        )
+    yield options.source and not options.scene, f"--source {needs} ..."
+    yield options.source and options.cameras, "expected --cameras or --source, and not both"
+    yield (
+        decides and not options.cameras and not (options.scene and open_blend()),
+        "no cameras: give --cameras, or open a .blend that has some",
+    )
+    for role in ROLES if not options.scene else ():
+        for text, volume in getattr(options, role) or ():
+            yield (
+                volume is None,
+                (
+                    f"--{role.replace('_', '-')} {text}: objects have names in Blender alone; "
+                    "here give box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius"
+                ),
+            )
 
 
 def open_blend() -> str:
@@ -104,174 +112,52 @@ def open_blend() -> str:
 
 
 def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
-    """Return the splat files to be made."""
+    """The files of splats to be made."""
+    output = options.output
+    if output is None or (options.command == "lod" and is_streamed(output)):
+        return []
     if options.command == "lod":
-        count = len(options.psnr or options.levels or DEFAULT_LEVELS)
-        if is_streamed(options.output_dir):
-            return []
-        return level_paths(
-            options.inputs[0], options.output_dir, count, options.format or SUFFIXES[0]
-        )
-    if getattr(options, "output_dir", None):
-        return [options.output_dir / path.name for path in options.inputs]
-    return [options.output] if getattr(options, "output", None) else []
+        format_named(output)  # refuses endings that are not written
+        return level_paths(options.inputs[0], output, len(options.shares))
+    if names_file(output) or options.command == "convert":
+        return [output]
+    return [output / path.name for path in options.inputs]
 
 
-def _check_report(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+def _check_report(options: argparse.Namespace, made: Sequence[Path | Url]) -> None:
     """Refuse a report that would replace what is read or written, even with --overwrite."""
-    if options.report is None:
-        return
-    others = [*options.inputs, *_outputs(options), getattr(options, "cameras", None)]
-    if options.command == "lod":
-        others.append(options.output_dir)
+    report, pictures = options.report, options.pictures
+    others = [*options.inputs, *made, options.output, options.cameras]
     if options.scene:
         others.append(open_blend())
-    path = os.path.realpath(options.report)
+    path = os.path.realpath(report)
     for other in filter(None, others):
         # Unlike pathlib's, these two never fail, whatever the name.
         if os.path.realpath(os.path.expanduser(other)) == path:
-            parser.error(f"--report {options.report} is {other}, expected a file of its own")
-    pictures = getattr(options, "pictures", None)
+            raise RefineError(f"--report {report} is {other}, expected a file of its own")
     if pictures and path.endswith(".png") and os.path.dirname(path) == os.path.realpath(pictures):
-        parser.error(f"--report {options.report} may be one of the pictures; choose another name")
-    beginning = _beginning(options.report) if options.overwrite else None
-    if beginning is not None and not is_report(beginning):
-        parser.error(f"{options.report} exists and is no report: write to another name")
+        raise RefineError(f"--report {report} may be one of the pictures; choose another name")
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        # What is no file `refuse_existing` says.
+        if options.overwrite and stat.S_ISREG(report.stat().st_mode):
+            with report.open("rb") as stream:
+                if not is_report(stream.read(64)):
+                    raise RefineError(f"{report} exists and is no report: write to another name")
 
 
-def _check_output(parser: argparse.ArgumentParser, path: Path | Url) -> None:
-    """Refuse an output that would replace something other than splats, cameras above all."""
-    try:
-        if format_named(path) or path.suffix.lower() == ".ply":
-            return
-    except RefineError as error:
-        parser.error(str(error))
-    if isinstance(path, Url):
-        parser.error(f"{path}: expected a name that ends in .ply")
-    beginning = _beginning(path)
-    if beginning is not None and not beginning.startswith(b"ply"):
-        parser.error(f"{path} exists and is no PLY: write to another name")
-
-
-def _beginning(path: Path) -> bytes | None:
-    """Return the first bytes of a file; None where there is none."""
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            return None  # which `refuse_existing` says
-        with path.open("rb") as stream:
-            return stream.read(64)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except OSError as error:
-        raise RefineError(
-            f"{path}: cannot be looked into ({error.strerror or error}); nothing was changed"
-        ) from error
-
-
-def _check_source(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Refuse an object beside files or out of Blender, and a choice of cameras beside another."""
-    if bool(options.inputs) == bool(options.object):
-        parser.error("expected INPUT files or --object NAME, and not both")
-    if options.object and options.model:
-        parser.error("--model goes with INPUT files; an object has it in the panel, under Splats")
-    if options.object and not options.scene:
-        command = f"blender -b scene.blend --command refine {options.command} ..."
-        parser.error(f"--object needs Blender: {command}")
-    if not (options.source or options.frames):
-        return
-    option = "--source" if options.source else "--frames"
-    if not options.object:
-        parser.error(f"{option} goes with --object; for INPUT files give --cameras")
-    if options.cameras is not None:
-        parser.error(f"expected --cameras or {option}, and not both")
-    if options.frames and options.source and options.source[0] != "FRAMES":
-        parser.error("--frames goes with --source frames alone, or without --source")
-
-
-def _check_prune(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    if options.clean and options.object:
-        parser.error("--clean goes with INPUT files, not with --object")
-    if options.together:
-        _check_together(parser, options)
-    elif options.workers is not None or options.scheduler:
-        parser.error("--workers and --scheduler go with --together")
-    _check_source(parser, options)
-    if options.object:
-        if options.output_dir:
-            parser.error("--object is written with -o, not with --output-dir")
-        if not (options.output or options.save or options.dry_run):
-            parser.error("--object needs -o OUT.ply, --save or --dry-run")
-    else:
-        if options.save:
-            parser.error("--save goes with --object")
-        if not (options.output or options.output_dir or options.dry_run):
-            parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
-        _check_files(parser, options)
-
-
-def _check_together(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Refuse what needs all splats at once, or one output."""
-    alone = ("object", "output", "clean", *ROLES)
-    for name in alone:
-        if getattr(options, name, None):
-            option = "-o" if name == "output" else f"--{name.replace('_', '-')}"
-            parser.error(f"{option} does not go with --together")
-    if options.workers is not None and options.scheduler:
-        parser.error("expected --workers or --scheduler, and not both")
-    if options.workers is not None and options.workers < 1:
-        parser.error(f"workers is {options.workers}, expected 1 or more")
-
-
-def _check_score(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    _check_source(parser, options)
-    if len(options.inputs) > 1:
-        parser.error(f"expected one INPUT, got {len(options.inputs)}")
-    if format_named(options.output):
-        parser.error(f"-o {options.output}: only a .ply holds scores")
-
-
-def _check_files(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    if options.output and options.output_dir:
-        parser.error("expected -o or --output-dir, and not both")
-    if options.output and len(options.inputs) > 1:
-        parser.error(f"-o takes one input, got {len(options.inputs)}: use --output-dir")
-    if options.output_dir:
-        advice = "call the command for each, with its own --output-dir or -o"
-        if getattr(options, "together", False):
-            advice = "rename one of them"
-        _refuse_doubles(parser, options.inputs, lambda path: options.output_dir / path.name, advice)
-        if not getattr(options, "together", False):
-            _refuse_replaced(parser, options.inputs, options.output_dir)
-    if getattr(options, "pictures", None):
-        if options.together:
-            parser.error("--pictures draws each input by itself, not --together")
-        _refuse_doubles(
-            parser,
-            options.inputs,
-            lambda path: options.pictures / f"{without_suffix(path.name)}-CAMERA-after.png",
-            "call the command for each, with its own --pictures",
-        )
-
-
-def _refuse_doubles(
-    parser: argparse.ArgumentParser,
-    inputs: Sequence[Path],
-    output_of: Callable[[Path], Path],
-    advice: str,
-) -> None:
+def _refuse_doubles(inputs: Sequence[Path], made: Sequence[Path], advice: str) -> None:
     """Refuse two inputs of which the same file would be made."""
     first: dict[str, Path] = {}
-    for path in inputs:
-        output = output_of(path)
-        other = first.setdefault(os.path.realpath(str(output)), path)
+    for path, output in zip(inputs, made, strict=False):
+        other = first.setdefault(os.path.realpath(output), path)
         if other is not path:
-            parser.error(f"{other} and {path} would both be {output}: {advice}")
+            raise RefineError(f"{other} and {path} would both be {output}: {advice}")
 
 
-def _refuse_replaced(parser: argparse.ArgumentParser, inputs: Sequence[Path], folder: Path) -> None:
+def _refuse_replaced(inputs: Sequence[Path], made: Sequence[Path]) -> None:
     """Refuse an output that is another input by a link: it would be replaced before it is read."""
     read = {os.path.realpath(path): path for path in inputs}
-    for path in inputs:
-        other = read.get(os.path.realpath(str(folder / path.name)), path)
+    for path, output in zip(inputs, made, strict=True):
+        other = read.get(os.path.realpath(output), path)
         if other is not path:
-            parser.error(f"{folder / path.name} is {other} by a link, which is read too")
+            raise RefineError(f"{output} is {other} by a link, which is read too")

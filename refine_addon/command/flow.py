@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 
 from ..core import RefineError
-from . import checks, runs
-from .options import make_parser
+from . import checks, options, report
+from .run import Run
+from .subcommands import SUBCOMMANDS
 from .terminal import complain, described, flush
-
-DONE, FAILED, USAGE = 0, 1, 2
-"""Exit codes: done, failed on an input, wrong usage."""
 
 
 def run(arguments: Sequence[str], *, scene: bool) -> int:
@@ -25,22 +22,30 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
     Returns
     -------
     int
-        Exit code: `DONE`, `FAILED` or `USAGE`.
+        Exit code: 0 done, 1 failed on an input, 2 wrong usage.
     """
-    parser = make_parser()
+    parser = options.make_parser()
     try:
-        options = parser.parse_args(list(arguments), argparse.Namespace(scene=scene))
+        given = parser.parse_args(list(arguments))
+        given.scene = scene
         if scene:
-            from . import open_blend
+            from .scene import refuse_unopened
 
-            open_blend.check()
-        checks.check(parser, options)
-        return DONE if runs.execute(options) else FAILED
+            refuse_unopened()
+        try:
+            options.complete(given)
+            checks.check(given)
+        except RefineError as error:
+            parser.error(str(error))
+        if given.report is not None:
+            report.check(given.report, overwrite=given.overwrite)
+        done = Run(given)
+        SUBCOMMANDS[given.command](done)
+        done.finish()
+        return int(done.failed)
     except SystemExit as leaving:  # argparse leaves the process; Blender wants a number
         flush()
-        return int(leaving.code or DONE)
-    except RefineError as error:
-        complain(str(error))
-    except (OSError, MemoryError) as error:
+        return int(leaving.code or 0)
+    except (RefineError, OSError, MemoryError) as error:
         complain(described(error))
-    return FAILED
+    return 1

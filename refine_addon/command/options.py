@@ -1,88 +1,292 @@
-"""The options of all subcommands, and what they say as budget and settings."""
+"""The options of all subcommands, each once, and the settings that they make."""
 
 from __future__ import annotations
 
 import argparse
+import functools
+import re
 from collections.abc import Callable
-from functools import partial
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..core import (
-    METHODS,
-    REASONS,
-    Budget,
-    Cleaning,
-    Levels,
-    Merge,
-    Method,
-    Move,
-    RefineError,
-    Refit,
-)
+from ..core import METHODS, REASONS, Budget, Cleaning, Levels, Merge, RefineError, Refit
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
-from ..core.lod import SHARES as DEFAULT_LEVELS
+from ..core.lod import SHARES
 from ..core.splats import MODELS
-from ..core.whole_file import Url, expanded, is_url, refuse_url
+from ..core.volumes import Volume, parse
+from ..core.whole_file import Url, expanded, is_url
 from ..version import VERSION
-from . import zones
 
-DEFAULT_RATIO = 0.5
+_SOURCES = "visible, active, selected, collection:NAME, frames or frames:A:B:STEP"
 
-FORMATS = ", ".join(SUFFIXES)
+_VOLUMES = """box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius in the coordinates of the cameras, or in
+                        Blender an object, a closed mesh or an empty shown as cube or sphere"""
 
-_FILES = f"files: {', '.join(READ_SUFFIXES)}"
+_TABLE = f"""
+inputs INPUT            files of splats: {", ".join(READ_SUFFIXES)}
+output FILE             the file to make, by its suffix: {", ".join(SUFFIXES)}
+--object NAME           in place of INPUT: this splat object of the open .blend, by the cameras that
+                        are chosen in the panel there, with what it protects and crops; of the
+                        panel's other settings none counts
+--source WHICH          which cameras of the open scene decide instead: {_SOURCES}, the active one
+                        at frame A and every STEP-th after it to B; frames are the panel's range
+render --source WHICH   which frames: frames for all of the scene, or frames:A:B:STEP for frame A
+                        and every STEP-th after it to B; the current one by default
+--cameras PATH          cameras.json, transforms.json or a COLMAP model; default: the visible
+                        cameras of the open scene
+--save                  with --object: delete the splats there and save
+-o OUT                  a file, in the format of its suffix, or for any number of inputs a folder,
+                        which is any other name; made if it is not there
+score -o OUT            a .ply, or a folder, which is any other name; made if it is not there
+lod -o OUT              a folder, for NAME.lod1.ply and so on; FOLDER/NAME.spz makes NAME.lod1.spz,
+                        and FOLDER/lod-meta.json a streamed SOG of all levels, which viewers on the
+                        web load by chunks; made if it is not there
+--ratio B               share of the splats to remove, 0 <= B < 1 (default 0.5)
+--keep N                how many splats stay
+--max-mb M              size of the file, in 1e6 bytes
+--psnr DB               remove as much as leaves the views' pictures this close to the unpruned
+                        ones: 40 is hard to tell apart, 30 is seen
+--levels S,S,...        share of the splats that stays in each, the finest first (default
+                        {",".join(f"{share:g}" for share in SHARES)})
+lod --psnr DB,DB,...    or how close each stays to the original in these views, in dB
+--method METHOD         from instant to best: {", ".join(METHODS)}. closed-form takes nothing
+                        as hidden, occlusion knows what hides what; both delete, and the other rows
+                        stay as they were. merge (the default) merges what goes into what stays, or
+                        deletes where that is as good; refit then fits what stays to what all splats
+                        look like, some dB better in several times the time
+--rounds N              with --method refit: fit up to N times, each time to other rays (default: 2
+                        to 4 times, fewer of more splats; more rounds bring up to 1 dB)
+--views N               use at most N views, spread out evenly; 0 uses all (default {Merge.views})
+--clean                 first remove floaters and outliers, as clean does; the budget counts the
+                        rest
+--reasons R,R,...       which to remove, of {", ".join(REASONS)}
+                        (default {",".join(Cleaning.reasons)})
+--protect VOLUME        splats in it stay unchanged, whatever else is said: {_VOLUMES};
+                        also a vertex group or boolean attribute of --object; may be given again
+--remove-inside VOLUME  splats in it go first, and count as removed (in score: they score 0, and the
+                        others as if they had gone): {_VOLUMES}; may be given again
+--keep-inside VOLUME    all splats go that are in no volume of this kind; like --remove-inside
+--pictures DIR          draw up to 3 of the views before and after, and what differs, as
+                        NAME-CAMERA-before.png and so on; made if it is not there
+--together              the inputs are tiles of one scene: one budget over all of them, and never
+                        all of them in memory; for plain PLY; all are written or none; INPUT and OUT
+                        may be URLs such as s3://bucket/tiles (needs the extra distributed)
+--workers N|ADDRESS     with --together: on N processes of a Dask cluster, started here, or on the
+                        workers of the scheduler at an address (needs the extra distributed)
+--degree D              leave out harmonics above this degree, 0 to 4
+--model MODEL           how the splats are drawn, where a file does not say or is wrong:
+                        {", ".join(MODELS)} (antialiased: Mip-Splatting, gsplat, Brush's mip;
+                        2dgs: discs)
+--dry-run               decide and report, write no splats; --pictures are drawn
+--report FILE.json      write a report as JSON
+--overwrite             replace files that exist
+--quiet                 print errors only
+"""
+"""Each option, before it the subcommand where that has it in words of its own."""
 
-SOURCES = ("visible", "active", "selected", "frames", "collection:NAME")
-"""What --source takes: the choices of the panel, in small letters."""
+_REST = "--report --overwrite --quiet"
+_VIEWS = f"--cameras --source --views --remove-inside --keep-inside --model {_REST}"
+BLENDER = "blender -b scene.blend --command refine"
 
-BLENDER = "blender -b scene.blend --command "
-"""What stands before ``refine`` in an example that needs Blender."""
-
-EXAMPLES = {
+_COMMANDS = {
     "prune": (
-        "refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply",
-        "refine prune *.ply --cameras cameras.json --psnr 40 --output-dir pruned",
-        "refine prune in.ply --cameras sparse/0 --max-mb 5 --method refit -o out.ply",
-        "refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply",
-        f"{BLENDER}refine prune --object Splats --protect Statue --remove-inside Sky -o out.ply",
-        "refine prune *.ply --together --cameras sparse/0 --ratio 0.6 --output-dir out",
-        f"{BLENDER}refine prune --object Splats -o out.ply",
-        f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
-        f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
-        f"{BLENDER}refine prune --object Splats --dry-run --pictures before_and_after",
+        "remove the splats the cameras would miss least",
+        f"inputs* --object --save -o --ratio --keep --max-mb --psnr --method --rounds {_VIEWS} "
+        "--clean --protect --pictures --together --workers --dry-run",
+        f"""
+  refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply
+  refine prune *.ply --cameras cameras.json --psnr 40 -o pruned
+  refine prune in.ply --cameras sparse/0 --max-mb 5 --method refit -o out.ply
+  refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply
+  refine prune *.ply --together --cameras sparse/0 --ratio 0.6 -o out
+  {BLENDER} prune --object Splats --protect Statue --remove-inside Sky -o out.ply
+  {BLENDER} prune --object Splats --source frames:1:250:10 --save
+  {BLENDER} prune --object Splats --source collection:Shot --dry-run
+  {BLENDER} prune --object Splats --dry-run --pictures before_and_after""",
     ),
     "score": (
-        "refine score in.ply --cameras cameras.json -o scored.ply",
-        f"{BLENDER}refine score --object Splats -o scored.ply",
+        "write files with a float property refine_score",
+        f"inputs* --object -o --method {_VIEWS}",
+        f"""
+  refine score in.ply --cameras cameras.json -o scored.ply
+  {BLENDER} score --object Splats -o scored.ply""",
     ),
     "clean": (
-        "refine clean in.ply --cameras cameras.json",
-        "refine clean *.ply --cameras cameras.json --output-dir cleaned",
-        "refine clean in.ply --cameras cameras.json --reasons front,isolated -o out.ply",
+        "remove what the cameras see to float in the air; without -o, only say what would go",
+        f"inputs+ -o --reasons --protect {_VIEWS}",
+        """
+  refine clean in.ply --cameras cameras.json
+  refine clean *.ply --cameras cameras.json -o cleaned
+  refine clean in.ply --cameras cameras.json --reasons front,isolated -o out.ply""",
     ),
     "lod": (
-        "refine lod in.ply --cameras cameras.json -o levels",
-        "refine lod in.ply --cameras cameras.json -o web/lod-meta.json",
-        "refine lod in.ply --cameras cameras.json --psnr 45,40,35 --format .spz -o levels",
+        "write levels of detail, each with what it costs",
+        f"inputs+ -o --levels --psnr --method --rounds --protect {_VIEWS}",
+        """
+  refine lod in.ply --cameras cameras.json -o levels
+  refine lod in.ply --cameras cameras.json -o web/lod-meta.json
+  refine lod in.ply --cameras cameras.json --psnr 45,40,35 -o levels/in.spz""",
     ),
     "convert": (
-        "refine convert in.ply out.spz",
-        "refine convert room.ply statue.spz both.ply --rotate 2:0,90,0 --translate 2:0,-1.5,0",
-        "refine convert in.ply out.ply --degree 1 --morton",
+        "write files of splats as one, in another format",
+        f"inputs+ output --degree --model {_REST}",
+        """
+  refine convert in.ply out.spz
+  refine convert room.ply statue.spz both.ply
+  refine convert in.ply out.ply --degree 1""",
     ),
-    "info": ("refine info in.ply", "refine info *.ply --report report.json"),
+    "info": (
+        "say what is in files of splats",
+        f"inputs+ {_REST}",
+        """
+  refine info in.ply
+  refine info *.ply --report report.json""",
+    ),
     "render": (
-        f"{BLENDER}refine render",
-        f"{BLENDER}refine render --animation",
-        f"{BLENDER}refine render --frames 1:250:10",
+        "render the open scene with splats, by its output settings",
+        "--source --quiet",
+        f"""
+  {BLENDER} render
+  {BLENDER} render --source frames
+  {BLENDER} render --source frames:1:250:10""",
     ),
 }
-"""Under the help of each subcommand."""
+"""Of each subcommand its purpose, what it takes, and examples."""
 
 LAST_FRAME = 1_048_574
 """The last frame that Blender knows, and with a minus the first."""
+
+
+def settings(kind: type, options: argparse.Namespace, **default: Any) -> Any:
+    """Settings of a kind: each field by the option of its name; where none is given, `default`."""
+    given = {field.name: getattr(options, field.name, None) for field in fields(kind)}
+    given = {name: value for name, value in given.items() if value is not None}
+    return kind(**(given or default))
+
+
+def complete(options: argparse.Namespace) -> None:
+    """Make the settings: ``budget``, ``how`` (the method), ``cleaning``, ``shares`` (the levels).
+
+    Raises
+    ------
+    RefineError
+        If a value cannot be.
+    """
+    if options.command == "prune":
+        options.budget = settings(Budget, options, ratio=0.5)
+    if options.command in ("prune", "score", "lod"):
+        kind = METHODS[options.method or Merge.name]
+        if options.rounds is not None and kind is not Refit:
+            raise RefineError(f"rounds is {options.rounds}, expected only with --method refit")
+        options.how = settings(kind, options)
+    if options.command == "lod":
+        shares = options.levels or (() if options.psnr else SHARES)
+        options.shares = Levels(shares, options.psnr or ())
+    options.cleaning = None
+    if options.command == "clean" or options.clean:
+        options.cleaning = settings(Cleaning, options)
+
+
+def _name(text: str) -> str:
+    """What is there; a variable that a script did not set is a mistake, not a default."""
+    if not text:
+        raise RefineError("expected a name, got none")
+    return text
+
+
+def _given(text: str) -> Path | Url:
+    """The place of what is read, as it was given."""
+    if "\0" in text:
+        raise RefineError("a path holds no zero byte")
+    return Url(text) if is_url(text) else Path(_name(text))
+
+
+def _made(text: str) -> Path | Url:
+    """The place of what is written, the home folder spelt out."""
+    if text == "-":
+        raise RefineError(
+            "nothing is written to standard output: give the name of a file (./- is one, too)"
+        )
+    place = _given(text)
+    return place if isinstance(place, Url) else expanded(place)
+
+
+def _workers(text: str) -> int | str:
+    """How many, or the address of a scheduler."""
+    if not text.lstrip("-").isdecimal():
+        return _name(text)
+    if int(text) < 1:
+        raise RefineError(f"workers is {text}, expected 1 or more")
+    return int(text)
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(map(float, text.split(",")))
+    except ValueError:
+        raise RefineError(f"expected numbers with commas between them, got {text!r}") from None
+
+
+def _volume(text: str) -> tuple[str, Volume | None]:
+    """What was given, and the volume if that is one in numbers, not a name."""
+    return _name(text), parse(text)
+
+
+def _source(text: str) -> tuple[str, str | range]:
+    """The kind of source as the panel names it, with the name of a collection or the frames."""
+    kind, colon, rest = text.partition(":")
+    if kind == "frames" and colon:
+        return "FRAMES", _frames(rest)
+    known = text in ("visible", "active", "selected", "frames") or kind == "collection"
+    if not known or (colon and not rest):
+        raise RefineError(f"expected {_SOURCES}, got {text!r}")
+    return kind.upper(), rest
+
+
+def _frames(text: str) -> range:
+    """The frames between colons, both ends included."""
+    words = text.split(":")
+    try:
+        first, last, step = map(int, words if words[2:] else [*words, "1"])
+    except ValueError:
+        raise RefineError(f"expected A:B:STEP or A:B in whole numbers, got {text!r}") from None
+    if step < 1 or max(abs(first), abs(last)) > LAST_FRAME:
+        raise RefineError(
+            f"expected A:B:STEP with frames from {-LAST_FRAME} to {LAST_FRAME} and a step of at "
+            f"least 1, got {text!r}"
+        )
+    if last < first:
+        raise RefineError(f"expected at least one frame, got {text!r}, which starts after it ends")
+    return range(first, last + 1, step)
+
+
+def _told(take: Callable[[str], Any]) -> Callable[[str], Any]:
+    """The same for argparse, which tells what is wrong with an argument in its own error alone."""
+
+    @functools.wraps(take)
+    def told(text: str) -> Any:
+        try:
+            return take(text)
+        except RefineError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return told
+
+
+_TYPES: dict[str, Callable[[str], Any]] = {
+    **dict.fromkeys(("N", "D"), int),
+    **dict.fromkeys(("B", "M", "DB"), float),
+    **dict.fromkeys(("S,S,...", "DB,DB,..."), _numbers),
+    "R,R,...": lambda text: tuple(word.strip() for word in text.split(",")),
+    **dict.fromkeys(("INPUT", "PATH"), _given),
+    **dict.fromkeys(("OUT", "FILE", "DIR", "FILE.json"), _made),
+    **{"NAME": _name, "N|ADDRESS": _workers, "WHICH": _source, "VOLUME": _volume},
+}
+"""What an option takes, by what stands for it in the help; else any text."""
+
+_CHOICES = {"METHOD": tuple(METHODS), "MODEL": MODELS, "D": tuple(range(5))}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -93,7 +297,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all subcommands."""
+    """Return the parser of all subcommands; what one does not have is None."""
     parser = _Parser(
         prog="refine",
         description="Prune 3D Gaussian splats by how much the cameras would miss them.",
@@ -104,479 +308,36 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", dest="command", required=True, metavar="COMMAND"
     )
-    _add_prune(commands)
-    _add_score(commands)
-    _add_clean(commands)
-    _add_lod(commands)
-    _add_convert(commands)
-    info = _add(commands, "info", "say what is in files of splats")
-    info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="files of splats")
-    _add_common(info)
-    _add_render(commands)
+    row = r"^(?:(\w+) )?(-\S+|inputs|output)(?: (\S+))? {2,}(.*(?:\n .*)*)"
+    rows = {
+        (own, option): (metavar, " ".join(text.split()))
+        for own, option, metavar, text in re.findall(row, _TABLE, re.MULTILINE)
+    }
+    parser.set_defaults(**{option.strip("-").replace("-", "_"): None for _, option in rows})
+    parser.set_defaults(inputs=())
+    for name, (purpose, takes, examples) in _COMMANDS.items():
+        command = commands.add_parser(
+            name,
+            help=purpose,
+            description=f"{purpose[0].upper()}{purpose[1:]}.",
+            epilog=f"examples:{examples}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        for word in takes.split():
+            option = word.rstrip("*+")
+            metavar, text = rows.get((name, option)) or rows["", option]
+            if not metavar:
+                command.add_argument(option, help=text, action="store_true")
+                continue
+            command.add_argument(
+                option,
+                help=text,
+                metavar=metavar,
+                type=_told(_TYPES.get(metavar, str)),
+                choices=_CHOICES.get(metavar),
+                nargs=word[-1] if word != option else None,
+                action="append" if metavar == "VOLUME" else "store",
+                **({"dest": "output"} if option == "-o" else {}),
+            )
     return parser
-
-
-def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:
-    """Return the parser of a new subcommand, with examples under its help."""
-    examples = "\n".join(f"  {example}" for example in EXAMPLES[name])
-    return commands.add_parser(
-        name,
-        help=purpose,
-        description=f"{purpose[0].upper()}{purpose[1:]}.",
-        epilog=f"examples:\n{examples}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-
-
-def _add_prune(commands: Any) -> None:
-    prune = _add(commands, "prune", "remove the splats the cameras would miss least")
-    prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=_FILES)
-    _add_object(prune)
-    prune.add_argument(
-        "--save", action="store_true", help="with --object: delete the splats there and save"
-    )
-    _add_outputs(prune, folder=_folder)
-    amount = prune.add_mutually_exclusive_group()
-    amount.add_argument(
-        "--ratio",
-        type=float,
-        metavar="B",
-        help=f"share of the splats to remove, 0 <= B < 1 (default {DEFAULT_RATIO})",
-    )
-    amount.add_argument("--keep", type=int, metavar="N", help="how many splats stay")
-    amount.add_argument("--max-mb", type=float, metavar="M", help="size of the file, in 1e6 bytes")
-    amount.add_argument("--threshold", type=float, metavar="S", help="remove scores below S")
-    amount.add_argument(
-        "--min-seen", type=float, metavar="P", help="remove what fewer than P %% of the views see"
-    )
-    amount.add_argument(
-        "--psnr",
-        type=float,
-        metavar="DB",
-        help="remove as much as leaves the views' pictures this close to the unpruned ones: 40 "
-        "is hard to tell apart, 30 is seen",
-    )
-    _add_scoring(prune)
-    prune.add_argument(
-        "--clean",
-        action="store_true",
-        help="first remove floaters and outliers, as clean does; the budget counts the rest",
-    )
-    zones.add(prune, names="a vertex group or boolean attribute of --object, ")
-    prune.add_argument(
-        "--pictures",
-        type=_path,
-        metavar="DIR",
-        help="draw up to 3 of the views before and after, and what differs, as "
-        "NAME-CAMERA-before.png and so on; made if it is not there; --dry-run draws them too",
-    )
-    prune.add_argument(
-        "--together",
-        action="store_true",
-        help="the inputs are tiles of one scene: one budget over all of them, and never all of "
-        "them in memory; for plain PLY; all are written or none; INPUT and DIR may be URLs such as "
-        "s3://bucket/a.ply (needs the extra distributed)",
-    )
-    prune.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="with --together: on N processes of a Dask cluster, started here (needs the extra "
-        "distributed)",
-    )
-    prune.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="with --together: on the workers of this Dask scheduler, which see the same files "
-        "under the same paths",
-    )
-    _add_model(prune)
-    prune.add_argument("--dry-run", action="store_true", help="decide and report, write no splats")
-    _add_common(prune)
-
-
-def _add_clean(commands: Any) -> None:
-    cleaning = _add(commands, "clean", "remove what the cameras see to float in the air")
-    cleaning.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help=_FILES)
-    _add_outputs(cleaning, "; without it, only say what would go")
-    _add_cameras(cleaning)
-    cleaning.add_argument(
-        "--reasons",
-        type=_words,
-        default=Cleaning.reasons,
-        metavar="R,R,...",
-        help=f"which to remove, of {', '.join(REASONS)} (default {','.join(Cleaning.reasons)})",
-    )
-    _add_views(cleaning)
-    zones.add(cleaning)
-    _add_model(cleaning)
-    _add_common(cleaning)
-
-
-def _add_score(commands: Any) -> None:
-    scoring = _add(commands, "score", "write the file with a float property refine_score")
-    scoring.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help="a file of splats")
-    _add_object(scoring)
-    scoring.add_argument(
-        "-o", "--output", type=_path, metavar="OUT.ply", required=True, help="the file to make"
-    )
-    _add_scoring(scoring)
-    zones.add(scoring, protects=False)
-    _add_model(scoring)
-    _add_common(scoring)
-
-
-def _add_lod(commands: Any) -> None:
-    making = _add(commands, "lod", "write levels of detail, each with what it costs")
-    making.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
-    making.add_argument(
-        "-o",
-        "--output-dir",
-        type=_path,
-        metavar="DIR",
-        required=True,
-        help="for NAME.lod1.ply and so on; DIR/lod-meta.json makes a streamed SOG of all levels, "
-        "which viewers on the web load by chunks; DIR is made if it is not there",
-    )
-    amount = making.add_mutually_exclusive_group()
-    amount.add_argument(
-        "--levels",
-        type=_numbers,
-        default=(),
-        metavar="S,S,...",
-        help="share of the splats that stays in each, the finest first (default "
-        f"{','.join(f'{share:g}' for share in DEFAULT_LEVELS)})",
-    )
-    amount.add_argument(
-        "--psnr",
-        type=_numbers,
-        default=(),
-        metavar="DB,DB,...",
-        help="or how close each stays to the original in these views, in dB",
-    )
-    making.add_argument(
-        "--format",
-        type=str.lower,
-        choices=SUFFIXES,
-        metavar="SUFFIX",
-        help=f"of the files: {FORMATS} (default {SUFFIXES[0]})",
-    )
-    _add_scoring(making)
-    zones.add(making)
-    _add_model(making)
-    _add_common(making)
-
-
-def _add_convert(commands: Any) -> None:
-    convert = _add(commands, "convert", "write files of splats as one, in another format")
-    convert.add_argument(
-        "inputs", nargs="+", type=_given, metavar="IN", help="known by its content; several merge"
-    )
-    convert.add_argument("output", type=_path, metavar="OUT", help=f"by its suffix: {FORMATS}")
-    for name, metavar, what in (
-        ("translate", "[N:]X,Y,Z", "by so many units, after the others"),
-        ("rotate", "[N:]X,Y,Z", "by degrees about x, then y, then z"),
-        ("scale", "[N:]S", "by a factor, before the others"),
-    ):
-        convert.add_argument(
-            f"--{name}",
-            type=partial(_numbered, count=metavar.count(",") + 1),
-            action="append",
-            default=[],
-            metavar=metavar,
-            help=f"move the N-th input {what}; without N all of them; --{name}=-1 for a minus",
-        )
-    convert.add_argument(
-        "--degree",
-        type=int,
-        choices=range(5),
-        metavar="D",
-        help="leave out harmonics above this degree, 0 to 4",
-    )
-    convert.add_argument(
-        "--morton",
-        action="store_true",
-        help="sort splats along a Z-shaped (Morton) curve, so that near ones follow each other",
-    )
-    convert.add_argument(
-        "--level",
-        type=int,
-        default=0,
-        metavar="L",
-        help="of a streamed SOG (lod-meta.json): 0, the default, is the finest",
-    )
-    _add_model(convert)
-    _add_common(convert)
-
-
-def _add_render(commands: Any) -> None:
-    render = _add(commands, "render", "render the open scene with splats, by its output settings")
-    chosen = render.add_mutually_exclusive_group()
-    chosen.add_argument(
-        "--animation", action="store_true", help="all frames of the scene, not only the current one"
-    )
-    chosen.add_argument(
-        "--frames",
-        type=_frames,
-        metavar="A:B:STEP",
-        help="frame A and every STEP-th after it to B (every one without STEP)",
-    )
-    render.add_argument("--quiet", action="store_true", help="print errors only")
-    render.set_defaults(inputs=[], report=None)
-
-
-def _add_object(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--object",
-        type=_name,
-        metavar="NAME",
-        help="in place of INPUT: this splat object of the open .blend, by the cameras that are "
-        "chosen in the panel there, with what it protects and crops; of the panel's other settings "
-        "none counts",
-    )
-    parser.add_argument(
-        "--source",
-        type=_source,
-        metavar="WHICH",
-        help=f"with --object: which cameras decide instead, one of {', '.join(SOURCES)}",
-    )
-    parser.add_argument(
-        "--frames",
-        type=_frames,
-        metavar="A:B:STEP",
-        help="with --object: the active camera decides, at frame A and every STEP-th after it to B "
-        "(every one without STEP); --source frames alone takes the panel's range",
-    )
-
-
-def _add_outputs(
-    parser: argparse.ArgumentParser, more: str = "", folder: Callable[[str], Any] | None = None
-) -> None:
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=_path,
-        metavar="OUT.ply",
-        help=f"for a single input; written in the format of its suffix{more}",
-    )
-    parser.add_argument(
-        "--output-dir",
-        type=folder or _path,
-        metavar="DIR",
-        help="for many inputs; made if it is not there",
-    )
-
-
-def _add_cameras(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--cameras",
-        type=_given,
-        metavar="FILE_OR_FOLDER",
-        help="cameras.json, transforms.json or a COLMAP model; default: the visible cameras of the "
-        "open scene",
-    )
-
-
-def _add_views(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--views",
-        type=int,
-        default=Merge.views,
-        metavar="N",
-        help=f"use at most N views, spread out evenly; 0 uses all (default {Merge.views})",
-    )
-    parser.add_argument(
-        "--views-between",
-        type=int,
-        default=0,
-        metavar="N",
-        help="besides, use N more views, halfway between neighbouring ones: for pictures from "
-        "where no camera stood (default 0)",
-    )
-
-
-def _add_scoring(parser: argparse.ArgumentParser) -> None:
-    _add_cameras(parser)
-    parser.add_argument(
-        "--method",
-        choices=METHODS,
-        default=Merge.name,
-        help="from instant to best: closed-form takes nothing as hidden, occlusion knows what "
-        "hides what; both delete, and the other rows stay as they were. merge (the default) merges "
-        "what goes into what stays, or deletes where that is as good; refit then fits what stays "
-        "to what all splats look like, some dB better in several times the time",
-    )
-    parser.add_argument(
-        "--rounds",
-        type=int,
-        metavar="N",
-        help="with --method refit: fit up to N times, each time to other rays (default: 2 to 4 "
-        "times, fewer of more splats; more rounds bring up to 1 dB, and take longer)",
-    )
-    _add_views(parser)
-
-
-def _add_model(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--model",
-        choices=MODELS,
-        help="how the splats are drawn, where a file does not say or is wrong: default, "
-        "antialiased (Mip-Splatting, gsplat, Brush's mip) or 2dgs (discs)",
-    )
-
-
-def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--report", type=_path, metavar="FILE.json", help="write a report as JSON")
-    parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
-    parser.add_argument("--quiet", action="store_true", help="print errors only")
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    """Return numbers between commas."""
-    try:
-        return tuple(float(word) for word in text.split(","))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"expected numbers with commas between them, got {text!r}"
-        ) from error
-
-
-def _numbered(text: str, count: int) -> tuple[int | None, tuple[float, ...]]:
-    """Return the number of an input, None for all, and so many numbers."""
-    first, colon, rest = text.rpartition(":")
-    numbers = _numbers(rest)
-    if len(numbers) != count or (colon and not (first.isdecimal() and int(first))):
-        raise argparse.ArgumentTypeError(
-            f"expected {count} numbers with commas between them, or N: and these, got {text!r}"
-        )
-    return int(first) if colon else None, numbers
-
-
-def _words(text: str) -> tuple[str, ...]:
-    """Return words between commas."""
-    return tuple(word.strip() for word in text.split(","))
-
-
-def _name(text: str) -> str:
-    """Return what is there; a variable that a script did not set is a mistake, not a default."""
-    if not text:
-        raise argparse.ArgumentTypeError("expected a name, got none")
-    return text
-
-
-def _source(text: str) -> tuple[str, str]:
-    """Return the kind of source as the panel names it, and the name of a collection or ""."""
-    kind, colon, name = text.partition(":")
-    if (f"{kind}:NAME" if colon else kind) not in SOURCES or (colon and not name):
-        raise argparse.ArgumentTypeError(f"expected one of {', '.join(SOURCES)}, got {text!r}")
-    return kind.upper(), name
-
-
-def _frames(text: str) -> range:
-    """Return the frames between colons, both ends included."""
-    numbers = text.split(":")
-    try:
-        first, last, step = map(int, numbers if numbers[2:] else [*numbers, "1"])
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"expected A:B:STEP or A:B in whole numbers, got {text!r}"
-        ) from error
-    if step < 1 or max(abs(first), abs(last)) > LAST_FRAME:
-        raise argparse.ArgumentTypeError(
-            f"expected A:B:STEP with frames from {-LAST_FRAME} to {LAST_FRAME} and a step of at "
-            f"least 1, got {text!r}"
-        )
-    if last < first:
-        raise argparse.ArgumentTypeError(
-            f"expected at least one frame, got {text!r}, which starts after it ends"
-        )
-    return range(first, last + 1, step)
-
-
-def _given(text: str) -> Path:
-    """Return the path of what is read, as it was given."""
-    if "\0" in text:
-        raise argparse.ArgumentTypeError("a path holds no zero byte")
-    try:
-        refuse_url(text)
-    except RefineError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-    return Path(_name(text))
-
-
-def _tile(text: str) -> Path | Url:
-    """Return a URL, or what `_given` does."""
-    return Url(text) if is_url(text) else _given(text)
-
-
-def _folder(text: str) -> Path | Url:
-    """Return a URL, or what `_path` does."""
-    return Url(text) if is_url(text) else _path(text)
-
-
-def _path(text: str) -> Path:
-    """Return the path of what is written, the home folder spelt out."""
-    if text == "-":
-        raise argparse.ArgumentTypeError(
-            "nothing is written to standard output: give the name of a file (./- is one, too)"
-        )
-    try:
-        return expanded(_given(text))
-    except RefineError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def method(options: argparse.Namespace) -> Method:
-    """The method with its settings; raises `RefineError` where a value cannot be."""
-    kind, rounds = METHODS[options.method], options.rounds
-    if kind is Refit:
-        return Refit(most_views(options), rounds)
-    if rounds is not None:
-        raise RefineError(f"rounds is {rounds}, expected only with --method refit")
-    return kind(most_views(options))
-
-
-def most_views(options: argparse.Namespace) -> int:
-    """Return how many views may be used, with those in between; 0 for all.
-
-    Raise `RefineError` where their number cannot be.
-    """
-    if options.views_between < 0:
-        raise RefineError(f"--views-between is {options.views_between}, expected 0 or more")
-    return options.views + options.views_between if options.views > 0 else options.views
-
-
-def cleaning(options: argparse.Namespace) -> Cleaning:
-    """Return what to clean away, or raise `RefineError` where a value cannot be."""
-    return Cleaning(getattr(options, "reasons", Cleaning.reasons), most_views(options))
-
-
-def levels(options: argparse.Namespace) -> Levels:
-    """Return which levels to make, or raise `RefineError` where a value cannot be."""
-    shares = () if options.psnr else options.levels or DEFAULT_LEVELS
-    return Levels(shares, options.psnr)
-
-
-def arrangement(options: argparse.Namespace) -> dict[str, Any]:
-    """What becomes of splats besides their format; raises `RefineError` where none can."""
-    asked: list[dict[str, Any]] = [{} for _ in options.inputs]
-    for name in ("translate", "rotate", "scale"):
-        # Those of all inputs first, so that an input's own takes their place.
-        for number, values in sorted(getattr(options, name), key=lambda item: item[0] or 0):
-            if number is not None and number > len(asked):
-                raise RefineError(f"--{name} {number}: there are {len(asked)} inputs")
-            for move in asked if number is None else [asked[number - 1]]:
-                move[name] = values if len(values) > 1 else values[0]
-    moves = tuple(Move(**move) for move in asked)
-    moved = moves if any(move != Move() for move in moves) else ()
-    return {
-        "moves": moved, "degree": options.degree, "morton": options.morton, "level": options.level
-    }  # fmt: skip
-
-
-def budget(options: argparse.Namespace) -> Budget:
-    """Return how much goes, or raise `RefineError` where a value cannot be."""
-    names = ("ratio", "keep", "max_mb", "threshold", "min_seen", "psnr")
-    amounts = {name: getattr(options, name) for name in names}
-    amounts = {name: amount for name, amount in amounts.items() if amount is not None}
-    return Budget(**(amounts or {"ratio": DEFAULT_RATIO}))

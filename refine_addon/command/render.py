@@ -14,9 +14,10 @@ from .run import Run
 def render(run: Run) -> None:
     """Render frames of the open scene, each written where its output settings say."""
     scene, options, shared = bpy.context.scene, run.options, Shared()
-    chosen = options.frames or range(scene.frame_current, scene.frame_current + 1)
-    if options.animation:
-        chosen = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+    chosen = range(scene.frame_current, scene.frame_current + 1)
+    if options.source:
+        whole = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        chosen = options.source[1] or whole
     try:
         for step in filter(None, frames.steps(scene, chosen, shared, write=True)):
             bpy.ops.render.render(scene=step.scene, animation=step.animation)
@@ -30,12 +31,14 @@ def render(run: Run) -> None:
         if frame in drawn:
             run.terminal.say(f"frame {frame}: {path}")
         else:
-            run.terminal.notes([f"{path}: exists and stays; the scene's Overwrite is off"])
+            run.terminal.say(f"  note: {path}: exists and stays; the scene's Overwrite is off")
     if not drawn:
         return
     among = f" among what {shared.engine} rendered" if shared.engine else ""
     run.terminal.say(f"  {shared.splats:,} splats{among}")
-    run.terminal.notes(frames.left_out(scene))
+    notes = [*frames.left_out(scene)]
     if shared.engine and shared.engine != scene.render.engine:
         engines = f"all but splats is by {shared.engine}, not {scene.render.engine}"
-        run.terminal.notes([f"{engines}: there is no graphics card, or only the world to render"])
+        notes.append(f"{engines}: there is no graphics card, or only the world to render")
+    for note in notes:
+        run.terminal.say(f"  note: {note}")

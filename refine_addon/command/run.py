@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..core import RefineError, ViewSet, read_cameras, with_views_between
+from ..core import RefineError, ViewSet, read_cameras
 from ..core.errors import printable
 from ..core.execute import Progress, TimeLeft, in_time
+from ..core.formats.registry import names_file
 from ..core.report import MANY_UNSEEN
-from ..core.whole_file import Url, new_folder
-from . import report
+from ..core.whole_file import new_folder
+from . import report, zones
 from .terminal import Terminal, complain, described
-from .zones import words
 
 
 class Run:
@@ -42,9 +43,8 @@ class Run:
         self.entries: list[dict[str, Any]] = []
         self.failed = False
         self._started = time.perf_counter()
-        each = [_size(path) for path in options.inputs]
-        together = getattr(options, "together", False)
-        self._sizes = [max(size, 1) for size in ([sum(each)] if together else each or [0])]
+        sizes = [_size(path) for path in options.inputs] or [0]
+        self._sizes = [max(size, 1) for size in ([sum(sizes)] if options.together else sizes)]
         self._begun = 0
         self._left = TimeLeft()
         self._cameras: dict[str, Any] = {}
@@ -55,12 +55,19 @@ class Run:
         if path is not None:
             views, facts = read_cameras(path), {"source": "file", "file": str(path)}
         else:
-            from . import scene_cameras
+            from . import scene
 
-            views, facts = scene_cameras.chosen(self.options)
+            views, facts = scene.views(self.options)
         self._cameras = {"cameras": facts}
-        more = self.options.views_between
-        return with_views_between(views.spread(self.options.views), more) if more else views
+        return views
+
+    def reading(self, name: str) -> dict[str, Any]:
+        """What all that is done with a file is told."""
+        options = self.options
+        return {
+            "zones": zones.of_files(options), "model": options.model,
+            "overwrite": options.overwrite, "progress": self.progress(name),
+        }  # fmt: skip
 
     def named(self, name: str) -> str:
         """The name of the file under way, with its place among several."""
@@ -74,54 +81,53 @@ class Run:
 
         def left(fraction: float) -> str:
             seconds = self._left.seconds((before + fraction * current) / total)
-            return "" if seconds is None else f"about {in_time(seconds)} left{several}"
+            return "" if seconds is None else f", about {in_time(seconds)} left{several}"
 
         return self.terminal.progress(self.named(name), left)
 
-    def say_what_decided(self, done: dict[str, Any], cleaned: int = 0) -> None:
-        """Say what the report of an input tells of what decided.
+    def say(self, done: dict[str, Any], line: str, *more: str, cleaned: int = 0) -> dict[str, Any]:
+        """Say what was done, then what decided, then more and the notes; return the report.
 
-        That is which cameras of the scene, since those of a file were named by the user; what had
-        to stay and go; and how many of the splats that were scored no view holds.
+        What decided is which cameras of the scene, since those of a file were named by the user;
+        what had to stay and go; and how many of the splats that were scored no view holds.
         """
-        if cameras := self._cameras["cameras"].get("words"):
-            self.terminal.say(f"  cameras: {cameras}")
-        if demanded := words(done):
-            self.terminal.say(f"  {demanded}")
-        splats = done["splats"]
-        if splats["unseen"]:
+        splats, lines = done["splats"], [zones.words(done)]
+        if words := self._cameras.get("cameras", {}).get("words"):
+            lines.insert(0, f"cameras: {words}")
+        if unseen := splats.get("unseen"):
             scored = splats["before"] - splats["removed_by_user"] - cleaned
-            self.terminal.say(f"  {splats['unseen']:,} of {scored:,} splats lie in no view")
-            if splats.get("unseen_removed", 0) and splats["unseen"] >= MANY_UNSEEN * scored:
-                share = splats["unseen_removed"] / splats["unseen"]
-                self.terminal.say(f"  {share:.0%} of these go: add views if others can see them")
+            lines.append(f"{unseen:,} of {scored:,} splats lie in no view")
+            if splats.get("unseen_removed", 0) and unseen >= MANY_UNSEEN * scored:
+                share = splats["unseen_removed"] / unseen
+                lines.append(f"{share:.0%} of these go: add views if others can see them")
+        self.terminal.clear()
+        self.terminal.say(line)
+        for text in filter(None, [*lines, *more, *(f"note: {note}" for note in done["notes"])]):
+            self.terminal.say(f"  {text}")
+        return done
 
     def each(self, work: Callable[[Run, Path, Path | None, ViewSet], dict[str, Any]]) -> None:
         """Do the work of every input: with its output, if there is to be one, and the views."""
-        options, views = self.options, self.views()
-        folder = None if getattr(options, "dry_run", False) else options.output_dir
-        with new_folder(folder) if folder else contextlib.nullcontext():
-            for source in options.inputs:
-                output = options.output
-                if options.output_dir:
-                    output = options.output_dir / source.name
-                self.attempt(
-                    str(source),
-                    lambda source=source, output=output: work(self, source, output, views),
-                )
+        views, output = self.views(), self.options.output
+        folder = None if output is None or names_file(output) else output
+        makes = folder and not self.options.dry_run
+        with new_folder(folder) if makes else contextlib.nullcontext():
+            for source in self.options.inputs:
+                made = folder / source.name if folder else output
+                self.attempt(str(source), work, source, made, views)
 
-    def attempt(self, label: str, work: Callable[[], dict[str, Any]]) -> None:
+    def attempt(self, label: str, work: Callable[..., dict[str, Any]], *arguments: Any) -> None:
         """Do one input's work; note its error, so that the others go on."""
         if not self._begun:
             self._left = TimeLeft()
         self._begun += 1
         try:
-            self.entries.append({"status": "done", **work(), **self._cameras})
+            self.entries.append({"status": "done", **work(self, *arguments), **self._cameras})
         except (RefineError, OSError, MemoryError) as error:
             self.failed = True
-            message = str(error) if isinstance(error, RefineError) else described(error)
+            message = described(error)
             # What is wrong with the splats is said without the file.
-            files = (Path(label), getattr(self.options, "output", None))
+            files = (Path(label), self.options.output)
             if not any(file and printable(file.name) in message for file in files):
                 message = f"{label}: {message}"
             self.entries.append({"status": "failed", "input": label, "error": message})
@@ -129,26 +135,19 @@ class Run:
 
     def finish(self) -> None:
         """Write the report, where one is wanted."""
-        options = self.options
+        options, seconds = self.options, time.perf_counter() - self._started
         if options.report is None:
             return
-        writes = options.command != "info" and not getattr(options, "dry_run", False)
-        if options.command == "clean":
-            writes = bool(options.output or options.output_dir)
+        done = [entry for entry in self.entries if entry["status"] == "done"]
+        splats = any(entry.get("files", {}).get("output") for entry in done)
+        splats |= bool(options.save and done and not options.dry_run)
         report.write(
-            options.report,
-            self.entries,
-            time.perf_counter() - self._started,
-            overwrite=options.overwrite,
-            splats=writes and any(entry["status"] == "done" for entry in self.entries),
+            options.report, self.entries, seconds, overwrite=options.overwrite, splats=splats
         )
 
 
-def _size(path: Path | Url) -> int:
-    """Return the bytes of a file, 0 where reading it will fail anyway, or a URL is not asked."""
-    if isinstance(path, Url):
-        return 0
-    try:
-        return path.stat().st_size
-    except (OSError, ValueError):
-        return 0
+def _size(path: os.PathLike[str] | str) -> int:
+    """Bytes of a file, 0 where reading it will fail anyway; a URL is not asked."""
+    with contextlib.suppress(OSError, ValueError):
+        return os.path.getsize(path)
+    return 0

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Literal, TextIO
 
-from ..core.errors import printable
+from ..core.errors import printable, reason_of
 
 _CLEAR = "\r\x1b[K"
 
 
-def described(error: OSError | MemoryError) -> str:
-    """Return what the system refused, and of which file."""
-    if not isinstance(error, OSError) or error.strerror is None:
-        return str(error) or type(error).__name__
-    return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+def described(error: Exception) -> str:
+    """Return what is wrong: of what the system refused, with the file."""
+    file = getattr(error, "filename", None)
+    return f"{file}: {error.strerror}" if file else reason_of(error)
 
 
 def complain(text: str) -> None:
@@ -48,21 +47,14 @@ class Terminal:
         if not self._quiet:
             _write("stdout", f"{printable(text)}\n")
 
-    def notes(self, notes: Iterable[str]) -> None:
-        """Print what else the user should know of a result, a line each."""
-        for note in notes:
-            self.say(f"  note: {note}")
-
-    def progress(
-        self, label: str, left: Callable[[float], str] = lambda _fraction: ""
-    ) -> Callable[[float, str], None]:
+    def progress(self, label: str, left: Callable[[float], str]) -> Callable[[float, str], None]:
         """Return a callback that draws on a terminal and is silent elsewhere.
 
         Parameters
         ----------
         label : str
             What is worked on.
-        left : callable, optional
+        left : callable
             Returns how much time the rest takes, in words, for the fraction done.
         """
         if not self._draws:
@@ -70,9 +62,7 @@ class Terminal:
         label = printable(label)
 
         def draw(fraction: float, what: str) -> None:
-            rest = left(fraction)
-            comma = ", " if rest else ""
-            _write("stderr", f"{_CLEAR}{label}: {what} {fraction:4.0%}{comma}{rest}")
+            _write("stderr", f"{_CLEAR}{label}: {what} {fraction:4.0%}{left(fraction)}")
 
         return draw
 

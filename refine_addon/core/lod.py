@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .errors import RefineError
 from .execute import Progress, seconds, silent, stages
-from .formats import sog
+from .formats import registry, sog
 from .formats.registry import format_named, held_splats, left_out, notes, scene_name, write_splats
 from .formats.streamed_sog import INDEX, StreamedSog, folder_for
 from .images import codec_for
@@ -290,16 +290,21 @@ def _both(first, second):
     return replace(second, keep=keep, merged=merged, scores=first.scores)
 
 
-def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") -> list[Path]:
-    """The names of the files of `count` levels.
+def level_paths(source: Path, target: Path, count: int) -> list[Path]:
+    """The names of the files of `count` levels, by that of `target` if it is a file, else `source`.
 
     Examples
     --------
     >>> from pathlib import Path
     >>> [path.as_posix() for path in level_paths(Path("a/b.compressed.ply"), Path("out"), 2)]
     ['out/b.lod1.ply', 'out/b.lod2.ply']
+    >>> [path.as_posix() for path in level_paths(Path("a/b.ply"), Path("out/c.spz"), 1)]
+    ['out/c.lod1.spz']
     """
-    name = scene_name(source)
+    folder, name, suffix = target, scene_name(source), ".ply"
+    if registry.names_file(target):
+        folder, name = target.parent, scene_name(target)
+        suffix = target.name[len(name) :].lower()
     return [folder / f"{name}.lod{number}{suffix}" for number in range(1, count + 1)]
 
 
@@ -309,13 +314,13 @@ def is_streamed(target: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _into_folder(source, target, count, suffix, overwrite):
+def _into_folder(source, target, count, overwrite):
     """A file of each level; level 0 is not written again. New files go if the block fails.
 
     Yields ``add(scene, level)``, which writes a level and returns the name and size of its file, of
     how many splats there is none in it, and sentences; and ``finish()``, which returns sentences.
     """
-    paths, written = level_paths(source, target, count, suffix), list[Path]()
+    paths, written = level_paths(source, target, count), list[Path]()
 
     def add(scene, level):
         path, keep, file = paths[level.number - 1], level.result.keep, scene.file()
@@ -326,10 +331,10 @@ def _into_folder(source, target, count, suffix, overwrite):
         return path.name, path.stat().st_size, missing, said
 
     def finish():
-        more = level_paths(source, target, MAX_LEVELS, suffix)[len(written) :]
+        more = level_paths(source, target, MAX_LEVELS)[len(written) :]
         return [f"{path.name} is of another run" for path in more if mode_of(path)]
 
-    with new_folder(target):
+    with new_folder(paths[0].parent):
         refuse_one_file(paths)
         for path in paths:
             refuse_existing(path, overwrite=overwrite)
@@ -400,7 +405,6 @@ def lod_file(
     method: Method = DEFAULT,
     *,
     zones: Sequence[Zone] = (),
-    suffix: str = ".ply",
     model: Model | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -414,14 +418,12 @@ def lod_file(
         The file to read, of any format (`read_splats`); level 0, which is not written again but in
         a streamed SOG.
     target : path-like
-        The folder where the files go, named as by `level_paths`; or the index of a streamed SOG,
-        ``lod-meta.json`` in such a folder. The folder is made if it is not there.
+        The folder where the files go; or a file there, by which they are named (`level_paths`); or
+        the index of a streamed SOG, ``lod-meta.json``. The folder is made if it is not there.
     views, levels, method, progress, threads
         See `lod`.
     zones, model
         See `read_scene`.
-    suffix : str
-        Of the files, which names their format; a streamed SOG has none.
     overwrite : bool
 
     Returns
@@ -439,7 +441,7 @@ def lod_file(
     output = (
         _streamed(path, views, overwrite)
         if is_streamed(path)
-        else _into_folder(file, path, len(levels), suffix, overwrite)
+        else _into_folder(file, path, len(levels), overwrite)
     )
     with output as (add, finish):
         scene = read_scene(source, zones, model)

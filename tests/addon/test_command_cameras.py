@@ -68,7 +68,7 @@ CHOICES = {
         {"source": "collection", "collection": "few", "words": "those in collection 'few'"},
     ),
     "FRAMES": (
-        ["--frames", "1:21:5"],
+        ["--source", "frames:1:21:5"],
         {
             "source": "frames",
             "frames": {"first": 1, "last": 21, "step": 5},
@@ -139,10 +139,10 @@ def test_an_object_is_scored_by_the_cameras_that_are_named(addon, animated, tmp_
 
 
 def test_frames_without_a_range_are_those_of_the_panel(addon, animated, tmp_path):
-    """`--source frames` is `--frames 1:21:5` there; `--frames 1:21` is another range."""
+    """`frames` is `frames:1:21:5` there; `frames:1:21` is another range."""
     short, facts = pruned(addon, tmp_path, "--source", "frames")
-    same, _ = pruned(addon, tmp_path, "--source", "frames", "--frames", "1:21:5")
-    other, other_facts = pruned(addon, tmp_path, "--frames", "1:21")
+    same, _ = pruned(addon, tmp_path, "--source", "frames:1:21:5")
+    other, other_facts = pruned(addon, tmp_path, "--source", "frames:1:21")
 
     assert facts["frames"] == {"first": 1, "last": 21, "step": 5}
     assert short == same
@@ -206,7 +206,11 @@ REFUSED = {
         r"room: no collection 'fwe' in the open \.blend \(collections: cameras, few\)",
     ),
     "no active camera": (_no_camera, [], "room: no cameras: scene 'Scene' has no active camera"),
-    "no active camera at a frame": (_no_camera, ["--frames", "1:2"], "no active camera at frame 1"),
+    "no active camera at a frame": (
+        _no_camera,
+        ["--source", "frames:1:2"],
+        "no active camera at frame 1",
+    ),
     "no frame": (_no_frame, [], "room: no frames: the range starts at 22 and ends at 21"),
     "no collection chosen": (_nothing_chosen, [], "room: no cameras: choose the collection"),
 }
@@ -231,20 +235,24 @@ def test_a_choice_without_cameras_is_refused(addon, animated, tmp_path, capsys, 
     unchanged()
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (["--source", "active", "--cameras", "c.json"], "expected --cameras or --source, and not"),
-        (["--frames", "1:2", "--cameras", "c.json"], "expected --cameras or --frames, and not"),
-        (["--source", "active", "--frames", "1:2"], "--frames goes with --source frames alone"),
-    ],
-)
-def test_two_choices_are_one_too_many(addon, animated, capsys, options, expected):
+def test_two_choices_are_one_too_many(addon, animated, capsys):
     """Wrong usage, code 2."""
-    words = ["prune", "--object", "room", "--dry-run", *options]
+    words = ["prune", "--object", "room", "--dry-run", "--source", "active", "--cameras", "c.json"]
 
     assert addon.command.main(words, scene=True) == 2
-    assert expected in capsys.readouterr().err
+    assert "expected --cameras or --source, and not both" in capsys.readouterr().err
+
+
+def test_the_cameras_of_files_are_chosen_too(addon, animated, tmp_path):
+    """By the active camera a file scores otherwise than by all visible ones."""
+    source, out = str(ROOM / "point_cloud.ply"), [tmp_path / "all.ply", tmp_path / "one.ply"]
+
+    for path, options in zip(out, ([], ["--source", "active"]), strict=True):
+        words = ["score", source, "-o", str(path), *CLOSED, *options]
+        assert addon.command.main(words, scene=True) == 0
+
+    assert out[0].read_bytes() != out[1].read_bytes()
+    assert addon.command.main(["score", source, "-o", "x.ply", "--source", "active"]) == 2
 
 
 @pytest.mark.usefixtures("room_cameras")

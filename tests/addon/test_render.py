@@ -508,9 +508,9 @@ def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys)
     shot.frame_set(7)
 
     codes = [addon.command.main(["render"], scene=True)]
-    codes.append(addon.command.main(["render", "--frames", "3:5:2"], scene=True))
+    codes.append(addon.command.main(["render", "--source", "frames:3:5:2"], scene=True))
     shot.camera = None
-    codes.append(addon.command.main(["render", "--animation"], scene=True))
+    codes.append(addon.command.main(["render", "--source", "frames"], scene=True))
 
     assert codes == [0, 0, 1]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f_03.png", "f_05.png", "f_07.png"]
@@ -543,7 +543,8 @@ def test_the_command_names_the_frames_that_it_leaves(addon, shot, tmp_path, caps
     (tmp_path / "f_03.png").touch()
 
     codes = [
-        addon.command.main(["render", "--frames", frames], scene=True) for frames in ("3:3", "3:4")
+        addon.command.main(["render", "--source", f"frames:{frames}"], scene=True)
+        for frames in ("3:3", "3:4")
     ]
 
     assert codes == [0, 0]

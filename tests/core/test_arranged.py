@@ -52,11 +52,11 @@ def test_files_are_merged_in_their_order(files, capsys):
     assert "a.ply + " in capsys.readouterr().out
 
 
-def test_each_input_is_moved_by_what_names_it(files):
-    """The first as all are, the second by its own: half a turn about z, twice as large."""
-    options = ["--translate", "1,0,-2", "--rotate", "2:0,0,180", "--scale", "2:2"]
+def test_each_input_is_moved_by_its_own(files):
+    """The second by half a turn about z, twice as large."""
+    moves = Move((1, 0, -2)), Move((1, 0, -2), (0, 0, 180), 2)
 
-    assert call(files, "a.ply", "b.ply", "out.ply", *options) == 0
+    convert_files([files / "a.ply", files / "b.ply"], files / "out.ply", moves=moves)
 
     one, two, both = (read_splats(files / f"{n}.ply").splats() for n in ("a", "b", "out"))
     np.testing.assert_allclose(both.means[:20], one.means + np.array([1, 0, -2]), atol=1e-6)
@@ -65,17 +65,6 @@ def test_each_input_is_moved_by_what_names_it(files):
     # Of degree 1, the functions of y and x change their sign.
     expected = two.sh_rest[:, :3] * np.array([-1, 1, -1])[:, None]
     np.testing.assert_allclose(both.sh_rest[20:, :3], expected, atol=1e-6)
-
-
-def test_an_inputs_own_numbers_take_the_place_of_those_of_all(files):
-    """Whatever their order on the command line; a minus in front needs the equals sign."""
-    options = ["--translate", "2:0,3,0", "--translate=-1,0,0"]
-
-    assert call(files, "a.ply", "b.ply", "out.ply", *options) == 0
-
-    one, two, both = (read_splats(files / f"{n}.ply").splats() for n in ("a", "b", "out"))
-    np.testing.assert_allclose(both.means[:20], one.means - [1, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(both.means[20:], two.means + np.array([0, 3, 0]), atol=1e-6)
 
 
 def test_turns_come_about_x_then_y_then_z():
@@ -126,7 +115,7 @@ def test_a_curve_puts_nearby_order(tmp_path):
     columns["y"][0] = np.nan
     (tmp_path / "in.ply").write_bytes(ply_of(columns))
 
-    assert call(tmp_path, "in.ply", "out.ply", "--morton") == 0
+    convert_files([tmp_path / "in.ply"], tmp_path / "out.ply", morton=True)
 
     means = read_splats(tmp_path / "out.ply").splats().means
     assert np.isnan(means[-1, 1])
@@ -171,19 +160,19 @@ def test_a_merge_may_replace_one_of_its_inputs(files):
     assert len(read_splats(files / "a.ply")) == 25
 
 
-def test_a_level_of_a_streamed_sog_is_converted(tmp_path, capsys):
+def test_a_level_of_a_streamed_sog_is_converted(tmp_path):
     """76 of 151 splats and 15 of the environment; other files have no levels."""
     pytest.importorskip("PIL", reason="needs Pillow, which SOG does outside of Blender")
     source = f"{__file__.rpartition('/core/')[0]}/data/other_tools/streamed/lod-meta.json"
     plain, out = str(tmp_path / "in.ply"), str(tmp_path / "out.ply")
     (tmp_path / "in.ply").write_bytes(plain_ply(3, 1))
 
-    assert main(["convert", source, plain, out, "--level", "1"]) == 0
+    convert_files([source, plain], out, level=1)
     assert len(read_splats(out)) == 76 + 15 + 3
-    assert main(["convert", plain, out, "--level", "1", "--overwrite"]) == 1
-    assert "only lod-meta.json has levels" in capsys.readouterr().err
-    assert main(["convert", source, out, "--level", "7", "--overwrite"]) == 1
-    assert "no level 7, expected 0 to 1" in capsys.readouterr().err
+    with pytest.raises(RefineError, match=r"only lod-meta\.json has levels"):
+        convert_files([plain], out, level=1, overwrite=True)
+    with pytest.raises(RefineError, match="no level 7, expected 0 to 1"):
+        convert_files([source], out, level=7, overwrite=True)
 
 
 def test_the_report_names_all_inputs(files):
@@ -198,24 +187,25 @@ def test_the_report_names_all_inputs(files):
     assert entry["splats"] == {"before": 25, "written": 25, "left_out": 0}
 
 
+def test_wrong_usage_ends_before_any_work(files, capsys):
+    """Code 2, and no file."""
+    assert call(files, "a.ply", "b.ply", "out.ply", "--degree", "5") == 2
+    assert "invalid choice" in capsys.readouterr().err
+    assert call(files, "a.ply", "b.ply", "folder") == 2
+    assert "folder: expected a name that ends in .ply" in capsys.readouterr().err
+    assert not (files / "out.ply").exists()
+
+
 @pytest.mark.parametrize(
-    ("options", "word"),
+    ("values", "word"),
     [
-        (["--translate", "1,2"], "expected 3 numbers with commas between them, or N: and these"),
-        (["--scale", "1,2"], "expected 1 numbers"),
-        (["--rotate", "x:1,2,3"], "expected 3 numbers"),
-        (["--rotate", "0:1,2,3"], "expected 3 numbers"),
-        (["--scale", "3:2"], "--scale 3: there are 2 inputs"),
-        (["--scale", "0"], "scale is 0, expected more than 0"),
-        (["--scale", "nan"], "expected finite numbers to move by"),
-        (["--degree", "5"], "invalid choice"),
+        ({"scale": 0}, "scale is 0, expected more than 0"),
+        ({"scale": float("nan")}, "expected finite numbers to move by"),
     ],
 )
-def test_wrong_usage_ends_before_any_work(files, capsys, options, word):
-    """Code 2, and no file."""
-    assert call(files, "a.ply", "b.ply", "out.ply", *options) == 2
-    assert word in capsys.readouterr().err
-    assert not (files / "out.ply").exists()
+def test_a_move_that_is_none_is_refused(values, word):
+    with pytest.raises(RefineError, match=word):
+        Move(**values)
 
 
 def test_a_move_that_splats_cannot_follow_is_refused(files):

@@ -61,13 +61,13 @@ def test_a_report_counts_what_the_written_file_holds(broken, capsys, command, su
 @pytest.mark.slow
 def test_a_manifest_counts_what_the_files_of_levels_hold(broken):
     """Of 577, .997 are 576 (575.3): the first that cannot be drawn goes, two are left out."""
-    options = ["--levels", ".997", "--format", ".SPLAT", "-o", str(broken / "out")]
+    options = ["--levels", ".997", "-o", str(broken / "out/levels.SPLAT")]
 
     entry = told(broken, "lod", "--cameras", str(broken), *options, *QUICK)["levels"][0]
 
     assert (entry["splats"], entry["left_out"]) == (574, 2)
-    assert entry["file"] == "scene.lod1.splat"
-    assert len(read_splats(broken / "out/scene.lod1.splat")) == 574
+    assert entry["file"] == "levels.lod1.splat"
+    assert len(read_splats(broken / "out/levels.lod1.splat")) == 574
 
 
 def test_nothing_is_said_to_be_written_where_nothing_is(broken):

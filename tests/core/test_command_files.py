@@ -73,13 +73,11 @@ SHUT = {
     ),
     "cameras' folder": (["prune", "in.ply", "--cameras", "shut", "-o", "out.ply"], "shut"),
     "output": ([*PRUNE, "-o", "shut/out.ply"], "shut/out.ply"),
-    "output of another kind": ([*PRUNE, "-o", "shut/out.dat"], "shut/out.dat"),
-    "output that may not be read": ([*PRUNE, "-o", "shut.dat", "--overwrite"], "shut.dat"),
     "output where nothing may be made": ([*PRUNE, "-o", "fixed/out.ply"], "fixed/out.ply"),
     "output of scores": (["score", *PRUNE[1:], "-o", "shut/out.ply"], "shut/out.ply"),
-    "folder of outputs": ([*PRUNE, "--output-dir", "shut"], "shut/in.ply"),
-    "folder of outputs in a folder": ([*PRUNE, "--output-dir", "shut/made"], "shut/made"),
-    "folder where none may be made": ([*PRUNE, "--output-dir", "fixed/made"], "fixed/made"),
+    "folder of outputs": ([*PRUNE, "-o", "shut"], "shut/in.ply"),
+    "folder of outputs in a folder": ([*PRUNE, "-o", "shut/made"], "shut/made"),
+    "folder where none may be made": ([*PRUNE, "-o", "fixed/made"], "fixed/made"),
     "report": ([*PRUNE, "-o", "out.ply", "--report", "shut/r.json"], "shut/r.json"),
     "report that may not be read": (
         [*PRUNE, "-o", "out.ply", "--report", "shut.json", "--overwrite"],
@@ -222,7 +220,7 @@ HARMLESS = r"a\x1b]0;title\x07\nb\x9b\u202e.ply"
 def test_control_characters_in_names_are_escaped_on_the_terminal_and_true_in_the_report(folder):
     """An escape sequence, a bell, a line end, C1's own escape, and writing from right to left."""
     (folder / "in.ply").rename(NASTY)
-    words = ["prune", NASTY, *CAMERAS, "--output-dir", "made", "--report", "report.json"]
+    words = ["prune", NASTY, *CAMERAS, "-o", "made", "--report", "report.json"]
 
     done = run(*words)
     again = run(*words, "--overwrite", "--save")
@@ -304,7 +302,7 @@ def test_an_output_that_is_another_input_by_a_link_is_refused(tmp_path, capsys):
     for path in inputs:
         path.write_bytes(b"ply\n")
     (tmp_path / "out/a.ply").symlink_to(inputs[1])
-    words = ["--cameras", str(tmp_path / "c.json"), "--output-dir", str(tmp_path / "out")]
+    words = ["--cameras", str(tmp_path / "c.json"), "-o", str(tmp_path / "out")]
 
     code = main(["prune", *map(str, inputs), *words, "--ratio", ".5", "--overwrite"])
 

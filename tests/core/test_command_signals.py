@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import subprocess
@@ -188,7 +187,7 @@ def test_ctrl_c_amid_the_import_of_numpy_is_code_130_and_one_line():
 
 
 def test_nothing_loads_numpy_before_signals_are_listened_to():
-    """Whoever imports the command has no NumPy yet: `main` loads it within its `Listener`."""
+    """Whoever imports the command has no NumPy yet: `main` loads it within `listening`."""
     check = "import sys, refine_addon.command; sys.exit('numpy' in sys.modules)"
 
     with start("-c", check) as process:
@@ -316,35 +315,6 @@ def test_a_signal_that_is_ignored_stays_ignored(folder, halfway):
 
     assert (process.returncode, errors) == (130, CANCELLED)
     assert outputs(folder) == []
-
-
-AT_ONCE = """
-import ctypes, itertools, os, sys
-from refine_addon import command
-from refine_addon.command import flow
-
-def run(*_, **__):
-    # One call of C for both: Python looks for signals only when it is over.
-    list(map(ctypes.PyDLL(None).kill, [os.getpid()] * 2, pair))
-
-flow.run = run
-for pair in itertools.permutations(map(int, sys.argv[1:]), 2):
-    child = os.fork()
-    if not child:
-        os._exit(command.main([], last=True))
-    print(*pair, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-"""
-
-
-def test_of_two_signals_at_once_the_first_says_the_code():
-    """Python calls handlers by the signals' numbers: 1, 2, 15, whichever came first."""
-    numbers = [int(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)]
-    with start("-c", AT_ONCE, *map(str, numbers)) as process:
-        printed, errors = process.communicate(timeout=SECONDS)
-
-    codes = [[*map(int, line.split())] for line in printed.splitlines()]
-    assert codes == [[*pair, 128 + pair[0]] for pair in itertools.permutations(numbers, 2)]
-    assert errors.count(b"nothing was left half-written\n") == len(codes)
 
 
 LEAVING = """

@@ -41,7 +41,7 @@ def call(*options):
 
 def test_one_budget_counts_over_all_files(folder, capsys):
     """Half of 100 splats go, most of them from the tile that is far away: as of one file."""
-    assert call(*CLOSED, "--ratio", "0.5", "--output-dir", "out", "--report", "told.json") == 0
+    assert call(*CLOSED, "--ratio", "0.5", "-o", "out", "--report", "told.json") == 0
 
     rows = np.concatenate([read_ply(name).rows for name in COUNTS])
     (folder / "whole.ply").write_bytes(plain_header(100, splat_names(0)) + rows.tobytes())
@@ -63,7 +63,7 @@ def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
     """Only the verb differs."""
     before = sorted(folder.rglob("*"))
 
-    assert call(*CLOSED, "--ratio", "0.5", "--output-dir", "out", "--dry-run") == 0
+    assert call(*CLOSED, "--ratio", "0.5", "-o", "out", "--dry-run") == 0
     assert "2 tiles: would keep 50 of 100 splats" in capsys.readouterr().out
     assert sorted(folder.rglob("*")) == before
 
@@ -72,7 +72,7 @@ def test_a_tile_that_is_missing_stops_all(folder, capsys):
     """Exit code 1, the name of the tile, and no other tile is written."""
     (folder / "b.ply").unlink()
 
-    assert call(*CLOSED, "--output-dir", "out") == 1
+    assert call(*CLOSED, "-o", "out") == 1
     assert "b.ply: cannot be read" in capsys.readouterr().err
     assert not (folder / "out").exists()
 
@@ -80,13 +80,13 @@ def test_a_tile_that_is_missing_stops_all(folder, capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ([*CLOSED, "-o", "out.ply"], "-o does not go with --together"),
-        ([*CLOSED, "--output-dir", "out", "--clean"], "--clean does not go with --together"),
+        ([*CLOSED, "-o", "out.ply"], "-o out.ply is one file, expected a folder"),
+        ([*CLOSED, "-o", "out", "--clean"], "--clean does not go with --together"),
         (
-            [*CLOSED, "--output-dir", "out", "--protect", "sphere:0,0,0,1"],
+            [*CLOSED, "-o", "out", "--protect", "sphere:0,0,0,1"],
             "--protect does not go with --together",
         ),
-        (CLOSED, "--output-dir DIR or --dry-run"),
+        (CLOSED, "expected -o OUT, --save or --dry-run"),
     ],
 )
 def test_what_does_not_go_with_tiles_is_wrong_usage(folder, capsys, options, words):
@@ -102,7 +102,7 @@ def test_two_tiles_of_one_name_are_wrong_usage(folder, capsys):
     (folder / "more/a.ply").write_bytes((folder / "a.ply").read_bytes())
 
     tiles = ["a.ply", "b.ply", "more/a.ply"]
-    options = ["--together", "--cameras", "cameras.json", *CLOSED, "--output-dir", "out"]
+    options = ["--together", "--cameras", "cameras.json", *CLOSED, "-o", "out"]
     assert main(["prune", *tiles, *options]) == 2
     said = capsys.readouterr().err
     assert "a.ply and more/a.ply would both be out/a.ply: rename one of them" in said
@@ -116,8 +116,8 @@ def test_after_ctrl_c_it_says_how_to_go_on(folder, capsys, monkeypatch):
             raise KeyboardInterrupt
 
         patched.setattr(storage, "publish", stop)
-        assert call(*CLOSED, "--output-dir", "out") == 130
+        assert call(*CLOSED, "-o", "out") == 130
     assert "the same command goes on where this one was" in capsys.readouterr().out
 
-    assert call(*CLOSED, "--output-dir", "out") == 0
+    assert call(*CLOSED, "-o", "out") == 0
     assert {path.name for path in (folder / "out").iterdir()} == set(COUNTS)

@@ -120,7 +120,7 @@ def test_levels_leave_out_what_must_go(scene):
     ("options", "code", "expected"),
     [
         (["--remove-inside", "Cube"], 2, "--remove-inside Cube: objects have names in Blender"),
-        (["--protect", ""], 2, "expected a name or a volume, got none"),
+        (["--protect", ""], 2, "expected a name, got none"),
         (["--protect", "box:1,2"], 2, "expected box:x0,y0,z0,x1,y1,z1 in numbers, got 'box:1,2'"),
         (["--keep-inside", "sphere:0,0,0,-1"], 2, "sphere has radius -1, expected more than 0"),
         (["--remove-inside", "sphere:99,0,0,1"], 1, "'sphere:99,0,0,1' holds the centre of no"),

@@ -281,10 +281,10 @@ def test_levels_are_written_in_any_format(tmp_path, suffix):
     source = file_of(colourful(), tmp_path / "a.ply")
     levels = Levels((0.5,))
 
-    done = lod_file(source, tmp_path, cameras(2), levels, QUICK, suffix=suffix)
+    done = lod_file(source, tmp_path / f"b{suffix}", cameras(2), levels, QUICK)
 
-    assert done["levels"][0]["file"] == f"a.lod1{suffix}"
-    assert len(read_splats(tmp_path / f"a.lod1{suffix}")) == 288
+    assert done["levels"][0]["file"] == f"b.lod1{suffix}"
+    assert len(read_splats(tmp_path / f"b.lod1{suffix}")) == 288
     assert any(suffix in note for note in done["notes"])
 
 

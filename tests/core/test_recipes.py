@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import shutil
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from refine_addon.command import checks
-from refine_addon.command.options import make_parser
+from refine_addon.command.options import complete, make_parser
 from tests.examples import blocks
 
 ROOT = Path(__file__).parents[2]
@@ -32,9 +31,11 @@ def test_a_recipe_for_blender_is_understood_and_refused_by_no_check(line, tmp_pa
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(checks, "open_blend", lambda: "scene.blend")
     words = shlex.split(line.replace("*.ply", "in.ply"))
-    parser = make_parser()
 
-    checks.check(parser, parser.parse_args(words, argparse.Namespace(scene=True)))
+    options = make_parser().parse_args(words)
+    options.scene = True
+    complete(options)
+    checks.check(options)
 
 
 def test_there_are_recipes_for_blender():

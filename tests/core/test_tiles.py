@@ -1291,14 +1291,14 @@ def call(*words):
 @pytest.mark.parametrize(
     "words",
     [
-        ["prune", "s3://in/a.ply", "--output-dir", "out"],
-        ["prune", "a.ply", "--output-dir", "s3://out"],
+        ["prune", "s3://in/a.ply", "-o", "out"],
+        ["prune", "a.ply", "-o", "s3://out"],
         ["prune", "a.ply", "-o", "s3://out/a.ply"],
         ["clean", "s3://in/a.ply"],
-        ["clean", "a.ply", "--output-dir", "s3://out"],
+        ["clean", "a.ply", "-o", "s3://out"],
         ["score", "s3://in/a.ply", "-o", "out.ply"],
         ["lod", "a.ply", "-o", "s3://out"],
-        ["prune", "a.ply", "--together", "--output-dir", "out", "--report", "s3://out/told.json"],
+        ["prune", "a.ply", "--together", "-o", "out", "--report", "s3://out/told.json"],
     ],
     ids=" ".join,
 )
@@ -1321,7 +1321,7 @@ def test_only_a_ply_is_made_behind_a_url(folder, memory, capsys):
     """What is there cannot be looked into to see that it holds splats."""
     memory.pipe_file("/in/cameras", (folder / "a.ply").read_bytes())
 
-    words = ["memory://in/cameras", "--together", "--output-dir", "memory://out"]
+    words = ["memory://in/cameras", "--together", "-o", "memory://out"]
     assert call("prune", *words) == 2
     assert "memory://out/cameras: expected a name that ends in .ply" in capsys.readouterr().err
 
@@ -1428,7 +1428,7 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch):
     monkeypatch.setattr(cluster, "_CONNECT", 1)
     with (
         pytest.raises(RefineError, match=r"tcp://127\.0\.0\.1:1: no Dask scheduler answers"),
-        cluster.cluster(scheduler="tcp://127.0.0.1:1"),
+        cluster.cluster("tcp://127.0.0.1:1"),
     ):
         pass
 
@@ -1536,22 +1536,18 @@ def test_without_dask_the_extra_is_named(tmp_path, tiles, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     options = ["--together", "--method", "closed-form", "--workers", "2"]
 
-    assert call("prune", *map(str, tiles), *options, "--output-dir", str(tmp_path / "out")) == 1
+    assert call("prune", *map(str, tiles), *options, "-o", str(tmp_path / "out")) == 1
     assert "pip install 'refine-addon[distributed]'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--workers", "2"], "--workers and --scheduler go with --together"),
+        (["--workers", "2"], "--workers goes with --together"),
         (["--together", "--method", "closed-form", "--workers", "0"], "expected 1 or more"),
-        (
-            ["--together", "--method", "closed-form", "--workers", "1", "--scheduler", "x"],
-            "--workers or --scheduler, and not both",
-        ),
     ],
 )
 def test_workers_that_cannot_be_are_wrong_usage(tiles, capsys, options, words):
     """Exit code 2."""
-    assert call("prune", *map(str, tiles), *options, "--output-dir", "out") == 2
+    assert call("prune", *map(str, tiles), *options, "-o", "out") == 2
     assert words in capsys.readouterr().err

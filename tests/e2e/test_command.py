@@ -197,7 +197,7 @@ def test_stopped_at_work_it_leaves_nothing_and_says_so(
 
     done = binary.run(
         *("python3", "-c", SIGNALLED, str(int(number)), made),
-        *("blender", "--background", "--command", "refine", *words, "--output-dir", made),
+        *("blender", "--background", "--command", "refine", *words, "-o", made),
     )
 
     assert done.returncode == 128 + number, done.stdout + done.stderr

@@ -97,6 +97,11 @@ def format_named(path: Path | Url) -> Format | None:
     return form
 
 
+def names_file(path: Path | Url) -> bool:
+    """Whether an output is a file of splats, by its name; any other name is a folder's."""
+    return path.name.lower().endswith((*SUFFIXES, *NOT_WRITTEN))
+
+
 def without_suffix(name: str) -> str:
     """File name without the ending of a format of splats, if it has one."""
     ends = (end for end in READ_SUFFIXES if name.lower().endswith(end))

@@ -54,15 +54,14 @@ _TRIES = 3
 
 
 @contextlib.contextmanager
-def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterator[Cluster]:
+def cluster(workers: int | str) -> Iterator[Cluster]:
     """Start workers in processes of their own, or use those of a scheduler.
 
     Parameters
     ----------
-    workers : int, optional
-        How many to start here, of one thread each.
-    scheduler : str, optional
-        Address of a scheduler, such as ``tcp://10.0.0.1:8786``.
+    workers : int or str
+        How many to start here, of one thread each; or the address of a scheduler, such as
+        ``tcp://10.0.0.1:8786``.
 
     Yields
     ------
@@ -80,7 +79,8 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
     except ImportError as error:
         raise RefineError("workers need Dask: pip install 'refine-addon[distributed]'") from error
     with contextlib.ExitStack() as held:
-        if scheduler is None:
+        scheduler: Any = workers
+        if not isinstance(workers, str):
             held.enter_context(dask.config.set(_MEMORY))
 
             def start() -> Any:
