@@ -112,6 +112,7 @@ class Frustums:
         self.beyond_per_unit = np.hypot(1.0, slope)
         planes = np.array([clip_planes(view, near) for view in views])
         self._near, self._far = planes[:, :1], planes[:, 1:]
+        self._has_far = bool(np.isfinite(self._far).any())
         # One buffer a thread is reused, since allocating one costs as much as the product.
         self._buffers = threading.local()
 
@@ -195,7 +196,8 @@ class Frustums:
         beyond = np.maximum(across[:count], across[count:], out=across[:count])
         beyond -= depth[:count]
         between = depth[:count] >= self._near[views[:count]]
-        between &= depth[:count] <= self._far[views[:count]]
+        if self._has_far:
+            between &= depth[:count] <= self._far[views[:count]]
         return depth, beyond, between
 
 
