@@ -11,7 +11,7 @@ import bpy
 
 from ..cameras.sets import CameraChoice
 from ..core import RefineError, ViewSet
-from ..objects import splat_object
+from ..objects import splat_group
 
 
 def refuse_unopened(words: Sequence[str] | None = None) -> None:
@@ -45,7 +45,7 @@ def views(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
     RefineError
         If there is no such object, collection or camera, or no frame; see `CameraChoice.views`.
     """
-    obj = splat_object.find(options.object) if options.object else None
+    obj = splat_group.find(options.object) if options.object else None
     chosen = CameraChoice.of_scene(bpy.context.scene)
     if options.source:
         kind, value = options.source

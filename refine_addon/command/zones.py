@@ -34,9 +34,9 @@ def of_object(options: argparse.Namespace) -> Any:
     """
     import bpy
 
-    from ..objects import demands, splat_object
+    from ..objects import demands, splat_group
 
-    obj = splat_object.find(options.object)
+    obj = splat_group.find(options.object)
     marks = {*obj.vertex_groups.keys(), *getattr(obj.data, "attributes", {}).keys()}
     names, zones = [], []
     for role, text, volume in _named(options):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import zlib
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import bpy
 import numpy as np
@@ -33,30 +33,23 @@ RECORD = "refine_scores"
 """Custom property of the mesh: how its scores came to be, as JSON."""
 
 
-class Together(NamedTuple):
-    """What an object's scores have in common with those of others that were scored with it.
+def store(
+    checked: SplatObject,
+    scores: Scores,
+    method: Method,
+    *,
+    origin: dict[str, Any] | None = None,
+    cameras: list[tuple[str, int]] | None = None,
+    protected: NDArray[np.bool_] | None = None,
+    together: tuple[str, int, NDArray[np.float64]] | None = None,
+    seconds: float | None = None,
+) -> None:
+    """Write scores to the attributes of an object's mesh, and record how they came to be.
 
-    Attributes
+    Parameters
     ----------
-    id : str
-        Of the scoring.
-    splats : int
-        How many all objects have.
-    ranks : (N,) float64
-        Of this object's splats among all.
-    """
-
-    id: str
-    splats: int
-    ranks: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Provenance:
-    """How scores came to be.
-
-    Attributes
-    ----------
+    checked : SplatObject
+    scores : Scores
     method : Method
         What they were made with.
     origin : dict, optional
@@ -65,22 +58,11 @@ class Provenance:
         Name of each view given, and how many splats lie in it.
     protected : (N,) bool, optional
         Which splats the curve takes to stay.
-    together : Together, optional
-        Where other objects were scored with them; the curve is that of all then.
+    together : (str, int, (N,) float64), optional
+        Where other objects were scored with it: a name for the scoring, how many splats all have,
+        and ranks of this object's among all; the curve is that of all then.
     seconds : float, optional
         How long scoring took.
-    """
-
-    method: Method
-    origin: dict[str, Any] | None = None
-    cameras: list[tuple[str, int]] | None = None
-    protected: NDArray[np.bool_] | None = None
-    together: Together | None = None
-    seconds: float | None = None
-
-
-def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
-    """Write scores to the attributes of an object's mesh, and record how they came to be.
 
     Raises
     ------
@@ -94,12 +76,11 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
             f"object '{checked.obj.name}': has {len(checked)} splats, was scored with "
             f"{len(scores.values)}; score it again"
         )
-    together = provenance.together
-    ranks = together.ranks if together else rank(scores.values)
+    ranks = together[2] if together else rank(scores.values)
     new_record = json.dumps(
         {
             "splats": len(scores.values),
-            "settings": provenance.method.facts(),
+            "settings": method.facts(),
             "method": scores.method,
             "views_given": scores.views_given,
             "views_used": scores.views_used,
@@ -108,11 +89,11 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
             "notes": scores.notes,
             "quality": scores.quality.facts() if scores.quality else None,
             "alignment": scores.alignment.facts() if scores.alignment else None,
-            "origin": provenance.origin,
-            "cameras": provenance.cameras,
-            "protected": digest(provenance.protected),
-            "seconds": provenance.seconds,
-            "together": together and {"id": together.id, "splats": together.splats},
+            "origin": origin,
+            "cameras": cameras,
+            "protected": digest(protected),
+            "seconds": seconds,
+            "together": together and {"id": together[0], "splats": together[1]},
         }
     )
     # The heat map may fail for want of memory, and comes first: scores and record belong together.
@@ -172,46 +153,58 @@ def move_origin(
         mesh[RECORD] = json.dumps({**recorded, "origin": origin})
 
 
-def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None) -> Scores:
-    """Return the scores that an object's mesh holds.
+def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | None = None) -> Scores:
+    """The scores that the meshes of objects hold, as of one.
 
     Parameters
     ----------
-    checked : SplatObject
+    group : sequence of SplatObject
     removed : (N,) bool, optional
-        Splats that have to go, and need no score.
+        Splats of all that have to go, and need no score.
 
     Raises
     ------
     RefineError
-        If it was not scored, or has splats that were not.
+        If one was not scored, or has splats that were not; or not all were scored together.
     """
-    mesh, label = checked.mesh, f"object '{checked.obj.name}'"
-    recorded = record(mesh)
-    if recorded is None or not _has_scores(mesh):
-        raise RefineError(f"{label}: has no scores; score it first")
-    values = mesh_attributes.read_attribute(mesh, SCORE)
-    scored = mesh_attributes.read_attribute(mesh, SCORED)
-    removed = np.zeros_like(scored) if removed is None else removed
-    unscored = int(np.count_nonzero(~scored & ~removed))
-    if len(values) > recorded["splats"] or unscored:
+    records, columns, start = [], [], 0
+    removed = np.zeros(sum(map(len, group)), np.bool_) if removed is None else removed
+    for checked in group:
+        recorded, label = record(checked.mesh), f"object '{checked.obj.name}'"
+        if recorded is None or not _has_scores(checked.mesh):
+            raise RefineError(f"{label}: has no scores; score it first")
+        own = [mesh_attributes.read_attribute(checked.mesh, n) for n in (SCORE, SEEN, SCORED)]
+        count = len(own[0])
+        unscored = int(np.count_nonzero(~own[2] & ~removed[start : start + count]))
+        if count > recorded["splats"] or unscored:
+            raise RefineError(
+                f"{label}: scored with {recorded['splats']} splats, has {count} now, "
+                f"{unscored} of them without a score; score it again"
+            )
+        records.append(recorded)
+        columns.append(own)
+        start += count
+    values, seen, scored = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    together = [each.get("together") or {} for each in records]
+    if len(group) > 1 and len({each.get("id") or index for index, each in enumerate(together)}) > 1:
         raise RefineError(
-            f"{label}: scored with {recorded['splats']} splats, has {len(values)} now, "
-            f"{unscored} of them without a score; score it again"
+            f"the {len(group)} selected objects were not scored together: score them as they are "
+            "selected, or select only one"
         )
-    # The curve is that of all splats that were scored: of one object, with the same removed.
-    whole = len(values) == recorded["splats"] and not recorded.get("together")
-    whole = whole and np.array_equal(removed, ~scored)
+    # The curve is that of all splats that were scored, with the same removed.
+    first = records[0]
+    total = together[0].get("splats", first["splats"])
+    whole = len(values) == total and np.array_equal(removed, ~scored)
     return Scores(
         values=values,
-        seen=mesh_attributes.read_attribute(mesh, SEEN),
-        views_used=recorded["views_used"],
-        undrawable=recorded.get("undrawable", 0),
-        facts=recorded.get("weights", {}),
-        notes=tuple(recorded.get("notes", ())),
-        method=recorded.get("method", ""),
-        views_given=recorded["views_given"],
-        quality=Quality.from_facts(recorded.get("quality")) if whole else None,
+        seen=seen,
+        views_used=first["views_used"],
+        undrawable=sum(each.get("undrawable", 0) for each in records),
+        facts=first.get("weights", {}),
+        notes=tuple(first.get("notes", ())),
+        method=first.get("method", ""),
+        views_given=first["views_given"],
+        quality=Quality.from_facts(first.get("quality")) if whole else None,
         scored=None if scored.all() else scored,
     )
 

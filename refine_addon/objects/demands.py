@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -91,8 +91,38 @@ class Demands:
         except RefineError as error:
             raise RefineError(f"object '{checked.obj.name}': {error}") from error
 
+    def of_each(self, group: Sequence[SplatObject]) -> list[Forced]:
+        """What must stay and what must go of each object; a name protects in those that have it.
+
+        Raises
+        ------
+        RefineError
+            See `forced`; also if no object has a name that protects.
+        """
+        if len(group) == 1:
+            return [self.forced(group[0])]
+        having = {name: _having(group, name) for name in self.names}
+        return [
+            replace(self, names=tuple(n for n in self.names if member in having[n])).forced(member)
+            for member in group
+        ]
+
 
 NONE = Demands()
+
+
+def _having(group: Sequence[SplatObject], name: str) -> list[SplatObject]:
+    """Objects that have a vertex group or an attribute of that name to protect; one at least."""
+    having, error = [], None
+    for member in group:
+        try:
+            mesh_edit.protected_mask(member.obj, name)
+            having.append(member)
+        except RefineError as refused:
+            error = refused
+    if error is not None and not having:
+        raise error
+    return having
 
 
 def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
@@ -195,8 +225,8 @@ def mark(checked: SplatObject, forced: Forced) -> None:
         del mesh[FACTS]
 
 
-def refresh(scene: bpy.types.Scene, checked: SplatObject) -> Forced:
-    """Mark what a scene demands of an object, and return it.
+def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced]:
+    """Mark what a scene demands of each object, and return it.
 
     Raises
     ------
@@ -204,12 +234,14 @@ def refresh(scene: bpy.types.Scene, checked: SplatObject) -> Forced:
         See `Demands`; it is recorded as well.
     """
     try:
-        forced = Demands.of_scene(scene).forced(checked)
-        mark(checked, forced)
+        each = Demands.of_scene(scene).of_each(group)
+        for checked, forced in zip(group, each, strict=True):
+            mark(checked, forced)
     except RefineError as error:
-        _record(checked.mesh, {"error": str(error)})
+        for checked in group:
+            _record(checked.mesh, {"error": str(error)})
         raise
-    return forced
+    return each
 
 
 def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import bpy
 from ..core.errors import RefineError
 from ..core.lod import Level
 from ..mesh.layout import SplatObject, check
-from . import splat_object
+from . import splat_group
 
 FACTS = "refine_lod"
 """Custom property of the object of a level: what is known of it, as in the report of files."""
@@ -39,7 +39,7 @@ def add_levels(
     Raises
     ------
     RefineError
-        See `splat_object.apply_object`; nothing is left of the levels then.
+        See `splat_group.apply`; nothing is left of the levels then.
     """
     name = checked.obj.name
     collection = bpy.data.collections.new(f"{name} levels")
@@ -51,7 +51,9 @@ def add_levels(
             copy.data = checked.obj.data.copy()
             copy.name = copy.data.name = f"{name}_lod{level.number}"
             bpy.context.view_layer.update()  # its place in the world
-            splat_object.apply_object(check(copy), level.result)
+            group = [check(copy)]
+            frames = splat_group.frames_of(group)
+            splat_group.apply(group, splat_group.changes(frames, level.result))
             facts = {**level.facts(), "distance": distance}
             copy[LEVEL_OF] = checked.obj
             copy[FACTS] = {key: value for key, value in facts.items() if value is not None}

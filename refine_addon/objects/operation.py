@@ -23,13 +23,13 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject, check
-from ..mesh.scores import Provenance, store
+from ..mesh.scores import store
 from .demands import NONE, Demands
-from .splat_object import (
-    changed,
+from .splat_group import (
+    changes,
     drift_notes,
     find,
-    frame_of,
+    frames_of,
     gather,
     modifier_notes,
     possible,
@@ -95,10 +95,10 @@ def prune_object(
             )
 
     def saved(result: Result, exported: Path | None) -> None:
-        change = changed(frame_of(checked), result.keep, result.merged)
+        (change,) = changes(frames_of([checked]), result)
         with mesh_edit.all_or_nothing(checked.obj):
             assert result.scores is not None
-            store(checked, result.scores, Provenance(method))
+            store(checked, result.scores, method)
             reduce_object(checked, change)
             _save(exported)
 
@@ -144,7 +144,7 @@ def _scene(
     return Scene(
         f"{bpy.data.filepath}#{checked.obj.name}",
         row * len(checked) + fixed,
-        gather(checked, whole=harmonics),
+        gather([checked], whole=harmonics),
         demands.forced(checked),
         lambda: mesh_attributes.file_from_object(checked),
         sizes,

@@ -1,45 +1,85 @@
-"""Several splat objects as one scene: scored against one another, and under one budget.
+"""What the panel and the command do to splat objects, one or several alike: score, apply, export.
 
-Operators of the panel work on the selection through here. A single object is handed on to
-`splat_object`.
+Several are one scene: scored against one another, and under one budget. An operation begins with
+`mesh.layout.check`, which makes sure that an object holds splats; lists of its `SplatObject` are
+what the functions here take. Each either does all it says, or raises `RefineError` and leaves the
+scene as it was.
 """
 
 from __future__ import annotations
 
 import uuid
-from collections.abc import Sequence
-from dataclasses import fields, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import astuple, dataclass, replace
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.objects import world_matrix
+from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
-from ..core.merging.merge import Merged
-from ..core.methods import Method
-from ..core.quality.curve import Quality
+from ..core.formats.ply import SplatFile
+from ..core.formats.ply_columns import values_by_name
+from ..core.methods import Merge, Method, Occlusion
 from ..core.result import Result
 from ..core.scores import Scores
 from ..core.selection import Budget, rank
 from ..core.splats import Splats, joined
 from ..core.views import ViewSet
 from ..core.volumes import Forced
+from ..mesh import attributes as mesh_attributes
+from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
+from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
-from ..mesh.scores import Provenance
-from . import demands, splat_object
+from . import demands
 from .demands import Demands
-from .splat_object import Change, Frame, Outcome
+from .transforms import read_to_move, uneven_notes
 
 Members = list["SplatObject"]
 """The objects, by name; one at least."""
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What a budget does to objects, or would.
+
+    Attributes
+    ----------
+    kept, removed : int
+        Splats that stay and go.
+    bytes_before, bytes_after : int
+        Size of the exported files.
+    """
+
+    kept: int
+    removed: int
+    bytes_before: int
+    bytes_after: int
+
+    @classmethod
+    def of(cls, count: int, kept: int, row_bytes: int, fixed_bytes: int) -> Outcome:
+        """What keeping so many of `count` splats does to a file.
+
+        Parameters
+        ----------
+        count, kept : int
+        row_bytes, fixed_bytes : int
+            What a splat takes in a file of all splats, and all else in it.
+        """
+        # The header says how many splats follow, in as many digits as that takes.
+        shorter = len(str(count)) - len(str(kept))
+        sizes = (fixed_bytes + row_bytes * count, fixed_bytes - shorter + row_bytes * kept)
+        return cls(kept, count - kept, *sizes)
+
+
 def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return the splat objects that are worked on, by name: the selected ones.
+    """The splat objects that are worked on, by name: the selected ones.
 
     Only the active one where it is alone, or not selected itself; quick enough for drawing.
     """
@@ -50,7 +90,7 @@ def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.typ
 
 
 def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
-    """Return the objects of `chosen`, all of which hold splats.
+    """The objects of `chosen`, all of which hold splats.
 
     Raises
     ------
@@ -71,19 +111,19 @@ def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
 
 
 def active_first(layer: bpy.types.ViewLayer, active: SplatObject | None) -> Members:
-    """Return the objects of `members`, the active one first; none without it."""
+    """The objects of `members`, the active one first; none without it."""
     if active is None:
         return []
     return sorted(members(layer, active), key=lambda member: member.obj != active.obj)
 
 
 def uids_of(group: Members) -> tuple[int, ...]:
-    """Return the numbers by which Blender knows the objects in this session; names may change."""
+    """The numbers by which Blender knows the objects in this session; names may change."""
     return tuple(member.obj.session_uid for member in group)
 
 
 def by_uids(uids: tuple[int, ...], known: SplatObject) -> Members:
-    """Return the objects again, in that order; see `mesh.layout.check`. One is known already."""
+    """The objects again, in that order; see `mesh.layout.check`. One is known already."""
     objects = {obj.session_uid: obj for obj in bpy.data.objects}
     return [_checked(objects.get(uid), known) for uid in uids]
 
@@ -92,113 +132,149 @@ def _checked(obj: bpy.types.Object | None, known: SplatObject) -> SplatObject:
     return known if obj == known.obj else mesh_layout.check(obj)
 
 
-def forced_of_each(scene: bpy.types.Scene, group: Members) -> list[Forced]:
-    """Return what must stay and what must go of each object, as a scene says it.
-
-    A name protects in the objects that have it.
-
-    Raises
-    ------
-    RefineError
-        See `Demands`; also if no object has a name that protects.
-    """
-    demanded = Demands.of_scene(scene)
-    if len(group) == 1:
-        return [demanded.forced(group[0])]
-    protecting = [(name, _protecting(group, name)) for name in demanded.names]
-    return [
-        replace(demanded, names=tuple(n for n, has in protecting if has[index])).forced(member)
-        for index, member in enumerate(group)
-    ]
+def forced(scene: bpy.types.Scene, group: Members) -> Forced:
+    """Which splats of all objects must stay and must go, as a scene says it; see `Demands`."""
+    return _as_one(Demands.of_scene(scene).of_each(group), group)
 
 
-def check_forced(scene: bpy.types.Scene, group: Members, before: Sequence[Forced]) -> None:
-    """Check that of each object the same must stay and go as before.
-
-    Raises
-    ------
-    RefineError
-        If not; also see `forced_of_each`.
-    """
-    for member, was, now in zip(group, before, forced_of_each(scene, group), strict=True):
-        pairs = ((was.protected, now.protected), (was.removed, now.removed))
-        if any(not _same_mask(*pair) for pair in pairs):
-            raise RefineError(
-                f"object '{member.obj.name}': what must stay or go has changed meanwhile; nothing "
-                "was removed: apply again"
-            )
-
-
-def _same_mask(one: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None) -> bool:
-    """Tell whether both mark the same; none means that nothing is marked."""
-    if one is None or other is None:
-        return not any(mask is not None and mask.any() for mask in (one, other))
-    return np.array_equal(one, other)
-
-
-def refresh(scene: bpy.types.Scene, group: Members) -> list[Forced]:
+def refresh(scene: bpy.types.Scene, group: Members) -> Forced:
     """Mark what a scene demands of each object, and return it; see `demands.refresh`."""
-    if len(group) == 1:
-        return [demands.refresh(scene, group[0])]
-    each = forced_of_each(scene, group)
-    for member, forced_of_member in zip(group, each, strict=True):
-        demands.mark(member, forced_of_member)
-    return each
+    return _as_one(demands.refresh(scene, group), group)
 
 
-def joined_forced(each: Sequence[Forced], group: Members) -> Forced:
-    """Return which splats of all objects must stay and must go, without facts."""
-    counts = [len(member) for member in group]
-    protected, out = (
-        None if all(mask is None for mask in masks) else _joined_masks(masks, counts)
-        for masks in ([one.protected for one in each], [one.removed for one in each])
-    )
-    return Forced(protected, out)
+def check_forced(scene: bpy.types.Scene, group: Members, before: Forced) -> None:
+    """Refuse objects of which other splats must stay or go than before."""
+    now = forced(scene, group)
+    pairs = ((before.protected, now.protected), (before.removed, now.removed))
+    if any(not np.array_equal(*map(_or_none, pair)) for pair in pairs):
+        raise RefineError(
+            "what must stay or go has changed meanwhile; nothing was removed: apply again"
+        )
+
+
+def _or_none(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    return mask if mask is not None and mask.any() else None
+
+
+def _as_one(each: Sequence[Forced], group: Members) -> Forced:
+    """What is demanded of several objects as of one, without facts."""
+    masks = []
+    for name in ("protected", "removed"):
+        parts = [getattr(one, name) for one in each]
+        filled = [
+            np.zeros(len(member), np.bool_) if part is None else part
+            for member, part in zip(group, parts, strict=True)
+        ]
+        masks.append(None if all(part is None for part in parts) else np.concatenate(filled))
+    return Forced(*masks)
+
+
+def rows_of(counts: Sequence[int]) -> list[slice]:
+    """Which of all splats are those of each object, of which each has so many."""
+    ends = np.cumsum(counts).tolist()
+    return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def parts_of(mask: NDArray[np.bool_] | None, group: Members) -> list[NDArray[np.bool_]]:
-    """Return what a mask of all objects' splats, (N,), says of each object's; None marks none."""
-    whole = np.zeros(sum(map(len, group)), np.bool_) if mask is None else mask
-    return [whole[rows] for rows in _rows(group)]
+    """What a mask of all objects' splats, (N,), says of each object's; None marks none."""
+    counts = [len(member) for member in group]
+    whole = np.zeros(sum(counts), np.bool_) if mask is None else mask
+    return [whole[rows] for rows in rows_of(counts)]
 
 
-def gather(group: Members, *, whole: bool | None = False) -> Splats:
-    """Return the splats of all objects as they stand in the world; see `splat_object.gather`."""
-    return joined([splat_object.gather(member, whole=whole) for member in group])
+def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splats:
+    """The splats of objects as they stand in the world, for scoring.
+
+    Modifiers are not looked at: what is scored is what is exported.
+
+    Parameters
+    ----------
+    group : sequence of SplatObject
+    whole : bool or None
+        Whether to read view-dependent colour, for merging; scales must be uniform then. None reads
+        that of objects whose scale is, for an estimate of the pictures' quality.
+
+    Raises
+    ------
+    RefineError
+        If a matrix cannot be applied; names the object.
+    """
+    parts = []
+    for checked in group:
+        matrix = _matrix(checked)
+        harmonics = is_uniform(matrix) if whole is None else whole
+        splats = mesh_attributes.splats_from_object(checked, sh_rest=harmonics)
+        if not np.array_equal(matrix, np.eye(4)):
+            try:
+                splats = transformed(splats, matrix, rotate_sh=harmonics)
+            except RefineError as error:
+                raise RefineError(f"object '{checked.obj.name}': {error}") from None
+        parts.append(splats)
+    return joined(parts)
+
+
+def _matrix(checked: SplatObject) -> NDArray[np.float64]:
+    return world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+
+
+def possible(group: Sequence[SplatObject], method: Method) -> Method:
+    """The method for some objects: where the scale of one is uneven, merging only deletes."""
+    even = all(is_uniform(_matrix(member)) for member in group)
+    return method if even or not isinstance(method, Merge) else Occlusion(method.views)
+
+
+def modifier_notes(obj: bpy.types.Object) -> list[str]:
+    """A sentence if modifiers show the object otherwise than it is scored and exported."""
+    drawing = ("REFINE", "KIRI")  # these draw splats and move none
+    names = [m.name for m in obj.modifiers if m.show_viewport and not m.name.startswith(drawing)]
+    if not names:
+        return []
+    note = (
+        f"object '{obj.name}': scored as without its modifiers ({', '.join(names)}); apply them "
+        "first if they move splats"
+    )
+    return [note]
+
+
+def drift_notes(checked: SplatObject) -> list[str]:
+    """What others did to an object's splats, in sentences; see `mesh.drift`."""
+    drift = mesh_drift.found(checked.mesh)
+    if drift is None:
+        return []
+    remedy = "; Mend Splats in the panel puts that right" if drift.mendable else ""
+    return [f"object '{checked.obj.name}': {told}{remedy}" for told in drift.told]
 
 
 def store(
-    group: Members, scores: Scores, provenance: Provenance, origins: Sequence[dict[str, Any]]
+    group: Members, scores: Scores, method: Method, origins: Sequence[dict[str, Any]], **facts: Any
 ) -> None:
-    """Write scores of all objects' splats to their meshes; see `mesh.scores.store`.
+    """Write scores of all objects' splats to their meshes; see `mesh.scores.store` for the facts.
 
     Parameters
     ----------
     group : list of SplatObject
     scores : Scores
         Of the splats of `gather`.
-    provenance : Provenance
-        Of them all.
+    method : Method
     origins : sequence of dict
         Of each object.
     """
     _check_counts(group, len(scores.values))
     ranks, scoring = rank(scores.values), uuid.uuid4().hex
-    protected = parts_of(provenance.protected, group)
-    for member, origin, rows, mask in zip(group, origins, _rows(group), protected, strict=True):
-        scores_of_member, together = scores, None
+    protected = parts_of(facts.pop("protected", None), group)
+    rows_of_each = rows_of([len(member) for member in group])
+    for member, origin, rows, mask in zip(group, origins, rows_of_each, protected, strict=True):
+        own, together = scores, None
         if len(group) > 1:
-            scores_of_member = _scores_of_rows(scores, rows)
-            together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
+            own = _scores_of_rows(scores, rows)
+            together = (scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
-            member,
-            scores_of_member,
-            replace(provenance, origin=origin, protected=mask, together=together),
+            member, own, method, origin=origin, protected=mask, together=together, **facts
         )
 
 
 def _scores_of_rows(scores: Scores, rows: slice) -> Scores:
-    """Return the scores of one object of those that were scored together."""
+    """The scores of one object of those that were scored together."""
     values = scores.values[rows]
     scored = np.ones(len(values), np.bool_) if scores.scored is None else scores.scored[rows]
     undrawable = int(np.count_nonzero((values == 0.0) & scored))
@@ -208,126 +284,175 @@ def _scores_of_rows(scores: Scores, rows: slice) -> Scores:
 
 
 def stored_arguments(
-    group: Members,
-    budget: Budget,
-    forced: Sequence[Forced],
-    method: Method,
-    views: ViewSet | None = None,
+    group: Members, budget: Budget, demanded: Forced, method: Method, views: ViewSet | None = None
 ) -> dict[str, Any]:
-    """The arguments of `prune` for Apply to all objects; see `splat_object.stored_arguments`.
+    """The arguments of `prune` for Apply, which goes by the scores that the objects hold.
 
     Parameters
     ----------
-    group, budget, method, views
-        See there.
-    forced : sequence of Forced
-        What must stay and what must go of each object.
+    group : list of SplatObject
+    budget : Budget
+    demanded : Forced
+        What must stay and what must go; see `forced`.
+    method : Method
+    views : ViewSet, optional
+        What merging and refitting go by; None where splats are deleted.
 
     Raises
     ------
     RefineError
-        Also if the objects were not scored together.
+        If an object was not scored, not with the others, or some of it needs scores now that had
+        to go then; also see `gather`.
     """
-    if len(group) > 1:
-        _check_scored_together(group)
-    parts = [
-        splat_object.stored_arguments(member, budget, each, method, views)
-        for member, each in zip(group, forced, strict=True)
-    ]
-    if len(parts) == 1:
-        return parts[0]
-    counts = [len(member) for member in group]
-    masks: dict[str, Any] = {
-        name: _joined_masks([part[name] for part in parts], counts)
-        for name in ("protected", "removed")
-        if any(part[name] is not None for part in parts)
-    }
+    sizes = [mesh_attributes.file_size(member) for member in group]
     return {
-        **parts[0],
-        "splats": None if views is None else joined([part["splats"] for part in parts]),
-        "scores": _scores(group, [part["scores"] for part in parts], masks),
+        "splats": None if views is None else gather(group, whole=True),
+        "views": views,
+        "budget": budget,
+        "method": method,
+        "scores": mesh_scores.stored_scores(group, demanded.removed),
+        "protected": demanded.protected,
+        "removed": demanded.removed,
         # Of rows of several lengths the longest counts: a size is never exceeded.
-        "sizes": (
-            max(part["sizes"][0] for part in parts),
-            sum(part["sizes"][1] for part in parts),
-        ),
-        **masks,
+        "sizes": (max(row for row, _ in sizes), sum(fixed for _, fixed in sizes)),
     }
 
 
 def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
     """Mark the splats that do not stay, (N,) of all objects."""
-    for member, rows in zip(group, _rows(group), strict=True):
-        mesh_edit.mark_removed(member.obj, ~keep[rows])
+    for member, going in zip(group, parts_of(~keep, group), strict=True):
+        mesh_edit.mark_removed(member.obj, going)
 
 
-def frames_of(group: Members) -> list[Frame]:
-    """Read what `changes` needs of each object; see `splat_object.frame_of`."""
-    return [splat_object.frame_of(member) for member in group]
+class Frame(NamedTuple):
+    """What is to be known of an object to prepare a change of its splats on any thread.
+
+    Attributes
+    ----------
+    count : int
+        Its splats.
+    degree : int
+        Of its harmonics.
+    matrix : (4, 4) float64
+        From the world to the object.
+    """
+
+    count: int
+    degree: int
+    matrix: NDArray[np.float64]
 
 
-def changes(frames: Sequence[Frame], counts: Sequence[int], result: Result) -> list[Change]:
-    """Return what is to become of each object's splats; touches nothing of Blender's.
+class Change(NamedTuple):
+    """What is to become of the splats of an object.
+
+    Attributes
+    ----------
+    keep : (N,) bool
+        Which stay; K of them.
+    rows : (M,) int64
+        Which of the K change, ascending.
+    columns : dict of str to (M,)
+        What their properties become, in the object's frame.
+    """
+
+    keep: NDArray[np.bool_]
+    rows: NDArray[np.int64]
+    columns: dict[str, NDArray[Any]]
+
+
+def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
+    """Read what `changes` needs of each object."""
+    return [
+        Frame(len(member), mesh_layout.sh_degree(member.mesh), np.linalg.inv(_matrix(member)))
+        for member in group
+    ]
+
+
+def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
+    """What is to become of each object's splats; touches nothing of Blender's.
 
     Parameters
     ----------
     frames : sequence of Frame
         Of each object.
-    counts : sequence of int
-        How many splats each has.
     result : Result
         What was decided of all of them.
     """
-    if len(frames) == 1:
-        return [splat_object.changed(frames[0], result.keep, result.merged)]
-    return [
-        splat_object.changed(frame, result.keep[rows], result.merged and _part(result.merged, rows))
-        for frame, rows in zip(frames, _runs(counts), strict=True)
-    ]
+    found, first, merged = [], 0, result.merged
+    for frame, rows in zip(frames, rows_of([frame.count for frame in frames]), strict=True):
+        keep = result.keep[rows]
+        start, first = first, first + int(np.count_nonzero(keep))
+        if merged is None:
+            found.append(_deletion(keep))
+            continue
+        changing = np.flatnonzero(merged.changed[start:first])
+        splats = merged.splats.take(start + changing).up_to_degree(frame.degree)
+        if not np.array_equal(frame.matrix, np.eye(4)):
+            splats = transformed(splats, frame.matrix)
+        columns = {name: np.ascontiguousarray(v) for name, v in values_by_name(splats).items()}
+        found.append(Change(keep, changing, columns))
+    return found
 
 
-def apply(group: Members, parts: Sequence[Change]) -> Outcome:
+def _deletion(keep: NDArray[np.bool_]) -> Change:
+    return Change(keep, np.empty(0, np.int64), {})
+
+
+def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
     """Delete the splats that do not stay, and store what the others became: in all objects or none.
+
+    Everything else of the objects and their meshes stays: attributes, vertex groups, custom
+    properties, materials, modifiers. The scores stay to be looked at, but the next apply asks for
+    new ones, as they hold for all splats together.
 
     Parameters
     ----------
-    group : list of SplatObject
+    group : sequence of SplatObject
     parts : sequence of Change
         See `changes`.
 
     Raises
     ------
     RefineError
-        See `splat_object.apply`; also if an object would be left without splats.
+        See `mesh_edit.check_deletable`; also if there are no longer as many splats, or an object
+        would be left without any.
     """
-    if len(group) > 1:
-        _check_counts(group, sum(len(part.keep) for part in parts))
-    for member, part in zip(group, parts, strict=True):
-        if len(group) > 1 and not part.keep.any():
+    _check_counts(group, sum(len(part.keep) for part in parts))
+    outcomes = []
+    for checked, part in zip(group, parts, strict=True):
+        mesh_edit.check_deletable(checked.obj)
+        if not part.keep.any():
             raise RefineError(
-                f"no splat of object '{member.obj.name}' would be left; nothing was removed: "
+                f"no splat of object '{checked.obj.name}' would be left; nothing was removed: "
                 "delete the object, or let more stay"
             )
-    outcomes = splat_object.apply(list(zip(group, parts, strict=True)))
-    totals = {
-        field.name: sum(getattr(outcome, field.name) for outcome in outcomes)
-        for field in fields(Outcome)
-    }
-    return Outcome(**totals)
+        kept = int(np.count_nonzero(part.keep))
+        outcomes.append(Outcome.of(len(part.keep), kept, *mesh_attributes.file_size(checked)))
+    with ExitStack() as stack:
+        for checked in group:
+            stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
+        for checked, part in zip(group, parts, strict=True):
+            reduce_object(checked, part)
+    return Outcome(*(sum(numbers) for numbers in zip(*map(astuple, outcomes), strict=True)))
 
 
-def _rows(group: Members) -> list[slice]:
-    """Return which of all splats are those of each object."""
-    return _runs([len(member) for member in group])
+def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
+    """Delete the splats of an object that do not stay, (N,); see `apply`."""
+    return apply([checked], [_deletion(keep)])
 
 
-def _runs(counts: Sequence[int]) -> list[slice]:
-    """Return which of all splats are those of each object, of which each has so many."""
-    ends = np.cumsum(counts).tolist()
-    return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+def reduce_object(checked: SplatObject, change: Change) -> None:
+    """Delete what does not stay, store what the others became, and drop the scores' record."""
+    mesh_edit.delete_vertices(checked.obj, ~change.keep)
+    mesh_attributes.write_rows(checked, change.rows, change.columns)
+    if change.columns:
+        mesh_drift.renew(checked.mesh)
+    mesh_floaters.forget(checked.mesh)
+    if mesh_scores.RECORD in checked.mesh:
+        del checked.mesh[mesh_scores.RECORD]
 
 
-def _check_counts(group: Members, count: int) -> None:
+def _check_counts(group: Sequence[SplatObject], count: int) -> None:
     total = sum(len(member) for member in group)
     if total != count:
         names = ", ".join(repr(member.obj.name) for member in group)
@@ -337,69 +462,43 @@ def _check_counts(group: Members, count: int) -> None:
         )
 
 
-def _check_scored_together(group: Members) -> None:
-    """Refuse objects of several scorings: scores compare only within one."""
-    ids = {
-        ((mesh_scores.record(member.mesh) or {}).get("together") or {}).get("id")
-        for member in group
-    }
-    if len(ids) > 1 or None in ids:
-        raise RefineError(
-            f"the {len(group)} selected objects were not scored together: score them as they are "
-            "selected, or select only one"
-        )
+def read_for_export(
+    checked: SplatObject, *, apply_transform: bool = False
+) -> Callable[[], SplatFile]:
+    """Read an object; what makes its PLY file of that, in memory, on any thread.
 
+    The file is in the layout that the object was imported with.
 
-def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:
-    """Return the scores of all objects as one; their curve, if all that were scored are there."""
-    record, removed = mesh_scores.record(group[0].mesh) or {}, masks.get("removed")
-    values = np.concatenate([part.values for part in parts])
-    scored = ~_joined_masks(
-        [None if part.scored is None else ~part.scored for part in parts],
-        [len(part.values) for part in parts],
-    )
-    removed = np.zeros_like(scored) if removed is None else removed
-    whole = record["together"]["splats"] == len(values) and np.array_equal(removed, ~scored)
-    return replace(
-        parts[0],
-        values=values,
-        seen=np.concatenate([part.seen for part in parts]),
-        undrawable=sum(part.undrawable for part in parts),
-        quality=Quality.from_facts(record.get("quality")) if whole else None,
-        scored=scored,
-    )
+    Parameters
+    ----------
+    checked : SplatObject
+    apply_transform : bool
+        Whether the splats are to be as they stand in the world, harmonics turned with them.
 
-
-def _protecting(group: Members, name: str) -> list[bool]:
-    """Return which objects have a vertex group or an attribute of that name that protects.
-
-    Raise `RefineError` if none has.
+    Raises
+    ------
+    RefineError
+        If the transform is to be applied and cannot be, being flat.
     """
-    protecting, errors = [], []
-    for member in group:
-        try:
-            mesh_edit.protected_mask(member.obj, name)
-            protecting.append(True)
-        except RefineError as error:
-            protecting.append(False)
-            errors.append(error)
-    if not any(protecting):
-        raise errors[0]
-    return protecting
+    if not apply_transform:
+        return mesh_attributes.read_for_file(checked)
+    names, move = read_to_move(checked, _matrix(checked))
+    return mesh_attributes.read_for_file(checked, names, lambda: move()[0])
 
 
-def _joined_masks(parts: list[Any], counts: list[int]) -> NDArray[np.bool_]:
-    """Return masks of several objects as one; none means that nothing is marked."""
-    return np.concatenate([
-        np.zeros(count, np.bool_) if part is None else part
-        for part, count in zip(parts, counts, strict=True)
-    ])  # fmt: skip
+def export_notes(checked: SplatObject, *, apply_transform: bool = False) -> list[str]:
+    """What is to be said of an exported object; see `drift_notes`, `uneven_notes`."""
+    uneven = uneven_notes(checked, _matrix(checked)) if apply_transform else []
+    return [*drift_notes(checked), *uneven]
 
 
-def _part(merged: Merged, rows: slice) -> Merged:
-    """The kept splats of one object."""
-    first = int(np.count_nonzero(merged.keep[: rows.start]))
-    keep = merged.keep[rows]
-    kept = slice(first, first + int(np.count_nonzero(keep)))
-    splats = merged.splats.take(kept)
-    return replace(merged, keep=keep, splats=splats, changed=merged.changed[kept])
+def find(name: str) -> bpy.types.Object:
+    """The object of that name, or raise `RefineError` with those that hold splats."""
+    obj = bpy.context.scene.objects.get(name)
+    if obj is None:
+        names = [o.name for o in bpy.context.scene.objects if mesh_layout.looks_like_splats(o)]
+        listed = ", ".join(names[:8]) or "none"
+        raise RefineError(
+            f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {listed})"
+        )
+    return obj

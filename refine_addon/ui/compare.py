@@ -46,7 +46,7 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
         """What Apply would decide by, the splats, and the view of the active camera."""
         view = CameraChoice("ACTIVE").views(context, context.object)[0]
         group = selected(context)
-        forced = splat_group.forced_of_each(context.scene, group)
+        forced = splat_group.forced(context.scene, group)
         arguments = apply_arguments(context, group, forced)
         splats = arguments["splats"] or splat_group.gather(group, whole=None)
         return [], (arguments, splats, ViewSet((replace(view, weight=1.0),)))

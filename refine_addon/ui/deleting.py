@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
-from ..objects import splat_object
+from ..objects import splat_group
 from . import plans
 from .operator_bases import Answer, AtOnce, OnSplats
 
@@ -23,7 +23,7 @@ class Deleting(AtOnce, OnSplats):
     def act(self, context: bpy.types.Context) -> Answer:
         """Delete them, drop the plan that was made with them, and say how many they were."""
         checked = mesh_layout.check(context.object)
-        outcome = splat_object.delete_splats(checked, ~self.going(context, checked))
+        outcome = splat_group.delete_splats(checked, ~self.going(context, checked))
         plans.forget(checked.mesh)
         plans.refresh(context)
         self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")

@@ -29,7 +29,7 @@ from ..core.whole_file import expanded, refuse_existing
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
-from ..objects import level_objects, splat_object
+from ..objects import level_objects, splat_group
 from .operator_bases import Answer, Job, OnSplats
 
 _FORMATS = (
@@ -116,8 +116,8 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         checked, moved = mesh_layout.check(context.object), self.apply_transform
         target = expanded(bpy.path.abspath(self.filepath))
         refuse_existing(target, overwrite=self.overwrite)
-        file = splat_object.read_for_export(checked, apply_transform=moved)
-        notes = splat_object.export_notes(checked, apply_transform=moved)
+        file = splat_group.read_for_export(checked, apply_transform=moved)
+        notes = splat_group.export_notes(checked, apply_transform=moved)
         return [], (file, target, self.overwrite, notes)
 
     @staticmethod
@@ -159,9 +159,9 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
         objects = level_objects.levels_of(mesh_layout.check(context.object).obj)
         moved = self.apply_transform
         each = [mesh_layout.check(obj) for obj in objects]
-        files = [splat_object.read_for_export(one, apply_transform=moved) for one in each]
+        files = [splat_group.read_for_export(one, apply_transform=moved) for one in each]
         notes = [
-            note for one in each for note in splat_object.export_notes(one, apply_transform=moved)
+            note for one in each for note in splat_group.export_notes(one, apply_transform=moved)
         ]
         width = objects[1][level_objects.FACTS].get("distance", np.inf)
         if not moved:  # as long in the object's own unit

@@ -14,7 +14,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
-from ..objects import splat_object
+from ..objects import splat_group
 from ..objects.demands import Demands
 from . import plans
 from .operator_bases import Answer, AtOnce, Job, OnSplats
@@ -34,9 +34,9 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
         checked, settings = mesh_layout.check(context.object), context.scene.refine
         mesh_edit.check_writable(checked.obj)
         cleaning = Cleaning(tuple(settings.reasons), settings.views)
-        forced = Demands.of_scene(context.scene).forced(checked)
+        forced = splat_group.forced(context.scene, [checked])
         masks = {"protected": forced.protected, "removed": forced.removed}
-        return [checked], ((splat_object.gather(checked), chosen_views(context), cleaning), masks)
+        return [checked], ((splat_group.gather([checked]), chosen_views(context), cleaning), masks)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> Cleaned:
@@ -77,7 +77,7 @@ class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
         if not floating.any():
             self.report({"INFO"}, f"There are no floaters to delete{spared}")
             return {"CANCELLED"}
-        outcome = splat_object.delete_splats(checked, ~floating)
+        outcome = splat_group.delete_splats(checked, ~floating)
         plans.forget(checked.mesh)
         plans.refresh(context)
         self.report(

@@ -26,11 +26,8 @@ from ..core.visibility import frustum
 from ..core.volumes import Forced
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
-from ..mesh.scores import Provenance
-from ..objects import level_objects, splat_group, splat_object
-from ..objects.demands import Demands
-from ..objects.splat_group import Members
-from ..objects.splat_object import Change
+from ..objects import level_objects, splat_group
+from ..objects.splat_group import Change, Members
 from . import plans, staleness
 from .operator_bases import Answer, Job, OnScored, OnSplats, in_object_mode
 from .wrapped import counted
@@ -44,13 +41,13 @@ def chosen_views(context: Context) -> ViewSet:
     return CameraChoice.of_scene(context.scene).views(context, context.object)
 
 
-def apply_arguments(context: Context, group: Members, forced: list[Forced]) -> dict[str, Any]:
+def apply_arguments(context: Context, group: Members, forced: Forced) -> dict[str, Any]:
     """The arguments of `prune` for the selected objects, by the settings of the panel.
 
-    `forced` is what must stay and what must go of each.
+    `forced` is what must stay and what must go.
     """
     settings = context.scene.refine
-    method = splat_object.possible(group, settings.to_method())
+    method = splat_group.possible(group, settings.to_method())
     views = chosen_views(context) if method.changes else None
     return splat_group.stored_arguments(group, settings.to_budget(), forced, method, views)
 
@@ -81,7 +78,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         for member in group:
             mesh_edit.check_writable(member.obj)
         quality = method.name != "closed-form" or settings.budget == "psnr"
-        forced = splat_group.joined_forced(splat_group.forced_of_each(context.scene, group), group)
+        forced = splat_group.forced(context.scene, group)
         arguments = {
             "splats": splat_group.gather(group, whole=None if quality else False),
             "views": views,
@@ -108,13 +105,10 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         (arguments, origins), (scores, counts, seconds) = job, result
         pairs = zip(arguments["views"], counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
-        provenance = Provenance(
-            arguments["method"],
-            cameras=cameras,
-            protected=arguments["protected"],
-            seconds=seconds,
-        )
-        splat_group.store(group, scores, provenance, origins)
+        splat_group.store(
+            group, scores, arguments["method"], origins,
+            cameras=cameras, protected=arguments["protected"], seconds=seconds,
+        )  # fmt: skip
         plans.refresh(context)
         removed = arguments["removed"]
         out = 0 if removed is None else int(np.count_nonzero(removed))
@@ -125,8 +119,8 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
             f"{scores.views_used} of {counted(scores.views_given, 'view')}; "
             f"{unseen:,} lie in none",
         )
-        modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
-        drifts = [note for each in group for note in splat_object.drift_notes(each)]
+        modifiers = [note for each in group for note in splat_group.modifier_notes(each.obj)]
+        drifts = [note for each in group for note in splat_group.drift_notes(each)]
         for note in (*scoring_notes(scores), *modifiers, *drifts):
             self.report({"WARNING"}, note)
 
@@ -162,26 +156,26 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
         group = selected(context)
         for member in group:
             mesh_edit.check_deletable(member.obj)
-        forced = splat_group.forced_of_each(context.scene, group)
-        frames, counts = splat_group.frames_of(group), [len(member) for member in group]
-        return group, (apply_arguments(context, group, forced), forced, frames, counts)
+        forced = splat_group.forced(context.scene, group)
+        frames = splat_group.frames_of(group)
+        return group, (apply_arguments(context, group, forced), forced, frames)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> _Applied:
         """Which splats stay, and what they become."""
-        arguments, _, frames, counts = job
+        arguments, _, frames = job
         result = prune(**arguments, partial=True, progress=progress)
-        return _Applied(result, splat_group.changes(frames, counts, result))
+        return _Applied(result, splat_group.changes(frames, result))
 
     def put(self, context: Context, group: Members, job: Any, applied: Any) -> None:
         """Delete what does not stay, and change what does."""
-        (arguments, forced, *_), result = job, applied.result
+        (arguments, forced, _), result = job, applied.result
         context.view_layer.update()
         if arguments["method"].changes:  # on a thread, while volumes can be moved
             splat_group.check_forced(context.scene, group, forced)
         decided = arguments["budget"].needs_scores or not result.merged  # by the scores
         changed = _changes_since_scoring(context, group, arguments) if decided else []
-        drifts = [note for each in group for note in splat_object.drift_notes(each)]
+        drifts = [note for each in group for note in splat_group.drift_notes(each)]
         outcome = splat_group.apply(group, applied.changes)
         for member in group:
             plans.forget(member.mesh)
@@ -228,12 +222,12 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
 
     def gather(self, context: Context) -> tuple[Members, Any]:
         """The arguments of `lod`."""
-        checked, settings = mesh_layout.check(context.object), context.scene.refine
+        group, settings = [mesh_layout.check(context.object)], context.scene.refine
         method, levels = settings.to_method(), settings.to_levels()
-        splats = splat_object.gather(checked, whole=True if method.changes else None)
-        forced = Demands.of_scene(context.scene).forced(checked)
+        splats = splat_group.gather(group, whole=True if method.changes else None)
+        forced = splat_group.forced(context.scene, group)
         masks = {"protected": forced.protected, "removed": forced.removed}
-        return [checked], ((splats, chosen_views(context), levels, method), masks)
+        return group, ((splats, chosen_views(context), levels, method), masks)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> list[Level]:

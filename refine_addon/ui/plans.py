@@ -39,7 +39,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.records import parsed
 from ..objects import demands, splat_group
-from ..objects.splat_object import Outcome
+from ..objects.splat_group import Outcome
 from . import camera_list, price
 from .chart import Histogram, Place
 
@@ -137,7 +137,7 @@ def refresh_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
         _refresh(scene, obj)
     elif _is_ours(obj):
         with contextlib.suppress(RefineError):  # which the panel shows
-            demands.refresh(scene, mesh_layout.check(obj))
+            demands.refresh(scene, [mesh_layout.check(obj)])
 
 
 def refresh_objects(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> None:

@@ -16,12 +16,10 @@ from ..cameras.objects import UPRIGHT, WEIGHT, world_matrix
 from ..cameras.sets import CameraChoice, create_cameras
 from ..core.errors import RefineError
 from ..core.views import ViewSet, with_views_between
-from ..core.volumes import Forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from . import camera_list, plans
 from .operator_bases import Answer, AtOnce, OnSplats
@@ -168,8 +166,9 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> Answer:
         """Mark them."""
         group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
-        forced = splat_group.forced_of_each(context.scene, group)
-        masks = [_unseen(*pair) for pair in zip(group, forced, strict=True)]
+        removed = splat_group.forced(context.scene, group).removed
+        unseen = mesh_scores.stored_scores(group, removed).seen == 0
+        masks = splat_group.parts_of(unseen if removed is None else unseen & ~removed, group)
         for member in group:
             mesh_edit.check_writable(member.obj)
         for member, unseen in zip(group, masks, strict=True):
@@ -179,12 +178,6 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
         count = sum(int(np.count_nonzero(unseen)) for unseen in masks)
         self.report({"INFO"}, f"{count:,} splats that lie in no view stay")
         return {"FINISHED"}
-
-
-def _unseen(checked: SplatObject, forced: Forced) -> NDArray[np.bool_]:
-    """Return which splats lie in no view, (N,), and need not go for another reason."""
-    unseen = mesh_scores.stored_scores(checked, forced.removed).seen == 0
-    return unseen if forced.removed is None else unseen & ~forced.removed
 
 
 def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:

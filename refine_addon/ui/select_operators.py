@@ -21,7 +21,7 @@ from ..mesh import floaters, selection
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
-from ..objects import splat_object
+from ..objects import splat_group
 from ..objects.demands import Demands
 from . import plans
 from .deleting import Deleting
@@ -234,8 +234,8 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
         for collection in checked.obj.users_collection:
             collection.objects.link(apart)
         try:
-            splat_object.delete_splats(mesh_layout.check(apart), chosen)
-            splat_object.delete_splats(checked, ~chosen)
+            splat_group.delete_splats(mesh_layout.check(apart), chosen)
+            splat_group.delete_splats(checked, ~chosen)
         except BaseException:
             bpy.data.batch_remove([apart.data, apart])
             raise

@@ -43,7 +43,7 @@ def extension(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def addon(extension):
-    """Return the package with its modules as attributes: ``addon.objects.splat_object``."""
+    """Return the package with its modules as attributes: ``addon.objects.splat_group``."""
     for path in (ROOT / "refine_addon").glob("*.py"):
         if not path.stem.startswith("__"):
             importlib.import_module(f"{MODULE}.{path.stem}")
@@ -59,7 +59,7 @@ def core(addon):
 
 def export(addon, checked, path, **options):
     """Write an object to a file, as *Export* does; see `read_for_export` for the options."""
-    file = addon.objects.splat_object.read_for_export(checked, **options)()
+    file = addon.objects.splat_group.read_for_export(checked, **options)()
     addon.core.formats.registry.write_splats(path, file)
 
 
@@ -73,10 +73,16 @@ def keep_mask(addon, obj, budget, protect=""):
 def deleted(addon, checked, budget, found=None):
     """What *Apply* decides by the scores of an object where splats are deleted."""
     found = found or addon.core.volumes.Forced()
-    arguments = addon.objects.splat_object.stored_arguments(
-        checked, budget, found, addon.core.Occlusion(), None
+    arguments = addon.objects.splat_group.stored_arguments(
+        [checked], budget, found, addon.core.Occlusion(), None
     )
     return addon.core.prune(**arguments)
+
+
+def applied(addon, checked, result):
+    """Do to an object what was decided, as *Apply* does it."""
+    group = addon.objects.splat_group
+    group.apply([checked], group.changes(group.frames_of([checked]), result))
 
 
 @pytest.fixture(autouse=True)
@@ -140,8 +146,8 @@ def score(addon):
 
     def score(obj, views):
         method, checked = addon.core.ClosedForm(), addon.mesh.layout.check(obj)
-        scores = addon.core.score(addon.objects.splat_object.gather(checked), views, method)
-        addon.mesh.scores.store(checked, scores, addon.mesh.scores.Provenance(method))
+        scores = addon.core.score(addon.objects.splat_group.gather([checked]), views, method)
+        addon.mesh.scores.store(checked, scores, method)
 
     return score
 

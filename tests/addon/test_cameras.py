@@ -367,7 +367,7 @@ def test_blender_shows_what_the_imported_camera_saw(addon, room_cameras, room_vi
 def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, room_views):
     """Float32 moves scores in the seventh digit; on this scene no row changes sides."""
     expected = core.prune(
-        addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
+        addon.objects.splat_group.gather([addon.mesh.layout.check(room)]),
         room_views,
         core.Budget(ratio=0.5),
         addon.core.ClosedForm(),
@@ -376,7 +376,7 @@ def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, 
         del camera["refine_view"]
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     got = core.prune(
-        addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
+        addon.objects.splat_group.gather([addon.mesh.layout.check(room)]),
         views,
         core.Budget(ratio=0.5),
         addon.core.ClosedForm(),

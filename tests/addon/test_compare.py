@@ -25,14 +25,14 @@ def test_the_pictures_are_those_of_what_apply_leaves(addon, quarter, room_camera
     scene.camera = room_cameras.objects[24]
     scene.refine.ratio, scene.refine.method, scene.refine.views = 0.7, method, 16
     bpy.ops.refine.score()
-    gather, check = addon.objects.splat_object.gather, addon.mesh.layout.check
-    before = gather(check(quarter), whole=True)
+    gather, check = addon.objects.splat_group.gather, addon.mesh.layout.check
+    before = gather([check(quarter)], whole=True)
 
     assert bpy.ops.refine.compare() == {"FINISHED"}
 
     assert len(quarter.data.vertices) == 9_939
     bpy.ops.refine.apply()
-    after = gather(check(quarter), whole=True)
+    after = gather([check(quarter)], whole=True)
     assert len(after) == 9_939 - 6_957  # floor(.7 * 9939)
     views = addon.cameras.sets.CameraChoice("ACTIVE").views(bpy.context, quarter)
     (expected,) = addon.core.pictures.compare(before, after, views)

@@ -40,7 +40,7 @@ def marked(addon, room):
 def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
     """The same splats and views: the same verdict, marked and counted by reason; none deleted."""
     room, moved = polluted
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(room))
+    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(room)])
     count = len(splats)
     expected = addon.core.clean(
         splats, addon.ui.operators.chosen_views(bpy.context), addon.core.Cleaning(views=24)

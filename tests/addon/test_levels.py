@@ -29,7 +29,7 @@ def test_levels_are_objects_beside_the_original(addon, few, room_views):
     """3976 splats: 1988 and 398, those that core keeps, in a collection of their own."""
     core = addon.core
     wanted = core.lod(
-        addon.objects.splat_object.gather(addon.mesh.layout.check(few), whole=True),
+        addon.objects.splat_group.gather([addon.mesh.layout.check(few)], whole=True),
         room_views,
         core.Levels((0.5, 0.1)),
         addon.core.ClosedForm(),
@@ -98,15 +98,15 @@ def test_levels_that_cannot_be_leave_the_scene_alone(few, levels):
 
 def test_where_an_object_cannot_be_made_none_is(addon, few, monkeypatch):
     """The second level fails: collection, objects and meshes are gone again."""
-    whole, calls = addon.objects.splat_object.apply_object, []
+    whole, calls = addon.objects.splat_group.apply, []
 
-    def failing(checked, result):
+    def failing(group, parts):
         calls.append(1)
         if len(calls) == 2:
             raise addon.core.RefineError("no")
-        return whole(checked, result)
+        return whole(group, parts)
 
-    monkeypatch.setattr(addon.objects.splat_object, "apply_object", failing)
+    monkeypatch.setattr(addon.objects.splat_group, "apply", failing)
     before = snapshot()
 
     with pytest.raises(RuntimeError, match="no"):

@@ -29,7 +29,7 @@ BOTH = pytest.mark.parametrize("method", ["merge", "refit"])
 
 def merged_in_core(addon, obj, views, budget, method="merge"):
     return addon.core.prune(
-        addon.objects.splat_object.gather(addon.mesh.layout.check(obj), whole=True),
+        addon.objects.splat_group.gather([addon.mesh.layout.check(obj)], whole=True),
         views,
         budget,
         addon.core.METHODS[method](),

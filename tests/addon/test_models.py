@@ -9,7 +9,7 @@ import pytest
 from tests.e2e.inside.clouds import as_cloud
 from tests.strategies import ply_of
 
-from .conftest import export
+from .conftest import applied, export
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_the_tag_of_a_file_goes_with_the_object_to_the_file(addon, make_splats, 
     export(addon, checked, tmp_path / "out.ply")
 
     assert bpy.context.scene.refine.model == "antialiased"
-    assert addon.objects.splat_object.gather(checked).model == "antialiased"
+    assert addon.objects.splat_group.gather([checked]).model == "antialiased"
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
 
 
@@ -66,7 +66,7 @@ def test_discs_are_turned_and_merged(addon, discs, tmp_path, room_views):
     checked = addon.mesh.layout.check(obj)
     export(addon, checked, tmp_path / "turned.ply", apply_transform=True)
     turned = addon.core.read_ply(tmp_path / "turned.ply").splats()
-    expected = addon.objects.splat_object.gather(checked, whole=True)
+    expected = addon.objects.splat_group.gather([checked], whole=True)
     np.testing.assert_allclose(turned.means, expected.means, rtol=1e-5)
     assert turned.model == "2dgs"
 
@@ -74,7 +74,7 @@ def test_discs_are_turned_and_merged(addon, discs, tmp_path, room_views):
         expected, room_views, addon.core.Budget(ratio=0.5), addon.core.Refit(rounds=1)
     )
     assert result.merged is not None
-    addon.objects.splat_object.apply_object(checked, result)
+    applied(addon, checked, result)
 
     left = addon.mesh.layout.check(obj)
     assert (len(left), left.layout.model) == (20, "2dgs")

@@ -118,7 +118,7 @@ def test_a_point_cloud_is_scored_like_the_file_it_exports(addon, core, cloud, ro
         core.read_ply(tmp_path / "out.ply").splats(), room_views, addon.core.ClosedForm()
     )
     bpy.ops.refine.score()
-    got = addon.mesh.scores.stored_scores(addon.mesh.layout.check(cloud))
+    got = addon.mesh.scores.stored_scores([addon.mesh.layout.check(cloud)])
 
     # Blender's cameras are float32.
     assert np.allclose(got.values, expected.values, rtol=1e-3)

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
-from .conftest import deleted, export, keep_mask
+from .conftest import applied, deleted, export, keep_mask
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
@@ -479,7 +479,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
     """By the eye, by the monitor icon, by excluding the collection; the command reaches all."""
     views = addon.cameras.sets.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
     expected = addon.core.prune(
-        addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
+        addon.objects.splat_group.gather([addon.mesh.layout.check(room)]),
         views,
         addon.core.Budget(ratio=0.5),
         addon.core.ClosedForm(),
@@ -497,7 +497,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
     score(room, views)
     keep = keep_mask(addon, room, addon.core.Budget(ratio=0.5))
     result = deleted(addon, addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5))
-    addon.objects.splat_object.apply_object(addon.mesh.layout.check(room), result)
+    applied(addon, addon.mesh.layout.check(room), result)
 
     assert np.array_equal(keep, expected)
     assert len(room.data.vertices) == expected.sum()

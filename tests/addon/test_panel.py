@@ -86,8 +86,7 @@ def draw(addon, monkeypatch):
     def draw():
         drawn = []
         with monkeypatch.context() as patch:
-            for name in ("stored_scores", "gather", "apply"):
-                patch.setattr(addon.objects.splat_object, name, never)
+            patch.setattr(addon.mesh.scores, "stored_scores", never)
             for name in ("members", "stored_arguments", "mark_removed", "gather", "apply"):
                 patch.setattr(addon.objects.splat_group, name, never)
             patch.setattr(addon.mesh.attributes, "read_attribute", never)
@@ -129,7 +128,7 @@ def test_each_step_shows_what_came_of_it(draw, room, room_cameras):
 
 def test_each_reason_of_floaters_is_told_with_how_sure_it_is(draw, addon, room, room_cameras):
     """Per cent are the mean over what goes for the reason; where nothing goes there are none."""
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(room))
+    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(room)])
     views = addon.ui.operators.chosen_views(bpy.context)
     expected = addon.core.clean(splats, views, addon.core.Cleaning())
 
@@ -277,7 +276,7 @@ def test_each_camera_is_listed_with_what_it_sees(draw, addon, room, room_cameras
     drawn = draw()
     lines = [text for text in drawn if text.startswith("0") and ": " in text]
     counts = [int(line.split(": ")[1]) for line in lines]
-    means = addon.objects.splat_object.gather(addon.mesh.layout.check(room)).means
+    means = addon.objects.splat_group.gather([addon.mesh.layout.check(room)]).means
     local = room_views[0].rotation @ (means - room_views[0].center).T
     x = room_views[0].fx * local[0] / local[2] + room_views[0].cx
     y = room_views[0].fy * local[1] / local[2] + room_views[0].cy
@@ -360,7 +359,7 @@ def test_the_quality_of_the_pictures_is_a_budget(draw, addon, room, room_cameras
     assert "score again with a PSNR as budget" in " ".join(draw())
 
     bpy.ops.refine.score()
-    stored = addon.mesh.scores.stored_scores(addon.mesh.layout.check(room))
+    stored = addon.mesh.scores.stored_scores([addon.mesh.layout.check(room)])
     assert stored.quality is not None
     assert any(text.startswith("Keeps ") for text in draw())
 
@@ -373,6 +372,6 @@ def test_a_curve_of_more_splats_than_are_left_is_not_used(addon, room, room_came
     noted = json.loads(room.data[scores.RECORD])
     room.data[scores.RECORD] = json.dumps(noted | {"splats": noted["splats"] + 5})
 
-    stored = scores.stored_scores(addon.mesh.layout.check(room))
+    stored = scores.stored_scores([addon.mesh.layout.check(room)])
 
     assert stored.quality is None

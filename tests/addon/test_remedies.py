@@ -57,7 +57,7 @@ def test_the_list_tells_how_close_each_picture_stays(addon, room, room_cameras):
     settings.method, settings.views, settings.percent = "occlusion", 8, 30.0
     bpy.ops.refine.score()
     few = {item.name: item.psnr for item in manager.refine_cameras}
-    curve = addon.mesh.scores.stored_scores(addon.mesh.layout.check(room)).quality
+    curve = addon.mesh.scores.stored_scores([addon.mesh.layout.check(room)]).quality
     settings.percent = 80.0
     many = {item.name: item.psnr for item in manager.refine_cameras}
     told = [name for name, psnr in few.items() if psnr >= 0.0]
@@ -414,7 +414,7 @@ def test_what_must_go_is_not_kept_and_pictures_are_without_it(addon, room, room_
     bpy.ops.refine.score()
     checked = addon.mesh.layout.check(room)
     gone = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked).removed
-    curve = addon.mesh.scores.stored_scores(checked, gone).quality
+    curve = addon.mesh.scores.stored_scores([checked], gone).quality
     removed = np.count_nonzero(read(addon, room, "refine_remove"))
     share = (removed - gone.sum()) / (len(gone) - gone.sum())
     expected = curve.of_views(share)

@@ -50,7 +50,7 @@ def drawn(addon, scene, obj, **changes):
     view = addon.cameras.objects.view_from_camera(
         scene.camera, scene, bpy.context.evaluated_depsgraph_get()
     )
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(obj), whole=True)
+    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(obj)], whole=True)
     picture = addon.core.pictures.draw(splats, addon.render.engine.replace(view, **changes))
     picture[:3] /= np.maximum(picture[3], 1e-6)
     return np.moveaxis(picture, 0, -1).clip(0.0, 1.0)
@@ -158,7 +158,7 @@ def test_splats_between_glass_and_a_wall_are_seen(addon, shot, quarter):
     """
     shot.view_settings.view_transform = "Standard"
     shot.cycles.samples = 64
-    depths = addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True).means
+    depths = addon.objects.splat_group.gather([addon.mesh.layout.check(quarter)], whole=True).means
     view = addon.cameras.objects.view_from_camera(
         shot.camera, shot, bpy.context.evaluated_depsgraph_get()
     )
@@ -192,7 +192,7 @@ def test_splats_among_glass_and_walls_are_those_of_the_reference_renderer(addon,
     view = addon.cameras.objects.view_from_camera(
         shot.camera, shot, bpy.context.evaluated_depsgraph_get()
     )
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True)
+    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(quarter)], whole=True)
     depths = (splats.means - view.center) @ view.rotation[2]
     expected, light = np.zeros((2, 80, 120, 3))
     left, passed, near = np.ones((80, 120, 1)), np.ones((80, 120, 1)), 0.0

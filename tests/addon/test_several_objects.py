@@ -74,8 +74,8 @@ def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, m
 
     assert (plan["splats"], plan["kept"]) == (COUNT, COUNT - 27_828)
     np.testing.assert_array_equal(rows(addon, halves), np.flatnonzero(expected.keep))
-    check, gather = addon.mesh.layout.check, addon.objects.splat_object.gather
-    left = [gather(check(obj), whole=True) for obj in halves]
+    check, gather = addon.mesh.layout.check, addon.objects.splat_group.gather
+    left = [gather([check(obj)], whole=True) for obj in halves]
     wanted = expected.splats
     np.testing.assert_allclose(
         np.concatenate([part.means for part in left]), wanted.means, rtol=1e-6, atol=1e-6
@@ -133,11 +133,11 @@ def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):
     group, scores = addon.objects.splat_group, addon.mesh.scores
     members = group.members(bpy.context.view_layer, addon.mesh.layout.check(halves[1]))
 
-    found = group.forced_of_each(bpy.context.scene, members)
+    found = group.forced(bpy.context.scene, members)
     arguments = group.stored_arguments(members, settings.to_budget(), found, settings.to_method())
 
     assert arguments["scores"].quality is not None
-    assert all(scores.stored_scores(member).quality is None for member in members)
+    assert all(scores.stored_scores([member]).quality is None for member in members)
     ranks = [addon.mesh.attributes.read_attribute(obj.data, "refine_rank") for obj in halves]
     np.testing.assert_allclose(np.sort(np.concatenate(ranks)), np.linspace(0, 1, COUNT), atol=1e-6)
 

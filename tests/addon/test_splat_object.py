@@ -124,7 +124,7 @@ def test_an_unevenly_scaled_object_is_scored_as_it_stands_in_the_world(addon, co
     obj = bpy.data.objects.new("stretched", mesh)
     obj.scale = (1.0, 2.0, 1.0)
     bpy.context.scene.collection.objects.link(obj)
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(obj))
+    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(obj)])
 
     assert np.allclose(splats.means[:, 1], 2 * columns["y"])
     assert np.allclose(
@@ -179,7 +179,7 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):
     """Someone deleted a vertex while the scoring ran."""
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     scores = addon.core.score(
-        addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
+        addon.objects.splat_group.gather([addon.mesh.layout.check(room)]),
         views,
         addon.core.ClosedForm(),
     )
@@ -191,14 +191,14 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):
         addon.mesh.scores.store(
             addon.mesh.layout.check(room),
             scores,
-            addon.mesh.scores.Provenance(addon.core.ClosedForm()),
+            addon.core.ClosedForm(),
         )
 
 
 def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, quarter, room_views):
     """The thread of the window: same scores; after `cancel` its result raises `Cancelled`."""
     core = addon.core
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(quarter))
+    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(quarter)])
     worker = addon.ui.worker.Worker(
         lambda progress: core.score(splats, room_views, progress=progress)
     )
@@ -232,8 +232,8 @@ def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras,
 def test_modifiers_that_could_move_splats_are_mentioned(addon, room):
     """What is scored and exported is the mesh itself; KIRI's drawing moves none."""
     room.modifiers.new("KIRI_3DGS_Render_GN", "NODES")
-    quiet = addon.objects.splat_object.modifier_notes(room)
+    quiet = addon.objects.splat_group.modifier_notes(room)
     room.modifiers.new("Wave", "WAVE")
 
     assert quiet == []
-    assert "without its modifiers (Wave)" in addon.objects.splat_object.modifier_notes(room)[0]
+    assert "without its modifiers (Wave)" in addon.objects.splat_group.modifier_notes(room)[0]

@@ -49,7 +49,7 @@ def seen(addon, view):
         check, objects = addon.mesh.layout.check, addon.objects
         parts = [
             addon.core.affine.transformed(
-                objects.splat_object.gather(check(obj), whole=True),
+                objects.splat_group.gather([check(obj)], whole=True),
                 np.linalg.inv(np.array(within, np.float64)),
             )
             for obj in bpy.context.scene.objects
@@ -139,7 +139,7 @@ def test_an_uneven_scale_is_baked_as_near_as_harmonics_come(addon, imported, see
     """Shapes as M covariance M'; colours are those that the 3D view draws, in M's frame."""
     imported.scale = (1.0, 1.2, 1.0)
     checked = addon.mesh.layout.check(imported)
-    shapes = addon.objects.splat_object.gather(checked)
+    shapes = addon.objects.splat_group.gather([checked])
     arrays = addon.viewport.arrays
     packed = arrays.pack(addon.mesh.attributes.splats_from_object(checked))
     colors = arrays.colors(packed, arrays.Eye(None, view.center / [1.0, 1.2, 1.0], True))
@@ -148,14 +148,14 @@ def test_an_uneven_scale_is_baked_as_near_as_harmonics_come(addon, imported, see
     drawn = replace(shapes, sh_dc=dc, sh_rest=np.zeros((len(shapes), 0, 3)))
     before = render(drawn, view).clip(0.0, 1.0)
 
-    assert addon.objects.splat_object.export_notes(checked) == []
-    notes = addon.objects.splat_object.export_notes(checked, apply_transform=True)
+    assert addon.objects.splat_group.export_notes(checked) == []
+    notes = addon.objects.splat_group.export_notes(checked, apply_transform=True)
     (note,) = addon.objects.transforms.bake([checked])
 
     assert notes == [note]
     assert note.endswith("became the nearest")
     assert psnr(seen(), before) > 48.0
-    got = addon.objects.splat_object.gather(addon.mesh.layout.check(imported))
+    got = addon.objects.splat_group.gather([addon.mesh.layout.check(imported)])
     np.testing.assert_allclose(got.means, shapes.means, rtol=1e-6)
     covariances = [arrays.pack(splats).covariances for splats in (got, shapes)]
     np.testing.assert_allclose(*covariances, rtol=1e-4, atol=2e-7)
@@ -382,8 +382,8 @@ def test_join_of_blender_is_named_and_mended(addon, make_splats, tmp_path, degre
     )
     one.matrix_world, two.matrix_world = SOMEWHERE, ELSEWHERE
     bpy.context.view_layer.update()
-    gather, check = addon.objects.splat_object.gather, addon.mesh.layout.check
-    expected = addon.core.splats.joined([gather(check(obj), whole=True) for obj in (one, two)])
+    gather, check = addon.objects.splat_group.gather, addon.mesh.layout.check
+    expected = gather([check(one), check(two)], whole=True)
     select(one, two)
     bpy.ops.object.join()
     told = told_of(addon, one)
@@ -392,7 +392,7 @@ def test_join_of_blender_is_named_and_mended(addon, make_splats, tmp_path, degre
 
     assert "200 splats were joined without their sizes, rotations and colours" in told[0]
     assert ("another SH degree" in " ".join(told)) == (degrees[0] != degrees[1])
-    got = gather(check(one), whole=True)
+    got = gather([check(one)], whole=True)
     np.testing.assert_allclose(got.means, expected.means, rtol=1e-4, atol=1e-5)
     pack = addon.viewport.arrays.pack
     np.testing.assert_allclose(
@@ -408,7 +408,7 @@ def test_a_turn_in_edit_mode_is_mended_and_a_move_is_not_mentioned(addon, import
     in_edit_mode(imported, which, lambda: bpy.ops.transform.translate(value=(0.5, 0.0, 0.0)))
     assert told_of(addon, imported) == []
     in_edit_mode(imported, which, lambda: bpy.ops.transform.translate(value=(-0.5, 0.0, 0.0)))
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(imported), whole=True)
+    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(imported)], whole=True)
     turned = addon.core.affine.transformed(splats.take(which), np.array(SOMEWHERE))
     expected = addon.core.splats.joined([turned, splats.take(~which)])
 
@@ -420,7 +420,7 @@ def test_a_turn_in_edit_mode_is_mended_and_a_move_is_not_mentioned(addon, import
     bpy.ops.refine.mend()
 
     assert "3,313 splats were transformed" in told[0]
-    got = addon.objects.splat_object.gather(addon.mesh.layout.check(imported), whole=True)
+    got = addon.objects.splat_group.gather([addon.mesh.layout.check(imported)], whole=True)
     order = np.concatenate([np.flatnonzero(which), np.flatnonzero(~which)])
     for field in addon.core.splats.ARRAYS:
         np.testing.assert_allclose(
@@ -519,7 +519,7 @@ def test_splats_of_another_importer_are_noted_as_soon_as_they_are_seen(addon, ro
 def test_who_turns_sizes_and_rotations_as_well_is_left_alone(addon, imported):
     """Another add-on that transforms all of a splat did it right; nothing is to be mended."""
     checked = addon.mesh.layout.check(imported)
-    splats = addon.objects.splat_object.gather(checked, whole=True)
+    splats = addon.objects.splat_group.gather([checked], whole=True)
     turned = addon.core.affine.transformed(splats, np.array(SOMEWHERE))
     values = addon.core.formats.ply_columns.values_by_name(turned)
     columns = {name: column.astype(np.float32) for name, column in values.items()}

@@ -61,7 +61,7 @@ def test_ranks_wait_until_the_splats_that_they_belong_to_are_packed(addon, room,
     keep = np.ones(count, np.bool_)
     keep[:1000] = False
 
-    addon.objects.splat_object.delete_splats(addon.mesh.layout.check(room), keep)
+    addon.objects.splat_group.delete_splats(addon.mesh.layout.check(room), keep)
 
     slot = drawn(addon, content, room)
     assert slot.packed.vertices.max() == count - 1

@@ -20,7 +20,7 @@ FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 def means(addon, obj):
     """Return where the splats are in the world."""
-    return addon.objects.splat_object.gather(addon.mesh.layout.check(obj)).means
+    return addon.objects.splat_group.gather([addon.mesh.layout.check(obj)]).means
 
 
 def middle(addon, obj):
@@ -147,7 +147,7 @@ def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     views = addon.ui.operators.chosen_views(bpy.context)
     by_api = core.prune(
-        addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True), views,
+        addon.objects.splat_group.gather([addon.mesh.layout.check(quarter)], whole=True), views,
         core.Budget(ratio=0.8), core.METHODS[method](8),
         protected=protected, removed=removed,
     )  # fmt: skip
@@ -479,7 +479,7 @@ def test_a_volume_that_moves_marks_all_splats_anew(addon, room, room_cameras):
     volume(box, "REMOVE")
     bpy.ops.refine.score()
     others[0].select_set(True)
-    addon.objects.demands.refresh(bpy.context.scene, addon.mesh.layout.check(others[1]))
+    addon.objects.demands.refresh(bpy.context.scene, [addon.mesh.layout.check(others[1])])
     before = mask(addon, others[1], "refine_force")
     held = addon.ui.plans.key(bpy.context.scene.refine)
     box.location.x += 0.4
@@ -513,7 +513,7 @@ def test_levels_and_floaters_leave_out_what_must_go(addon, core, room, quarter, 
     settings = bpy.context.scene.refine
     settings.levels, settings.views = "0.2", 8
     expected = core.clean(
-        addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
+        addon.objects.splat_group.gather([addon.mesh.layout.check(room)]),
         addon.ui.operators.chosen_views(bpy.context), core.Cleaning(views=8),
         protected=protected, removed=removed,
     )  # fmt: skip

@@ -175,7 +175,7 @@ def noted(addon, monkeypatch):
 
         monkeypatch.setattr(module, name, noting)
 
-    note(addon.objects.splat_object, "gather")
+    note(addon.objects.splat_group, "gather")
     note(addon.ui.operators, "score")
     note(importlib.import_module(f"{addon.__name__}.core.prune"), "merge_down")
     return references
@@ -239,7 +239,7 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(
             raise addon.core.RefineError("failed")
 
         monkeypatch.setattr(addon.mesh.scores, "store", refuse)
-        monkeypatch.setattr(addon.objects.splat_object, "apply", refuse)
+        monkeypatch.setattr(addon.objects.splat_group, "apply", refuse)
     operator, context, said = started(name)
     assert addon.ui.running.now().operator == f"refine.{name}"
     if how == "escape":

@@ -93,9 +93,9 @@ def select(objects: list[bpy.types.Object]) -> None:
 def seen(objects: list[bpy.types.Object]) -> Any:
     """Return the splats of objects as they stand in the world."""
     package = importlib.import_module(extension.MODULE)
-    check, gather = package.mesh.layout.check, package.objects.splat_object.gather
+    check, gather = package.mesh.layout.check, package.objects.splat_group.gather
     bpy.context.view_layer.update()
-    return package.core.splats.joined([gather(check(obj), whole=True) for obj in objects])
+    return gather([check(obj) for obj in objects], whole=True)
 
 
 def apart(one: Any, other: Any) -> float:
