@@ -235,30 +235,16 @@ def move_columns(checked: SplatObject, layout: Layout) -> None:
     layout : Layout
         It has all columns of the object, and may have more.
     """
-    mesh, places = checked.mesh, {column.name: column for column in layout.columns}
+    mesh, places = checked.mesh, {column.name: column.place for column in layout.columns}
     stored = stored_columns(checked)
-    other = [
-        column
-        for column in checked.layout.columns
-        if (column.attribute, column.dtype.lstrip("<>"))
-        != (places[column.name].attribute, places[column.name].dtype.lstrip("<>"))
-    ]
-    values = {column.name: stored[column.name].copy() for column in other}
-    for name in dict.fromkeys(column.attribute for column in other):
-        remove_attribute(mesh, name)
-    vectors: dict[str, NDArray[np.float32]] = {}
-    for name, numbers in values.items():
-        place, kind = places[name].place, places[name].dtype[1:]
-        if place.kinds == ("FLOAT_VECTOR",):
-            vector = vectors.setdefault(place.attribute, np.zeros((len(numbers), 3), np.float32))
-            vector[:, place.component] = numbers
-            continue
-        coded = numbers.astype(kind)
-        coded = coded.view(np.int32) if kind == "u4" else coded
-        write_attribute(mesh, place.attribute, place.kinds[0], coded)
-    for name, vector in vectors.items():
-        write_attribute(mesh, name, "FLOAT_VECTOR", vector)
-    updated(mesh)
+    moving = [c for c in checked.layout.columns if c.place != places[c.name]]
+    values = {column.name: np.array(stored[column.name]) for column in moving}
+    for column in moving:
+        remove_attribute(mesh, column.attribute)
+    for name in values:
+        if (place := places[name]).attribute not in mesh.attributes:
+            mesh.attributes.new(place.attribute, place.kinds[0], "POINT")
+    write_columns(SplatObject(checked.obj, layout), values)
 
 
 def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:

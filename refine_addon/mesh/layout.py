@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -277,8 +278,11 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         header = re.sub(_COUNT, count, noted["header"].encode("latin-1"), count=1)
         layout = Layout(columns, header, native.is_native(mesh))
         # Join adds harmonics of a higher degree.
-        if rest_count(mesh) > sum(column.name.startswith("f_rest_") for column in columns):
-            layout = _with(layout, splat_count(mesh), _unlisted_harmonics(layout, mesh))
+        names = layout.row_dtype.names or ()
+        rest = [n for i in range(rest_count(mesh)) if (n := f"f_rest_{i}") not in names]
+        if rest:
+            more = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in rest]
+            layout = _with(layout, splat_count(mesh), more)
         described = layout.row_dtype.itemsize > 0
     except (AttributeError, KeyError, TypeError, ValueError):
         # Another program may have written there: what does not describe a file is no layout.
@@ -287,39 +291,26 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
 
 
 def merged(layouts: Sequence[Layout]) -> Layout:
-    """Return the layout of meshes that are joined: all columns of each, those of the first first.
+    """The layout of meshes that are joined: all columns of each, those of the first first.
 
     A column has a type that holds the values of all. How many rows there are stands on the mesh.
     """
-    first = layouts[0]
-    kinds: dict[str, np.dtype[Any]] = {}
+    first, columns = layouts[0], dict[str, Column]()
     for column in (column for layout in layouts for column in layout.columns):
-        own = np.dtype(column.dtype).newbyteorder("<")
-        widest = np.promote_types(kinds.get(column.name, own), own)
-        kinds[column.name] = widest if widest.str[1:] in STORAGE else np.dtype("<f8")
-    columns = {column.name: _retyped(column, kinds[column.name].str) for column in first.columns}
-    taken, more = {column.attribute for column in columns.values()}, []
-    for column in (column for layout in layouts[1:] for column in layout.columns):
-        if column.name in columns:
-            continue
-        attribute = column.attribute
-        if attribute in taken:  # which holds another property in the first
-            attribute = f"ply_{column.name}"[:_LONGEST_NAME]
-        new = Column(column.name, column.dtype, column.place._replace(attribute=attribute))
-        columns[column.name] = new = _retyped(new, kinds[column.name].str)
-        taken.add(attribute)
-        more.append(new)
-    same = tuple(columns[column.name] for column in first.columns)
-    if same == first.columns and not more:
+        known = columns.setdefault(column.name, column)
+        if (known.place, known.dtype[1:]) != (column.place, column.dtype[1:]):
+            kinds = (np.dtype(each.dtype).newbyteorder("<") for each in (known, column))
+            widest = np.promote_types(*kinds).str
+            dtype = widest if widest[1:] in STORAGE else "<f8"
+            place = _plain(dtype, known.attribute, known.place.component)
+            columns[column.name] = Column(column.name, dtype, place)
+    places = Counter(column.place[:2] for column in columns.values())
+    if twice := [attribute for (attribute, _), count in places.items() if count > 1]:
+        raise RefineError(f"attribute '{twice[0]}' holds different properties; rename one")
+    if tuple(columns.values()) == first.columns:
         return first
-    return _with(Layout(same, first.header), 0, more)
-
-
-def _retyped(column: Column, dtype: str) -> Column:
-    """Return a column of another type; vectors of Blender keep theirs."""
-    if column.place.kinds == ("FLOAT_VECTOR",):
-        return Column(column.name, dtype, column.place)
-    return Column(column.name, dtype, _plain(dtype, column.attribute))
+    more = [column for name, column in columns.items() if name not in first.row_dtype.names]
+    return _with(Layout(tuple(columns[c.name] for c in first.columns), first.header), 0, more)
 
 
 def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
@@ -338,17 +329,6 @@ def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
     first = header.index(b"element")
     header = header[:first] + b"".join(line + b"\n" for line in comments) + header[first:]
     return Layout(tuple(plain), header, layout.native)
-
-
-def _unlisted_harmonics(layout: Layout, mesh: bpy.types.Mesh) -> list[Column]:
-    """Return the columns of harmonics for which a mesh has attributes, and a layout no columns."""
-    names, places = {column.name for column in layout.columns}, _native_places(mesh)
-    wanted = (f"f_rest_{index}" for index in range(rest_count(mesh)))
-    return [
-        Column(name, "<f4", places.get(name) or _plain("<f4", name))
-        for name in wanted
-        if name not in names
-    ]
 
 
 def note(mesh: bpy.types.Mesh | bpy.types.PointCloud, layout: Layout) -> None:
@@ -377,7 +357,12 @@ def _standard(obj: bpy.types.Object) -> Layout:
     attributes = obj.data.attributes
     rest = [f"f_rest_{index}" for index in range(rest_count(obj.data))]
     if len(rest) not in REST_COUNTS:
-        raise _wrong_rest_count(obj, len(rest))
+        name, width = (native.HARMONIC, 3) if native.is_native(obj.data) else ("f_rest_", 1)
+        *counts, most = (each // width for each in REST_COUNTS)
+        raise RefineError(
+            f"object '{obj.name}': has {len(rest) // width} attributes {name}*, expected "
+            f"{', '.join(map(str, counts))} or {most} of them (degree 0 to 4)"
+        )
     normals: tuple[str, ...] = ("nx", "ny", "nz") if "nx" in attributes else ()
     places = PLACES | _native_places(obj.data)
     if not normals and _is(attributes.get("normal"), ("FLOAT_VECTOR",)):
@@ -390,17 +375,6 @@ def _standard(obj: bpy.types.Object) -> Layout:
     columns += _further_columns(obj.data, {*names, *(column.attribute for column in columns)})
     header = new_header(_row(columns), splat_count(obj.data))
     return Layout(tuple(columns), header, native.is_native(obj.data))
-
-
-def _wrong_rest_count(obj: bpy.types.Object, count: int) -> RefineError:
-    """Return the error for so many ``f_rest_*``, which are those of no degree."""
-    name, width = (native.HARMONIC, 3) if native.is_native(obj.data) else ("f_rest_", 1)
-    *counts, most = (each // width for each in REST_COUNTS)
-    msg = (
-        f"object '{obj.name}': has {count // width} attributes {name}*, expected "
-        f"{', '.join(map(str, counts))} or {most} of them (degree 0 to 4)"
-    )
-    return RefineError(msg)
 
 
 def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
@@ -462,16 +436,16 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
         Where each property is to go, in the order of the file.
     """
     columns = []
-    for index, name in enumerate(rows.names or ()):
+    for name in rows.names or ():
         kind = rows[name].str
         if name in PLACES:
             columns.append(Column(name, kind, PLACES[name]))
             continue
         # Blender keeps some names for itself, we others.
         plain = name not in _TAKEN and len(name.encode()) <= _LONGEST_NAME and name[0] != "."
-        place = name if plain else f"ply_{index}"
-        attribute = mesh.attributes.new(place, STORAGE[kind[1:]], "POINT")
-        attribute = attribute or mesh.attributes.new(f"ply_{index}", STORAGE[kind[1:]], "POINT")
+        other = f"ply_{name}".encode()[:_LONGEST_NAME].decode(errors="ignore")
+        attribute = mesh.attributes.new(name if plain else other, STORAGE[kind[1:]], "POINT")
+        attribute = attribute or mesh.attributes.new(other, STORAGE[kind[1:]], "POINT")
         columns.append(Column(name, kind, _plain(kind, attribute.name)))
     note(mesh, Layout(tuple(columns), vertex_header(header)))
     return tuple(columns)

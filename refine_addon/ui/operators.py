@@ -105,10 +105,8 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         (arguments, origins), (scores, counts, seconds) = job, result
         pairs = zip(arguments["views"], counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
-        splat_group.store(
-            group, scores, arguments["method"], origins,
-            cameras=cameras, protected=arguments["protected"], seconds=seconds,
-        )  # fmt: skip
+        facts = {"cameras": cameras, "protected": arguments["protected"], "seconds": seconds}
+        splat_group.store(group, scores, arguments["method"], origins, **facts)
         plans.refresh(context)
         removed = arguments["removed"]
         out = 0 if removed is None else int(np.count_nonzero(removed))
