@@ -98,5 +98,4 @@ def mark(checked: SplatObject, reasons: Collection[str]) -> None:
 def forget(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     """Remove what was found."""
     mesh_attributes.remove_attribute(mesh, REASON)
-    if FOUND in mesh:
-        del mesh[FOUND]
+    mesh.pop(FOUND, None)

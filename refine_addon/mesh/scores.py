@@ -118,10 +118,8 @@ def forget(checked: SplatObject) -> None:
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
     for name in (SCORE, RANK, SEEN, SCORED, heat_map.HEAT, mesh_edit.REMOVE):
-        if name in mesh.attributes:
-            mesh.attributes.remove(mesh.attributes[name])
-    if RECORD in mesh:
-        del mesh[RECORD]
+        mesh_attributes.remove_attribute(mesh, name)
+    mesh.pop(RECORD, None)
     mesh_attributes.updated(mesh)
 
 

@@ -7,6 +7,8 @@ hidden, of which Blender itself knows nothing.
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 import bmesh
 import bpy
 import numpy as np
@@ -25,19 +27,18 @@ def name_of(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> str:
 
 
 def selected(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    """Return which splats of an object are selected, (N,)."""
-    if _in_edit_mode(obj):
-        vertices = bmesh.from_edit_mesh(obj.data).verts
-        return np.fromiter((v.select for v in vertices), np.bool_, len(vertices))
-    return _chosen(obj)
+    """Which splats of an object are selected, (N,)."""
+    return _in_edit(obj, "select") if _in_edit_mode(obj) else _chosen(obj)
 
 
 def hidden(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    """Return which splats of an object are hidden, (N,)."""
-    if _in_edit_mode(obj):
-        vertices = bmesh.from_edit_mesh(obj.data).verts
-        return np.fromiter((v.hide for v in vertices), np.bool_, len(vertices))
-    return _flags(obj.data, HIDDEN)
+    """Which splats of an object are hidden, (N,)."""
+    return _in_edit(obj, "hide") if _in_edit_mode(obj) else _flags(obj.data, HIDDEN)
+
+
+def _in_edit(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
+    vertices = bmesh.from_edit_mesh(obj.data).verts
+    return np.fromiter(map(attrgetter(name), vertices), np.bool_, len(vertices))
 
 
 def select(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
@@ -126,9 +127,8 @@ def _chosen(obj: bpy.types.Object) -> NDArray[np.bool_]:
 
 
 def _flags(mesh: bpy.types.Mesh | bpy.types.PointCloud, name: str) -> NDArray[np.bool_]:
-    attribute = mesh.attributes.get(name)
-    if not attribute or attribute.domain != "POINT" or len(attribute.data) != splat_count(mesh):
-        return np.zeros(splat_count(mesh), np.bool_)
-    if attribute.data_type not in {"BOOLEAN", "FLOAT"}:
-        return np.zeros(splat_count(mesh), np.bool_)
+    attribute, count = mesh.attributes.get(name), splat_count(mesh)
+    fits = attribute and attribute.domain == "POINT" and len(attribute.data) == count
+    if not fits or attribute.data_type not in {"BOOLEAN", "FLOAT"}:
+        return np.zeros(count, np.bool_)
     return np.asarray(mesh_attributes.read_attribute(mesh, name) > 0)

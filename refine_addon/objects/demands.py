@@ -161,43 +161,32 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
         If it is neither, or cannot be evaluated. Whether a mesh is closed is found out when it is
         used.
     """
-    label = f"object '{obj.name}'"
-    depsgraph = bpy.context.evaluated_depsgraph_get()
+    label, graph = f"object '{obj.name}'", bpy.context.evaluated_depsgraph_get()
+    make: Callable[[], Volume]
     if obj.type == "MESH":
-        volume = _mesh_volume(obj, label, depsgraph)
+        local, triangles = _surface(obj, graph)
+        vertices = moved(local, world_matrix(obj, graph))
+        key, make = _digest(vertices, triangles), partial(Solid, vertices, triangles)
     elif _is_shape(obj):
-        volume = _empty_volume(obj, label, depsgraph)
+        kind, size, matrix = (
+            obj.empty_display_type,
+            obj.empty_display_size,
+            world_matrix(obj, graph),
+        )
+        ball, box = Sphere((0.0, 0.0, 0.0), size), Box((-size,) * 3, (size,) * 3)
+        key = _digest(repr((kind, size)).encode(), matrix)
+        make = partial(MovedVolume, ball if kind == "SPHERE" else box, matrix)
     else:
-        kind = f"of type {obj.type}"
+        what = f"of type {obj.type}"
         if obj.type == "EMPTY":
-            kind = f"an empty shown as {obj.empty_display_type.replace('_', ' ').lower()}"
-        raise RefineError(f"{label}: is {kind}, {UNFIT}")
-    return Zone(role, label, volume, idle)
+            what = f"an empty shown as {obj.empty_display_type.replace('_', ' ').lower()}"
+        raise RefineError(f"{label}: is {what}, {UNFIT}")
+    return Zone(role, label, _CachedVolume(label, key, make), idle)
 
 
 def _is_shape(obj: bpy.types.Object) -> bool:
     """Tell whether an object is an empty that is drawn as a volume."""
     return obj.type == "EMPTY" and obj.empty_display_type in {"CUBE", "SPHERE"}
-
-
-def _empty_volume(
-    obj: bpy.types.Object, label: str, depsgraph: bpy.types.Depsgraph
-) -> _CachedVolume:
-    matrix, size = world_matrix(obj, depsgraph), obj.empty_display_size
-    shape: Volume = Box((-size,) * 3, (size,) * 3)
-    if obj.empty_display_type == "SPHERE":
-        shape = Sphere((0.0, 0.0, 0.0), size)
-    key = _digest(repr((obj.empty_display_type, size)).encode(), matrix.tobytes())
-    return _CachedVolume(label, key, partial(MovedVolume, shape, matrix))
-
-
-def _mesh_volume(
-    obj: bpy.types.Object, label: str, depsgraph: bpy.types.Depsgraph
-) -> _CachedVolume:
-    local, triangles = _surface(obj, depsgraph)
-    vertices = moved(local, world_matrix(obj, depsgraph))
-    key = _digest(vertices.tobytes(), triangles.tobytes())
-    return _CachedVolume(label, key, partial(Solid, vertices, triangles))
 
 
 def mark(checked: SplatObject, forced: Forced) -> None:
@@ -221,8 +210,8 @@ def mark(checked: SplatObject, forced: Forced) -> None:
     if forced.facts or forced.protected is not None or removed is not None:
         volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]
         _record(mesh, {**forced.counts(), "volumes": volumes})
-    elif FACTS in mesh:
-        del mesh[FACTS]
+    else:
+        mesh.pop(FACTS, None)
 
 
 def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced]:
@@ -303,7 +292,7 @@ class _CachedVolume:
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which points, (N, 3), lie inside, (N,); nobody may change it."""
-        key = _digest(self.key, np.ascontiguousarray(points))
+        key = _digest(self.key, points)
         if key not in _masks:
             try:
                 mask = self.make().inside(points)
@@ -318,5 +307,5 @@ class _CachedVolume:
 def _digest(*parts: Any) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
     for part in parts:
-        digest.update(part)
+        digest.update(part if isinstance(part, bytes) else np.ascontiguousarray(part))
     return digest.digest()

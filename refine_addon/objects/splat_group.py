@@ -9,7 +9,7 @@ scene as it was.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, replace
 from typing import Any, NamedTuple
@@ -97,7 +97,7 @@ def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
     RefineError
         See `mesh.layout.check`; also if two of them share their data.
     """
-    group = [_checked(obj, active) for obj in chosen(layer, active.obj)]
+    group = [active if o == active.obj else mesh_layout.check(o) for o in chosen(layer, active.obj)]
     owners: dict[bpy.types.Mesh, str] = {}
     for member in group:
         other = owners.setdefault(member.mesh, member.obj.name)
@@ -108,28 +108,6 @@ def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
                 "or select only one"
             )
     return group
-
-
-def active_first(layer: bpy.types.ViewLayer, active: SplatObject | None) -> Members:
-    """The objects of `members`, the active one first; none without it."""
-    if active is None:
-        return []
-    return sorted(members(layer, active), key=lambda member: member.obj != active.obj)
-
-
-def uids_of(group: Members) -> tuple[int, ...]:
-    """The numbers by which Blender knows the objects in this session; names may change."""
-    return tuple(member.obj.session_uid for member in group)
-
-
-def by_uids(uids: tuple[int, ...], known: SplatObject) -> Members:
-    """The objects again, in that order; see `mesh.layout.check`. One is known already."""
-    objects = {obj.session_uid: obj for obj in bpy.data.objects}
-    return [_checked(objects.get(uid), known) for uid in uids]
-
-
-def _checked(obj: bpy.types.Object | None, known: SplatObject) -> SplatObject:
-    return known if obj == known.obj else mesh_layout.check(obj)
 
 
 def forced(scene: bpy.types.Scene, group: Members) -> Forced:
@@ -161,25 +139,22 @@ def _as_one(each: Sequence[Forced], group: Members) -> Forced:
     masks = []
     for name in ("protected", "removed"):
         parts = [getattr(one, name) for one in each]
-        filled = [
-            np.zeros(len(member), np.bool_) if part is None else part
-            for member, part in zip(group, parts, strict=True)
-        ]
+        none = [np.zeros(len(member), np.bool_) for member in group]
+        filled = [a if part is None else part for a, part in zip(none, parts, strict=True)]
         masks.append(None if all(part is None for part in parts) else np.concatenate(filled))
     return Forced(*masks)
 
 
-def rows_of(counts: Sequence[int]) -> list[slice]:
+def _rows(counts: Iterable[int]) -> list[slice]:
     """Which of all splats are those of each object, of which each has so many."""
-    ends = np.cumsum(counts).tolist()
+    ends = np.cumsum(list(counts)).tolist()
     return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def parts_of(mask: NDArray[np.bool_] | None, group: Members) -> list[NDArray[np.bool_]]:
     """What a mask of all objects' splats, (N,), says of each object's; None marks none."""
-    counts = [len(member) for member in group]
-    whole = np.zeros(sum(counts), np.bool_) if mask is None else mask
-    return [whole[rows] for rows in rows_of(counts)]
+    whole = np.zeros(sum(map(len, group)), np.bool_) if mask is None else mask
+    return [whole[rows] for rows in _rows(map(len, group))]
 
 
 def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splats:
@@ -229,11 +204,10 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
     names = [m.name for m in obj.modifiers if m.show_viewport and not m.name.startswith(drawing)]
     if not names:
         return []
-    note = (
+    return [
         f"object '{obj.name}': scored as without its modifiers ({', '.join(names)}); apply them "
         "first if they move splats"
-    )
-    return [note]
+    ]
 
 
 def drift_notes(checked: SplatObject) -> list[str]:
@@ -260,27 +234,20 @@ def store(
         Of each object.
     """
     _check_counts(group, len(scores.values))
-    ranks, scoring = rank(scores.values), uuid.uuid4().hex
+    ranks, scoring, all_scored = rank(scores.values), uuid.uuid4().hex, scores.scored is None
     protected = parts_of(facts.pop("protected", None), group)
-    rows_of_each = rows_of([len(member) for member in group])
-    for member, origin, rows, mask in zip(group, origins, rows_of_each, protected, strict=True):
+    each = zip(group, origins, _rows(map(len, group)), protected, strict=True)
+    for member, origin, rows, mask in each:
         own, together = scores, None
         if len(group) > 1:
-            own = _scores_of_rows(scores, rows)
+            values, seen = scores.values[rows], scores.seen[rows]
+            scored = np.ones(len(values), np.bool_) if all_scored else scores.scored[rows]
+            undrawable = int(np.count_nonzero((values == 0.0) & scored))
+            own = replace(scores, values=values, seen=seen, undrawable=undrawable, scored=scored)
             together = (scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
             member, own, method, origin=origin, protected=mask, together=together, **facts
         )
-
-
-def _scores_of_rows(scores: Scores, rows: slice) -> Scores:
-    """The scores of one object of those that were scored together."""
-    values = scores.values[rows]
-    scored = np.ones(len(values), np.bool_) if scores.scored is None else scores.scored[rows]
-    undrawable = int(np.count_nonzero((values == 0.0) & scored))
-    return replace(
-        scores, values=values, seen=scores.seen[rows], undrawable=undrawable, scored=scored
-    )
 
 
 def stored_arguments(
@@ -379,7 +346,7 @@ def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
         What was decided of all of them.
     """
     found, first, merged = [], 0, result.merged
-    for frame, rows in zip(frames, rows_of([frame.count for frame in frames]), strict=True):
+    for frame, rows in zip(frames, _rows(frame.count for frame in frames), strict=True):
         keep = result.keep[rows]
         start, first = first, first + int(np.count_nonzero(keep))
         if merged is None:
@@ -448,8 +415,7 @@ def reduce_object(checked: SplatObject, change: Change) -> None:
     if change.columns:
         mesh_drift.renew(checked.mesh)
     mesh_floaters.forget(checked.mesh)
-    if mesh_scores.RECORD in checked.mesh:
-        del checked.mesh[mesh_scores.RECORD]
+    checked.mesh.pop(mesh_scores.RECORD, None)
 
 
 def _check_counts(group: Sequence[SplatObject], count: int) -> None:

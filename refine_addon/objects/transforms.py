@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from ..cameras.objects import snapped, world_matrix
 from ..core.affine import Move, baked, check_affine, is_flat, is_uniform, moved
 from ..core.errors import RefineError
-from ..core.execute import Progress, chunks, report, run_all, silent
+from ..core.execute import Progress, chunks, run_all, silent
 from ..core.formats.ply_columns import values_by_name
 from ..core.splats import Splats, above_constant, refuse_mixed
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
-from ..mesh import heat_map
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
@@ -36,29 +35,11 @@ _NORMALS = ("nx", "ny", "nz")
 _ROWS = 1 << 14
 """Splats that are moved at a time, on one thread."""
 
-_UNMOVED = {
-    "location": (0.0, 0.0, 0.0),
-    "rotation_euler": (0.0, 0.0, 0.0),
-    "rotation_quaternion": (1.0, 0.0, 0.0, 0.0),
-    "rotation_axis_angle": (0.0, 0.0, 1.0, 0.0),
-    "scale": (1.0, 1.0, 1.0),
-    "delta_location": (0.0, 0.0, 0.0),
-    "delta_rotation_euler": (0.0, 0.0, 0.0),
-    "delta_rotation_quaternion": (1.0, 0.0, 0.0, 0.0),
-    "delta_scale": (1.0, 1.0, 1.0),
-}
-"""Properties of an object that make its transform, without one."""
-
-_OF_ALL = (
-    mesh_scores.SCORE,
-    mesh_scores.RANK,
-    mesh_scores.SEEN,
-    mesh_scores.SCORED,
-    heat_map.HEAT,
-    mesh_edit.REMOVE,
-    mesh_edit.FORCE,
+_TRANSFORM = (
+    *("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale"),
+    *("delta_location", "delta_rotation_euler", "delta_rotation_quaternion", "delta_scale"),
 )
-"""Attributes that say something of a splat among all others of its scene."""
+"""Properties of an object that make its transform."""
 
 
 def read_to_move(
@@ -175,11 +156,10 @@ def uneven_notes(checked: SplatObject, matrix: NDArray[np.float64]) -> list[str]
     """Return a sentence if colours cannot follow a matrix, (4, 4), exactly."""
     if is_uniform(matrix) or not mesh_layout.sh_degree(checked.mesh):
         return []
-    note = (
+    return [
         f"object '{checked.obj.name}': the scale is uneven, which harmonics cannot follow exactly: "
         "colours that change with the direction became the nearest"
-    )
-    return [note]
+    ]
 
 
 def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) -> None:
@@ -263,8 +243,8 @@ def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
     bpy.context.view_layer.update()
     before = obj.matrix_world.copy()
     place = obj.matrix_basis.translation.copy()
-    for name, value in _UNMOVED.items():
-        setattr(obj, name, value)
+    for name in _TRANSFORM:
+        setattr(obj, name, obj.bl_rna.properties[name].default_array)
     if not location:
         obj.location = place
     bpy.context.view_layer.update()
@@ -297,11 +277,7 @@ def read_to_join(group: Sequence[SplatObject]) -> Callable[[Progress], Joined]:
     ]
 
     def work(progress: Progress) -> Joined:
-        columns = []
-        for number, part in enumerate(parts):
-            report(progress, number / len(parts), "")
-            columns.append(part()[0])
-        return Joined(matrices, columns)
+        return Joined(matrices, run_all(lambda p: p()[0], parts, progress=progress, threads=1))
 
     return work
 
@@ -393,12 +369,10 @@ def _copied(member: SplatObject, bench: bpy.types.Collection, rest: int) -> bpy.
     """A mesh object with a copy of an object's splats, with so many harmonics, without scores."""
     obj = bpy.data.objects.new("REFINE join", member.mesh.copy())
     bench.objects.link(obj)
-    for name in _OF_ALL:
-        mesh_attributes.remove_attribute(obj.data, name)
+    mesh_scores.forget(mesh_layout.check(obj))
     mesh_floaters.forget(obj.data)
-    for record in (mesh_scores.RECORD, demands.FACTS):
-        if record in obj.data:
-            del obj.data[record]
+    mesh_attributes.remove_attribute(obj.data, mesh_edit.FORCE)
+    obj.data.pop(demands.FACTS, None)
     for index in range(mesh_layout.rest_count(obj.data), rest):
         obj.data.attributes.new(f"f_rest_{index}", "FLOAT", "POINT")
     bpy.context.view_layer.update()

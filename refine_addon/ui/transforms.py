@@ -72,8 +72,8 @@ class REFINE_OT_join(Job, OnSplats, bpy.types.Operator):
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
         """The selected objects, the active one first, and what moves their splats."""
-        active = mesh_layout.check(context.object)
-        group = splat_group.active_first(context.view_layer, active)
+        group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
+        group.sort(key=lambda member: member.obj != context.object)
         return group, transforms.read_to_join(group)
 
     @staticmethod
