@@ -80,12 +80,12 @@ class CameraChoice:
         context.view_layer.update()  # or the list of objects holds gaps where some were removed
         cameras = [_active_camera(scene)] if self.source == "ACTIVE" else self.cameras(context)
         if not cameras:
-            where = f"none is visible in scene '{scene.name}'"
-            if self.source == "SELECTED":
-                where = "none is selected"
-            elif self.source == "COLLECTION":
-                where = f"none is in collection '{self.collection.name}'"
-            raise RefineError(f"no cameras: {where}; scoring needs at least one")
+            where = {"SELECTED": "selected", "VISIBLE": f"visible in scene '{scene.name}'"}
+            if self.collection:
+                where["COLLECTION"] = f"in collection '{self.collection.name}'"
+            raise RefineError(
+                f"no cameras: none is {where[self.source]}; scoring needs at least one"
+            )
         depsgraph = context.evaluated_depsgraph_get()
         views = tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras)
         return ViewSet(views, turn=_turn(cameras, views, splats, depsgraph))

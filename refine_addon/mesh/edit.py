@@ -138,8 +138,8 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         )
 
 
-def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
-    """Mark splats, (N,), as what goes, for all previews.
+def mark(obj: bpy.types.Object, name: str, values: NDArray[Any], *, even_none: bool = True) -> None:
+    """Mark splats by a point attribute of that name, (N,) bool or int32, and no others.
 
     Raises
     ------
@@ -147,8 +147,19 @@ def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         See `check_writable`.
     """
     check_writable(obj)
-    mesh_attributes.write_attribute(obj.data, REMOVE, "BOOLEAN", remove)
+    if even_none or values.any():
+        kind = "BOOLEAN" if values.dtype == np.bool_ else "INT"
+        mesh_attributes.write_attribute(obj.data, name, kind, values)
+    elif name in obj.data.attributes:
+        mesh_attributes.remove_attribute(obj.data, name)
+    else:
+        return
     mesh_attributes.updated(obj.data)
+
+
+def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
+    """Mark splats, (N,), as what goes, for all previews; see `mark`."""
+    mark(obj, REMOVE, remove)
 
 
 def mark_forced(
@@ -156,25 +167,12 @@ def mark_forced(
     protected: NDArray[np.bool_] | None,
     removed: NDArray[np.bool_] | None,
 ) -> None:
-    """Mark, for the 3D views, what stays and what goes in any case: (N,) each, or None.
-
-    Raises
-    ------
-    RefineError
-        See `check_writable`.
-    """
-    check_writable(obj)
+    """Mark, for the 3D views, what stays and what goes in any case: (N,) each, or None."""
     force = np.zeros(splat_count(obj.data), np.int32)
     for number, mask in ((2, removed), (1, protected)):
         if mask is not None:
             force[mask] = number
-    if force.any():
-        mesh_attributes.write_attribute(obj.data, FORCE, "INT", force)
-    elif FORCE in obj.data.attributes:
-        mesh_attributes.remove_attribute(obj.data, FORCE)
-    else:
-        return
-    mesh_attributes.updated(obj.data)
+    mark(obj, FORCE, force, even_none=False)
 
 
 def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
@@ -213,13 +211,10 @@ def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     if name in obj.vertex_groups:
         return group_weights(obj, name) > 0.0
     what = f" ('{name}' is {attribute.data_type} on {attribute.domain})" if attribute else ""
-    expected = "a boolean or float attribute on points"
-    if obj.type == "POINTCLOUD":
-        expected += " (a point cloud has no vertex groups)"
-    else:
-        expected = f"a vertex group, or {expected}"
+    no_groups = " (a point cloud has no vertex groups)" if obj.type == "POINTCLOUD" else ""
     raise RefineError(
-        f"object '{obj.name}': nothing to protect is named '{name}'{what}; expected {expected}"
+        f"object '{obj.name}': nothing to protect is named '{name}'{what}; expected a vertex "
+        f"group, or a boolean or float attribute on points{no_groups}"
     )
 
 
@@ -232,19 +227,8 @@ def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
 
 
 def mark_by_hand(obj: bpy.types.Object, marked: NDArray[np.bool_], name: str = PROTECT) -> None:
-    """Mark the splats of `marked`, (N,), with `PROTECT` or `MUST_GO`, and no others.
-
-    Raises
-    ------
-    RefineError
-        See `check_writable`.
-    """
-    check_writable(obj)
-    mesh = obj.data
-    mesh_attributes.remove_attribute(mesh, name)  # it may be of another type
-    if marked.any():
-        mesh_attributes.write_attribute(mesh, name, "BOOLEAN", marked)
-    mesh_attributes.updated(mesh)
+    """Mark the splats of `marked`, (N,), with `PROTECT` or `MUST_GO`, and no others."""
+    mark(obj, name, marked, even_none=False)
 
 
 def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
@@ -268,10 +252,8 @@ def _tree(kind: str, name: str, data_type: str, target: str) -> tuple[Any, bpy.t
     tree = bpy.data.node_groups.new("REFINE", "GeometryNodeTree")
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
-    start, node, read, end = map(
-        tree.nodes.new,
-        ("NodeGroupInput", kind, "GeometryNodeInputNamedAttribute", "NodeGroupOutput"),
-    )
+    kinds = ("NodeGroupInput", kind, "GeometryNodeInputNamedAttribute", "NodeGroupOutput")
+    start, node, read, end = map(tree.nodes.new, kinds)
     node.domain, read.data_type = "POINT", data_type
     if hasattr(node, "data_type"):
         node.data_type = data_type

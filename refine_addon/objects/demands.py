@@ -168,11 +168,8 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
         vertices = moved(local, world_matrix(obj, graph))
         key, make = _digest(vertices, triangles), partial(Solid, vertices, triangles)
     elif _is_shape(obj):
-        kind, size, matrix = (
-            obj.empty_display_type,
-            obj.empty_display_size,
-            world_matrix(obj, graph),
-        )
+        kind, size = obj.empty_display_type, obj.empty_display_size
+        matrix = world_matrix(obj, graph)
         ball, box = Sphere((0.0, 0.0, 0.0), size), Box((-size,) * 3, (size,) * 3)
         key = _digest(repr((kind, size)).encode(), matrix)
         make = partial(MovedVolume, ball if kind == "SPHERE" else box, matrix)
