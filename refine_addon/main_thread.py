@@ -7,11 +7,9 @@ import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from typing import Any, TypeVar
+from typing import Any
 
 from .core.execute import Cancelled, checkpoint
-
-Answer = TypeVar("Answer")
 
 _STEP = 0.1
 """Seconds after which waiting work asks again whether it was cancelled."""
@@ -19,7 +17,7 @@ _STEP = 0.1
 _asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
 
 
-def call(function: Callable[[], Answer]) -> Answer:
+def call(function: Callable[[], Any]) -> Any:
     """Have the main thread call a function, and return what it returns.
 
     Called on the main thread, it does so at once; on another, it waits until `serve` has done it.
@@ -33,7 +31,7 @@ def call(function: Callable[[], Answer]) -> Answer:
     """
     if threading.current_thread() is threading.main_thread():
         return function()
-    answer: Future[Answer] = Future()
+    answer: Future[Any] = Future()
     _asked.put((function, answer))
     while not wait([answer], _STEP).done:
         try:

@@ -53,27 +53,6 @@ def select(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
     _store(obj, wanted & ~away, away)
 
 
-def change(obj: bpy.types.Object, before: NDArray[np.bool_], wanted: NDArray[np.bool_]) -> None:
-    """Select as `select` does, (N,) bool, given what is selected: in edit mode far quicker.
-
-    None of the splats that are wanted may be hidden.
-
-    Raises
-    ------
-    RefineError
-        If the object belongs to a library.
-    """
-    if not _in_edit_mode(obj):
-        select(obj, wanted)
-        return
-    check_writable(obj)
-    vertices = bmesh.from_edit_mesh(obj.data).verts
-    vertices.ensure_lookup_table()
-    for row in np.flatnonzero(before != wanted).tolist():
-        vertices[row].select = bool(wanted[row])
-    bmesh.update_edit_mesh(obj.data, loop_triangles=False, destructive=False)
-
-
 def hide(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
     """Hide splats, (N,) bool, and no others; what is hidden is selected no more.
 
@@ -99,12 +78,11 @@ def _store(
     mesh = obj.data
     if _in_edit_mode(obj):
         vertices = bmesh.from_edit_mesh(mesh).verts
-        pairs = zip(wanted.tolist(), out_of_sight.tolist(), strict=True)
-        for vertex, (chosen, away) in zip(vertices, pairs, strict=True):
-            if vertex.hide != away:
-                vertex.hide_set(away)
-            if vertex.select != chosen:
-                vertex.select = chosen
+        vertices.ensure_lookup_table()
+        for row in np.flatnonzero(hidden(obj) != out_of_sight).tolist():
+            vertices[row].hide_set(bool(out_of_sight[row]))
+        for row in np.flatnonzero(selected(obj) != wanted).tolist():
+            vertices[row].select = bool(wanted[row])
         bmesh.update_edit_mesh(mesh, loop_triangles=False, destructive=False)
         return
     for name, flags in ((name_of(mesh), wanted), (HIDDEN, out_of_sight)):

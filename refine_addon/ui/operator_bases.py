@@ -116,8 +116,8 @@ class AtOnce:
 class Job:
     """An operator that works beside the window, with a bar to watch and a key to cancel.
 
-    It is three functions and a name. Meanwhile events go on to the rest of the window, but for
-    undo and save. Before anything is written to an object, it is compared with what it was.
+    It is three functions and a name. Meanwhile all events but Esc go on to the rest of the window.
+    Before anything is written to an object, it is compared with what it was.
 
     Attributes
     ----------
@@ -181,13 +181,9 @@ class Job:
             return {"CANCELLED"}
         if event.type == "TIMER":
             return self._looked(context, now)
-        if event.type == "ESC" and event.value == "PRESS":
-            now.worker.cancel()
-        elif why := running.refused(event):
-            self.report({"WARNING"}, why)
-            now.refuse(context, why)
-        else:
+        if event.type != "ESC" or event.value != "PRESS":
             return {"PASS_THROUGH"}
+        now.worker.cancel()
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
@@ -206,16 +202,14 @@ class Job:
             result, group = now.worker.result(), now.unchanged()
             self._over(context, now)
             self.put(context, group, now.job, result)
-        except Cancelled:
+        except BaseException as error:
             self._over(context, now)
+            if isinstance(error, FAILURES):
+                return fail(self, error)
+            if not isinstance(error, Cancelled):
+                raise
             self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
             return {"CANCELLED"}
-        except FAILURES as error:
-            self._over(context, now)
-            return fail(self, error)
-        except BaseException:
-            self._over(context, now)
-            raise
         return {"FINISHED"}
 
     def _over(self, context: bpy.types.Context, now: Running) -> None:

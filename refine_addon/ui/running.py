@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,20 +17,6 @@ from .worker import Worker
 
 _STEP = 0.05
 """Seconds between two events of the timer, at each of which the thread is looked at."""
-
-_UNDO, _SAVE = "Undo", "Save"
-_WAIT = {
-    "ed.undo": _UNDO,
-    "ed.redo": "Redo",
-    "ed.undo_history": _UNDO,
-    "wm.save_mainfile": _SAVE,
-    "wm.save_as_mainfile": _SAVE,
-}
-"""What waits until the work is over, by the names of Blender's operators."""
-
-
-_LONG = 5.0
-"""Seconds for which a refusal stays in the status bar."""
 
 
 class Target(NamedTuple):
@@ -72,7 +57,7 @@ class Running:
         self.operator, self.doing = type(operator).bl_idname, operator.doing
         self.job, self.waits = job, ""
         self._offers, self._targets = operator.offers, [Target.of(each) for each in group]
-        self._said, self._left, self._told = ("", 0.0), TimeLeft(), ""
+        self._left, self._told = TimeLeft(), ""
         self.worker = Worker(partial(operator.compute, job))
         self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
         _now[:] = [self]
@@ -138,15 +123,9 @@ class Running:
         what = f" ({self.worker.what})" if self.worker.what else ""
         return f"{self.doing}{what}; Esc {self.at_escape}"
 
-    def refuse(self, context: bpy.types.Context, why: str) -> None:
-        """Say in the status bar for `_LONG` why something has to wait."""
-        self._said = why, time.monotonic() + _LONG
-        self.tell(context)
-
     def tell(self, context: bpy.types.Context) -> None:
         """Say in status bar and panels how far it is, if there is news."""
-        said, until = self._said
-        text = said if time.monotonic() < until else f"{self.sentence}: {self.share}"
+        text = f"{self.sentence}: {self.share}"
         if text != self._told:
             self._told = text
             context.workspace.status_text_set(text)
@@ -158,8 +137,9 @@ class Running:
         if self in _now:
             _now.clear()
         context.window_manager.event_timer_remove(self._timer)
-        for workspace in bpy.data.workspaces:  # work goes on where another one is chosen meanwhile
-            workspace.status_text_set(None)
+        if not bpy.app.background:
+            # Not at once: a window that is being closed ends Blender where it is drawn.
+            bpy.app.timers.register(_clear_bars, first_interval=0.0)
         redraw_panels(context)
 
 
@@ -179,25 +159,12 @@ def refusal() -> str:
     return f"{running.doing}: wait until it is over, or press Esc, which {running.at_escape}"
 
 
-def refused(event: bpy.types.Event) -> str:
-    """Return why a key does not do what it usually does, "" where it does."""
-    running = now()
-    if running is None or event.value != "PRESS":
-        return ""
-    for keymap in bpy.context.window_manager.keyconfigs.user.keymaps:
-        for item in keymap.keymap_items:
-            if item.idname in _WAIT and _is(event, item):
-                return f"{_WAIT[item.idname]} waits: {refusal()}"
-    return ""
-
-
-def _is(event: bpy.types.Event, item: bpy.types.KeyMapItem) -> bool:
-    """Tell whether an event is what a line of a key map names."""
-    if not item.active or item.type != event.type or item.value not in {"PRESS", "ANY"}:
-        return False
-    held = ("ctrl", "shift", "alt", "oskey")
-    wanted = ((getattr(item, key), getattr(event, key)) for key in held)
-    return item.any or all(want in {-1, int(have)} for want, have in wanted)
+def _clear_bars() -> None:
+    """Clear the status bars of all workspaces: another may have been chosen meanwhile."""
+    for window in bpy.context.window_manager.windows if now() is None else ():
+        for workspace in bpy.data.workspaces:
+            with bpy.context.temp_override(window=window, workspace=workspace):
+                workspace.status_text_set(None)
 
 
 def redraw_panels(context: bpy.types.Context) -> None:
@@ -212,9 +179,7 @@ def redraw_panels(context: bpy.types.Context) -> None:
 
 
 def register() -> None:
-    """Say in the menus what waits, and end the work where another file is loaded."""
-    bpy.types.TOPBAR_MT_edit.prepend(_draw_edit)
-    bpy.types.TOPBAR_MT_file.prepend(_draw_file)
+    """End the work where another file is loaded."""
     bpy.app.handlers.load_pre.append(_end)
 
 
@@ -225,8 +190,6 @@ def unregister() -> None:
         _end()
         running.over(bpy.context)
     bpy.app.handlers.load_pre.remove(_end)
-    bpy.types.TOPBAR_MT_file.remove(_draw_file)
-    bpy.types.TOPBAR_MT_edit.remove(_draw_edit)
 
 
 @persistent
@@ -235,19 +198,3 @@ def _end(*_arguments: object) -> None:
     if (running := now()) is not None:
         _now.clear()
         running.worker.end()
-
-
-def _draw_edit(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
-    """Switch off the menu with *Undo*, and say why."""
-    if why := refusal():
-        menu.layout.label(text=why, icon="TIME")
-        menu.layout.separator()
-        menu.layout.enabled = False
-
-
-def _draw_file(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
-    """Say above *Save* what it would leave out."""
-    if (running := now()) is not None:
-        text = f"{running.doing}: what is saved now is without it"
-        menu.layout.label(text=text, icon="TIME")
-        menu.layout.separator()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import bpy
 import gpu
-import numpy as np
 from bpy.props import EnumProperty
+from bpy.types import Context
 from gpu_extras.batch import batch_for_shader
 
 from ..core.picking import Mode
@@ -16,7 +15,7 @@ from ..mesh import selection
 from . import selecting
 from .operator_bases import FAILURES, Answer, Needing, fail, idle, on_splats
 from .panel_cache import cached
-from .selecting import How, Stroke
+from .selecting import Stroke, circle
 
 SHAPES = (
     ("BRUSH", "Brush", "Take the splats that a round brush covers"),
@@ -30,13 +29,7 @@ MODES = (
     ("SET", "Set", "Select these splats and no others", "SELECT_SET", 0),
     ("ADD", "Add", "Select these splats as well (Shift)", "SELECT_EXTEND", 1),
     ("SUBTRACT", "Subtract", "Select these splats no more (Ctrl)", "SELECT_SUBTRACT", 2),
-    (
-        "INTERSECT",
-        "Intersect",
-        "Of the selected splats leave these alone (Shift Ctrl)",
-        "SELECT_INTERSECT",
-        3,
-    ),
+    ("INTERSECT", "Intersect", "Select what both hold (Shift Ctrl)", "SELECT_INTERSECT", 3),
 )
 
 _KEYS: dict[Mode, dict[str, bool]] = {
@@ -49,11 +42,8 @@ _KEYS: dict[Mode, dict[str, bool]] = {
 _STEP = 0.03
 """Seconds between two looks at whether the thread knows what the view shows."""
 
-_LESS, _MORE = 1 / 1.2, 1.2
-"""Factors of the brush's radius at a key."""
 
-
-def _in_view(context: bpy.types.Context) -> str:
+def _in_view(context: Context) -> str:
     """Return that a 3D view is needed, "" in one."""
     return "" if context.region_data else "Select over a 3D view"
 
@@ -70,24 +60,22 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
     mode: EnumProperty(name="Mode", description="What becomes of those taken", items=MODES)
 
     _stroke: Stroke | None = None
-    _stop: Callable[[], None] | None = None
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+    def invoke(self, context: Context, event: bpy.types.Event) -> Answer:
         """Begin a stroke."""
-        settings = context.scene.refine
-        how = How(
-            self.shape, self.mode, settings.select_hidden,
-            settings.select_radius, settings.select_tolerance,
-        )  # fmt: skip
         try:
-            self._stroke = Stroke.begin(context, how, _place(context, event))
+            self._stroke = Stroke(context, self.shape, self.mode, _place(context, event))
         except FAILURES as error:
             return fail(self, error)
-        self._stop = _watched(context, self._stroke)
-        context.window_manager.modal_handler_add(self)
+        manager, arguments = context.window_manager, (self._stroke, context.region.as_pointer())
+        self._timer = manager.event_timer_add(_STEP, window=context.window)
+        self._drawn = bpy.types.SpaceView3D.draw_handler_add(
+            _draw, arguments, "WINDOW", "POST_PIXEL"
+        )
+        manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+    def modal(self, context: Context, event: bpy.types.Event) -> Answer:
         """Follow the mouse until the button is released and it is known what the view shows."""
         stroke = self._stroke
         if stroke is None or event.type in {"ESC", "RIGHTMOUSE"}:
@@ -96,7 +84,7 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
             stroke.path.append(_place(context, event))
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
             stroke.released = True
-        elif event.type != "TIMER" or (stroke.known and not stroke.released):
+        elif event.type != "TIMER" or (stroke.selected is not None and not stroke.released):
             return {"RUNNING_MODAL"}
         try:
             known = stroke.follow()
@@ -110,99 +98,53 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
             return fail(self, error)
         return {"RUNNING_MODAL"}
 
-    def cancel(self, context: bpy.types.Context) -> None:
+    def cancel(self, context: Context) -> None:
         """End where Blender ends the operator: its window is closed, or its file."""
         self._over(context, kept=False)
 
-    def _over(self, context: bpy.types.Context, *, kept: bool) -> Answer:
-        stroke, self._stroke = self._stroke, None
-        stop, self._stop = self._stop, None
-        if stop is not None:
-            stop()
+    def _over(self, context: Context, *, kept: bool) -> Answer:
         if context.area is not None:
             context.area.header_text_set(None)
             context.area.tag_redraw()
-        if stroke is not None and kept:
-            selecting.keep(stroke)
-            return {"FINISHED"}
-        if stroke is not None:
-            selecting.stop(stroke)
-        return {"CANCELLED"}
+        stroke, self._stroke = self._stroke, None
+        if stroke is None:
+            return {"CANCELLED"}
+        context.window_manager.event_timer_remove(self._timer)
+        bpy.types.SpaceView3D.draw_handler_remove(self._drawn, "WINDOW")
+        stroke.end(kept=kept)
+        return {"FINISHED"} if kept else {"CANCELLED"}
 
 
-def _place(context: bpy.types.Context, event: bpy.types.Event) -> tuple[float, float]:
+def _place(context: Context, event: bpy.types.Event) -> tuple[float, float]:
     """Return where the mouse is, from the upper left of the region, pixels."""
     below = context.region.height - 1 - event.mouse_region_y
     return event.mouse_region_x + 0.5, below + 0.5
 
 
-def _watched(context: bpy.types.Context, stroke: Stroke) -> Callable[[], None]:
-    """Draw a stroke's outline and have timer events come; return what ends both."""
-    space, manager, region = bpy.types.SpaceView3D, context.window_manager, context.region
-    timer = manager.event_timer_add(_STEP, window=context.window)
-    handle = space.draw_handler_add(_draw, (stroke, region.as_pointer()), "WINDOW", "POST_PIXEL")
-
-    def stop() -> None:
-        manager.event_timer_remove(timer)
-        space.draw_handler_remove(handle, "WINDOW")
-
-    return stop
-
-
 def _draw(stroke: Stroke, region: int) -> None:
-    """Draw a stroke's outline into its view: black beside white, to be seen on both."""
-    if bpy.context.region.as_pointer() != region:
-        return
-    height = bpy.context.region.height
-    for shift, shade in ((1.0, 0.0), (0.0, 1.0)):
-        line = [(x + shift, height - y - shift) for x, y in stroke.outline()]
-        _line(line, shade)
+    """Draw a stroke's outline into its view."""
+    if bpy.context.region.as_pointer() == region:
+        height = bpy.context.region.height
+        _line([(x, height - y) for x, y in stroke.outline()])
 
 
-def _line(places: list[tuple[float, float]], shade: float) -> None:
-    if not places:
-        return
+def _line(places: list[tuple[float, float]]) -> None:
+    """Draw a line, black beside white, to be seen on both."""
     program = gpu.shader.from_builtin("UNIFORM_COLOR")
-    program.uniform_float("color", (shade, shade, shade, 1.0))
-    batch_for_shader(program, "LINE_STRIP", {"pos": places}).draw(program)
-
-
-class REFINE_OT_brush_radius(bpy.types.Operator):
-    """Make the brush that selects splats smaller or larger"""
-
-    bl_idname = "refine.brush_radius"
-    bl_label = "Brush Radius"
-    bl_options = {"INTERNAL"}
-
-    larger: bpy.props.BoolProperty(name="Larger", description="Rather than smaller")
-
-    def execute(self, context: bpy.types.Context) -> Answer:
-        """Change it."""
-        context.scene.refine.select_radius *= _MORE if self.larger else _LESS
-        if context.area is not None:
-            context.area.tag_redraw()
-        return {"FINISHED"}
-
-
-def _strokes(shape: str) -> tuple[Any, ...]:
-    """Return the mouse of a tool: with Shift it adds, with Ctrl it subtracts."""
-    return tuple(
-        (
-            "refine.select_stroke",
-            {"type": "LEFTMOUSE", "value": "PRESS", **keys},
-            {"properties": [("shape", shape), ("mode", mode)]},
-        )
-        for mode, keys in _KEYS.items()
-    )
+    for shift, shade in ((1.0, 0.0), (0.0, 1.0)) if places else ():
+        beside = [(x + shift, y - shift) for x, y in places]
+        program.uniform_float("color", (shade, shade, shade, 1.0))
+        batch_for_shader(program, "LINE_STRIP", {"pos": beside}).draw(program)
 
 
 def _key(name: str, kind: str, *values: tuple[str, Any], **held: bool) -> tuple[Any, ...]:
     return (name, {"type": kind, "value": "PRESS", **held}, {"properties": [*values]})
 
 
+_RADIUS = ("data_path", "scene.refine.select_radius")
 _BRUSH_KEYS = (
-    _key("refine.brush_radius", "LEFT_BRACKET", ("larger", False)),
-    _key("refine.brush_radius", "RIGHT_BRACKET", ("larger", True)),
+    _key("wm.context_scale_float", "LEFT_BRACKET", _RADIUS, ("value", 1 / 1.2)),
+    _key("wm.context_scale_float", "RIGHT_BRACKET", _RADIUS, ("value", 1.2)),
 )
 
 _OBJECT_KEYS = (
@@ -228,7 +170,7 @@ _ICONS = {
 
 
 def _draw_settings(
-    context: bpy.types.Context, layout: bpy.types.UILayout, tool: bpy.types.WorkSpaceTool
+    context: Context, layout: bpy.types.UILayout, tool: bpy.types.WorkSpaceTool
 ) -> None:
     settings = context.scene.refine
     if tool.idname.endswith("brush"):
@@ -240,24 +182,22 @@ def _draw_settings(
         layout.label(text=f"{selected_count(context):,} selected")
 
 
-def selected_count(context: bpy.types.Context) -> int:
+def selected_count(context: Context) -> int:
     """Return how many splats of the active object are selected."""
     return cached("selected", context, lambda: selection.count(context.object))
 
 
-def _draw_brush(
-    context: bpy.types.Context, _tool: bpy.types.WorkSpaceTool, place: tuple[int, int]
-) -> None:
-    turns = np.linspace(0.0, 2.0 * np.pi, 49)
-    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1) * context.scene.refine.select_radius
-    for shift, shade in ((1.0, 0.0), (0.0, 1.0)):
-        _line((circle + place + (shift, -shift)).tolist(), shade)
+def _draw_brush(context: Context, _tool: bpy.types.WorkSpaceTool, place: tuple[int, int]) -> None:
+    _line(circle(place, context.scene.refine.select_radius))
 
 
 def _tool(shape: str, mode: str) -> type[bpy.types.WorkSpaceTool]:
     """Return the tool of a shape in a mode of Blender."""
     label, text = next((label, text) for name, label, text in SHAPES if name == shape)
-    keys = _strokes(shape)
+    keys = tuple(
+        _key("refine.select_stroke", "LEFTMOUSE", ("shape", shape), ("mode", mode), **held)
+        for mode, held in _KEYS.items()
+    )
     keys += _BRUSH_KEYS if shape == "BRUSH" else ()
     keys += _OBJECT_KEYS if mode == "OBJECT" else ()
     body: dict[str, Any] = {
@@ -295,4 +235,4 @@ def unregister() -> None:
     selecting.forget()
 
 
-CLASSES = (REFINE_OT_select_stroke, REFINE_OT_brush_radius)
+CLASSES = (REFINE_OT_select_stroke,)

@@ -6,18 +6,19 @@ from the same place finds it there. Until it is known the way of the mouse is re
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from dataclasses import replace
 
-import bpy
 import numpy as np
+from bpy.types import Context
 from numpy.typing import NDArray
 
 from ..cameras.objects import world_matrix
 from ..core import picking
 from ..core.affine import transformed
 from ..core.execute import Progress
-from ..core.picking import Mode, Prepared, Sight, Surface
+from ..core.picking import Prepared, Sight, Surface
 from ..core.splats import Splats
 from ..core.views import pinhole
 from ..mesh import attributes as mesh_attributes
@@ -32,41 +33,8 @@ LEAST_SIDE = 2
 """Pixels: a box or a lasso that is narrower was a click, which takes nothing."""
 
 
-@dataclass(frozen=True)
-class How:
-    """How a stroke takes splats.
-
-    Attributes
-    ----------
-    shape : {"BRUSH", "LASSO", "BOX", "SPHERE", "COLOR"}
-    mode : str
-        See `picking.Mode`.
-    hidden : bool
-        Whether it takes what other splats hide too.
-    radius : float
-        Of the brush, pixels.
-    tolerance : float
-        Of the colour, 0 to 1.
-    """
-
-    shape: str
-    mode: Mode
-    hidden: bool
-    radius: float
-    tolerance: float
-
-
-class _Kept(NamedTuple):
-    """What a stroke saw, and of what: splats are prepared once, and looked at once a view."""
-
-    splats: object
-    prepared: Prepared
-    view: object
-    sight: Sight
-
-
-_kept: list[_Kept] = []
-"""Of the last stroke."""
+_kept: dict[object, Prepared | Sight] = {}
+"""Of the last stroke: splats are prepared once, and looked at once a view."""
 
 
 def forget() -> None:
@@ -74,31 +42,8 @@ def forget() -> None:
     _kept.clear()
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """What a thread needs to look."""
-
-    splats: object
-    view: object
-    selected: NDArray[np.bool_]
-    source: Splats | Prepared | Sight
-    matrix: NDArray[np.float64]
-    camera: tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, int]]
-
-    def __call__(self, _progress: Progress) -> _Kept:
-        """Return what the view shows."""
-        source = self.source
-        if isinstance(source, Splats):
-            world = transformed(source, self.matrix, rotate_sh=False)
-            source = picking.prepare(world, pinhole(*self.camera, world.means))
-        if isinstance(source, Prepared):
-            view = pinhole(*self.camera, source.splats.means)
-            source = picking.look(source, view)
-        return _Kept(self.splats, source.prepared, self.view, source)
-
-
-def _job(context: bpy.types.Context) -> _Job:
-    """Read the active object and the view."""
+def _read(context: Context) -> tuple[NDArray[np.bool_], Callable[[Progress], dict]]:
+    """Which splats are selected, (N,), and what a thread calls to see what `_kept` is to hold."""
     obj, region, eye = context.object, context.region, context.region_data
     matrix = world_matrix(obj, context.evaluated_depsgraph_get())
     camera = (
@@ -111,14 +56,18 @@ def _job(context: bpy.types.Context) -> _Job:
         digest = mesh_attributes.digest(checked)
         splats = (obj.data.session_uid, digest, matrix.tobytes(), away.tobytes())
         view = (splats, camera[0].tobytes(), camera[1].tobytes(), camera[2])
-        kept = _kept[0] if _kept else None
-        source: Splats | Prepared | Sight
-        if kept is not None and kept.splats == splats:
-            source = kept.sight if kept.view == view else kept.prepared
-        else:
-            _kept.clear()
-            source = _drawn(checked, away)
-    return _Job(splats, view, selected, source, matrix, camera)
+        source = _kept.get(view) or _kept.get(splats) or _drawn(checked, away)
+
+    def look(_progress: Progress) -> dict[object, Prepared | Sight]:
+        seen = source
+        if isinstance(seen, Splats):
+            world = transformed(seen, matrix, rotate_sh=False)
+            seen = picking.prepare(world, pinhole(*camera, world.means))
+        if isinstance(seen, Prepared):
+            seen = picking.look(seen, pinhole(*camera, seen.splats.means))
+        return {splats: seen.prepared, view: seen}
+
+    return selected, look
 
 
 def _drawn(checked: SplatObject, away: NDArray[np.bool_]) -> Splats:
@@ -137,51 +86,41 @@ def _not_drawn(checked: SplatObject) -> NDArray[np.bool_]:
     return away
 
 
-@dataclass(eq=False)
 class Stroke:
-    """One stroke of a tool over a view.
+    """One stroke of a tool over a view, begun where the button was pressed.
 
     Attributes
     ----------
-    obj : bpy.types.Object
-    how : How
+    shape, mode : str
+        See `select_tools.SHAPES` and `picking.Mode`.
     path : list of (float, float)
         Where the mouse was: column and row of the region from its upper left, pixels.
+    released : bool
+        Whether the button is.
     before : (N,) bool
         What was selected.
     selected : (N,) bool or None
         What is to be, as far as it is known.
+
+    Raises
+    ------
+    RefineError
+        If the object cannot be read.
     """
 
-    obj: bpy.types.Object
-    how: How
-    path: list[tuple[float, float]]
-    before: NDArray[np.bool_]
-    size: tuple[int, int]
-    worker: Worker
-    released: bool = False
-    selected: NDArray[np.bool_] | None = None
-    _sight: Sight | None = None
-    _surface: Surface | None = None
-    _area: NDArray[np.bool_] | None = None
-    _painted: int = 0
-
-    @classmethod
-    def begin(cls, context: bpy.types.Context, how: How, at: tuple[float, float]) -> Stroke:
-        """Begin where the button was pressed.
-
-        Raises
-        ------
-        RefineError
-            See `_job`.
-        """
-        job, obj = _job(context), context.object
-        return cls(obj, how, [at], job.selected, job.camera[2], Worker(job))
-
-    @property
-    def known(self) -> bool:
-        """Whether it is known what the view shows."""
-        return self._sight is not None
+    def __init__(
+        self, context: Context, shape: str, mode: picking.Mode, at: tuple[float, float]
+    ) -> None:
+        settings, region = context.scene.refine, context.region
+        self.obj, self.shape, self.mode, self.path = context.object, shape, mode, [at]
+        self._hidden, self._tolerance = settings.select_hidden, settings.select_tolerance
+        self._brush, self._painted = settings.select_radius, 0
+        self._area = np.zeros((region.height, region.width), np.bool_)
+        self.released, self.selected = False, None
+        self._sight: Sight | None = None
+        self._surface: Surface | None = None
+        self.before, look = _read(context)
+        self._worker = Worker(look)
 
     def follow(self) -> bool:
         """Take what the stroke covers by now; tell whether that is known.
@@ -192,81 +131,66 @@ class Stroke:
             What the thread raised.
         """
         if self._sight is None:
-            if self.worker.running():
+            if self._worker.running():
                 return False
-            _kept[:] = [self.worker.result()]
-            self._sight = _kept[0].sight
-        taken = self._taken(self._sight)
-        self.selected = picking.combined(self.before, taken, self.how.mode)
+            _kept.clear()
+            _kept.update(self._worker.result())
+            self._sight = list(_kept.values())[-1]
+        self.selected = picking.combined(self.before, self._taken(self._sight), self.mode)
         viewport_draw.select(self.obj.data.session_uid, self.selected)
         return True
 
     def sentence(self) -> str:
-        """Return how many splats are to be selected."""
+        """How many splats are to be selected."""
         chosen = self.before if self.selected is None else self.selected
         return f"{int(np.count_nonzero(chosen)):,} of {len(chosen):,} splats selected"
 
-    def radius(self) -> float:
-        """Return how far the mouse is from where it was pressed, pixels."""
-        (x, y), (u, v) = self.path[0], self.path[-1]
-        return float(np.hypot(u - x, v - y))
-
     def outline(self) -> list[tuple[float, float]]:
-        """Return the corners of what is drawn over the view, closed; columns and rows."""
+        """Corners of what is drawn over the view, closed; columns and rows."""
         (x, y), (u, v) = self.path[0], self.path[-1]
-        if self.how.shape == "LASSO":
-            return [*self.path, self.path[0]]
-        if self.how.shape == "BOX":
-            return [(x, y), (u, y), (u, v), (x, v), (x, y)]
-        if self.how.shape == "COLOR":
-            return []
-        ball = self.how.shape == "SPHERE"
-        radius = self.radius() if ball else self.how.radius
-        turns = np.linspace(0.0, 2.0 * np.pi, 49)
-        middle = self.path[0] if ball else self.path[-1]
-        circle = np.stack([np.cos(turns), np.sin(turns)], axis=1) * radius + middle
-        return [(float(a), float(b)) for a, b in circle]
+        if self.shape == "SPHERE":
+            return circle((x, y), math.hypot(u - x, v - y))
+        if self.shape == "BRUSH":
+            return circle((u, v), self._brush)
+        if self.shape == "LASSO":
+            return [*self.path, (x, y)]
+        return [(x, y), (u, y), (u, v), (x, v), (x, y)] if self.shape == "BOX" else []
+
+    def end(self, *, kept: bool) -> None:
+        """Select what the stroke covers, or show the selection as it was before."""
+        if not kept or self.selected is None:
+            self._worker.cancel()
+            viewport_draw.select(self.obj.data.session_uid, self.before)
+            return
+        selection.select(self.obj, self.selected)
+        if viewport_draw.mode() == "OFF" and self.obj.mode != "EDIT":
+            viewport_draw.show("SCENE")  # or nobody would see it
 
     def _taken(self, seen: Sight) -> NDArray[np.bool_]:
-        """Return which splats the stroke covers, (N,)."""
-        hidden, shape = self.how.hidden, self.how.shape
-        if shape in {"SPHERE", "COLOR"}:
-            return self._from_surface(seen)
-        width, height = self.size
-        if shape == "BRUSH":
-            if self._area is None:
-                self._area = np.zeros((height, width), np.bool_)
+        """Which splats the stroke covers, (N,)."""
+        (x, y), (u, v) = self.path[0], self.path[-1]
+        if self.shape == "BRUSH":
             for place in range(self._painted, len(self.path)):
                 ends = self.path[max(place - 1, 0)], self.path[place]
-                picking.paint(self._area, *ends, self.how.radius)
+                picking.paint(self._area, *ends, self._brush)
             self._painted = len(self.path)
-            return seen.in_area(self._area, hidden=hidden)
-        corners = self.outline()[:-1]
-        if np.ptp(corners, axis=0).max() < LEAST_SIDE:
+            return seen.in_area(self._area, hidden=self._hidden)
+        if self.shape in {"LASSO", "BOX"}:
+            corners = self.outline()[:-1]
+            if np.ptp(corners, axis=0).max() < LEAST_SIDE:
+                return np.zeros(len(self.before), np.bool_)
+            area = picking.polygon(corners, *self._area.shape[::-1])
+            return seen.in_area(area, hidden=self._hidden)
+        surface = self._surface = self._surface or seen.surface(int(x), int(y))
+        if surface is None:
             return np.zeros(len(self.before), np.bool_)
-        return seen.in_area(picking.polygon(corners, width, height), hidden=hidden)
-
-    def _from_surface(self, seen: Sight) -> NDArray[np.bool_]:
-        """Return which splats lie around what was pressed, or have its colour, (N,)."""
-        column, row = (int(number) for number in self.path[0])
-        self._surface = self._surface or seen.surface(column, row)
-        if self._surface is None:
-            return np.zeros(len(self.before), np.bool_)
-        if self.how.shape == "COLOR":
-            return seen.of_color(self._surface.color, self.how.tolerance, hidden=self.how.hidden)
-        radius = self.radius() / self._surface.scale
-        return seen.in_ball(self._surface.place, radius, hidden=self.how.hidden)
+        if self.shape == "COLOR":
+            return seen.of_color(surface.color, self._tolerance, hidden=self._hidden)
+        radius = math.hypot(u - x, v - y) / surface.scale
+        return seen.in_ball(surface.place, radius, hidden=self._hidden)
 
 
-def stop(stroke: Stroke) -> None:
-    """Show the selection as it was before a stroke."""
-    stroke.worker.cancel()
-    viewport_draw.select(stroke.obj.data.session_uid, stroke.before)
-
-
-def keep(stroke: Stroke) -> None:
-    """Select what a stroke covers, which is known."""
-    if stroke.selected is not None:
-        selection.change(stroke.obj, stroke.before, stroke.selected)
-    if viewport_draw.mode() == "OFF" and stroke.obj.mode != "EDIT":
-        viewport_draw.show("SCENE")  # or nobody would see it
+def circle(middle: tuple[float, float], radius: float) -> list[tuple[float, float]]:
+    """Corners of a circle, closed."""
+    turns = np.linspace(0.0, 2.0 * np.pi, 49)
+    return (np.stack([np.cos(turns), np.sin(turns)], axis=1) * radius + middle).tolist()

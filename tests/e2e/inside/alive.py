@@ -55,8 +55,7 @@ def main(blend: str, cloud: str, pictures: str) -> Generator[float, None, dict[s
     yield from hand.click("refine.score(")
     yield from window.until(gate.held, "it is held back")
     found |= yield from meanwhile(hand, gate, blend)
-    yield from window.picture(pictures, "alive-1-refused")
-    yield from menu(hand, pictures)
+    yield from window.picture(pictures, "alive-1-meanwhile")
     begun = time.monotonic()
     yield from hand.press("ESC")
     yield from window.until(gate.idle, "it is cancelled")
@@ -91,7 +90,7 @@ def main(blend: str, cloud: str, pictures: str) -> Generator[float, None, dict[s
 
 
 def meanwhile(hand: window.Hand, gate: Gate, blend: str) -> Generator[float, None, dict[str, Any]]:
-    """Do while splats are scored what the window is to allow, and what it is to refuse."""
+    """Do while splats are scored what the window is to allow."""
     view, draws = hand.area.spaces.active.region_3d, Draws()
     for _ in range(STRETCHES):  # at first the view is still drawn for what came before
         draws.clear()
@@ -101,9 +100,13 @@ def meanwhile(hand: window.Hand, gate: Gate, blend: str) -> Generator[float, Non
     drawn = draws.stop()
     turned, far = view.view_rotation.copy(), view.view_distance
     yield from orbit(hand)
-    saved, noted = Path(blend).stat().st_mtime_ns, record()
+    saved = Path(blend).stat().st_mtime_ns
     yield from hand.undo()
+    yield 0.5
+    undone = record()
     yield from hand.press("Z", ctrl=True, shift=True)
+    yield 0.5
+    redone = record()
     yield from hand.press("S", ctrl=True)
     yield 0.5
     return {
@@ -111,7 +114,7 @@ def meanwhile(hand: window.Hand, gate: Gate, blend: str) -> Generator[float, Non
         "orbited": view.view_rotation.rotation_difference(turned).angle,
         "zoomed": view.view_distance / far,
         "saved": Path(blend).stat().st_mtime_ns != saved,
-        "undone": record() != noted,
+        "undone": [undone, redone],
         "apply": bpy.ops.refine.apply.poll(),
         "still": gate.held(),
     }
@@ -128,16 +131,6 @@ def orbit(hand: window.Hand) -> Generator[float, None, None]:
     yield 0.3
     hand.window.event_simulate(type="WHEELUPMOUSE", value="PRESS", **hand.at)
     yield 0.5
-
-
-def menu(hand: window.Hand, pictures: str) -> Generator[float, None, None]:
-    """Show the menu *Edit*, and close it."""
-    region = next(region for region in hand.area.regions if region.type == "WINDOW")
-    with bpy.context.temp_override(window=hand.window, area=hand.area, region=region):
-        bpy.ops.wm.call_menu(name="TOPBAR_MT_edit")
-    yield from window.picture(pictures, "alive-1-menu")
-    yield from hand.press("ESC")
-    yield from hand.move(hand.area.x + 50, hand.area.y + 50)
 
 
 def load(blend: str) -> Generator[float, None, None]:
