@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .cleaning.search import connected
 from .execute import Progress, silent
 from .merging.graph import nearest
 from .splats import Splats
@@ -47,6 +48,9 @@ Mode = Literal["SET", "ADD", "SUBTRACT", "INTERSECT"]
 
 NEIGHBOURS = 8
 """So many nearest splats are the neighbours by which a selection grows and shrinks."""
+
+GAP = 4.0
+"""How many times as far as most neighbours are, others may be and still hang together."""
 
 
 class Surface(NamedTuple):
@@ -320,6 +324,33 @@ def grown(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray
 def shrunk(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """A selection, (N,), without the splats that have a neighbour outside it."""
     return ~grown(neighbours, ~selected)
+
+
+def piece(
+    means: NDArray[Any], chosen: NDArray[np.bool_], place: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Those of the chosen splats, (N,), that hang together with the one nearest to a place.
+
+    Two of them do if they are neighbours among the chosen and no farther apart than `GAP`.
+
+    Parameters
+    ----------
+    means : (N, 3)
+    chosen : (N,) bool
+    place : (3,) float64
+    """
+    rows = np.flatnonzero(chosen)
+    if not len(rows):
+        return chosen
+    places = np.asarray(means[rows], np.float64)
+    near = neighbours_of(places)
+    lengths = np.linalg.norm(places[near] - places[:, None], axis=2)
+    one, link = np.nonzero(lengths <= GAP * np.median(lengths)) if near.size else (rows[:0],) * 2
+    parts = connected(len(rows), one, near[one, link].astype(np.int64))
+    first = np.argmin(np.linalg.norm(places - place, axis=1))
+    held = np.zeros_like(chosen)
+    held[rows[parts == parts[first]]] = True
+    return held
 
 
 def neighbours_of(means: NDArray[Any], *, progress: Progress = silent) -> NDArray[np.int32]:

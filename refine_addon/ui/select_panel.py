@@ -47,6 +47,9 @@ class SelectSettings:
         min=0.0,
         max=1.0,
     )
+    select_connected: BoolProperty(
+        name="Connected", description="Take the colour only where it hangs together with the mouse"
+    )
     select_mode: EnumProperty(
         name="Mode", description="What becomes of the splats that a button takes", items=MODES
     )

@@ -177,6 +177,7 @@ def _draw_settings(
         layout.prop(settings, "select_radius")
     if tool.idname.endswith("color"):
         layout.prop(settings, "select_tolerance")
+        layout.prop(settings, "select_connected")
     layout.prop(settings, "select_hidden")
     if not on_splats(context):
         layout.label(text=f"{selected_count(context):,} selected")

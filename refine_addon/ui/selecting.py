@@ -114,7 +114,8 @@ class Stroke:
         settings, region = context.scene.refine, context.region
         self.obj, self.shape, self.mode, self.path = context.object, shape, mode, [at]
         self._hidden, self._tolerance = settings.select_hidden, settings.select_tolerance
-        self._brush, self._painted = settings.select_radius, 0
+        self._connected, self._brush = settings.select_connected, settings.select_radius
+        self._painted = 0
         self._area = np.zeros((region.height, region.width), np.bool_)
         self.released, self.selected = False, None
         self._sight: Sight | None = None
@@ -136,7 +137,8 @@ class Stroke:
             _kept.clear()
             _kept.update(self._worker.result())
             self._sight = list(_kept.values())[-1]
-        self.selected = picking.combined(self.before, self._taken(self._sight), self.mode)
+        if self.selected is None or self.shape != "COLOR":
+            self.selected = picking.combined(self.before, self._taken(self._sight), self.mode)
         viewport_draw.select(self.obj.data.session_uid, self.selected)
         return True
 
@@ -185,7 +187,10 @@ class Stroke:
         if surface is None:
             return np.zeros(len(self.before), np.bool_)
         if self.shape == "COLOR":
-            return seen.of_color(surface.color, self._tolerance, hidden=self._hidden)
+            taken = seen.of_color(surface.color, self._tolerance, hidden=self._hidden)
+            if self._connected:
+                taken = picking.piece(seen.prepared.splats.means, taken, surface.place)
+            return taken
         radius = math.hypot(u - x, v - y) / surface.scale
         return seen.in_ball(surface.place, radius, hidden=self._hidden)
 

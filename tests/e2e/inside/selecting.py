@@ -93,7 +93,9 @@ def shapes(hand: Tools, box: np.ndarray, show: Show) -> Generator[float, None, d
     found["intersected is both"] = bool((mask() == (box & brush)).all())
     found["sphere"] = yield from hand.drag("sphere", (0.5, 0.5), (0.6, 0.5))
     found["color"] = yield from hand.drag("color", (0.5, 0.5), (0.5, 0.5))
-
+    bpy.context.scene.refine.select_connected = True
+    found["piece"] = yield from hand.drag("color", (0.5, 0.5), (0.5, 0.5))
+    yield from show.picture("select-4-piece")
     return found
 
 
