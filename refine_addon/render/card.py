@@ -73,15 +73,12 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
 
         def between(number: int) -> NDArray[np.float64]:
             """Splats between two walls, (4, H, W), colours times alpha, the top row first."""
-            numbers = np.zeros(24, np.float32)
-            numbers[:16] = projection.T.reshape(-1)
-            numbers[16:20] = view.width, view.height, view.near, 1.0
-            numbers[20:23] = 1.0, number < len(walls), number > 0
+            numbers = (view.width, view.height, view.near, 1.0)
+            numbers += (True, number < len(walls), number > 0)
             ends = {"near_depths": walls[number - 1]} if number else {}
             ends |= {"depths": walls[number]} if walls[number:] else {}
             picture = gpu.types.GPUTexture((view.width, view.height), format="RGBA32F")
-            frame = gpu.types.GPUFrameBuffer(color_slots=picture)
-            shader.blend(frame, {**given, **ends}, numbers, len(order))
+            frame = shader.blend(picture, {**given, **ends}, projection, numbers, len(order))
             values = gpu.types.Buffer("FLOAT", view.width * view.height * 4)
             frame.read_color(0, 0, view.width, view.height, 4, 0, "FLOAT", data=values)
             pixels = np.frombuffer(memoryview(values), np.float32)

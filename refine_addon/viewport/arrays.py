@@ -78,7 +78,7 @@ class Packed:
     model: Model = "default"
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Tell how many there are."""
         return len(self.means)
 
 
@@ -100,7 +100,7 @@ class Eye(NamedTuple):
 
 
 def pack(splats: Splats) -> Packed:
-    """Return what is drawn of splats."""
+    """What is drawn of splats."""
     opacities = opacity(splats.opacity_logits).astype(np.float32)  # (N,)
     shown = drawable(splats) & (opacities >= ALPHA_CUT)
     vertices = np.flatnonzero(shown).astype(np.int32)
@@ -120,25 +120,25 @@ def pack(splats: Splats) -> Packed:
 
 
 def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> NDArray[np.int32]:
-    """Return the splats in the order in which fewer of them are chosen, (M,).
+    """Splats in the order in which fewer of them are chosen, (M,).
 
     Parameters
     ----------
     packed : Packed
-    ranks : (N,) floating, optional
-        Of the scores of all vertices: the highest first. Without them, opacity times the sum of
+    ranks : (M,) floating, optional
+        Of their scores: the highest first. Without them, opacity times the sum of
         squared standard deviations: about the area that is seen.
     """
     if ranks is None:
         sizes = packed.covariances[:, 0] + packed.covariances[:, 3] + packed.covariances[:, 5]
         worth = packed.opacities * sizes
     else:
-        worth = np.nan_to_num(ranks[packed.vertices])
+        worth = np.nan_to_num(ranks)
     return np.argsort(-worth, kind="stable").astype(np.int32)
 
 
 def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
-    """Return display-referred colours with opacity, (M, 4).
+    """Display-referred colours with opacity, (M, 4).
 
     Parameters
     ----------
@@ -160,17 +160,16 @@ def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
 
 
 def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the colour of each rank in 0..1 with opacity, (M, 4).
+    """Colour of each rank in 0..1 with opacity, (M, 4).
 
     Parameters
     ----------
     packed : Packed
-    ranks : (N,) floating
-        Of all vertices of the mesh.
+    ranks : (M,) floating
     ramp : (C, 3) float64
         Colours from rank 0 to 1.
     """
-    index = np.nan_to_num(ranks[packed.vertices]) * (len(ramp) - 1) + 0.5
+    index = np.nan_to_num(ranks) * (len(ramp) - 1) + 0.5
     rgba = np.empty((len(packed), 4), np.float32)
     rgba[:, :3] = ramp[np.clip(index, 0, len(ramp) - 1).astype(np.int64)]
     rgba[:, 3] = packed.opacities
@@ -180,14 +179,14 @@ def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDAr
 def tinted(
     rgba: NDArray[np.float32], tint: tuple[float, float, float], share: float
 ) -> NDArray[np.float32]:
-    """Return colours, (M, 4), of which a share is the tint."""
+    """Colours, (M, 4), of which a share is the tint."""
     mixed = rgba.copy()
     mixed[:, :3] = (1.0 - share) * np.clip(rgba[:, :3], 0.0, 1.0) + share * np.array(tint)
     return mixed
 
 
 def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> NDArray[np.float32]:
-    """Return colours, (M, 4), with those of what stays and goes in any case, (M,), tinted."""
+    """Colours, (M, 4), with those of what stays and goes in any case, (M,), tinted."""
     if force is None or mode not in SHARES:
         return rgba
     mixed = rgba.copy()
@@ -200,7 +199,7 @@ def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> 
 def in_front(
     means: NDArray[np.float32], eye: Eye, near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return which means, (M, 3), lie behind the near plane of a view, (V,), and their depths."""
+    """Tell which means, (M, 3), lie behind the near plane of a view, (V,), and their depths."""
     with np.errstate(over="ignore", invalid="ignore"):
         depths = means @ eye.row[:3].astype(np.float32) + np.float32(eye.row[3])
     shown = np.flatnonzero((depths > near) & (depths < np.inf))
@@ -208,7 +207,7 @@ def in_front(
 
 
 def farthest_first(depths: NDArray[np.float32], *, perspective: bool) -> NDArray[np.int64]:
-    """Return the order of depths, the largest first; nearly equal ones keep their order.
+    """Order of depths, the largest first; nearly equal ones keep their order.
 
     Depths are rounded to 16 bits, for which NumPy has a radix sort, 8 times as fast as its sort of
     float32. In perspective their logarithms are rounded, to steps of some 1e-4 of the depth.
@@ -234,7 +233,7 @@ def farthest_first(depths: NDArray[np.float32], *, perspective: bool) -> NDArray
 
 
 def as_texture(values: NDArray[Any]) -> NDArray[np.float32]:
-    """Return values, (M,) or (M, C), as rows of `WIDTH` texels: (R, WIDTH * C) float32.
+    """Values, (M,) or (M, C), as rows of `WIDTH` texels: (R, WIDTH * C) float32.
 
     The last row is filled with zeros; there is at least one.
     """
@@ -246,7 +245,7 @@ def as_texture(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def first_of_each(counts: list[int], most: int) -> list[int]:
-    """Return how many splats of each object are drawn if `most` are in all: equal shares."""
+    """Tell how many splats of each object are drawn if `most` are in all: equal shares."""
     total = sum(counts)
     if total <= most:
         return list(counts)
@@ -254,14 +253,14 @@ def first_of_each(counts: list[int], most: int) -> list[int]:
 
 
 def _half(values: NDArray[Any]) -> NDArray[Any]:
-    """Return finite values, those beyond the range of float16 as its ends."""
+    """Finite values, those beyond the range of float16 as its ends."""
     if values.size and max(values.max(), -values.min()) > _LARGEST_HALF:
         return np.clip(values, -_LARGEST_HALF, _LARGEST_HALF)
     return values
 
 
 def _directions(means: NDArray[np.float32], eye: Eye) -> NDArray[np.float32]:
-    """Return unit vectors from the eye to the means, (M, 3)."""
+    """Unit vectors from the eye to the means, (M, 3)."""
     if not eye.perspective:
         toward = eye.place / np.linalg.norm(eye.place)
         return np.broadcast_to(toward.astype(np.float32), means.shape)

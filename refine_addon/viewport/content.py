@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import gpu
@@ -20,9 +20,19 @@ from ..mesh import scores as mesh_scores
 from ..mesh import selection as mesh_selection
 from ..mesh.edit_mode import readable
 from ..mesh.layout import SplatObject, check, sh_degree
-from . import background, points, shader
+from . import shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
-from .placing import Placing
+from .placing import Placing, is_edited
+
+
+class Marks(NamedTuple):
+    """What a mesh says of its splats, each one value a splat, or None."""
+
+    ranks: NDArray[Any] | None = None
+    going: NDArray[Any] | None = None
+    forced: NDArray[Any] | None = None
+    selected: NDArray[Any] | None = None
+    hidden: NDArray[Any] | None = None
 
 
 @dataclass(eq=False)
@@ -37,43 +47,31 @@ class MeshSplats:
         While the M drawable splats are packed.
     packed : Packed or None
         Once they are.
-    ranks : (N,) floating or None
-        Of the scores of all vertices, by which `important` was made.
+    read : Marks
+        Of all N vertices, as they were last read.
+    marks : Marks
+        Of the packed splats: ranks of the scores, what the plan removes, what stays and what goes
+        in any case, what is selected, what is hidden.
     important : (M,) int32 or None
         The packed splats, the ones that matter most first.
-    going : (M,) bool or None
-        What the plan removes.
     degree : int
         Of the harmonics.
     scored, marked : int
-        Rise where `ranks` and `forced` have changed.
-    forced : (M,) int32 or None
-        What stays and what goes in any case.
-    marks : tuple of int
-        Which of `arrays.MARKS` are in `forced`.
-    selected, hidden : (M,) bool or None
-    read_remove, read_ranks, read_force, read_selected, read_hidden : (N,) or None
-        Attributes of the mesh as they were last read.
+        Rise where ranks, and what stays and goes in any case, have changed.
+    kinds : tuple of int
+        Which of `arrays.MARKS` there are.
     """
 
     signature: tuple[Any, ...] = ()
     future: Future[Packed] | None = None
     packed: Packed | None = None
-    ranks: NDArray[Any] | None = None
+    read: Marks = field(default_factory=Marks)
+    marks: Marks = field(default_factory=Marks)
     important: NDArray[np.int32] | None = None
-    going: NDArray[np.bool_] | None = None
     degree: int = 0
     scored: int = 0
-    forced: NDArray[np.int32] | None = None
     marked: int = 0
-    marks: tuple[int, ...] = ()
-    selected: NDArray[np.bool_] | None = None
-    hidden: NDArray[np.bool_] | None = None
-    read_selected: NDArray[np.bool_] | None = field(default=None, repr=False)
-    read_hidden: NDArray[np.bool_] | None = field(default=None, repr=False)
-    read_remove: NDArray[np.bool_] | None = field(default=None, repr=False)
-    read_ranks: NDArray[Any] | None = field(default=None, repr=False)
-    read_force: NDArray[np.int32] | None = field(default=None, repr=False)
+    kinds: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +83,11 @@ class Slot:
     number: int
     start: int
     count: int
+
+    @property
+    def rows(self) -> slice:
+        """Rows of the textures."""
+        return slice(self.start, self.start + self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +104,9 @@ class Atlas:
     """
 
     slots: dict[tuple[int, int], Slot]
-    means: gpu.types.GPUTexture
-    covariances: gpu.types.GPUTexture
-    more_covariances: gpu.types.GPUTexture
+    means: gpu.types.GPUTexture | None
+    covariances: gpu.types.GPUTexture | None
+    more_covariances: gpu.types.GPUTexture | None
 
     @property
     def rows(self) -> int:
@@ -116,7 +119,9 @@ class Content:
 
     Attributes
     ----------
-    atlas : Atlas or None
+    pool : ThreadPoolExecutor
+        One thread for what takes longer than a frame: arrays only.
+    atlas : Atlas
     refused : set of int
         Identities of meshes that look like splats at first sight alone.
     changes : int
@@ -126,7 +131,8 @@ class Content:
     """
 
     def __init__(self) -> None:
-        self.atlas: Atlas | None = None
+        self.pool = ThreadPoolExecutor(1, "refine-view")
+        self.atlas = Atlas({}, None, None, None)
         self.changes = self.selections = 0
         self._selection: tuple[object, gpu.types.GPUTexture] | None = None
         self._held: dict[int, MeshSplats] = {}
@@ -139,27 +145,25 @@ class Content:
         self.refused.difference_update(list(self.refused) if mesh is None else [mesh])
 
     def marks(self) -> set[int]:
-        """Return which of `arrays.MARKS` there are among the splats that are drawn."""
-        slots = self.atlas.slots.values() if self.atlas else ()
-        return {mark for slot in slots for mark in slot.held.marks}
+        """Tell which of `arrays.MARKS` there are among the splats that are drawn."""
+        return {mark for slot in self.atlas.slots.values() for mark in slot.held.kinds}
 
     def select(self, mesh: int, chosen: NDArray[np.bool_]) -> None:
         """Show splats of a mesh, (N,), as selected, whatever it says, until it changes."""
         held = self._held.get(mesh)
         if held is not None and held.packed is not None and held.signature[0] == len(chosen):
-            held.read_selected = chosen
-            self._mark_selected(held)
+            held.read = held.read._replace(selected=chosen)
+            held.marks = held.marks._replace(selected=chosen[held.packed.vertices])
+            self.selections += 1
 
     def selection(self) -> gpu.types.GPUTexture:
-        """Return a texel for each row of the atlas: 1 where the splat is selected, else 0."""
+        """A texel for each row of the atlas: 1 where the splat is selected, else 0."""
         key = (self.atlas, self.selections)
         if self._selection is None or self._selection[0] != key:
-            slots = self.atlas.slots.values() if self.atlas else ()
-            flags = np.zeros(sum(slot.count for slot in slots), np.float32)
-            for slot in slots:
-                if slot.held.selected is not None:
-                    rows = slice(slot.start, slot.start + slot.count)
-                    flags[rows] = slot.held.selected[: slot.count]
+            flags = np.zeros(self.atlas.rows, np.float32)
+            for slot in self.atlas.slots.values():
+                if slot.held.marks.selected is not None:
+                    flags[slot.rows] = slot.held.marks.selected[: slot.count]
             self._selection = key, shader.texture(as_texture(flags), 1, "R8")
         return self._selection[1]
 
@@ -197,7 +201,7 @@ class Content:
             mesh = key[1]
             if mesh in self.refused:
                 continue
-            if points.is_edited(obj):
+            if is_edited(obj):
                 if mesh not in self._held:
                     continue  # `read_edited` is to come
             elif mesh not in self._held or mesh in self._stale:
@@ -229,51 +233,44 @@ class Content:
         mesh = checked.mesh
         held = self._held.setdefault(uid, MeshSplats())
         held.degree = sh_degree(mesh)
-        held.read_ranks = _attribute(mesh, mesh_scores.RANK, "FLOAT")
-        held.read_remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
-        held.read_force = _attribute(mesh, mesh_edit.FORCE, "INT")
-        held.read_selected = _attribute(mesh, mesh_selection.name_of(mesh), "BOOLEAN")
-        held.read_hidden = _attribute(mesh, mesh_selection.HIDDEN, "BOOLEAN")
+        held.read = Marks(
+            _attribute(mesh, mesh_scores.RANK, "FLOAT"),
+            _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN"),
+            _attribute(mesh, mesh_edit.FORCE, "INT"),
+            _attribute(mesh, mesh_selection.name_of(mesh), "BOOLEAN"),
+            _attribute(mesh, mesh_selection.HIDDEN, "BOOLEAN"),
+        )
         signature = (len(checked), held.degree, mesh_attributes.digest(checked))
         if signature != held.signature:
             held.signature = signature
-            held.future = background.start(pack, mesh_attributes.splats_from_object(checked))
+            held.future = self.pool.submit(pack, mesh_attributes.splats_from_object(checked))
         elif held.future is None:
             self._mark(held)
 
     def _mark(self, held: MeshSplats) -> None:
         """Note which of the splats that are drawn matter, and which the plan removes."""
-        packed = held.packed
+        packed, before = held.packed, held.marks
         if packed is None:
             return
-        held.going = None if held.read_remove is None else held.read_remove[packed.vertices]
-        held.hidden = None if held.read_hidden is None else held.read_hidden[packed.vertices]
-        self._mark_selected(held)
-        forced = None if held.read_force is None else held.read_force[packed.vertices]
-        if not same(held.forced, forced):
-            held.forced = forced
+        held.marks = marks = Marks(
+            *(None if values is None else values[packed.vertices] for values in held.read)
+        )
+        self.selections += not same(before.selected, marks.selected)
+        if not same(before.forced, marks.forced):
             held.marked += 1
-            held.marks = tuple(mark for mark in MARKS if forced is not None and mark in forced)
-        if not same(held.ranks, held.read_ranks):
-            held.ranks, held.important = held.read_ranks, None
+            held.kinds = tuple(k for k in MARKS if marks.forced is not None and k in marks.forced)
+        if not same(before.ranks, marks.ranks):
             held.scored += 1
+            held.important = None
         if held.important is None:
-            held.important = most_important_first(packed, held.ranks)
+            held.important = most_important_first(packed, marks.ranks)
         self.changes += 1
-
-    def _mark_selected(self, held: MeshSplats) -> None:
-        """Note which of the splats that are drawn are selected."""
-        read = held.read_selected
-        chosen = None if read is None or not read.any() else read[held.packed.vertices]
-        if not same(held.selected, chosen):
-            held.selected = chosen
-            self.selections += 1
 
     def _place(
         self, wanted: set[tuple[int, int]], existing: Callable[[], set[tuple[int, int]]]
     ) -> None:
         """Make the textures again if splats came or became others."""
-        slots = self.atlas.slots if self.atlas else {}
+        slots = self.atlas.slots
         fresh = {
             key for key in wanted if key in slots and slots[key].packed is self._held[key[1]].packed
         }
@@ -289,34 +286,24 @@ class Content:
 
 
 def _atlas(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> Atlas:
-    """Make the textures of some objects, by the identities of objects and meshes."""
-    slots = _slots(keys, held)
-    total = sum(slot.count for slot in slots.values())
-    means = np.empty((total, 4), np.float32)
-    covariances = np.zeros((total, 8), np.float32)
-    for slot in slots.values():
-        rows = slice(slot.start, slot.start + slot.count)
-        means[rows, :3] = slot.packed.means[: slot.count]
-        means[rows, 3] = slot.number
-        covariances[rows, :6] = slot.packed.covariances[: slot.count]
-        covariances[rows, 6] = MODELS.index(slot.packed.model)
+    """Make the textures of some objects, with at most `MOST` splats in all."""
+    packs = [held[mesh].packed for _, mesh in keys]
+    counts = first_of_each([len(packed) for packed in packs], MOST)
+    means = np.empty((sum(counts), 4), np.float32)
+    covariances = np.zeros((sum(counts), 8), np.float32)
+    slots, start = {}, 0
+    for number, (key, packed, count) in enumerate(zip(keys, packs, counts, strict=True)):
+        slots[key] = slot = Slot(held[key[1]], packed, number, start, count)
+        means[slot.rows, :3], means[slot.rows, 3] = packed.means[:count], number
+        covariances[slot.rows, :6] = packed.covariances[:count]
+        covariances[slot.rows, 6] = MODELS.index(packed.model)
+        start += count
     return Atlas(
         slots,
         shader.texture(as_texture(means), 4, "RGBA32F"),
         shader.texture(as_texture(covariances[:, :4]), 4, "RGBA32F"),
         shader.texture(as_texture(covariances[:, 4:]), 4, "RGBA32F"),
     )
-
-
-def _slots(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> dict[tuple[int, int], Slot]:
-    """Place objects one after another, with at most `MOST` splats in all."""
-    packs = [packed for _, mesh in keys if (packed := held[mesh].packed) is not None]
-    counts = first_of_each([len(packed) for packed in packs], MOST)
-    slots, start = {}, 0
-    for number, (key, packed, count) in enumerate(zip(keys, packs, counts, strict=True)):
-        slots[key] = Slot(held[key[1]], packed, number, start, count)
-        start += count
-    return slots
 
 
 def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
-from . import background, legend, overlays, placing, points, shader
+from . import overlays, placing, shader
 from .content import Content
 from .view import Camera, View
 
@@ -57,12 +57,12 @@ _state = _State()
 
 
 def mode() -> str:
-    """Return which of `MODES` is shown."""
+    """Tell which of `MODES` is shown."""
     return _state.mode
 
 
 def failure() -> str:
-    """Return why nothing can be drawn here, or an empty text."""
+    """Tell why nothing can be drawn here, or an empty text."""
     return _state.failure
 
 
@@ -72,7 +72,7 @@ def complete() -> bool:
 
 
 def drawn(region: bpy.types.Region) -> int:
-    """Return how many splats a region shows."""
+    """Tell how many splats a region shows."""
     view = _state.views.get(region.as_pointer())
     return view.count if view else 0
 
@@ -91,7 +91,6 @@ def show(wanted: str) -> None:
         return
     if _state.mode == "OFF":
         _state.failure = ""
-        _hook()
     _state.mode = wanted
     _hide_points()
     _redraw()
@@ -102,64 +101,39 @@ def stop() -> None:
     if _state.mode == "OFF":
         return
     _state.mode = "OFF"
-    _unhook()
-    background.stop()
+    for timer in (_tick, _read_edited):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
     _forget()
     shader.forget()
-    points.show()
+    _hide_points()
     _redraw()
 
 
 def register() -> None:
-    """Have files keep what is shown, and show it again."""
-    bpy.app.handlers.save_pre.append(_saving)
-    bpy.app.handlers.load_post.append(_opened)
-
-
-def unregister() -> None:
-    """Draw nothing, and let files be."""
-    stop()
-    bpy.app.handlers.load_post.remove(_opened)
-    bpy.app.handlers.save_pre.remove(_saving)
-
-
-def _forget() -> None:
-    _state.content, _state.views = Content(), {}
-
-
-def _listeners() -> tuple[tuple[Callable[..., None], tuple[str, ...]], ...]:
-    """Return what is called at which events of Blender."""
-    return (
-        (_updated, ("depsgraph_update_post", "frame_change_post")),
-        (_undone, ("undo_post", "redo_post")),
-        (_leaving, ("load_pre",)),
-        (_loaded, ("load_post",)),
-    )
-
-
-def _hook() -> None:
-    space = bpy.types.SpaceView3D
-    _state.handles = [
-        space.draw_handler_add(partial(_guarded, _draw), (), "WINDOW", "POST_VIEW"),
-        space.draw_handler_add(partial(_guarded, _draw_legend), (), "WINDOW", "POST_PIXEL"),
-    ]
-    for handler, names in _listeners():
+    """Have views call what draws in them, and Blender what keeps it true."""
+    add = bpy.types.SpaceView3D.draw_handler_add
+    for work, kind in ((_draw, "POST_VIEW"), (_draw_legend, "POST_PIXEL")):
+        _state.handles.append(add(partial(_guarded, work), (), "WINDOW", kind))
+    for handler, names in _LISTENERS.items():
         for name in names:
             getattr(bpy.app.handlers, name).append(handler)
 
 
-def _unhook() -> None:
-    for handle in _state.handles:
-        bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
-    _state.handles = []
-    for handler, names in _listeners():
+def unregister() -> None:
+    """Draw nothing, and undo `register`."""
+    stop()
+    for handler, names in _LISTENERS.items():
         for name in names:
-            listening = getattr(bpy.app.handlers, name)
-            if handler in listening:
-                listening.remove(handler)
-    for timer in (_tick, _read_edited):
-        if bpy.app.timers.is_registered(timer):
-            bpy.app.timers.unregister(timer)
+            getattr(bpy.app.handlers, name).remove(handler)
+    while _state.handles:
+        bpy.types.SpaceView3D.draw_handler_remove(_state.handles.pop(), "WINDOW")
+
+
+@persistent
+def _forget(*_: object) -> None:
+    _state.content.pool.shutdown(wait=False, cancel_futures=True)
+    _state.content, _state.views = Content(), {}
 
 
 def _guarded(work: Callable[[], None]) -> None:
@@ -171,7 +145,6 @@ def _guarded(work: Callable[[], None]) -> None:
     except Exception as error:
         traceback.print_exc()
         _state.failure = f"Splats cannot be drawn here: {error}"
-        # Handlers must not be removed while they run.
         bpy.app.timers.register(stop, first_interval=0.0)
 
 
@@ -196,14 +169,14 @@ def _draw() -> None:
     solid = not overlays.is_xray(space.shading)
     solid = solid and not all(looks_like_splats(obj) for obj in context.visible_objects)
     view.draw(_state.content, placed, camera, _state.mode, solid=solid)
-    overlays.draw(context)
-    if view.waits() and not bpy.app.timers.is_registered(_tick):
+    overlays.draw(context, mixed=view.count > 0)
+    if not view.complete and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)
 
 
 def _draw_legend() -> None:
     warnings = [text for tell in warned_by for text in tell(bpy.context)]
-    legend.draw(bpy.context, _state.mode, _state.content.marks(), warnings)
+    overlays.draw_legend(bpy.context, _state.mode, _state.content.marks(), warnings)
 
 
 def _tick() -> float | None:
@@ -211,9 +184,9 @@ def _tick() -> float | None:
     if _state.mode == "OFF":
         return None
     ready = _state.content.ready()
-    for region in _regions():
+    for region in (region for area in _areas() for region in area.regions):
         view = _state.views.get(region.as_pointer())
-        if view is None or ready or view.due():
+        if region.type == "WINDOW" and (view is None or ready or view.due()):
             region.tag_redraw()
     return None if complete() else _TICK
 
@@ -226,7 +199,7 @@ def _read_edited() -> float | None:
     layers = [window.view_layer for window in bpy.context.window_manager.windows]
     _state.reads = True  # which counts as a change of its own
     for obj in {obj for layer in layers for obj in layer.objects}:
-        if points.is_edited(obj) and looks_like_splats(obj) and splat_count(obj.data):
+        if placing.is_edited(obj) and looks_like_splats(obj) and splat_count(obj.data):
             with contextlib.suppress(RefineError):
                 _state.content.read_edited(obj)
     for layer in layers:
@@ -237,25 +210,19 @@ def _read_edited() -> float | None:
 
 
 def _redraw() -> None:
-    for region in _regions():
-        region.tag_redraw()
     for area in _areas():
         area.tag_redraw()
 
 
 def _hide_points() -> None:
-    if _state.mode != "OFF":
-        for depsgraph in points.graphs():
-            points.hide(depsgraph, _state.content.refused)
+    """Hide the plain points of what is drawn, in all windows, or show them again."""
+    for depsgraph in placing.graphs():
+        placing.hide_points(depsgraph, None if _state.mode == "OFF" else _state.content.refused)
 
 
 def _areas() -> list[bpy.types.Area]:
     windows = bpy.context.window_manager.windows
     return [a for window in windows for a in window.screen.areas if a.type == "VIEW_3D"]
-
-
-def _regions() -> list[bpy.types.Region]:
-    return [r for area in _areas() for r in area.regions if r.type == "WINDOW"]
 
 
 @persistent
@@ -274,12 +241,16 @@ def _opened(*_: object) -> None:
     wanted = bpy.context.scene.get(SHOWN) if not bpy.app.background else None
     if wanted in MODES:
         show(wanted)
-        _loaded()
+    if _state.mode != "OFF":
+        for window in bpy.context.window_manager.windows:
+            window.view_layer.update()  # what is not evaluated yet would be drawn as points once
+        _hide_points()
+        _redraw()
 
 
 @persistent
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
-    if depsgraph is None:
+    if depsgraph is None or _state.mode == "OFF":
         return
     for update in depsgraph.updates:
         if update.is_updated_geometry:
@@ -290,23 +261,21 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
                     _state.edited_at = time.monotonic()
                     if not bpy.app.timers.is_registered(_read_edited):
                         bpy.app.timers.register(_read_edited, first_interval=_EDIT_REST)
-    points.hide(depsgraph, _state.content.refused)
+    placing.hide_points(depsgraph, _state.content.refused)
 
 
 @persistent
 def _undone(*_: object) -> None:
-    _state.content.has_changed()
-    _hide_points()
+    if _state.mode != "OFF":
+        _state.content.has_changed()
+        _hide_points()
 
 
-@persistent
-def _leaving(*_: object) -> None:
-    _forget()
-
-
-@persistent
-def _loaded(*_: object) -> None:
-    for window in bpy.context.window_manager.windows:
-        window.view_layer.update()  # what is not evaluated yet would be drawn as points once
-    _hide_points()
-    _redraw()
+_LISTENERS: dict[Callable[..., None], tuple[str, ...]] = {
+    _updated: ("depsgraph_update_post", "frame_change_post"),
+    _undone: ("undo_post", "redo_post"),
+    _forget: ("load_pre",),
+    _opened: ("load_post",),
+    _saving: ("save_pre",),
+}
+"""What is called at which events of Blender."""

@@ -1,4 +1,4 @@
-"""What is drawn over splats: meshes that one sees through, and edges of the volumes in the panel.
+"""What is drawn over splats: see-through meshes, edges of volumes, and what the colours mean.
 
 Blender draws such meshes without depth, so what lies before splats cannot be told from what lies
 behind them. They are mixed over all splats, the nearest face of each pixel, lit from the viewer.
@@ -6,8 +6,12 @@ behind them. They are mixed over all splats, the nearest face of each pixel, lit
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
+from functools import partial
 from itertools import product
+from typing import Any
 
+import blf
 import bpy
 import gpu
 import numpy as np
@@ -15,19 +19,34 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Color, Vector
 from numpy.typing import NDArray
 
+from ..mesh.heat_map import ramp
 from ..mesh.layout import looks_like_splats
 from .arrays import GOES, MARKS, STAYS
 
 _OPAQUE = 0.995
 """Opacity from which on Blender draws a mesh with its depth."""
 
-_GRAY = (0.8, 0.8, 0.8, 1.0)
-
 _COLORS = {"PROTECT": MARKS[STAYS], "REMOVE": MARKS[GOES], "KEEP": MARKS[GOES]}
 """By the role of a volume."""
 
 _FILLED = {"SOLID", "TEXTURED"}
 """Display types of objects whose faces are drawn."""
+
+WORDS = {"HEAT": ("goes first", "goes last"), "STAYS": ("What stays",), "GOES": ("What goes",)}
+"""What is written in a view, by mode; of the heat map at both ends of its bar."""
+
+MARKED = {STAYS: "Protected", GOES: "Must go"}
+"""What is written beside the tint of what stays and goes in any case."""
+
+_REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}
+"""Marks that no splat has in a mode."""
+
+_WIDE, _HIGH, _EDGE, _FONT = 220, 10, 16, 12  # pixels at scale 1
+_GAP = 6  # between the bar and the words above it
+
+_WHITE, _BLACK = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
+_WARNING = (1.0, 0.8, 0.2, 1.0)
+_BLUR = 5  # of the shadow: 0, 3 or 5
 
 _TURN = np.linspace(0.0, 2.0 * np.pi, 49)
 
@@ -38,10 +57,10 @@ def is_xray(shading: bpy.types.View3DShading) -> bool:
     return bool(seen.get(shading.type))
 
 
-def draw(context: bpy.types.Context) -> None:
-    """Draw into a view, before its matrices."""
+def draw(context: bpy.types.Context, *, mixed: bool) -> None:
+    """Draw edges of volumes into a view, and meshes that are to be mixed with what it shows."""
     shading = context.space_data.shading
-    if shading.type != "WIREFRAME":
+    if mixed and shading.type != "WIREFRAME":
         if is_xray(shading):  # of which Blender 5 has kept the depth
             gpu.state.active_framebuffer_get().clear(depth=1.0)
         for obj in context.visible_objects:
@@ -50,8 +69,11 @@ def draw(context: bpy.types.Context) -> None:
     for item in context.scene.refine.volumes:
         obj = item.object
         if obj is not None and obj.type == "EMPTY" and obj.visible_get(viewport=context.space_data):
-            lines = _sphere() if obj.empty_display_type == "SPHERE" else _cube()
-            _draw(lines * obj.empty_display_size, obj, _COLORS[item.role])
+            lines = _edges(obj.empty_display_type)
+            colors = np.tile((*_COLORS[item.role], 1.0), (len(lines), 1))
+            with gpu.matrix.push_pop():
+                gpu.matrix.multiply_matrix(obj.matrix_world)
+                _shape("LINES", lines * obj.empty_display_size, colors)()
 
 
 def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
@@ -77,20 +99,18 @@ def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
     seen = paint[:, 3] < _OPAQUE
     if not seen.any():
         return
-    program = gpu.shader.from_builtin("SMOOTH_COLOR")
     corners = corners.reshape(-1, 3)[seen].ravel()
-    content = {"pos": places.reshape(-1, 3)[corners], "color": np.repeat(paint[seen], 3, axis=0)}
-    batch = batch_for_shader(program, "TRIS", content)
+    shape = _shape("TRIS", places.reshape(-1, 3)[corners], np.repeat(paint[seen], 3, axis=0))
     gpu.state.depth_mask_set(True)
     with gpu.matrix.push_pop():
         gpu.matrix.multiply_matrix(obj.matrix_world)
         gpu.state.color_mask_set(False, False, False, False)
         gpu.state.depth_test_set("LESS_EQUAL")
-        batch.draw(program)
+        shape()
         gpu.state.color_mask_set(True, True, True, True)
         gpu.state.depth_test_set("EQUAL")
         gpu.state.blend_set("ALPHA")
-        batch.draw(program)
+        shape()
     gpu.state.blend_set("NONE")
     gpu.state.depth_mask_set(False)
     gpu.state.depth_test_set("NONE")
@@ -100,49 +120,93 @@ def _color(
     obj: bpy.types.Object, material: bpy.types.Material | None, shading: bpy.types.View3DShading
 ) -> tuple[float, ...]:
     """Colour of a material in a view, as it is shown, and its opacity."""
-    color, opacity = _GRAY, 1.0
+    color, opacity = (0.8, 0.8, 0.8, 1.0), 1.0
     if shading.type == "SOLID":
         if shading.color_type == "OBJECT":
             color = obj.color
-        elif shading.color_type == "SINGLE":
-            color = (*shading.single_color, 1.0)
         elif shading.color_type == "MATERIAL" and material is not None:
             color = material.diffuse_color
         opacity = color[3] * (shading.xray_alpha if shading.show_xray else 1.0)
     elif material is not None and material.surface_render_method == "BLENDED":
         color, opacity = material.diffuse_color, 0.5
-        nodes = material.node_tree.nodes if material.node_tree else ()
-        for node in nodes:
+        for node in material.node_tree.nodes if material.node_tree else ():
             if node.type == "BSDF_PRINCIPLED":
                 color, alpha = node.inputs["Base Color"].default_value, node.inputs["Alpha"]
                 opacity = 0.5 if alpha.is_linked else alpha.default_value
     return (*Color(color[:3]).from_scene_linear_to_srgb(), opacity)
 
 
-def _cube() -> NDArray[np.float64]:
-    """Return the ends of 12 edges, (24, 3)."""
-    corners = np.array(list(product((-1.0, 1.0), repeat=3)))
-    ends = [
-        (one, other)
-        for one, other in product(corners, corners)
-        if np.count_nonzero(one != other) == 1 and one.sum() < other.sum()
-    ]
-    return np.array(ends).reshape(-1, 3)
-
-
-def _sphere() -> NDArray[np.float64]:
-    """Return the ends of the pieces of three circles, (288, 3)."""
-    circle = np.stack([np.cos(_TURN), np.sin(_TURN), np.zeros_like(_TURN)], axis=1)
-    pieces = np.stack([circle[:-1], circle[1:]], axis=1).reshape(-1, 3)
+def _edges(shape: str) -> NDArray[np.float64]:
+    """The ends of the edges of a cube, (24, 3), or of the pieces of three circles, (288, 3)."""
+    if shape == "SPHERE":
+        circle = np.stack([np.cos(_TURN), np.sin(_TURN), np.zeros_like(_TURN)], axis=1)
+        pieces = np.stack([circle[:-1], circle[1:]], axis=1).reshape(-1, 3)
+    else:
+        signs = (-1.0, 1.0)
+        pieces = np.array([(x, y, z) for y, z in product(signs, signs) for x in signs])
     return np.concatenate([np.roll(pieces, turn, axis=1) for turn in range(3)])
 
 
-def _draw(
-    lines: NDArray[np.float64], obj: bpy.types.Object, color: tuple[float, float, float]
+def draw_legend(
+    context: bpy.types.Context,
+    mode: str,
+    marks: Collection[int] = (),
+    warnings: Collection[str] = (),
 ) -> None:
-    program = gpu.shader.from_builtin("UNIFORM_COLOR")
-    gpu.state.depth_test_set("NONE")
-    with gpu.matrix.push_pop():
-        gpu.matrix.multiply_matrix(obj.matrix_world)
-        program.uniform_float("color", (*color, 1.0))
-        batch_for_shader(program, "LINES", {"pos": lines.astype(np.float32)}).draw(program)
+    """Draw the legend of a mode, and of marks that splats have (`MARKED`), into a view.
+
+    Warnings stand above it, a line each.
+    """
+    if mode not in WORDS and not marks and not warnings:
+        return
+    scale = context.preferences.system.ui_scale
+    x, y = _beside_tools(context) + _EDGE * scale, _EDGE * scale
+    blf.size(0, _FONT * scale)
+    blf.color(0, *_WHITE)
+    blf.enable(0, blf.SHADOW)
+    blf.shadow(0, _BLUR, *_BLACK)
+    line, high, wide = y, _HIGH * scale, _WIDE * scale
+    if mode == "HEAT":
+        _bar(x, y, wide, high, ramp()[::8])
+        line += high + _GAP * scale
+    if mode in WORDS:
+        for index, text in enumerate(WORDS[mode]):  # the second ends where the bar does
+            _write(text, x + index * (wide - blf.dimensions(0, text)[0]), line)
+        line += 2 * high
+    for mark, text in MARKED.items():
+        if mark in marks and (mark, mode) not in _REDUNDANT:
+            _write(text, x + 2 * high, line)
+            _bar(x, line, high, high, (MARKS[mark],) * 2)
+            line += 2 * high
+    blf.color(0, *_WARNING)
+    for text in warnings:
+        _write(text, x, line)
+        line += 2 * high
+    blf.disable(0, blf.SHADOW)
+
+
+def _write(text: str, x: float, y: float) -> None:
+    blf.position(0, x, y, 0.0)
+    blf.draw(0, text)
+
+
+def _beside_tools(context: bpy.types.Context) -> int:
+    """Pixels of a view that the toolbar covers."""
+    regions = (region for region in context.area.regions if region.type == "TOOLS")
+    return sum(region.width for region in regions if region.x <= context.region.x)
+
+
+def _bar(x: float, y: float, wide: float, high: float, colors: Any) -> None:
+    """Draw colours, (C, 3), side by side."""
+    places = [
+        (x + wide * k / (len(colors) - 1), y + up) for k in range(len(colors)) for up in (0, high)
+    ]
+    painted = np.repeat(np.pad(colors, ((0, 0), (0, 1)), constant_values=1.0), 2, axis=0)
+    _shape("TRI_STRIP", places, painted)()
+
+
+def _shape(kind: str, places: Any, colors: Any) -> Callable[[], None]:
+    """What draws corners, with a colour of each."""
+    program = gpu.shader.from_builtin("SMOOTH_COLOR")
+    content = {"pos": np.asarray(places, np.float32), "color": np.asarray(colors, np.float32)}
+    return partial(batch_for_shader(program, kind, content).draw, program)

@@ -1,8 +1,13 @@
-"""Where splats stand in a view: objects of the view layer, and instances of collections."""
+"""Where splats stand in a view: objects of the view layer, and instances of collections.
+
+Blender draws a mesh without faces as points, and has no switch for that. What it draws is an
+evaluated copy of the object, which no file, undo step or script ever gets to see: on that copy the
+object is shown as its bounding box. The object itself is not touched.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from typing import NamedTuple
 
 import bpy
@@ -41,12 +46,12 @@ def placings(objects: list[bpy.types.Object]) -> Iterator[Placing]:
 
 
 def instanced(objects: list[bpy.types.Object]) -> set[bpy.types.Object]:
-    """Return the splat objects that some objects instance."""
+    """Splat objects that some objects instance."""
     return {place.obj for place in placings(objects)} - set(objects)
 
 
 def every() -> set[tuple[int, int]]:
-    """Return the keys of all splats of the file."""
+    """Keys of all splats of the file."""
     return {placing.key for placing in placings(list(bpy.data.objects))}
 
 
@@ -64,3 +69,36 @@ def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> It
     for member in collection.all_objects:
         if not member.hide_viewport:
             yield from _placed(member, base @ member.matrix_world, chain, depth + 1)
+
+
+def hide_points(depsgraph: bpy.types.Depsgraph, refused: Container[int] | None) -> None:
+    """Show splats of a view layer as bounding boxes, but for refused meshes; all points by None."""
+    for obj, evaluated in _copies(depsgraph):
+        hidden = refused is not None and obj.data.session_uid not in refused
+        wanted = "BOUNDS" if hidden and not is_edited(obj) else obj.display_type
+        if evaluated.display_type != wanted:
+            evaluated.display_type = wanted
+
+
+def is_edited(obj: bpy.types.Object) -> bool:
+    """Tell whether splats are in edit mode, of this object or of another that shares them."""
+    return obj.mode == "EDIT" or getattr(obj.data, "is_editmode", False)
+
+
+def graphs() -> Iterator[bpy.types.Depsgraph]:
+    """Give what is evaluated for each window."""
+    for window in bpy.context.window_manager.windows:
+        yield window.view_layer.depsgraph
+
+
+def _copies(
+    depsgraph: bpy.types.Depsgraph | None,
+) -> Iterator[tuple[bpy.types.Object, bpy.types.Object]]:
+    if depsgraph is None or depsgraph.mode != "VIEWPORT":
+        return
+    objects = [obj.original for obj in depsgraph.scene.objects]
+    for original in {*objects, *instanced(objects)}:
+        if looks_like_splats(original):
+            evaluated = original.evaluated_get(depsgraph)
+            if evaluated.is_evaluated:
+                yield original, evaluated

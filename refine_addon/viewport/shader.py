@@ -7,6 +7,7 @@ would decode them first. So splats are blended in a picture apart, and put into 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 
 import gpu
@@ -83,9 +84,6 @@ void main()
   paint = value_at(colors, row);
   float chosen = SELECTED_SHARE * step(0.5, value_at(selection, row).r);
   paint.rgb = mix(paint.rgb, SELECTED, chosen);
-  if (paint.a <= ALPHA_CUT) {
-    return;
-  }
   bool disc = lower.z > 1.5;
   vec4 clip = view_data.projection * vec4(seen, 1.0);
   vec3 ndc = clip.xyz / clip.w;
@@ -191,18 +189,14 @@ void main()
   if (alpha < ALPHA_CUT) {
     discard;
   }
-  if (view_data.choices.y > 0.5) {
-    ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
-    float occluder = texelFetch(depths, min(texel, textureSize(depths, 0) - 1), 0).r;
-    if (gl_FragCoord.z > occluder) {
-      discard;
-    }
-  }
+  ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
+  ivec2 within = min(texel, textureSize(depths, 0) - 1);
+  bool hidden = view_data.choices.y > 0.5 && gl_FragCoord.z > texelFetch(depths, within, 0).r;
   if (view_data.choices.z > 0.5) {
-    ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
-    if (gl_FragCoord.z <= texelFetch(near_depths, texel, 0).r) {
-      discard;
-    }
+    hidden = hidden || gl_FragCoord.z <= texelFetch(near_depths, texel, 0).r;
+  }
+  if (hidden) {
+    discard;
   }
   color = vec4(paint.rgb * alpha, alpha);
 }
@@ -238,7 +232,7 @@ void main()
 
 @cache
 def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
-    """Return the shader of splats, and the quad that is drawn once for each."""
+    """Shader of splats, and the quad that is drawn once for each."""
     info = gpu.types.GPUShaderCreateInfo()
     info.typedef_source(_CONSTANTS + _VIEW)
     info.uniform_buf(0, "ViewData", "view_data")
@@ -258,7 +252,7 @@ def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
 
 @cache
 def picture() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
-    """Return the shader that puts a picture into a view, and the quad that covers it."""
+    """Shader that puts a picture into a view, and the quad that covers it."""
     info = gpu.types.GPUShaderCreateInfo()
     info.sampler(0, "FLOAT_2D", "picture")
     between = gpu.types.GPUStageInterfaceInfo("refine_picture")
@@ -273,7 +267,7 @@ def forget() -> None:
 
 
 def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.GPUTexture:
-    """Return rows of texels on the graphics card.
+    """Rows of texels on the graphics card.
 
     Parameters
     ----------
@@ -288,24 +282,29 @@ def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.
 
 
 def blend(
-    frame: gpu.types.GPUFrameBuffer,
+    picture: gpu.types.GPUTexture,
     textures: dict[str, gpu.types.GPUTexture],
-    numbers: NDArray[np.float32],
+    projection: NDArray[np.float64],
+    numbers: Sequence[float],
     count: int,
-) -> None:
-    """Draw splats into a cleared framebuffer.
+) -> gpu.types.GPUFrameBuffer:
+    """Draw splats into a picture, which is cleared before.
 
     Parameters
     ----------
-    frame : gpu.types.GPUFrameBuffer
+    picture : gpu.types.GPUTexture
     textures : dict of str to gpu.types.GPUTexture
         What the shader of `splats` reads; held by the caller until they are drawn.
-    numbers : (24,) float32
-        ``ViewData``.
+    projection : (4, 4) float64
+    numbers : sequence of 7 float
+        The rest of ``ViewData``, but for its last.
     count : int
         How many splats of the order.
     """
-    block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(numbers), numbers))
+    data = np.zeros(24, np.float32)
+    data[:16], data[16:23] = projection.T.reshape(-1), numbers
+    block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(data), data))
+    frame = gpu.types.GPUFrameBuffer(color_slots=picture)
     with frame.bind():
         frame.clear(color=(0.0, 0.0, 0.0, 0.0))
         if count:
@@ -318,6 +317,7 @@ def blend(
                 program.uniform_sampler(name, texture)
             quad.draw_instanced(program, instance_count=count)
             gpu.state.blend_set("NONE")
+    return frame
 
 
 def _program(

@@ -7,9 +7,7 @@ them are sorted and coloured on the thread, and drawn when that is done.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from concurrent.futures import Future
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import gpu
@@ -17,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.heat_map import ramp
-from . import background, shader
+from . import shader
 from .arrays import (
     GOES,
     Eye,
@@ -31,7 +29,7 @@ from .arrays import (
     same,
     tinted,
 )
-from .content import Atlas, Content, Slot
+from .content import Atlas, Content, Marks, Slot
 
 REST = 0.2
 """Seconds without a change after which a view rests."""
@@ -40,14 +38,8 @@ TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55
 """What goes is shown in this colour, by that share."""
 
 
-class Moving(NamedTuple):
-    """What is drawn while a view moves: at most so many splats, each so many pixels wide."""
-
-    splats: int
-    pixels: int
-
-
-BY_CARD, BY_PROCESSOR = Moving(300_000, 1), Moving(20_000, 3)
+BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)
+"""What is drawn while a view moves: at most so many splats, each so many pixels wide."""
 
 
 class Camera(NamedTuple):
@@ -78,40 +70,25 @@ class Camera(NamedTuple):
         return float(p[2, 3] / (p[2, 2] - 1.0) if self.perspective else (p[2, 3] + 1.0) / p[2, 2])
 
     def key(self) -> bytes:
-        """Return what tells it from another."""
+        """Cache key."""
         return self.view.tobytes() + self.projection.tobytes() + bytes(str(self.size), "ascii")
-
-
-class Shown(NamedTuple):
-    """An object in a view: its place in the textures and its matrix to the camera, (4, 4)."""
-
-    slot: Slot
-    matrix: NDArray[np.float64]
 
 
 class _Part(NamedTuple):
     """What the thread needs of one object."""
 
     slot: Slot
-    going: NDArray[np.bool_] | None
-    hidden: NDArray[np.bool_] | None
-    ranks: NDArray[Any] | None
-    forced: NDArray[np.int32] | None
+    marks: Marks
     important: NDArray[np.int32] | None
     eye: Eye
 
 
-class _Sorted(NamedTuple):
-    """What the thread computed."""
-
-    order: NDArray[np.float32]
-    drawn: int
-    colors: NDArray[np.float32] | None
+_Sorted = tuple[NDArray[np.float32], int, NDArray[np.float32] | None]
+"""What the thread computed: the order of splats as a texture, how many are drawn, their colours."""
 
 
-@dataclass(eq=False)
-class _Order:
-    """The splats that are drawn, back to front, on the graphics card."""
+class _Order(NamedTuple):
+    """The splats that are drawn, on the graphics card."""
 
     texture: gpu.types.GPUTexture
     count: int
@@ -134,10 +111,6 @@ class View:
         self._changed = 0.0
         self.complete = False
         self.count = 0
-
-    def waits(self) -> bool:
-        """Tell whether this is not yet all that is to be seen."""
-        return not self.complete
 
     def due(self) -> bool:
         """Tell whether drawing again would show more."""
@@ -168,27 +141,27 @@ class View:
             Whether anything but splats is in the view that hides what is behind it.
         """
         atlas = content.atlas
-        if atlas is None or not places:
+        if not places:
             self.complete, self.count = not content.pending(), 0
             return
-        shown = [Shown(atlas.slots[key], camera.view @ matrix) for key, matrix in places.items()]
-        matrices = b"".join(s.matrix.tobytes() for s in shown)
+        shown = [(atlas.slots[key], camera.view @ matrix) for key, matrix in places.items()]
+        matrices = b"".join(matrix.tobytes() for _, matrix in shown)
         moving = self._moves(camera.key() + matrices)
         full = (atlas, content.changes, mode, matrices, camera.perspective, camera.near)
         self._take()
-        least = BY_PROCESSOR if gpu.platform.device_type_get() == "SOFTWARE" else BY_CARD
+        by_card = gpu.platform.device_type_get() != "SOFTWARE"
+        few, wide = BY_CARD if by_card else BY_PROCESSOR
         if self._colored is not atlas:
             self._order, self._colors = None, None
         if moving:
-            self._sort(full, shown, camera, mode, least.splats)
+            self._sort((*full, few), shown, camera, mode, few)
         elif self._job is None and (self._order is None or self._order.key != full):
-            self._start(full, shown, camera, mode, least.splats)
+            self._start(content.pool, full, _parts(shown, camera), camera.near, mode, few)
         self.complete = not moving and self._order is not None and self._order.key == full
         if self._order is None or self._colors is None:
             return
         self.count = self._order.count
-        pixels = 1 if self.complete else least.pixels
-        self._paint(content, shown, camera, pixels, solid=solid)
+        self._paint(content, shown, camera, 1 if self.complete else wide, solid)
         _put(self._picture)
 
     def _moves(self, key: bytes) -> bool:
@@ -205,20 +178,17 @@ class View:
             return
         order_key, colors_key, future = self._job
         self._job = None
-        result = future.result()
-        self._order = _Order(shader.texture(result.order, 1, "R32F"), result.drawn, order_key)
-        if result.colors is not None:
-            self._colors = shader.texture(result.colors, 4, "RGBA16F")
+        order, count, painted = future.result()
+        self._order = _Order(shader.texture(order, 1, "R32F"), count, order_key)
+        if painted is not None:
+            self._colors = shader.texture(painted, 4, "RGBA16F")
             self._colors_key, self._colored = colors_key, order_key[0]
 
-    def _start(
-        self, key: tuple[Any, ...], shown: list[Shown], camera: Camera, mode: str, few: int
-    ) -> None:
+    def _start(self, pool, key, parts, near, mode, few):
         """Have all splats sorted, and coloured if they look otherwise from here.
 
         Where nothing is seen yet, only those that matter most, in their constant colours.
         """
-        parts = _parts(shown, camera)
         objects = [(p.slot.number, p.slot.held.marked) for p in parts]
         colors_key: tuple[Any, ...] = (key[0], mode, objects)
         if mode == "HEAT":
@@ -227,42 +197,36 @@ class View:
             colors_key += tuple(p.eye.place.tobytes() for p in parts if p.slot.held.degree)
         rows = None if colors_key == self._colors_key else key[0].rows
         if self._colors is None and key[0].rows > few:
-            first = background.start(_sort_and_color, parts, camera.near, mode, rows, few)
-            self._job = ((*key, few), None, first)
+            key, colors_key = (*key, few), None
         else:
-            work = background.start(_sort_and_color, parts, camera.near, mode, rows)
-            self._job = (key, colors_key, work)
+            few = None
+        work = pool.submit(_sort_and_color, parts, near, mode, rows, few)
+        self._job = (key, colors_key, work)
 
-    def _sort(
-        self, key: tuple[Any, ...], shown: list[Shown], camera: Camera, mode: str, most: int
-    ) -> None:
+    def _sort(self, key, shown, camera, mode, most):
         """Sort the splats that matter most, at once."""
-        key = (*key, most)
         if self._order is None or self._order.key != key:
             order = _order(_parts(shown, camera), camera.near, mode, most)
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
 
-    def _paint(
-        self,
-        content: Content,
-        shown: list[Shown],
-        camera: Camera,
-        pixels: int,
-        *,
-        solid: bool,
-    ) -> None:
+    def _paint(self, content, shown, camera, pixels, solid):
         """Draw the splats into the picture, unless it shows them already."""
         depths = _depths(camera.size) if solid else None
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
-        look = (self._order.key, self._colors_key, self._camera_key, size)
-        wanted = (*look, content.selections)
+        look = (self._order.key, self._colors_key, self._camera_key)
+        wanted = (*look, size, content.selections)
         if self._picture and wanted == self._drawn and same(depths, self._depths):
             return
         self._drawn, self._depths = wanted, depths
         if not self._picture or (self._picture.width, self._picture.height) != size:
             self._picture = gpu.types.GPUTexture(size, format="RGBA16F")
+        rows = np.zeros((1 + max(slot.number for slot, _ in shown), 12), np.float32)
+        for slot, matrix in shown:
+            rows[slot.number] = matrix[:3].reshape(-1)
         atlas = content.atlas
-        occluders = np.ones((1, 1), np.float32) if depths is None else depths
+        farthest = shader.texture(
+            np.ones((1, 1), np.float32) if depths is None else depths, 1, "R32F"
+        )
         textures = {
             "order": self._order.texture,
             "means": atlas.means,
@@ -270,44 +234,22 @@ class View:
             "more_covariances": atlas.more_covariances,
             "colors": self._colors,
             "selection": content.selection(),
-            "matrices": shader.texture(_matrix_rows(shown), 4, "RGBA32F"),
-            "depths": (farthest := shader.texture(occluders, 1, "R32F")),
+            "matrices": shader.texture(rows, 4, "RGBA32F"),
+            "depths": farthest,
             "near_depths": farthest,
         }  # held until they are drawn: the shader does not keep what it is given
-        numbers = _view_data(camera, size, solid=depths is not None)
-        frame = gpu.types.GPUFrameBuffer(color_slots=self._picture)
-        shader.blend(frame, textures, numbers, self._order.count)
+        numbers = (*size, camera.near, camera.size[0] / size[0])
+        numbers += (camera.perspective, depths is not None, False)
+        shader.blend(self._picture, textures, camera.projection, numbers, self._order.count)
 
 
-def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
-    """Return the upper three rows of each object's matrix, by the number of its slot, (S, 12)."""
-    rows = np.zeros((1 + max(each.slot.number for each in shown), 12), np.float32)
-    for each in shown:
-        rows[each.slot.number] = each.matrix[:3].reshape(-1)
-    return rows
-
-
-def _view_data(camera: Camera, size: tuple[int, int], *, solid: bool) -> NDArray[np.float32]:
-    """Return what the shader knows of a view as ``ViewData``, for a picture of this size."""
-    numbers = np.zeros(24, np.float32)
-    numbers[:16] = camera.projection.T.reshape(-1)
-    numbers[16:20] = (*size, camera.near, camera.size[0] / size[0])
-    numbers[20:22] = (camera.perspective, solid)
-    return numbers
-
-
-def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:
+def _parts(shown: list[tuple[Slot, NDArray[Any]]], camera: Camera) -> list[_Part]:
     parts = []
     for slot, matrix in shown:
-        if camera.perspective:
-            place = np.linalg.pinv(matrix)[:3, 3]
-        else:
-            place = np.linalg.pinv(matrix)[:3, :3] @ (0.0, 0.0, -1.0)
-        held = slot.held
+        back = np.linalg.pinv(matrix)[:3]
+        place = back[:, 3] if camera.perspective else back[:, :3] @ (0.0, 0.0, -1.0)
         eye = Eye(-matrix[2], place, camera.perspective)
-        parts.append(
-            _Part(slot, held.going, held.hidden, held.ranks, held.forced, held.important, eye)
-        )
+        parts.append(_Part(slot, slot.held.marks, slot.held.important, eye))
     return parts
 
 
@@ -320,20 +262,19 @@ def _sort_and_color(
     """
     order = _order(parts, near, mode, few)
     if rows is None:
-        return _Sorted(as_texture(order), len(order), None)
+        return as_texture(order), len(order), None
     painted = np.zeros((rows, 4), np.float32)
     for part in parts:
-        slot = part.slot
         rgba = _colored(part, mode, constant=few is not None)
-        painted[slot.start : slot.start + slot.count] = rgba[: slot.count]
-    return _Sorted(as_texture(order), len(order), as_texture(painted))
+        painted[part.slot.rows] = rgba[: part.slot.count]
+    return as_texture(order), len(order), as_texture(painted)
 
 
 def _colored(part: _Part, mode: str, *, constant: bool) -> NDArray[np.float32]:
-    """Return the colours of an object's splats in a mode, (M, 4)."""
-    packed, forced = part.slot.packed, part.forced
-    if mode == "HEAT" and part.ranks is not None:
-        rgba = heat(packed, part.ranks, ramp())
+    """Colours of an object's splats in a mode, (M, 4)."""
+    packed, forced = part.slot.packed, part.marks.forced
+    if mode == "HEAT" and part.marks.ranks is not None:
+        rgba = heat(packed, part.marks.ranks, ramp())
     else:
         rgba = colors(packed, None if constant else part.eye)
     if mode == "GOES":
@@ -343,7 +284,7 @@ def _colored(part: _Part, mode: str, *, constant: bool) -> NDArray[np.float32]:
 
 
 def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) -> NDArray[Any]:
-    """Return the rows of the textures that are drawn, the farthest first."""
+    """Rows of the textures that are drawn, the farthest first."""
     counts = [part.slot.count for part in parts]
     counts = counts if most is None else first_of_each(counts, most)
     rows, depths = zip(
@@ -356,7 +297,7 @@ def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) 
 def _in_view(
     part: _Part, count: int, near: float, mode: str
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the rows of an object's most important splats that a view draws, and their depths."""
+    """Rows of an object's most important splats that a view draws, and their depths."""
     slot, important = part.slot, part.important
     if count == slot.count or important is None:
         shown, depths = in_front(slot.packed.means[:count], part.eye, near)
@@ -364,26 +305,17 @@ def _in_view(
         chosen = important[important < slot.count][:count]
         places, depths = in_front(slot.packed.means[chosen], part.eye, near)
         shown = chosen[places].astype(np.int64)
-    if mode in {"STAYS", "GOES"}:
-        wanted = _wanted(part.going, mode, shown)
-        shown, depths = shown[wanted], depths[wanted]
-    if part.hidden is not None:
-        wanted = ~part.hidden[shown]
-        shown, depths = shown[wanted], depths[wanted]
-    return shown + slot.start, depths
-
-
-def _wanted(
-    going: NDArray[np.bool_] | None, mode: str, rows: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Return which rows stay, or go; without a plan all stay."""
-    if going is None:
-        return np.full(len(rows), mode == "STAYS")
-    return going[rows] if mode == "GOES" else ~going[rows]
+    going, hidden = part.marks.going, part.marks.hidden
+    wanted = np.full(len(shown), mode != "GOES")  # without a plan all stay
+    if mode in {"STAYS", "GOES"} and going is not None:
+        wanted = going[shown] == (mode == "GOES")
+    if hidden is not None:
+        wanted &= ~hidden[shown]
+    return shown[wanted] + slot.start, depths[wanted]
 
 
 def _depths(size: tuple[int, int]) -> NDArray[np.float32] | None:
-    """Return the depths that Blender has drawn in the view, (H, W), None where it kept none.
+    """Depths that Blender has drawn in the view, (H, W), None where it kept none.
 
     EEVEE of 4.3 leaves zeros where overlays are off.
     """

@@ -15,7 +15,7 @@ class Packing:
     def __init__(self) -> None:
         self.waiting = []
 
-    def start(self, *call):
+    def submit(self, *call):
         """Take a call; it is not run before `run`."""
         self.waiting.append((Future(), call))
         return self.waiting[-1][0]
@@ -28,18 +28,18 @@ class Packing:
 
 
 @pytest.fixture
-def packing(addon, monkeypatch):
-    """Give the thread, in the place of the one there is."""
-    packing = Packing()
-    monkeypatch.setattr(addon.viewport.content.background, "start", packing.start)
-    return packing
+def packing():
+    """Give the thread, for the place of the one there is."""
+    return Packing()
 
 
 @pytest.fixture
 def content(addon, packing, monkeypatch):
     """Give what views draw from, without textures: there is no graphics card in the background."""
     monkeypatch.setattr(addon.viewport.content.shader, "texture", lambda *_: None)
-    return addon.viewport.content.Content()
+    content = addon.viewport.content.Content()
+    content.pool = packing
+    return content
 
 
 def drawn(addon, content, obj):
@@ -57,19 +57,20 @@ def test_ranks_wait_until_the_splats_that_they_belong_to_are_packed(addon, room,
     assert drawn(addon, content, room) is None
     packing.run()
     slot = drawn(addon, content, room)
-    count, ranks = len(room.data.vertices), slot.held.ranks
+    count, ranks = len(room.data.vertices), slot.held.marks.ranks
     keep = np.ones(count, np.bool_)
     keep[:1000] = False
+    stay = keep[slot.packed.vertices]
 
     addon.objects.splat_group.delete_splats(addon.mesh.layout.check(room), keep)
 
     slot = drawn(addon, content, room)
     assert slot.packed.vertices.max() == count - 1
-    np.testing.assert_array_equal(slot.held.ranks, ranks)
+    np.testing.assert_array_equal(slot.held.marks.ranks, ranks)
     packing.run()
     slot = drawn(addon, content, room)
     assert slot.packed.vertices.max() == count - 1001
-    np.testing.assert_array_equal(slot.held.ranks, ranks[keep])
+    np.testing.assert_array_equal(slot.held.marks.ranks, ranks[stay])
 
 
 @pytest.mark.usefixtures("room_cameras")

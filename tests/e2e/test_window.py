@@ -260,7 +260,7 @@ def test_splats_stand_among_other_objects(binary: Binary, cloud: Path):
             "linked",
         )
     }
-    rows, columns = (slice(size // 2 - 15, size // 2 + 15) for size in plain.shape[:2])
+    rows, columns = (slice(size // 2 - 7, size // 2 + 7) for size in plain.shape[:2])
     center = rows, columns
 
     assert found["failure"] == ""
