@@ -40,18 +40,23 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
     matrix = np.empty((3, 4))  # world to camera: x right, y up, z back
     matrix[:, :3] = np.array([1.0, -1.0, -1.0])[:, None] * view.rotation
     matrix[:, 3] = -matrix[:, :3] @ view.center
-    projection = _projection(view)
-    packed = pack(splats)
+    near, far = view.near, min(view.far, _FARTHEST * view.near)
+    projection = np.zeros((4, 4))  # as OpenGL has it
+    projection[0, [0, 2]] = 2.0 * view.fx / view.width, 1.0 - 2.0 * view.cx / view.width
+    projection[1, [1, 2]] = 2.0 * view.fy / view.height, 2.0 * view.cy / view.height - 1.0
+    projection[2, 2:] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
+    projection[3, 2] = -1.0
+    packed, size = pack(splats), (view.height, view.width)
     means, covariances = np.zeros((2, len(packed), 4), np.float32)  # as `Atlas` has them
     means[:, :3] = packed.means
     covariances[:, :2], covariances[:, 2] = packed.covariances[:, 4:], MODELS.index(packed.model)
     eye = Eye(-matrix[2], view.center, perspective=True)
-    rows, depths = in_front(packed.means, eye, view.near)
+    rows, depths = in_front(packed.means, eye, near)
     rows = rows[depths < view.far]
     order = rows[farthest_first(depths[depths < view.far], perspective=True)]
     limits = []  # depths in the window that part the splats, the lowest row first
     for depth in () if layers is None else layers.depths:
-        away = np.maximum(depth[::-1], view.near)
+        away = np.maximum(depth[::-1], near)
         ndc = (projection[2, 2] * -away + projection[2, 3]) / away
         limits.append((0.5 * ndc + 0.5).astype(np.float32))
     everything = np.ones((1, 1), np.float32)
@@ -81,13 +86,12 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
             frame = shader.blend(picture, {**given, **ends}, projection, numbers, len(order))
             values = gpu.types.Buffer("FLOAT", view.width * view.height * 4)
             frame.read_color(0, 0, view.width, view.height, 4, 0, "FLOAT", data=values)
-            pixels = np.frombuffer(memoryview(values), np.float32)
-            pixels = pixels.reshape(view.height, view.width, 4)[::-1]
-            return np.moveaxis(pixels, -1, 0).astype(np.float64)
+            pixels = np.frombuffer(memoryview(values), np.float32).reshape(*size, 4)
+            return np.moveaxis(pixels[::-1], -1, 0).astype(np.float64)
 
         if layers is None:
             return between(0)
-        image, passed, left = np.zeros((4, view.height, view.width)), 1.0, layers.left()
+        image, passed, left = np.zeros((4, *size)), 1.0, layers.left()
         for number, share in enumerate(left):  # the splats before each layer, and behind the last
             if (share > 0.0).any():
                 drawn = between(number)
@@ -101,14 +105,3 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
         return image.clip(0.0, 1.0)
 
     return paint
-
-
-def _projection(view: View) -> NDArray[np.float64]:
-    """The projection matrix of a view, (4, 4), as OpenGL has it."""
-    near, far = view.near, min(view.far, _FARTHEST * view.near)
-    p = np.zeros((4, 4))
-    p[0, 0], p[0, 2] = 2.0 * view.fx / view.width, 1.0 - 2.0 * view.cx / view.width
-    p[1, 1], p[1, 2] = 2.0 * view.fy / view.height, 2.0 * view.cy / view.height - 1.0
-    p[2, 2], p[2, 3] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
-    p[3, 2] = -1.0
-    return p

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
 
 import bpy
 import numpy as np
@@ -19,7 +19,7 @@ from .. import main_thread
 from ..cameras.objects import pose
 from ..core.affine import is_flat, transformed
 from ..core.errors import RefineError
-from ..core.execute import Cancelled, checked_by, checkpoint
+from ..core.execute import Cancelled, checked_by, checkpoint, report
 from ..core.pictures import Layers, draw, seen_from
 from ..core.splats import Splats, drawable, joined
 from ..core.views import View, ViewSet, view_through
@@ -96,25 +96,19 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.error_set("Use Render > Render with Splats: this engine is a part of it")
             return
         try:
-            self._render(depsgraph, shared)
+            frame, folder = depsgraph.scene.frame_current, shared.finished
+            drawn = np.load(folder / f"{frame}.npy") / 65535.0 if folder else None
+            picture = self._picture(depsgraph, shared) if drawn is None else drawn
+            result = self.begin_result(0, 0, *picture.shape[:0:-1])
+            result.layers[0].passes["Combined"].rect.foreach_set(_linear(picture).ravel())
+            self.end_result(result)
+            shared.picture = picture
+            shared.frames.append(frame)
         except Cancelled:
             pass
         except BaseException as error:
             shared.error = error
             self.error_set(str(error))
-
-    def _render(self, depsgraph: bpy.types.Depsgraph, shared: Shared) -> None:
-        frame = depsgraph.scene.frame_current
-        if shared.finished:
-            picture = np.load(shared.finished / f"{frame}.npy") / 65535.0
-        else:
-            picture = self._picture(depsgraph, shared)
-        _, height, width = picture.shape
-        result = self.begin_result(0, 0, width, height)
-        result.layers[0].passes["Combined"].rect.foreach_set(_linear(picture).ravel())
-        self.end_result(result)
-        shared.picture = picture
-        shared.frames.append(frame)
 
     def _picture(self, depsgraph: bpy.types.Depsgraph, shared: Shared) -> NDArray[np.float64]:
         """What the camera sees, as `draw` does."""
@@ -130,7 +124,7 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
         shared.splats = len(splats)
         if shared.card and not away and len(splats):
             paint = card.painter(splats, view, layers)
-            with checked_by(self._check):
+            with checked_by(partial(report, self._progress, 0.5, "drawing")):
                 picture = main_thread.call(paint)
         else:
             frame = scene_of(splats.means, drawable(splats), camera)
@@ -139,22 +133,13 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
             picture[3] = 1.0
         return picture
 
-    def _check(self) -> None:
-        if self._is_stopped():
-            raise Cancelled
-
     def _progress(self, fraction: float, what: str) -> bool:
         self.update_progress(fraction)
         self.update_stats("", f"Splats: {what}")
-        return not self._is_stopped()
-
-    def _is_stopped(self) -> bool:
-        return bool(self.test_break()) or self.shared is None or self.shared.stopped
+        return not (self.test_break() or self.shared is None or self.shared.stopped)
 
 
-def _place(
-    depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, size: tuple[int, int]
-) -> tuple[View, float]:
+def _place(depsgraph, camera, size):
     """How a camera sees, and how far behind it the view stands.
 
     A view is a pinhole, so that of a camera without perspective stands far away.
@@ -165,12 +150,10 @@ def _place(
             f"camera '{camera.name}' is a panorama (lens type {data.type}): splats can be drawn in "
             "perspective and orthographic cameras; change its lens type"
         )
-    width, height = size
     pixel = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
-    projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, **pixel)
+    projection = camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1], **pixel)
     looking = pose(camera.name, np.array(camera.matrix_world, np.float64))
-    parallel = data.type == "ORTHO"
-    away = _FAR * data.ortho_scale if parallel else 0.0
+    away = _FAR * data.ortho_scale if data.type == "ORTHO" else 0.0
     view = view_through(np.array(projection, np.float64), looking, size, (0.0, away))
     near, far = away + data.clip_start, away + data.clip_end
     return replace(view, near=near, far=far, name=camera.name), away
@@ -204,22 +187,12 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
         if not np.isfinite(matrix).all() or is_flat(matrix):  # shows nothing, as a mesh would
             continue
         evaluated = SimpleNamespace(data=obj.data.evaluated_get(depsgraph))
-        checked = SplatObject(cast("bpy.types.Object", evaluated), check(obj).layout)
+        checked = SplatObject(evaluated, check(obj).layout)
         splats = mesh_attributes.splats_from_object(checked)
         local = np.linalg.inv(matrix)
         splats = seen_from(splats, local[:3, :3] @ eye + local[:3, 3])
         parts.append(transformed(splats, matrix, rotate_sh=False))
-    return joined(parts) if parts else _NOTHING
-
-
-_NOTHING = Splats(
-    means=np.empty((0, 3)),
-    log_scales=np.empty((0, 3)),
-    quaternions=np.empty((0, 4)),
-    opacity_logits=np.empty(0),
-    sh_dc=np.empty((0, 3)),
-    sh_rest=np.empty((0, 0, 3)),
-)
+    return joined(parts or [Splats(*map(np.empty, ((0, 3), (0, 3), (0, 4), 0, (0, 3), (0, 0, 3))))])
 
 
 def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -230,9 +203,6 @@ def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
     colors, alphas = picture[:3], picture[3]
     straight = (colors / np.maximum(alphas, 1e-6)).clip(0.0, 1.0)
     curved = ((straight + 0.055) / 1.055) ** 2.4
-    pixels = np.empty((*alphas.shape, 4), np.float32)
-    pixels[..., :3] = np.moveaxis(
-        alphas * np.where(straight > _KNEE, curved, straight / 12.92), 0, -1
-    )
-    pixels[..., 3] = alphas
-    return pixels[::-1].reshape(-1, 4)
+    linear = alphas * np.where(straight > _KNEE, curved, straight / 12.92)
+    pixels = np.concatenate([linear, picture[3:]]).astype(np.float32)
+    return np.moveaxis(pixels, 0, -1)[::-1].reshape(-1, 4)

@@ -13,7 +13,6 @@ import bpy
 from ..core.errors import RefineError
 from ..core.execute import Cancelled
 from . import copies
-from .copies import Step
 from .engine import REFINE_engine, Shared
 from .meshes import Meshes, drawn_by_us
 
@@ -37,10 +36,8 @@ def left_out(scene: bpy.types.Scene) -> list[str]:
     asked = {"depth of field": scene.camera.data.dof.use_dof, "motion blur": render.use_motion_blur}
     if blurred := [name for name, is_asked in asked.items() if is_asked]:
         told.append(f"Splats are drawn without {' and '.join(blurred)}")
-    if hasattr(scene, "compositing_node_group"):  # since 5.0
-        nodes = scene.compositing_node_group
-    else:
-        nodes = scene.use_nodes and scene.node_tree
+    new = hasattr(scene, "compositing_node_group")  # since 5.0
+    nodes = scene.compositing_node_group if new else scene.use_nodes and scene.node_tree
     if render.use_compositing and nodes:
         told.append("Compositing nodes are left out")
     if sum(layer.use for layer in scene.view_layers) > 1:
@@ -50,7 +47,7 @@ def left_out(scene: bpy.types.Scene) -> list[str]:
 
 def steps(
     scene: bpy.types.Scene, frames: Sequence[int], shared: Shared, *, write: bool
-) -> Generator[Step | None, None, None]:
+) -> Generator[copies.Step | None, None, None]:
     """Yield what Blender has to render for some frames, one after another.
 
     Whoever renders them asks for the next when one is over. Where None is yielded there is nothing
@@ -88,14 +85,14 @@ def steps(
                 continue
             shared.layers = yield from meshes.layers(frame)
             copies.set_frames(whole, [frame])
-            yield Step(whole, animation=write, what="splats")
+            yield copies.Step(whole, animation=write, what="splats")
             _check(shared, frame)
             if movie:
                 shared.save(folder, frame)
         if movie:
             shared.finished = folder
             copies.set_frames(written, frames)
-            yield Step(written, animation=True, what="movie")
+            yield copies.Step(written, animation=True, what="movie")
             _check(shared, frames[-1])
 
 
@@ -119,12 +116,11 @@ def _check(shared: Shared, frame: int) -> None:
 def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
     """Tell whether the file of a frame is there and stays; else make one in its place if wanted."""
     path = Path(bpy.path.abspath(copies.existing(name).render.frame_path(frame=frame)))
-    if stays and path.exists():
-        return True
-    if placeholder and not path.exists():
+    there = path.exists()
+    if placeholder and not there:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    return False
+    return stays and there
 
 
 @contextmanager

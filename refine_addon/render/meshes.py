@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
 import bpy
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.execute import Cancelled
 from ..core.pictures import Layers
 from ..mesh import native
 from ..mesh.layout import looks_like_splats
 from . import copies, passes
-from .copies import Step
-from .out_of_sight import out_of_sight
-from .see_through import lets_through
 
 _RENDERED = {
     *("MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES", "POINTCLOUD", "GREASEPENCIL"),
     *("GPENCIL", "EMPTY"),  # an empty may stand for a collection
 }
+
+_MARK = "refine_out_of_sight"
+"""Custom property of such an object: the property that was changed."""
+
+_BY_RAYS = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES"}
+"""Objects that cameras can be told not to see; EEVEE does not look at that for instances."""
 
 _TILE = 128
 """Pixels along each side of a tile that the processor renders, at most."""
@@ -43,6 +46,9 @@ _PIXELS = 1 << 18
 
 _MOMENT = 0.01
 """Seconds that Blender may stand still."""
+
+
+Steps = Generator[copies.Step | None, None, Callable[[], Layers] | None]
 
 
 def drawn_by_us(obj: bpy.types.Object) -> bool:
@@ -84,10 +90,10 @@ class Meshes:
             meshes = bpy.data.scenes[self._meshes]
             engine = meshes.render.engine
             glass = engine == "CYCLES" and meshes.cycles.film_transparent_glass
-            self._clear = [obj for obj in shown if lets_through(obj, glass=glass)]
+            self._clear = [obj for obj in shown if _lets_through(obj, glass)]
             self._opaque = [obj for obj in shown if obj not in self._clear]
-            if self._clear and engine != "CYCLES" and hasattr(meshes, "cycles"):
-                # EEVEE knows no depth of what it blends.
+            if self._clear and engine.startswith("BLENDER_EEVEE") and hasattr(meshes, "cycles"):
+                # It knows no depth of what it blends.
                 self._depths = self._copy(scene, "depths", cycles=True, samples=1).name
         if not scene.render.film_transparent and scene.world is not None:
             # Cycles is quicker to begin, and needs no graphics card.
@@ -99,9 +105,7 @@ class Meshes:
         self._any = self._meshes or self._world
         self.engine = bpy.data.scenes[self._any].render.engine if self._any else ""
 
-    def layers(
-        self, frame: int
-    ) -> Generator[Step | None, None, Callable[[], Layers | None] | None]:
+    def layers(self, frame: int) -> Steps:
         """Yield what has to be rendered of a frame; return what gives it as layers, on any thread.
 
         Where None is yielded Blender may do something else.
@@ -125,26 +129,23 @@ class Meshes:
             future = pool.submit(passes.read, files, world, far)
             while not wait([future], _MOMENT).done:
                 yield None
-        light = future.result()
-        shown = yield from self._shown(light.pictures)
-        return partial(light.layers, shown)
+        pictures, blended = future.result()
+        return partial(blended, (yield from self._shown(pictures)))
 
-    def _rendered(self, name: str, frame: int, label: str) -> Generator[Step, None, Path]:
+    def _rendered(self, name, frame, label):
         """Render a frame of a copy; return the file, under another name.
 
         Blender takes Esc for itself, and writes nothing of what it has not finished.
         """
         copies.set_frames(name, [frame])
-        yield Step(name, animation=True, what="meshes")
+        yield copies.Step(name, animation=True, what="meshes")
         try:
             written = Path(bpy.data.scenes[name].render.frame_path(frame=frame))
             return written.replace(self._folder / f"{label}.exr")
         except FileNotFoundError:
             raise Cancelled from None
 
-    def _copy(
-        self, scene: bpy.types.Scene, what: str, *, cycles: bool = False, samples: int = 0
-    ) -> bpy.types.Scene:
+    def _copy(self, scene, what, *, cycles=False, samples=0):
         """Make a copy; by Cycles if there is no other way, or told so; with few rays if told so."""
         copy = copies.copied(scene, what)
         copies.write_exr(copy, self._folder / f"{what}_######")
@@ -153,18 +154,16 @@ class Meshes:
             layer.use_pass_combined = layer.use_pass_z = True
             # Cycles: the depth of what is nearest, seen through or not.
             layer.pass_alpha_threshold = 0.0
-        eevee = copy.render.engine.startswith("BLENDER_EEVEE")
-        few = min(samples or copy.eevee.taa_render_samples, copy.eevee.taa_render_samples)
-        copy.eevee.taa_render_samples = few
-        settings = getattr(copy, "cycles", None)
+        settings, most = getattr(copy, "cycles", None), copy.eevee.taa_render_samples
+        copy.eevee.taa_render_samples = few = min(samples or most, most)
         if settings is None:
             return copy
-        if eevee and not _has_card():
-            copy.render.engine, settings.samples, settings.use_denoising = "CYCLES", few, False
-        if cycles:
+        instead = copy.render.engine.startswith("BLENDER_EEVEE") and not _has_card()
+        if cycles or instead:
             copy.render.engine = "CYCLES"
-        if samples:
-            settings.samples, settings.use_denoising = min(settings.samples, samples), False
+        if samples or instead:
+            settings.samples = few if instead else min(settings.samples, samples)
+            settings.use_denoising = False
         if samples == 1:
             settings.device = "CPU"  # whose kernels are there already
         if settings.device == "CPU":  # Cycles looks for Esc between tiles
@@ -172,16 +171,12 @@ class Meshes:
             settings.use_auto_tile, settings.tile_size = True, min(tile, _TILE)
         return copy
 
-    def _shown(
-        self, pictures: Sequence[NDArray[np.float32]]
-    ) -> Generator[None, None, list[NDArray[np.float32]]]:
+    def _shown(self, pictures):
         """Linear colours, (3, H, W) each, as the view transform of the scene shows them.
 
         Only Blender knows the transform, and applies it where it saves an image. So much is done
         between two yields that Blender stands still for a tenth of a second.
         """
-        if not pictures:
-            return []
         tall = np.concatenate(pictures, axis=1)
         rows = max(_PIXELS // tall.shape[2], 1)
         bands = []
@@ -190,29 +185,24 @@ class Meshes:
             bands.append(self._band_shown(tall[:, start : start + rows]))
         return np.split(np.concatenate(bands, axis=1), len(pictures), axis=1)
 
-    def _band_shown(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _band_shown(self, band):
         """Some rows of linear colours, (3, R, W), as they are shown."""
-        scene = copies.existing(self._any)
-        path = self._folder / "shown.png"
+        scene, path = copies.existing(self._any), str(self._folder / "shown.png")
         height, width = band.shape[1:]
         pixels = np.ones((height, width, 4), np.float32)
         pixels[..., :3] = np.moveaxis(band, 0, -1)
-        linear = bpy.data.images.new("REFINE", width, height, float_buffer=True)
+        images = [bpy.data.images.new("REFINE", width, height, float_buffer=True)]
         try:
-            linear.pixels.foreach_set(pixels.ravel())
+            images[0].pixels.foreach_set(pixels.ravel())
             copies.write_png(scene)
-            linear.save_render(str(path), scene=scene)
+            images[0].save_render(path, scene=scene)
+            images.append(bpy.data.images.load(path))
+            images[1].colorspace_settings.name = "Non-Color"
+            images[1].alpha_mode = "CHANNEL_PACKED"
+            images[1].pixels.foreach_get(pixels.ravel())
         finally:
-            bpy.data.images.remove(linear)
+            bpy.data.batch_remove(images)
             copies.write_exr(scene, Path(scene.render.filepath))
-        shown = bpy.data.images.load(str(path))
-        try:
-            shown.colorspace_settings.name = "Non-Color"
-            shown.alpha_mode = "CHANNEL_PACKED"
-            shown.pixels.foreach_get(pixels.ravel())
-        finally:
-            bpy.data.images.remove(shown)
-            path.unlink()
         return np.moveaxis(pixels[..., :3], -1, 0)
 
 
@@ -221,3 +211,59 @@ def _has_card() -> bool:
     if not bpy.app.background or not sys.platform.startswith("linux"):
         return True
     return Path("/dev/dri").exists() or Path("/dev/nvidia0").exists()
+
+
+def _lets_through(obj: bpy.types.Object, glass: bool) -> bool:
+    """Tell whether a material may let light through; by Cycles also one of glass."""
+    trees = {slot.material.node_tree for slot in obj.material_slots if slot.material} - {None}
+    return any(_is_clear(node, glass) for tree in trees for node in _nodes(tree))
+
+
+def _nodes(tree):
+    """Nodes of a tree and of the groups in it."""
+    for node in tree.nodes:
+        yield node
+        if getattr(node, "node_tree", None) is not None:
+            yield from _nodes(node.node_tree)
+
+
+def _is_clear(node: bpy.types.Node, glass: bool) -> bool:
+    def between(name: str, opaque: float) -> bool:
+        socket = node.inputs.get(name)
+        return socket is not None and (socket.is_linked or socket.default_value != opaque)
+
+    if node.type in {"BSDF_TRANSPARENT", "HOLDOUT"}:
+        return True
+    if node.type == "BSDF_PRINCIPLED":
+        return between("Alpha", 1.0) or (glass and between("Transmission Weight", 0.0))
+    if node.type == "EEVEE_SPECULAR":
+        return between("Transparency", 0.0)
+    return glass and node.type in {"BSDF_GLASS", "BSDF_REFRACTION"}
+
+
+@contextmanager
+def out_of_sight(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
+    """Leave objects out of renders within the block; they cast shadows, and lights shine on them.
+
+    Each is marked until it is as it was: an undo or a file may bring it back as it is then.
+    """
+    for obj in objects:
+        seen_by_rays = obj.type in _BY_RAYS and obj.instance_type == "NONE"
+        name = "visible_camera" if seen_by_rays else "hide_render"
+        if getattr(obj, name) == seen_by_rays:  # else the scene leaves it out already
+            obj[_MARK] = name
+            setattr(obj, name, not seen_by_rays)
+    try:
+        yield
+    finally:
+        restore()
+
+
+def restore() -> None:
+    """Show all objects again that are left out."""
+    for obj in bpy.data.objects:
+        name = obj.get(_MARK)
+        if name is not None:
+            setattr(obj, name, name == "visible_camera")
+            with suppress(KeyError):
+                del obj[_MARK]

@@ -1,12 +1,12 @@
 """What engines have rendered, from files to layers: arrays alone, for any thread.
 
 Layers are blended as splats are, in the colours that are shown, which only Blender makes of light.
-So there are three steps: `read`, Blender's view transform of `Light.pictures`, `Light.layers`.
+So there are three steps: `read`, Blender's view transform of its pictures, its layers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -29,67 +29,63 @@ class Pass(NamedTuple):
     depths: NDArray[np.float32]
 
 
-class Light:
-    """What was rendered, as light.
+Blended = tuple[list[NDArray[np.float32]], Callable[[Sequence[NDArray[np.float32]]], Layers]]
+
+
+def read(files: Sequence[tuple[Path, Path]], world: Path | None, far: float) -> Blended:
+    """Read and remove files of what was rendered.
 
     Parameters
     ----------
-    passes : sequence of Pass
-    world : (3, H, W) float32, optional
+    files : sequence of (Path, Path)
+        Colours and depths of each pass.
+    world : Path or None
         What is behind all of them.
+    far : float
+        Depths from which on there is nothing.
 
-    Attributes
-    ----------
+    Returns
+    -------
     pictures : list of (3, H, W) float32
-        What the view transform is to be applied to: each pass as if it were opaque, and all as
-        they are seen without splats.
-    """
-
-    def __init__(self, passes: Sequence[Pass], world: NDArray[np.float32] | None) -> None:
-        self._passes = passes
-        self.pictures = [each.colors / np.maximum(each.alphas, 1e-6) for each in passes]
-        if not passes:
-            self.pictures += [] if world is None else [world]
-            self._seen = np.ones(())
-            return
-        stacked = in_order(passes)
-        over, left = stacked.over_nothing(), stacked.left()[-1]
-        self._seen = 1.0 - left if world is None else np.ones(())
-        over = over / np.maximum(self._seen, 1e-6) if world is None else over + left * world
-        self.pictures.append(over.astype(np.float32))
-
-    def layers(self, shown: Sequence[NDArray[np.float32]]) -> Layers | None:
-        """Layers by what `pictures` are shown as, None if there are none.
-
-        Where there are no splats they show what Blender does: the background makes up for what
-        blending shown colours does not.
-        """
-        if not shown:
-            return None
-        *opaque, whole = shown
-        pairs = zip(opaque, self._passes, strict=True)
-        passes = [each._replace(colors=each.alphas * colors) for colors, each in pairs]
-        nothing = np.zeros_like(whole[0])
-        layers = in_order(passes or [Pass(np.zeros_like(whole), nothing, nothing)])
-        return replace(layers, background=self._seen * whole - layers.over_nothing())
-
-
-def read(files: Sequence[tuple[Path, Path]], world: Path | None, far: float) -> Light:
-    """Read and remove files of what was rendered: colours and depths of each pass, and the world.
-
-    Depths from `far` on are those of nothing.
+        What the view transform is to be applied to.
+    layers : callable
+        Gives layers by what these are shown as.
 
     Raises
     ------
     RefineError
         See `read_exr`.
     """
-    found = []
+    passes = []
     for colors, depths in files:
         one = _read(colors)
         away = one.depths if depths == colors else _read(depths).depths
-        found.append(one._replace(depths=_known(away, one.alphas, far)))
-    return Light(found, _read(world).colors if world else None)
+        passes.append(one._replace(depths=_known(away, one.alphas, far)))
+    return _blended(passes, _read(world).colors if world else None)
+
+
+def _blended(passes: Sequence[Pass], world: NDArray[np.float32] | None) -> Blended:
+    """Each pass as if it were opaque, and all as they are seen without splats; see `read`."""
+    nothing = np.zeros_like(passes[0].colors if passes else world)
+    seen = [each for each in passes if each.alphas.any()]
+    passes = seen or [Pass(nothing, nothing[0], nothing[0])]
+    stacked = in_order(passes)
+    over, left = stacked.over_nothing(), stacked.left()[-1]
+    share = np.ones_like(left) if world is not None else 1.0 - left
+    over = over / np.maximum(share, 1e-6) if world is None else over + left * world
+
+    def layers(shown: Sequence[NDArray[np.float32]]) -> Layers:
+        """Where there are no splats they show what Blender does.
+
+        The background makes up for what blending shown colours does not.
+        """
+        pairs = zip(seen, shown, strict=False)
+        opaque = [each._replace(colors=each.alphas * colors) for each, colors in pairs]
+        layers = in_order(opaque or passes)
+        return replace(layers, background=share * shown[-1] - layers.over_nothing())
+
+    straight = [each.colors / np.maximum(each.alphas, 1e-6) for each in seen]
+    return [*straight, over.astype(np.float32)], layers
 
 
 def _read(path: Path) -> Pass:
@@ -101,9 +97,7 @@ def _read(path: Path) -> Pass:
     return Pass(colors, channels["Combined.A"].clip(0.0, 1.0), depths)
 
 
-def _known(
-    depths: NDArray[np.float32], alphas: NDArray[np.float32], far: float
-) -> NDArray[np.float32]:
+def _known(depths, alphas, far):
     """Depth of what is seen in each pixel, (H, W), 0 where it has none.
 
     Engines write that of one ray a pixel, which may miss what others hit: at an edge the nearest
@@ -112,7 +106,6 @@ def _known(
     known = np.where(depths >= far, np.float32(np.inf), depths)
     for _ in range(_ROUNDS):
         padded = np.pad(known, 1, constant_values=np.inf)
-        height, width = known.shape
-        around = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]
-        known = np.where(np.isinf(known), np.minimum.reduce(around), known)
+        around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).min(axis=(2, 3))
+        known = np.where(np.isinf(known), around, known)
     return np.where(np.isinf(known) | (alphas <= 0.0), np.float32(0.0), known)

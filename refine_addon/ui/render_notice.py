@@ -9,8 +9,8 @@ from collections.abc import Callable
 import bpy
 from bpy.app.handlers import persistent
 
-from ..render import copies, out_of_sight
-from ..render.meshes import drawn_by_us
+from ..render import copies
+from ..render.meshes import drawn_by_us, restore
 
 NOTICE = "Splats are not in this render: use Render > Render with Splats"
 """What is said."""
@@ -75,4 +75,4 @@ def _returned(*_: object) -> None:
     """Remove what a step back, or a file, has brought of a render that is over."""
     if not bpy.app.is_job_running("RENDER"):
         copies.remove_all()
-        out_of_sight.restore()
+        restore()

@@ -13,8 +13,8 @@ from bpy.props import BoolProperty
 from .. import main_thread
 from ..core.execute import Cancelled
 from ..render import card, frames
+from ..render.copies import Step
 from ..render.engine import Shared
-from ..render.frames import Step
 from .images import put
 from .operator_bases import FAILURES, Answer, Needing, fail, idle
 from .wrapped import counted

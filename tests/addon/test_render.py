@@ -234,7 +234,7 @@ def test_what_an_undo_brings_back_of_a_render_is_put_right(addon, shot):
     shown, gone = (plane(shot, 1.0, (1.0, 1.0, 1.0), 1.0) for _ in range(2))
     gone.visible_camera = False
     before = settings(shot)
-    hide = addon.render.out_of_sight.out_of_sight([shown, gone])
+    hide = addon.render.meshes.out_of_sight([shown, gone])
     hide.__enter__()
     meanwhile = shown.visible_camera
     addon.ui.render_notice._returned()
@@ -445,7 +445,7 @@ def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon,
     operators, begun = addon.ui.render_operators, []
     watch = operators._Watch()
     monkeypatch.setattr(operators, "_watch", watch)
-    step = addon.render.frames.Step(bpy.context.scene.name, animation=False, what="meshes")
+    step = addon.render.copies.Step(bpy.context.scene.name, animation=False, what="meshes")
     waiting = SimpleNamespace(
         _steps=iter([step, step]),
         _next=None,
