@@ -169,7 +169,7 @@ def _draw() -> None:
     solid = not overlays.is_xray(space.shading)
     solid = solid and not all(looks_like_splats(obj) for obj in context.visible_objects)
     view.draw(_state.content, placed, camera, _state.mode, solid=solid)
-    overlays.draw(context, mixed=view.count > 0)
+    overlays.draw(context, mixed=view.count > 0, has_depths=view.depths is not None)
     if not view.complete and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)
 

@@ -57,11 +57,14 @@ def is_xray(shading: bpy.types.View3DShading) -> bool:
     return bool(seen.get(shading.type))
 
 
-def draw(context: bpy.types.Context, *, mixed: bool) -> None:
-    """Draw edges of volumes into a view, and meshes that are to be mixed with what it shows."""
+def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
+    """Draw edges of volumes into a view, and meshes that are to be mixed with what it shows.
+
+    Where it has no depths of what hides others, they are of something else: see `view.View`.
+    """
     shading = context.space_data.shading
     if mixed and shading.type != "WIREFRAME":
-        if is_xray(shading):  # of which Blender 5 has kept the depth
+        if not has_depths:
             gpu.state.active_framebuffer_get().clear(depth=1.0)
         for obj in context.visible_objects:
             if obj.type == "MESH" and not looks_like_splats(obj) and obj.display_type in _FILLED:

@@ -96,12 +96,23 @@ class _Order(NamedTuple):
 
 
 class View:
-    """One region of a 3D view."""
+    """One region of a 3D view.
+
+    Attributes
+    ----------
+    depths : (H, W) float32 or None
+        Of what Blender has drawn; None where nothing hides what is behind it (Blender 5 keeps
+        depths of what X-ray shows), or Blender kept none.
+    complete : bool
+        Whether it shows all it is to show.
+    count : int
+        Splats that are shown.
+    """
 
     def __init__(self) -> None:
         self._picture: gpu.types.GPUTexture | None = None
         self._drawn: object = None
-        self._depths: NDArray[np.float32] | None = None
+        self.depths: NDArray[np.float32] | None = None
         self._order: _Order | None = None
         self._colors: gpu.types.GPUTexture | None = None
         self._colors_key: object = None
@@ -215,9 +226,9 @@ class View:
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
         look = (self._order.key, self._colors_key, self._camera_key)
         wanted = (*look, size, content.selections)
-        if self._picture and wanted == self._drawn and same(depths, self._depths):
+        if self._picture and wanted == self._drawn and same(depths, self.depths):
             return
-        self._drawn, self._depths = wanted, depths
+        self._drawn, self.depths = wanted, depths
         if not self._picture or (self._picture.width, self._picture.height) != size:
             self._picture = gpu.types.GPUTexture(size, format="RGBA16F")
         rows = np.zeros((1 + max(slot.number for slot, _ in shown), 12), np.float32)
