@@ -246,6 +246,7 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
         between = RaySample(ViewSet(tuple(halfway)).by_distance(), gaussians, splats)
         between.share = BETWEEN_RAYS
         between.cast_all(gaussians, scene, casting, threads)
+    del gaussians, of_groups, errors  # not needed any more where memory is highest
     rays = _RemovalRounds(samples.pop(), measured, loading, threads) if rounds > 1 else None
     undrawn = np.setdiff1d(np.arange(count), index)
     first = undrawn[np.argsort(prior[undrawn], kind="stable")]
