@@ -505,7 +505,7 @@ def test_scoring_for_one_budget_decides_what_scores_for_all_would(scored_for_all
         assert some.report[name] == whole.report[name]
     assert some.report["method"]["psnr"] == whole.report["method"]["psnr"]
     known = len(some.report["quality"]["shares"])
-    for name in ("shares", "psnr", "absorbed"):
+    for name in ("shares", "psnr", "merged"):
         # Means over the views are products of matrices, whose last digit depends on their shape.
         expected = whole.report["quality"][name][:known]
         assert some.report["quality"][name] == pytest.approx(expected, rel=1e-12)

@@ -24,7 +24,7 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.quality.curve import PSNR_CAP, SHARES, Quality, absorbed_from
+from refine_addon.core.quality.curve import PSNR_CAP, SHARES, Quality, merged_from
 from refine_addon.core.quality.psnr import psnr_against, psnr_kept, psnr_of, quality_curve
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.splats import opacity
@@ -327,31 +327,31 @@ def test_where_the_curve_is_flat_as_much_goes_as_can():
     assert flat.share(40.0) == 0.8
 
 
-def test_the_curve_of_absorbing_is_read_in_the_same_way():
+def test_the_curve_of_merging_is_read_in_the_same_way():
     """At the points what was put in."""
     assert CURVE.at(0.5, way="merge") == pytest.approx(47.0)
     assert CURVE.share(38.0, way="merge") == pytest.approx(0.8)
 
 
-def test_absorbing_is_expected_to_be_better_and_never_worse():
+def test_merging_is_expected_to_be_better_and_never_worse():
     """Up to a tenth it is deletion; at half removed 4.5 + .55 * 2 dB better; never above 100."""
     psnr = np.linspace(100.0, 10.0, len(SHARES))
 
-    found = absorbed_from(psnr, np.full(4, 2.0), 40_000)
+    found = merged_from(psnr, np.full(4, 2.0), 40_000)
 
     assert found[0] == psnr[0]
     assert found[SHARES.index(0.5)] == pytest.approx(psnr[SHARES.index(0.5)] + 5.6)
     assert np.all(np.diff(found) <= 0.0)
     assert np.all(found >= psnr)
-    assert absorbed_from(np.full(len(SHARES), 99.0), np.full(4, 9.0), 10**6).max() <= PSNR_CAP
-    assert np.array_equal(absorbed_from(psnr, np.full(4, -50.0), 40_000), psnr)
+    assert merged_from(np.full(len(SHARES), 99.0), np.full(4, 9.0), 10**6).max() <= PSNR_CAP
+    assert np.array_equal(merged_from(psnr, np.full(4, -50.0), 40_000), psnr)
 
 
-def test_fewer_splats_are_expected_to_gain_less_by_absorbing():
+def test_fewer_splats_are_expected_to_gain_less_by_merging():
     """From 40,000 on it is the same; 10,000 are two halvings, of .4 dB each at half removed."""
     psnr, half = np.linspace(80.0, 10.0, len(SHARES)), SHARES.index(0.5)
     many, more, few = (
-        absorbed_from(psnr, np.full(4, 2.0), count) for count in (40_000, 10**6, 10_000)
+        merged_from(psnr, np.full(4, 2.0), count) for count in (40_000, 10**6, 10_000)
     )
 
     assert np.array_equal(many, more)
@@ -390,7 +390,7 @@ def test_a_curve_comes_back_from_json():
     assert again is not None
     assert np.array_equal(again.shares, CURVE.shares)
     assert np.array_equal(again.psnr, CURVE.psnr)
-    assert np.array_equal(again.absorbed, CURVE.absorbed)
+    assert np.array_equal(again.merged, CURVE.merged)
     assert again.views["a"].tolist() == [51.0, 41.0, 31.0]
     for wrong in (None, {}, {"shares": [0.5]}, facts | {"psnr": [1.0]}, facts | {"psnr": ["x"]},
                   {name: [] for name in facts}, 3,
@@ -429,7 +429,7 @@ def test_every_method_reaches_a_psnr(method, goal):
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [25.0, 40.0])
 def test_merging_reaches_a_psnr_with_fewer(merges, goal):
-    """By its own estimate, to `absorb_splats.CLOSE` or as near as three tries come."""
+    """By its own estimate, to `prune.CLOSE` or as near as three tries come."""
     splats, views = cloud(1500), ring()
     plain = prune(splats, views, Budget(psnr=goal), Occlusion())
     merged = prune(splats, views, Budget(psnr=goal), Merge())
@@ -453,7 +453,7 @@ def test_protected_splats_stay_and_the_psnr_is_kept_all_the_same():
 
 
 def test_the_report_has_the_estimate_and_the_curve():
-    """Plain numbers: of the result, of absorbing instead, and of all shares."""
+    """Plain numbers: of the result, of merging instead, and of all shares."""
     done = prune(cloud(), ring(), Budget(ratio=0.5), Occlusion()).report
 
     at = done["quality"]["shares"].index(0.5)
@@ -504,7 +504,7 @@ def test_the_closed_form_says_that_it_made_no_estimate():
 
 
 @pytest.mark.slow
-def test_absorbing_casts_rays_of_no_more_views_than_validate_it():
+def test_merging_casts_rays_of_no_more_views_than_validate_it():
     """Of 60 views every third validates, at most 24: the same estimate as with the rays of all."""
     splats, views = cloud(), ring(60)
     some, _ = occlusion.score_once(splats, views, few_views=True)

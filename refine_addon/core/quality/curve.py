@@ -26,11 +26,11 @@ PSNR_CAP = 100.0
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 """Shares of the splats removed at which the estimate is made; between them it is interpolated."""
 
-ABSORBED_SHARES = (0.3, 0.5, 0.7, 0.9)
-"""Shares removed at which kept splats stand in for removed ones; see `absorbed_from`."""
+MERGED_SHARES = (0.3, 0.5, 0.7, 0.9)
+"""Shares removed at which kept splats stand in for removed ones; see `merged_from`."""
 
 GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
-"""What absorbing gains over deleting at those shares, dB: a constant, and a part of what
+"""What merging gains over deleting at those shares, dB: a constant, and a part of what
 standing in gains on rays."""
 
 FULL_GAIN = 40_000
@@ -44,10 +44,10 @@ FEWEST = 20_000
 """Of fewer splats it is not foretold: scenes differ by up to 7 dB."""
 
 PLAIN = 0.1
-"""Share removed up to which absorbing is plain deletion."""
+"""Share removed up to which merging is plain deletion."""
 
 REFIT_GAIN, REFIT_HITS, FEWER_RAYS = (2.9, 3.2, 3.8, 4.7), 78.0, 1.3
-"""What refitting gains over absorbing in the views that decide, dB: at `ABSORBED_SHARES`, where a
+"""What refitting gains over merging in the views that decide, dB: at `MERGED_SHARES`, where a
 ray hits `REFIT_HITS` splats, and so much less for each doubling of that. Rounds learn from a number
 of hits, so that of a scene in which rays hit more they see fewer rays."""
 
@@ -55,7 +55,7 @@ UNSEEN = 60.0
 """PSNR in dB above which pictures are the same to the eye: rounding to 8 bits alone makes 59."""
 
 AS_GOOD = 0.5
-"""By so much more, dB, absorbing has to reach than plain deletion, or deletion is as good: nobody
+"""By so much more, dB, merging has to reach than plain deletion, or deletion is as good: nobody
 sees a difference so small, and rows that stay to the bit can be compared with the original's."""
 
 PARTED = 3.0
@@ -91,10 +91,10 @@ class Quality:
         Ascending, between 0 and 1.
     psnr : (L,) float64
         With these shares deleted, lowest scores first; dB, never rising.
-    absorbed : (L,) float64
-        About what absorbing reaches with as many survivors; dB, never rising.
+    merged : (L,) float64
+        About what merging reaches with as many kept splats; dB, never rising.
     foretold : bool
-        Whether `absorbed` is accurate enough to be shown.
+        Whether `merged` is accurate enough to be shown.
     views : dict of str to (L,) float64
         As `psnr`, of single views by their names; those that no ray tells of are missing.
     hits : float
@@ -111,14 +111,14 @@ class Quality:
 
     shares: NDArray[np.float64]
     psnr: NDArray[np.float64]
-    absorbed: NDArray[np.float64]
+    merged: NDArray[np.float64]
     foretold: bool = True
     views: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     hits: float = REFIT_HITS
     between: NDArray[np.float64] | None = None
 
     def at(self, share: float, way: Way = "delete") -> float:
-        """PSNR with a share of the splats removed, dB; if survivors may change, about.
+        """PSNR with a share of the splats removed, dB; if kept splats may change, about.
 
         Between the shares of the curve the PSNR is taken as linear in the logarithm of the odds
         ``share / (1 - share)``, which it nearly is; beyond the last it stays.
@@ -128,7 +128,7 @@ class Quality:
     def of_views(self, share: float, way: Way = "delete") -> dict[str, float]:
         """PSNR of single views with a share of the splats removed, dB.
 
-        Absorbing and refitting are taken to gain as much in each view as in all together.
+        Merging and refitting are taken to gain as much in each view as in all together.
 
         Examples
         --------
@@ -145,7 +145,7 @@ class Quality:
     def at_between(self, share: float, way: Way = "delete") -> float | None:
         """PSNR in views between these with a share of the splats removed, dB.
 
-        Absorbing and refitting are taken to gain as much there. None where nothing tells it.
+        Merging and refitting are taken to gain as much there. None where nothing tells it.
 
         Examples
         --------
@@ -179,7 +179,7 @@ class Quality:
         if way == "delete":
             return self.psnr
         gain = refit_gain(self.shares, self.hits) if way == "refit" else 0.0
-        return np.minimum.accumulate(np.minimum(self.absorbed + gain, PSNR_CAP))
+        return np.minimum.accumulate(np.minimum(self.merged + gain, PSNR_CAP))
 
     def _odds(self):
         return [_log_odds(share) for share in (0.0, *self.shares.tolist())]
@@ -189,13 +189,13 @@ class Quality:
         return float(np.interp(_log_odds(share), self._odds(), [PSNR_CAP, *psnr]))
 
     def as_good(self, share: float) -> bool:
-        """Whether plain deletion of a share is about as good as absorbing, as foretold."""
+        """Whether plain deletion of a share is about as good as merging, as foretold."""
         plain = self.at(share)
         return deletion_will_do(plain) or plain > self.at(share, "merge") - AS_GOOD
 
     def facts(self) -> dict[str, Any]:
         """Plain JSON values; those of single views to hundredths of a dB."""
-        curves = {name: getattr(self, name).tolist() for name in ("shares", "psnr", "absorbed")}
+        curves = {name: getattr(self, name).tolist() for name in ("shares", "psnr", "merged")}
         views = {name: psnr.round(2).tolist() for name, psnr in self.views.items()}
         between = None if self.between is None else self.between.round(2).tolist()
         told = {"foretold": self.foretold, "hits": round(self.hits, 2)}
@@ -206,21 +206,21 @@ class Quality:
         """The curve that `facts` describe; None if they are malformed."""
         try:
             held, array = dict(facts or {}), partial(np.array, dtype=np.float64)
-            shares, psnr, absorbed = map(array, (held["shares"], held["psnr"], held["absorbed"]))
+            shares, psnr, merged = map(array, (held["shares"], held["psnr"], held["merged"]))
             views = {str(name): array(each) for name, each in (held.get("views") or {}).items()}
             between = None if held.get("between") is None else array(held["between"])
             told = [] if between is None else [between]
-            every = np.stack([shares, psnr, absorbed, *views.values(), *told])  # of one length
+            every = np.stack([shares, psnr, merged, *views.values(), *told])  # of one length
             if every.ndim != 2 or not every.size:
                 return None
             hits, foretold = float(held.get("hits", REFIT_HITS)), bool(held.get("foretold", True))
         except (AttributeError, KeyError, TypeError, ValueError):
             return None
-        return cls(shares, psnr, absorbed, foretold, views, hits, between)
+        return cls(shares, psnr, merged, foretold, views, hits, between)
 
 
 def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.float64]:
-    """About what refitting gains over absorbing, dB, at least 0.
+    """About what refitting gains over merging, dB, at least 0.
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.fl
     [4.5, 3.2, 1.9]
     """
     fewer = FEWER_RAYS * math.log2(max(hits, 1.0) / REFIT_HITS)
-    gain = np.interp(share, ABSORBED_SHARES, REFIT_GAIN) - fewer
+    gain = np.interp(share, MERGED_SHARES, REFIT_GAIN) - fewer
     return np.asarray(gain.clip(0.0), np.float64)
 
 
@@ -245,7 +245,7 @@ def expected(
     measured: Mapping[Way, float | None],
     hits: float | None = None,
 ) -> dict[Way, float | None]:
-    """About which PSNR is reached by what survivors become, dB; None where nothing tells it.
+    """About which PSNR is reached by what kept splats become, dB; None where nothing tells it.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def expected(
     measured : mapping of str to (float or None)
         The estimates that were measured, dB: these are returned.
     hits : float or None
-        How many splats a ray hits on average, to foretell what refitting gains over absorbing that
+        How many splats a ray hits on average, to foretell what refitting gains over merging that
         was measured; None where that is not foretold.
 
     Examples
@@ -277,7 +277,7 @@ def expected(
 
 
 def deletion_will_do(psnr: float | None) -> bool:
-    """Whether nobody would see what absorbing gains over plain deletion.
+    """Whether nobody would see what merging gains over plain deletion.
 
     Parameters
     ----------
@@ -291,7 +291,7 @@ def deletion_will_do(psnr: float | None) -> bool:
 def needed(gone: int | None, count: int) -> int | None:
     """How many of `count` splats the curve must be known for where `gone` are removed.
 
-    That is up to the next of `ABSORBED_SHARES`, so that what it says up to there is what the whole
+    That is up to the next of `MERGED_SHARES`, so that what it says up to there is what the whole
     curve says. None if the whole is needed.
 
     Parameters
@@ -305,25 +305,25 @@ def needed(gone: int | None, count: int) -> int | None:
     >>> needed(40, 100), needed(50, 100), needed(95, 100)
     (50, 50, None)
     """
-    places = (math.floor(share * count) for share in ABSORBED_SHARES)
+    places = (math.floor(share * count) for share in MERGED_SHARES)
     return None if gone is None else next((place for place in places if place >= gone), None)
 
 
-def absorbed_from(
+def merged_from(
     psnr: NDArray[np.float64], gains: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
-    """About what absorbing reaches at the first L of `SHARES`, without absorbing; dB.
+    """About what merging reaches at the first L of `SHARES`, without merging; dB.
 
     Rays tell what the pictures would be if removed splats stayed as opaque as they are, in the
     colour of the nearest kept hit (`Rays.colors_by_nearest_kept`). That is neither an upper nor a
-    lower bound of what absorbing reaches, but goes up and down with it from scene to scene.
+    lower bound of what merging reaches, but goes up and down with it from scene to scene.
 
     Parameters
     ----------
     psnr : (L,) float64
         With the splats deleted, at those shares.
     gains : (G,) float64
-        By how much it is higher with kept splats standing in, at the first G of `ABSORBED_SHARES`,
+        By how much it is higher with kept splats standing in, at the first G of `MERGED_SHARES`,
         which go as far.
     count : int
         How many splats there are.
@@ -331,7 +331,7 @@ def absorbed_from(
     constant, part, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
     halvings = max(math.log2(FULL_GAIN / max(count, 1)), 0.0)
     foretold = (constant + part * gains - halvings * fewer).clip(0.0)
-    known = (PLAIN, *ABSORBED_SHARES[: len(gains)])
+    known = (PLAIN, *MERGED_SHARES[: len(gains)])
     gain = np.interp(SHARES[: len(psnr)], known, np.concatenate([[0.0], foretold]))
     return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
 

@@ -19,7 +19,7 @@ from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import projection
 from ..visibility.cast import RaySample, cast, colors_from
-from .curve import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
+from .curve import FEWEST, MERGED_SHARES, PSNR_CAP, SHARES, Quality, merged_from
 
 MIN_RAYS_WITH_HITS = 256
 """So many rays must hit a splat at least, or nothing is estimated."""
@@ -102,9 +102,9 @@ def quality_curve(
     last = len(values) if settled is None else settled
     if settled is not None and protected is not None:
         last -= int(np.count_nonzero(protected))
-    removed, absorbed = (
+    removed, merged = (
         [count for share in shares if (count := math.floor(share * len(values))) <= last]
-        for shares in (SHARES, ABSORBED_SHARES)
+        for shares in (SHARES, MERGED_SHARES)
     )
     if not removed or not _enough(sample):
         return None
@@ -122,7 +122,7 @@ def quality_curve(
         """By how much the PSNR is higher if kept splats stand in."""
         view, colors = sample.views[number][0], sample.colors(number, rays)
         truth, gains, place_of_hit = rays.colors(colors), [], place[sample.splat_rows[rays.hit]]
-        for count in absorbed:
+        for count in merged:
             keep = place_of_hit >= count  # (u,)
             deleted = rays.keeping(keep).colors(colors)
             stood_in = rays.colors_by_nearest_kept(colors, keep)
@@ -137,7 +137,7 @@ def quality_curve(
     curve = Quality(
         np.array(SHARES[: len(removed)]),
         psnr,
-        absorbed_from(psnr, _mean(sample, gains, validating), len(values)),
+        merged_from(psnr, _mean(sample, gains, validating), len(values)),
         len(values) >= FEWEST,
         dict(zip(names, np.minimum.accumulate(of_views, axis=1), strict=True)),
         sample.hits_of_ray(),

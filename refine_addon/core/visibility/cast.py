@@ -44,7 +44,7 @@ MAX_RAYS_OF_VIEW = 60_000
 """A view has at most so many rays: their numbers fit into 16 bits."""
 
 VALIDATION_VIEWS = 24
-"""What takes longer to compare than deleted splats (absorbed ones, written files) is compared in at
+"""What takes longer to compare than deleted splats (merged ones, written files) is compared in at
 most about so many views."""
 
 MIN_RAYS_OF_VIEW = 16
