@@ -39,6 +39,7 @@ from refine_addon.core.splats import SH_C0
 from refine_addon.mesh import scores as mesh_scores
 from refine_addon.mesh.attributes import read_attribute, write_attribute
 from refine_addon.ui.render_operators import IMAGE
+from refine_addon.viewport.heat_map import ramp
 
 
 def training_cameras(path: Path) -> int:
@@ -76,7 +77,7 @@ def heat_map(name: str) -> Path:
     """Do the same with each splat in the colour of its rank."""
     obj, own = bpy.context.object, bpy.context.object.data
     obj.data = own.copy()
-    colors = read_attribute(obj.data, "refine_heat")
+    colors = ramp()[(255 * read_attribute(obj.data, "refine_rank") + 0.5).astype(np.uint8)]
     for channel in range(3):
         coefficients = (colors[:, channel] - 0.5) / SH_C0
         write_attribute(obj.data, f"f_dc_{channel}", "FLOAT", coefficients)

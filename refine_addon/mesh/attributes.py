@@ -113,9 +113,8 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
 
 def file_from_object(checked: SplatObject) -> SplatFile:
     """Return a splat object as the file it would be, in memory; `SplatFile.write` writes it."""
-    return _file(
-        checked.obj.name, checked.layout, len(checked), _groups_of(checked, frozenset()), dict
-    )
+    groups = _groups_of(checked, frozenset())
+    return _file(checked.obj.name, checked.layout, len(checked), groups, dict)
 
 
 def read_for_file(

@@ -87,7 +87,7 @@ _MOST_NAMES = 8
 _TAKEN = {
     *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
     *("refine_score", "refine_rank", "refine_seen", "refine_scored"),
-    *("refine_heat", "refine_color", "refine_remove"),
+    *("refine_color", "refine_remove"),
     *("refine_protect", "refine_must_go", "refine_force", "refine_floats"),
     *("refine_home", "refine_shape"),
 }
@@ -127,13 +127,10 @@ class Layout:
     ----------
     columns : tuple of Column
     header : bytes
-    native : bool
-        Whether the mesh holds Blender's own splats (`native`).
     """
 
     columns: tuple[Column, ...]
     header: bytes
-    native: bool = False
 
     @property
     def row_dtype(self) -> np.dtype[Any]:
@@ -276,7 +273,7 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         # Splats come and go; the count is the mesh's.
         count = rb"\g<1>%d" % splat_count(mesh)
         header = re.sub(_COUNT, count, noted["header"].encode("latin-1"), count=1)
-        layout = Layout(columns, header, native.is_native(mesh))
+        layout = Layout(columns, header)
         # Join adds harmonics of a higher degree.
         names = layout.row_dtype.names or ()
         rest = [n for i in range(rest_count(mesh)) if (n := f"f_rest_{i}") not in names]
@@ -328,7 +325,7 @@ def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
     comments = re.findall(rb"^(?:comment|obj_info)\b[^\r\n]*", layout.header, re.MULTILINE)
     first = header.index(b"element")
     header = header[:first] + b"".join(line + b"\n" for line in comments) + header[first:]
-    return Layout(tuple(plain), header, layout.native)
+    return Layout(tuple(plain), header)
 
 
 def note(mesh: bpy.types.Mesh | bpy.types.PointCloud, layout: Layout) -> None:
@@ -374,7 +371,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
     columns = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
     columns += _further_columns(obj.data, {*names, *(column.attribute for column in columns)})
     header = new_header(_row(columns), splat_count(obj.data))
-    return Layout(tuple(columns), header, native.is_native(obj.data))
+    return Layout(tuple(columns), header)
 
 
 def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:

@@ -18,7 +18,6 @@ from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
-from . import heat_map
 from .layout import SplatObject
 from .records import parsed
 
@@ -96,8 +95,6 @@ def store(
             "together": together and {"id": together[0], "splats": together[1]},
         }
     )
-    # The heat map may fail for want of memory, and comes first: scores and record belong together.
-    heat_map.write(mesh, ranks)
     mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
     mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
     mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
@@ -117,7 +114,7 @@ def forget(checked: SplatObject) -> None:
     """
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
-    for name in (SCORE, RANK, SEEN, SCORED, heat_map.HEAT, mesh_edit.REMOVE):
+    for name in (SCORE, RANK, SEEN, SCORED, mesh_edit.REMOVE):
         mesh_attributes.remove_attribute(mesh, name)
     mesh.pop(RECORD, None)
     mesh_attributes.updated(mesh)

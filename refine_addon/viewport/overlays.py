@@ -19,9 +19,9 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Color, Vector
 from numpy.typing import NDArray
 
-from ..mesh.heat_map import ramp
 from ..mesh.layout import looks_like_splats
 from .arrays import GOES, MARKS, STAYS
+from .heat_map import ramp
 
 _OPAQUE = 0.995
 """Opacity from which on Blender draws a mesh with its depth."""

@@ -14,7 +14,6 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.heat_map import ramp
 from . import shader
 from .arrays import (
     GOES,
@@ -30,6 +29,7 @@ from .arrays import (
     tinted,
 )
 from .content import Atlas, Content, Marks, Slot
+from .heat_map import ramp
 
 REST = 0.2
 """Seconds without a change after which a view rests."""

@@ -210,7 +210,7 @@ def test_turning_the_cameras_drops_their_scores(addon, imported):
 
     assert addon.mesh.scores.record(obj.data) is None
     assert addon.ui.plans.stored(obj, bpy.context.scene.refine) is None
-    left = {"refine_score", "refine_rank", "refine_heat", "refine_remove", "refine_scored"}
+    left = {"refine_score", "refine_rank", "refine_remove", "refine_scored"}
     assert not left & set(obj.data.attributes.keys())
     assert not bpy.ops.refine.apply.poll()
     assert addon.cameras.sets.known_turn(bpy.context, obj) == 0

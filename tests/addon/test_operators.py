@@ -105,20 +105,17 @@ def test_settings_reach_core_as_they_were_typed(addon):
         assert settings.to_method() == (core.Refit(7, 3) if name == "refit" else kind(7))
 
 
-def test_scoring_writes_scores_ranks_views_and_colours(addon, room, room_cameras):
-    """Rank 0 belongs to the lowest score, 1 to the highest; the colour follows the rank."""
+def test_scoring_writes_scores_ranks_and_views(addon, room, room_cameras):
+    """Rank 0 belongs to the lowest score, 1 to the highest."""
     bpy.ops.refine.score()
     read = addon.mesh.attributes.read_attribute
     score, rank = read(room.data, "refine_score"), read(room.data, "refine_rank")
-    seen, heat = read(room.data, "refine_seen"), read(room.data, "refine_heat")
-    ramp = addon.mesh.heat_map.ramp()
+    seen = read(room.data, "refine_seen")
 
     assert rank[np.argmin(score)] == 0.0
     assert score[np.argmax(rank)] == score.max()
     assert np.array_equal(np.argsort(rank), np.argsort(score, kind="stable"))
     assert seen.max() <= 64
-    assert np.allclose(heat[np.argmin(rank), :3], ramp[0], atol=1 / 255)
-    assert np.allclose(heat[np.argmax(rank), :3], ramp[-1], atol=1 / 255)
 
 
 def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import bpy
 import numpy as np
 from numpy.typing import NDArray
-
-from . import attributes as mesh_attributes
-
-HEAT = "refine_heat"
-"""Colour attribute on points."""
 
 _STEPS = 256
 _KNEE = 0.0031308
@@ -43,11 +37,3 @@ def ramp() -> NDArray[np.float64]:
     linear = np.clip((lab @ _OKLAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T, 0.0, 1.0)
     # The curve of sRGB (IEC 61966-2-1).
     return np.where(linear > _KNEE, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
-
-
-def write(mesh: bpy.types.Mesh, ranks: NDArray[np.float64]) -> None:
-    """Store the heat map of ranks in 0..1 as the colour attribute `HEAT`."""
-    colors = np.ones((_STEPS, 4), np.float32)
-    colors[:, :3] = ramp()
-    index = np.clip(ranks * (_STEPS - 1) + 0.5, 0, _STEPS - 1).astype(np.uint8)
-    mesh_attributes.write_attribute(mesh, HEAT, "BYTE_COLOR", colors[index])
