@@ -40,6 +40,10 @@ _RESIDUE = 3e-7
 SHEAR = 1e-4
 """How far from orthonormal the axes of a camera may be."""
 
+_SIZES = ("fx", "fy", "cx", "cy", "width", "height")
+_NOTED = (*_SIZES, *["rotation", "center", "near", "far", "matrix", "lens", "clip", "upright"])
+"""What is noted of an imported camera."""
+
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.01, 1000.0
 
 
@@ -165,7 +169,13 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     _place(obj, view)
     if view.weight != 1.0:
         obj[WEIGHT] = view.weight
-    obj[SOURCE] = json.dumps(_noted(view, obj) | {"upright": upright})
+    # The view, and what Blender's float32 made of it, to tell if it is touched.
+    noted = {name: getattr(view, name) for name in ("near", *_SIZES)}
+    noted |= {"rotation": view.rotation.tolist(), "center": view.center.tolist()}
+    noted["far"] = view.far if math.isfinite(view.far) else None
+    noted["matrix"] = snapped(np.array(obj.matrix_basis, np.float64)).tolist()
+    noted |= {"lens": _lens(data), "clip": [data.clip_start, data.clip_end], "upright": upright}
+    obj[SOURCE] = json.dumps(noted)
     return obj
 
 
@@ -187,7 +197,7 @@ def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -
         By `QUARTER` or its inverse; None where it was not imported, or stands otherwise.
     """
     source = _source(obj)
-    if not source or not isinstance(source.get("upright"), bool):
+    if not source:
         return None
     in_file = np.array(source["rotation"]) @ (QUARTER if source["upright"] else np.eye(3))
     turn = axes @ in_file.T @ view.rotation  # from where the camera looks to where its file says
@@ -280,34 +290,17 @@ def _lens(data: bpy.types.Camera) -> list[Any]:
     return [data.lens, data.sensor_fit, data.sensor_width, data.shift_x, data.shift_y]
 
 
-def _noted(view: View, obj: bpy.types.Object) -> dict[str, Any]:
-    """Return an imported view, and what Blender's float32 made of it, to tell if it is touched."""
-    return {
-        "rotation": view.rotation.tolist(),
-        "center": view.center.tolist(),
-        **{name: getattr(view, name) for name in ("fx", "fy", "cx", "cy", "width", "height")},
-        "near": view.near,
-        "far": view.far if math.isfinite(view.far) else None,
-        "matrix": snapped(np.array(obj.matrix_basis, np.float64)).tolist(),
-        "lens": _lens(obj.data),
-        "clip": [obj.data.clip_start, obj.data.clip_end],
-    }
-
-
 def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
     if SOURCE not in obj:
         return None
     try:
         source = json.loads(obj[SOURCE])
-        complete = source.keys() >= {"rotation", "center", "width", "height", "matrix", "lens"}
-    except (TypeError, ValueError, AttributeError):
-        complete = False
-    if not complete:
+        return {name: source[name] for name in _NOTED}
+    except (TypeError, ValueError, KeyError):
         raise RefineError(
             f"camera '{obj.name}': custom property {SOURCE} is damaged; delete it, and the camera "
             "is used as Blender shows it"
-        )
-    return source
+        ) from None
 
 
 def _restored(
@@ -321,8 +314,8 @@ def _restored(
     if np.array_equal(matrix, np.array(source["matrix"])):
         changes.update(rotation=np.array(source["rotation"]), center=np.array(source["center"]))
     if _lens(data) == source["lens"]:
-        changes.update({name: source[name] for name in ("fx", "fy", "cx", "cy")})
-    if [data.clip_start, data.clip_end] == source.get("clip"):
+        changes.update({name: source[name] for name in _SIZES[:4]})
+    if [data.clip_start, data.clip_end] == source["clip"]:
         changes["near"] = source["near"]
         changes["far"] = math.inf if source["far"] is None else source["far"]
     return replace(view, **changes)

@@ -218,19 +218,15 @@ _EVENTS = ("undo_post", "redo_post", "load_post")
 
 
 def register() -> None:
-    """Hear of changes, and have menus offer what splats follow."""
+    """Hear of changes."""
     viewport_draw.warned_by.append(_in_view)
     bpy.app.handlers.depsgraph_update_post.append(_updated)
     for event in _EVENTS:
         getattr(bpy.app.handlers, event).append(_changed)
-    bpy.types.VIEW3D_MT_object_apply.append(_draw_apply)
-    bpy.types.VIEW3D_MT_object.append(_draw_object)
 
 
 def unregister() -> None:
     """Undo `register`."""
-    bpy.types.VIEW3D_MT_object.remove(_draw_object)
-    bpy.types.VIEW3D_MT_object_apply.remove(_draw_apply)
     for event in _EVENTS:
         getattr(bpy.app.handlers, event).remove(_changed)
     bpy.app.handlers.depsgraph_update_post.remove(_updated)
@@ -241,3 +237,4 @@ def unregister() -> None:
 
 
 CLASSES = (REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend)
+MENUS = {"VIEW3D_MT_object_apply": _draw_apply, "VIEW3D_MT_object": _draw_object}
