@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cleaning.search import connected
+from .cleaning.search import connected, touching
 from .execute import Progress, silent
 from .merging.graph import nearest
 from .splats import Splats
@@ -48,9 +48,6 @@ Mode = Literal["SET", "ADD", "SUBTRACT", "INTERSECT"]
 
 NEIGHBOURS = 8
 """So many nearest splats are the neighbours by which a selection grows and shrinks."""
-
-GAP = 4.0
-"""How many times as far as most neighbours are, others may be and still hang together."""
 
 
 class Surface(NamedTuple):
@@ -142,6 +139,22 @@ class Sight:
         place[gaussians.index] = np.arange(len(gaussians))
         colors = np.minimum(gaussians.colors[place[self.rows]], 1.0)
         return self._of(np.abs(colors - color).max(axis=1) <= tolerance, hidden)
+
+    def piece(self, chosen: NDArray[np.bool_], place: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Those of the chosen splats, (N,), that hang together with the one nearest to a place.
+
+        Two of them do if they are neighbours among the chosen and touch.
+        """
+        gaussians = self.prepared.gaussians
+        picked = gaussians.take(np.flatnonzero(chosen[gaussians.index]))
+        rows, mask = picked.index, np.zeros_like(chosen)
+        if len(rows):
+            near, touch = touching(picked, np.arange(len(rows)), silent, None)
+            one, link = np.nonzero(touch)
+            parts = connected(len(rows), one, near[one, link])
+            away = self.prepared.splats.means[rows] - place
+            mask[rows[parts == parts[np.argmin(np.einsum("ij,ij->i", away, away))]]] = True
+        return mask
 
     def surface(self, column: int, row: int) -> Surface | None:
         """What lies under a pixel, None where there is next to nothing."""
@@ -324,33 +337,6 @@ def grown(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray
 def shrunk(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """A selection, (N,), without the splats that have a neighbour outside it."""
     return ~grown(neighbours, ~selected)
-
-
-def piece(
-    means: NDArray[Any], chosen: NDArray[np.bool_], place: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Those of the chosen splats, (N,), that hang together with the one nearest to a place.
-
-    Two of them do if they are neighbours among the chosen and no farther apart than `GAP`.
-
-    Parameters
-    ----------
-    means : (N, 3)
-    chosen : (N,) bool
-    place : (3,) float64
-    """
-    rows = np.flatnonzero(chosen)
-    if not len(rows):
-        return chosen
-    places = np.asarray(means[rows], np.float64)
-    near = neighbours_of(places)
-    lengths = np.linalg.norm(places[near] - places[:, None], axis=2)
-    one, link = np.nonzero(lengths <= GAP * np.median(lengths)) if near.size else (rows[:0],) * 2
-    parts = connected(len(rows), one, near[one, link].astype(np.int64))
-    first = np.argmin(np.linalg.norm(places - place, axis=1))
-    held = np.zeros_like(chosen)
-    held[rows[parts == parts[first]]] = True
-    return held
 
 
 def neighbours_of(means: NDArray[Any], *, progress: Progress = silent) -> NDArray[np.int32]:

@@ -188,9 +188,7 @@ class Stroke:
             return np.zeros(len(self.before), np.bool_)
         if self.shape == "COLOR":
             taken = seen.of_color(surface.color, self._tolerance, hidden=self._hidden)
-            if self._connected:
-                taken = picking.piece(seen.prepared.splats.means, taken, surface.place)
-            return taken
+            return seen.piece(taken, surface.place) if self._connected else taken
         radius = math.hypot(u - x, v - y) / surface.scale
         return seen.in_ball(surface.place, radius, hidden=self._hidden)
 

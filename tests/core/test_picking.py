@@ -170,13 +170,14 @@ def test_a_piece_is_what_hangs_together_with_a_place():
     """Of two patches of 400 with a gap the one that is nearer; what is not chosen is no bridge."""
     patch = wall(2.0, edge=0.3)
     means = np.concatenate([patch, patch + np.array([1.0, 0.0, 0.0]), wall(2.0, edge=2.0)])
+    sight = seen(splats(means))
     both = np.arange(len(means)) < 2 * len(patch)
     first = np.arange(len(means)) < len(patch)
 
-    assert np.array_equal(picking.piece(means, both, np.array([0.0, 0.0, 2.0])), first)
-    assert np.array_equal(picking.piece(means, both, np.array([1.0, 0.0, 2.0])), both & ~first)
-    assert picking.piece(means, first & (np.arange(len(means)) == 3), np.zeros(3)).sum() == 1
-    assert not picking.piece(means, both & ~both, np.zeros(3)).any()
+    assert np.array_equal(sight.piece(both, np.array([0.0, 0.0, 2.0])), first)
+    assert np.array_equal(sight.piece(both, np.array([1.0, 0.0, 2.0])), both & ~first)
+    assert sight.piece(first & (np.arange(len(means)) == 3), np.zeros(3)).sum() == 1
+    assert not sight.piece(both & ~both, np.zeros(3)).any()
 
 
 @pytest.mark.parametrize(
