@@ -141,9 +141,10 @@ class Sight:
         return self._of(np.abs(colors - color).max(axis=1) <= tolerance, hidden)
 
     def piece(self, chosen: NDArray[np.bool_], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Those of the chosen splats, (N,), that hang together with the one nearest to a place.
+        """Those of the chosen splats, (N,), that hang together at a place.
 
-        Two of them do if they are neighbours among the chosen and touch.
+        Two do if they are neighbours among the chosen and touch. Of the pieces of the `NEIGHBOURS`
+        that are nearest to the place it is the largest.
         """
         gaussians = self.prepared.gaussians
         picked = gaussians.take(np.flatnonzero(chosen[gaussians.index]))
@@ -153,7 +154,8 @@ class Sight:
             one, link = np.nonzero(touch)
             parts = connected(len(rows), one, near[one, link])
             away = self.prepared.splats.means[rows] - place
-            mask[rows[parts == parts[np.argmin(np.einsum("ij,ij->i", away, away))]]] = True
+            around = parts[np.argsort(np.einsum("ij,ij->i", away, away))[:NEIGHBOURS]]
+            mask[rows[parts == around[np.argmax(np.bincount(parts)[around])]]] = True
         return mask
 
     def surface(self, column: int, row: int) -> Surface | None:
