@@ -1,7 +1,7 @@
 """The command: ``blender -b [scene.blend] --command refine ...``, ``python -m refine_addon ...``.
 
 Both parse the same arguments and run the same pipeline. Only ``--object`` and the open scene
-(`scene`, `render`) need Blender; they are imported where they are used.
+(`scene`) need Blender; they are imported where they are used.
 
 In the order in which they work: `signals` listens for Ctrl-C, `flow` goes from arguments to exit
 code, `options` parses, `checks` refuses what cannot go together, `subcommands` does the rest. That

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ..core import RefineError
 from . import checks, options, report
 from .run import Run
-from .subcommands import SUBCOMMANDS
+from .subcommands import run_subcommand
 from .terminal import complain, described, flush
 
 
@@ -27,11 +27,11 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
     parser = options.make_parser()
     try:
         given = parser.parse_args(list(arguments))
-        given.scene = scene
+        given.scene, given.blend = scene, ""
         if scene:
-            from .scene import refuse_unopened
+            from .scene import opened
 
-            refuse_unopened()
+            given.blend = opened()
         try:
             options.complete(given)
             checks.check(given)
@@ -39,10 +39,9 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
             parser.error(str(error))
         if given.report is not None:
             report.check(given.report, overwrite=given.overwrite)
-        done = Run(given)
-        SUBCOMMANDS[given.command](done)
-        done.finish()
-        return int(done.failed)
+        work = Run(given)
+        run_subcommand(work)
+        return int(work.finish())
     except SystemExit as leaving:  # argparse leaves the process; Blender wants a number
         flush()
         return int(leaving.code or 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import re
 from collections.abc import Callable
@@ -21,28 +22,20 @@ from ..version import VERSION
 
 _SOURCES = "visible, active, selected, collection:NAME, frames or frames:A:B:STEP"
 
-_VOLUMES = """box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius in the coordinates of the cameras, or in
-                        Blender an object, a closed mesh or an empty shown as cube or sphere"""
-
 _TABLE = f"""
 inputs INPUT            files of splats: {", ".join(READ_SUFFIXES)}
 output FILE             the file to make, by its suffix: {", ".join(SUFFIXES)}
 --object NAME           in place of INPUT: this splat object of the open .blend, by the cameras that
-                        are chosen in the panel there, with what it protects and crops; of the
-                        panel's other settings none counts
---source WHICH          which cameras of the open scene decide instead: {_SOURCES}, the active one
+                        are chosen in the panel there, with what it protects and crops
+--source WHICH          which cameras of the open scene decide: {_SOURCES}, the active one
                         at frame A and every STEP-th after it to B; frames are the panel's range
-render --source WHICH   which frames: frames for all of the scene, or frames:A:B:STEP for frame A
-                        and every STEP-th after it to B; the current one by default
---cameras PATH          cameras.json, transforms.json or a COLMAP model; default: the visible
-                        cameras of the open scene
+render --source WHICH   frames, all of the scene, or frames:A:B:STEP; the current one by default
+--cameras PATH          cameras.json, transforms.json or a COLMAP model; without, those of the scene
 --save                  with --object: delete the splats there and save
 -o OUT                  a file, in the format of its suffix, or for any number of inputs a folder,
                         which is any other name; made if it is not there
-score -o OUT            a .ply, or a folder, which is any other name; made if it is not there
-lod -o OUT              a folder, for NAME.lod1.ply and so on; FOLDER/NAME.spz makes NAME.lod1.spz,
-                        and FOLDER/lod-meta.json a streamed SOG of all levels, which viewers on the
-                        web load by chunks; made if it is not there
+lod -o OUT              a folder, for INPUT.lod1.ply and so on; FOLDER/NAME.spz for NAME.lod1.spz;
+                        or FOLDER/lod-meta.json, a streamed SOG, which viewers load by chunks
 --ratio B               share of the splats to remove, 0 <= B < 1 (default 0.5)
 --keep N                how many splats stay
 --max-mb M              size of the file, in 1e6 bytes
@@ -51,34 +44,30 @@ lod -o OUT              a folder, for NAME.lod1.ply and so on; FOLDER/NAME.spz m
 --levels S,S,...        share of the splats that stays in each, the finest first (default
                         {",".join(f"{share:g}" for share in SHARES)})
 lod --psnr DB,DB,...    or how close each stays to the original in these views, in dB
---method METHOD         from instant to best: {", ".join(METHODS)}. closed-form takes nothing
-                        as hidden, occlusion knows what hides what; both delete, and the other rows
-                        stay as they were. merge (the default) merges what goes into what stays, or
-                        deletes where that is as good; refit then fits what stays to what all splats
-                        look like, some dB better in several times the time
---rounds N              with --method refit: fit up to N times, each time to other rays (default: 2
-                        to 4 times, fewer of more splats; more rounds bring up to 1 dB)
+--method METHOD         from instant to best: {", ".join(METHODS)}. The first two
+                        delete, closed-form as if nothing was hidden; merge (the default) merges
+                        what goes into what stays, or deletes where that is as good; refit then fits
+                        what stays to what all splats look like, some dB better, in more time
+--rounds N              with --method refit: fit up to N times (default 2 to 4, by what they bring)
 --views N               use at most N views, spread out evenly; 0 uses all (default {Merge.views})
---clean                 first remove floaters and outliers, as clean does; the budget counts the
-                        rest
+--clean                 first remove what floats, as clean does; the budget counts the rest
 --reasons R,R,...       which to remove, of {", ".join(REASONS)}
                         (default {",".join(Cleaning.reasons)})
---protect VOLUME        splats in it stay unchanged, whatever else is said: {_VOLUMES};
-                        also a vertex group or boolean attribute of --object; may be given again
---remove-inside VOLUME  splats in it go first, and count as removed (in score: they score 0, and the
-                        others as if they had gone): {_VOLUMES}; may be given again
---keep-inside VOLUME    all splats go that are in no volume of this kind; like --remove-inside
+--remove-inside VOLUME  splats in it go first, and count as removed: box:x0,y0,z0,x1,y1,z1 or
+                        sphere:x,y,z,radius in the coordinates of the cameras, or in Blender an
+                        object, a closed mesh or an empty shown as cube or sphere; may be repeated
+--keep-inside VOLUME    all splats go that are in no volume of this kind; see --remove-inside
+--protect VOLUME        splats in it stay unchanged, whatever else is said; see --remove-inside;
+                        also a vertex group or boolean attribute of --object
 --pictures DIR          draw up to 3 of the views before and after, and what differs, as
                         NAME-CAMERA-before.png and so on; made if it is not there
---together              the inputs are tiles of one scene: one budget over all of them, and never
-                        all of them in memory; for plain PLY; all are written or none; INPUT and OUT
-                        may be URLs such as s3://bucket/tiles (needs the extra distributed)
+--together              the inputs are tiles of one scene: one budget over all, never all in memory;
+                        for plain PLY; INPUT and OUT may be URLs (needs the extra distributed)
 --workers N|ADDRESS     with --together: on N processes of a Dask cluster, started here, or on the
                         workers of the scheduler at an address (needs the extra distributed)
 --degree D              leave out harmonics above this degree, 0 to 4
---model MODEL           how the splats are drawn, where a file does not say or is wrong:
-                        {", ".join(MODELS)} (antialiased: Mip-Splatting, gsplat, Brush's mip;
-                        2dgs: discs)
+--model MODEL           how the splats are drawn, where a file does not say or is wrong: default,
+                        antialiased (Mip-Splatting, gsplat, Brush's mip) or 2dgs (discs)
 --dry-run               decide and report, write no splats; --pictures are drawn
 --report FILE.json      write a report as JSON
 --overwrite             replace files that exist
@@ -88,14 +77,12 @@ lod --psnr DB,DB,...    or how close each stays to the original in these views, 
 
 _REST = "--report --overwrite --quiet"
 _VIEWS = f"--cameras --source --views --remove-inside --keep-inside --model {_REST}"
+_MORE = "--rounds --clean --protect --pictures --together --workers --dry-run"
 BLENDER = "blender -b scene.blend --command refine"
 
-_COMMANDS = {
-    "prune": (
-        "remove the splats the cameras would miss least",
-        f"inputs* --object --save -o --ratio --keep --max-mb --psnr --method --rounds {_VIEWS} "
-        "--clean --protect --pictures --together --workers --dry-run",
-        f"""
+_COMMANDS = f"""
+prune: remove the splats the cameras would miss least
+inputs* --object --save -o --ratio --keep --max-mb --psnr --method {_MORE} {_VIEWS}
   refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply
   refine prune *.ply --cameras cameras.json --psnr 40 -o pruned
   refine prune in.ply --cameras sparse/0 --max-mb 5 --method refit -o out.ply
@@ -103,57 +90,37 @@ _COMMANDS = {
   refine prune *.ply --together --cameras sparse/0 --ratio 0.6 -o out
   {BLENDER} prune --object Splats --protect Statue --remove-inside Sky -o out.ply
   {BLENDER} prune --object Splats --source frames:1:250:10 --save
-  {BLENDER} prune --object Splats --source collection:Shot --dry-run
-  {BLENDER} prune --object Splats --dry-run --pictures before_and_after""",
-    ),
-    "score": (
-        "write files with a float property refine_score",
-        f"inputs* --object -o --method {_VIEWS}",
-        f"""
+
+score: write files with a float property refine_score
+inputs* --object -o --method {_VIEWS}
   refine score in.ply --cameras cameras.json -o scored.ply
-  {BLENDER} score --object Splats -o scored.ply""",
-    ),
-    "clean": (
-        "remove what the cameras see to float in the air; without -o, only say what would go",
-        f"inputs+ -o --reasons --protect {_VIEWS}",
-        """
-  refine clean in.ply --cameras cameras.json
+  {BLENDER} score --object Splats -o scored.ply
+
+clean: remove what the cameras see to float in the air; without -o, only say what would go
+inputs+ -o --reasons --protect {_VIEWS}
   refine clean *.ply --cameras cameras.json -o cleaned
-  refine clean in.ply --cameras cameras.json --reasons front,isolated -o out.ply""",
-    ),
-    "lod": (
-        "write levels of detail, each with what it costs",
-        f"inputs+ -o --levels --psnr --method --rounds --protect {_VIEWS}",
-        """
+  refine clean in.ply --cameras cameras.json --reasons front,isolated -o out.ply
+
+lod: write levels of detail, each with what it costs
+inputs+ -o --levels --psnr --method --rounds --protect {_VIEWS}
   refine lod in.ply --cameras cameras.json -o levels
   refine lod in.ply --cameras cameras.json -o web/lod-meta.json
-  refine lod in.ply --cameras cameras.json --psnr 45,40,35 -o levels/in.spz""",
-    ),
-    "convert": (
-        "write files of splats as one, in another format",
-        f"inputs+ output --degree --model {_REST}",
-        """
+  refine lod in.ply --cameras cameras.json --psnr 45,40,35 -o levels/in.spz
+
+convert: write files of splats as one, in another format
+inputs+ output --degree --model {_REST}
   refine convert in.ply out.spz
-  refine convert room.ply statue.spz both.ply
-  refine convert in.ply out.ply --degree 1""",
-    ),
-    "info": (
-        "say what is in files of splats",
-        f"inputs+ {_REST}",
-        """
-  refine info in.ply
-  refine info *.ply --report report.json""",
-    ),
-    "render": (
-        "render the open scene with splats, by its output settings",
-        "--source --quiet",
-        f"""
-  {BLENDER} render
-  {BLENDER} render --source frames
-  {BLENDER} render --source frames:1:250:10""",
-    ),
-}
-"""Of each subcommand its purpose, what it takes, and examples."""
+  refine convert room.ply statue.spz both.sog --degree 1
+
+info: say what is in files of splats
+inputs+ {_REST}
+  refine info *.ply --report report.json
+
+render: render the open scene with splats, by its output settings
+--source --quiet
+  {BLENDER} render --source frames:1:250:10
+"""
+"""Of each subcommand its purpose, what it takes (inputs and options), and examples."""
 
 LAST_FRAME = 1_048_574
 """The last frame that Blender knows, and with a minus the first."""
@@ -161,13 +128,12 @@ LAST_FRAME = 1_048_574
 
 def settings(kind: type, options: argparse.Namespace, **default: Any) -> Any:
     """Settings of a kind: each field by the option of its name; where none is given, `default`."""
-    given = {field.name: getattr(options, field.name, None) for field in fields(kind)}
-    given = {name: value for name, value in given.items() if value is not None}
-    return kind(**(given or default))
+    values = {field.name: getattr(options, field.name, None) for field in fields(kind)}
+    return kind(**({n: value for n, value in values.items() if value is not None} or default))
 
 
 def complete(options: argparse.Namespace) -> None:
-    """Make the settings: ``budget``, ``how`` (the method), ``cleaning``, ``shares`` (the levels).
+    """Make the settings: ``budget``, ``how`` (the method), ``cleaning`` and ``levels``.
 
     Raises
     ------
@@ -176,17 +142,14 @@ def complete(options: argparse.Namespace) -> None:
     """
     if options.command == "prune":
         options.budget = settings(Budget, options, ratio=0.5)
-    if options.command in ("prune", "score", "lod"):
-        kind = METHODS[options.method or Merge.name]
-        if options.rounds is not None and kind is not Refit:
-            raise RefineError(f"rounds is {options.rounds}, expected only with --method refit")
-        options.how = settings(kind, options)
     if options.command == "lod":
-        shares = options.levels or (() if options.psnr else SHARES)
-        options.shares = Levels(shares, options.psnr or ())
-    options.cleaning = None
-    if options.command == "clean" or options.clean:
-        options.cleaning = settings(Cleaning, options)
+        options.levels = settings(Levels, options, shares=SHARES)
+    kind = METHODS[options.method or Merge.name]
+    if options.rounds is not None and kind is not Refit:
+        raise RefineError(f"rounds is {options.rounds}, expected only with --method refit")
+    options.how = settings(kind, options)
+    cleans = options.clean or options.command == "clean"
+    options.cleaning = settings(Cleaning, options) if cleans else None
 
 
 def _name(text: str) -> str:
@@ -206,9 +169,7 @@ def _given(text: str) -> Path | Url:
 def _made(text: str) -> Path | Url:
     """The place of what is written, the home folder spelt out."""
     if text == "-":
-        raise RefineError(
-            "nothing is written to standard output: give the name of a file (./- is one, too)"
-        )
+        raise RefineError("nothing is written to standard output: name a file (./- is one, too)")
     place = _given(text)
     return place if isinstance(place, Url) else expanded(place)
 
@@ -239,8 +200,7 @@ def _source(text: str) -> tuple[str, str | range]:
     kind, colon, rest = text.partition(":")
     if kind == "frames" and colon:
         return "FRAMES", _frames(rest)
-    known = text in ("visible", "active", "selected", "frames") or kind == "collection"
-    if not known or (colon and not rest):
+    if text not in ("visible", "active", "selected", "frames", f"collection:{rest or '?'}"):
         raise RefineError(f"expected {_SOURCES}, got {text!r}")
     return kind.upper(), rest
 
@@ -248,18 +208,14 @@ def _source(text: str) -> tuple[str, str | range]:
 def _frames(text: str) -> range:
     """The frames between colons, both ends included."""
     words = text.split(":")
-    try:
+    with contextlib.suppress(ValueError):
         first, last, step = map(int, words if words[2:] else [*words, "1"])
-    except ValueError:
-        raise RefineError(f"expected A:B:STEP or A:B in whole numbers, got {text!r}") from None
-    if step < 1 or max(abs(first), abs(last)) > LAST_FRAME:
-        raise RefineError(
-            f"expected A:B:STEP with frames from {-LAST_FRAME} to {LAST_FRAME} and a step of at "
-            f"least 1, got {text!r}"
-        )
-    if last < first:
-        raise RefineError(f"expected at least one frame, got {text!r}, which starts after it ends")
-    return range(first, last + 1, step)
+        if -LAST_FRAME <= first <= last <= LAST_FRAME and step >= 1:
+            return range(first, last + 1, step)
+    raise RefineError(
+        f"expected A:B:STEP or A:B in whole numbers, A to B from {-LAST_FRAME} to {LAST_FRAME} and "
+        f"STEP at least 1, got {text!r}"
+    )
 
 
 def _told(take: Callable[[str], Any]) -> Callable[[str], Any]:
@@ -286,6 +242,9 @@ _TYPES: dict[str, Callable[[str], Any]] = {
 }
 """What an option takes, by what stands for it in the help; else any text."""
 
+_NAMES = {"-o": "output", "--levels": "shares"}
+"""What options are called elsewhere, if not by their own names."""
+
 _CHOICES = {"METHOD": tuple(METHODS), "MODEL": MODELS, "D": tuple(range(5))}
 
 
@@ -301,8 +260,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="refine",
         description="Prune 3D Gaussian splats by how much the cameras would miss them.",
-        epilog="Exit codes: 0 done, 1 failed on an input, 2 wrong usage, 130 cancelled, 143 "
-        "terminated.",
+        epilog="Exit codes: 0 done, 1 failed on an input, 2 wrong usage, 130 cancelled (Ctrl-C).",
     )
     parser.add_argument("--version", action="version", version=f"refine {VERSION}")
     commands = parser.add_subparsers(
@@ -313,14 +271,16 @@ def make_parser() -> argparse.ArgumentParser:
         (own, option): (metavar, " ".join(text.split()))
         for own, option, metavar, text in re.findall(row, _TABLE, re.MULTILINE)
     }
-    parser.set_defaults(**{option.strip("-").replace("-", "_"): None for _, option in rows})
-    parser.set_defaults(inputs=())
-    for name, (purpose, takes, examples) in _COMMANDS.items():
+    none = {option.strip("-").replace("-", "_"): None for _, option in rows}
+    parser.set_defaults(**none | {"inputs": ()})
+    for block in _COMMANDS.strip().split("\n\n"):
+        head, takes, *examples = block.split("\n")
+        name, purpose = head.split(": ")
         command = commands.add_parser(
             name,
             help=purpose,
             description=f"{purpose[0].upper()}{purpose[1:]}.",
-            epilog=f"examples:{examples}",
+            epilog="\n".join(["examples:", *examples]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
@@ -338,6 +298,6 @@ def make_parser() -> argparse.ArgumentParser:
                 choices=_CHOICES.get(metavar),
                 nargs=word[-1] if word != option else None,
                 action="append" if metavar == "VOLUME" else "store",
-                **({"dest": "output"} if option == "-o" else {}),
+                **({"dest": _NAMES[option]} if option in _NAMES else {}),
             )
     return parser

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..core import RefineError
+from ..core.errors import reason_of
 from ..core.whole_file import refuse_existing, whole_file
 from ..version import VERSION
 
@@ -27,21 +27,17 @@ def check(path: Path, *, overwrite: bool) -> None:
         takes no files.
     """
     refuse_existing(path, overwrite=overwrite)
-    target = Path(os.path.realpath(path))  # a link stays one: what it points to is written
     try:
-        with contextlib.suppress(FileNotFoundError):
-            target.stat()  # of a name that is too long, whatever the version of Python, says so
-        with tempfile.TemporaryFile(dir=target.parent):
+        # A link stays one: what it points to is written.
+        with tempfile.TemporaryFile(dir=os.path.dirname(os.path.realpath(path))):
             pass
     except OSError as error:
         raise RefineError(
-            f"{path}: cannot be written ({error.strerror or error}); nothing was changed"
+            f"{path}: cannot be written ({reason_of(error)}); nothing was changed"
         ) from error
 
 
-def write(
-    path: Path, results: list[dict[str, Any]], seconds: float, *, overwrite: bool, splats: bool
-) -> None:
+def write(path: Path, results: list[Any], seconds: float, overwrite: bool, splats: bool) -> None:
     """Write the report.
 
     Parameters
@@ -74,9 +70,8 @@ def write(
             stream.write(json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
     except RefineError as error:
         # What `whole_file` says of "nothing" holds for its own file alone.
-        why = str(error).removeprefix(f"{path}: ")
-        if isinstance(error.__cause__, OSError):
-            why = error.__cause__.strerror or why
+        cause = error.__cause__
+        why = reason_of(cause if isinstance(cause, OSError) else error).removeprefix(f"{path}: ")
         done = "; the splats were" if splats else ""
         raise RefineError(f"{path}: the report was not written ({why}){done}") from error
 

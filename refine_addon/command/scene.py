@@ -1,4 +1,4 @@
-"""What the command asks of the open scene: that it is open, and its cameras. Needs Blender."""
+"""The open scene: whether it is open, which of its cameras decide, its render. Needs Blender."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ import bpy
 
 from ..cameras.sets import CameraChoice
 from ..core import RefineError, ViewSet
+from ..core.execute import Cancelled
 from ..objects import splat_group
+from ..render import frames
+from ..render.engine import Shared
+from .run import Run
 
 
-def refuse_unopened(words: Sequence[str] | None = None) -> None:
-    """Refuse to go on without the .blend that was named; Blender does, with an empty scene.
+def opened(words: Sequence[str] | None = None) -> str:
+    """Return the path of the open .blend, "" if it was never saved.
 
     Parameters
     ----------
@@ -25,13 +29,14 @@ def refuse_unopened(words: Sequence[str] | None = None) -> None:
     Raises
     ------
     RefineError
-        If a .blend was named before the command and is not open.
+        If a .blend was named before the command and is not open: Blender goes on without.
     """
     words = sys.argv if words is None else words
     starts = (place for place, word in enumerate(words) if word in ("-c", "--command"))
     named = [word for word in words[1 : next(starts, 0)] if word.lower().endswith(".blend")]
     if named and not bpy.data.filepath:
         raise RefineError(f"{named[-1]}: Blender could not open it, and says why above")
+    return str(bpy.data.filepath)
 
 
 def views(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
@@ -46,32 +51,55 @@ def views(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
         If there is no such object, collection or camera, or no frame; see `CameraChoice.views`.
     """
     obj = splat_group.find(options.object) if options.object else None
-    chosen = CameraChoice.of_scene(bpy.context.scene)
+    choice, why = CameraChoice("VISIBLE"), "of the open scene"
+    if obj or options.source:
+        choice, why = CameraChoice.of_scene(bpy.context.scene), "as chosen in the panel"
     if options.source:
         kind, value = options.source
         collection = bpy.data.collections.get(value) if kind == "COLLECTION" else None
         if kind == "COLLECTION" and collection is None:
             names = ", ".join(sorted(each.name for each in bpy.data.collections)) or "none"
             raise RefineError(f"no collection '{value}' in the open .blend (collections: {names})")
-        frames = value if isinstance(value, range) else chosen.frames
+        frames = value if isinstance(value, range) else choice.frames
         choice, why = CameraChoice(kind, collection, frames), "as the command line says"
-    elif obj:
-        choice, why = chosen, "as chosen in the panel"
-    else:
-        choice, why = CameraChoice("VISIBLE"), "of the open scene"
-    facts: dict[str, Any] = {"source": choice.source.lower()}
-    words = {
-        "VISIBLE": "all visible ones",
-        "ACTIVE": "the active one",
-        "SELECTED": "the selected ones",
-    }.get(choice.source, "")
     found = choice.views(bpy.context, obj)  # refuses a choice without cameras
+    facts: dict[str, Any] = {"source": choice.source.lower()}
+    words = {"VISIBLE": "all visible ones", "ACTIVE": "the active one"}
+    words["SELECTED"] = "the selected ones"
     if choice.source == "COLLECTION":
         facts["collection"] = choice.collection.name
-        words = f"those in collection '{choice.collection.name}'"
+        words["COLLECTION"] = f"those in collection '{choice.collection.name}'"
     elif choice.source == "FRAMES":
         first, last, step = choice.frames[0], choice.frames[-1], choice.frames.step
         facts["frames"] = {"first": first, "last": last, "step": step}
         every = f", every {step}" if step > 1 else ""
-        words = f"the active one at frames {first} to {last}{every}"
-    return found, facts | {"words": f"{words}, {why}"}
+        words["FRAMES"] = f"the active one at frames {first} to {last}{every}"
+    return found, facts | {"words": f"{words[choice.source]}, {why}"}
+
+
+def render(run: Run) -> None:
+    """Render frames of the open scene, each written where its output settings say."""
+    scene, shared = bpy.context.scene, Shared()
+    chosen: Any = range(scene.frame_current, scene.frame_current + 1)
+    if run.options.source:
+        every = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        chosen = run.options.source[1] or every
+    try:
+        for step in filter(None, frames.steps(scene, chosen, shared, write=True)):
+            bpy.ops.render.render(scene=step.scene, animation=step.animation)
+    except Cancelled:
+        raise RefineError("a render was stopped") from None
+    except RuntimeError as error:  # what Blender reports
+        raise RefineError(str(error).strip()) from error
+    drawn, say = set(shared.frames), run.terminal.say
+    for frame in chosen:
+        path = scene.render.frame_path(frame=frame)
+        there = f"  note: {path}: exists and stays; the scene's Overwrite is off"
+        say(f"frame {frame}: {path}" if frame in drawn else there)
+    if drawn:
+        among = f" among what {shared.engine} rendered" if shared.engine else ""
+        say(f"  {shared.splats:,} splats{among}")
+        say(*(f"  note: {note}" for note in frames.left_out(scene)))
+    if shared.engine and shared.engine != scene.render.engine:
+        engines = f"all but splats is by {shared.engine}, not {scene.render.engine}"
+        say(f"  note: {engines}: there is no graphics card, or only the world to render")

@@ -9,7 +9,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
-REASONS = {"SIGINT": "cancelled", "SIGTERM": "terminated", "SIGHUP": "hung up"}
+_WORDS = {"SIGINT": "cancelled", "SIGTERM": "terminated", "SIGHUP": "hung up"}
+REASONS = {getattr(signal, name): words for name, words in _WORDS.items() if hasattr(signal, name)}
 """What each signal is called in a message; Windows lacks the last."""
 
 
@@ -37,15 +38,16 @@ def listening(*, last: bool) -> Iterator[Callable[[], None]]:
     def arrive(number: int, _frame: Any) -> None:
         arrived.append(number)
         if raises and not _stopping():
-            raise Stopped(arrived[0])
+            raise_now()
 
     try:
-        if threading.current_thread() is threading.main_thread():  # no other may listen
-            for number in (getattr(signal, name, None) for name in REASONS):
-                if number and signal.getsignal(number) is not signal.SIG_IGN:
-                    # None: Blender's own for Ctrl-C, which Python cannot set again. It only asks
-                    # for a second Ctrl-C to end Blender, as the default does at the first.
-                    before[number] = signal.signal(number, arrive) or signal.SIG_DFL
+        # On another thread Python allows no handlers.
+        main = threading.current_thread() is threading.main_thread()
+        for number in REASONS if main else ():
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                # None: Blender's own for Ctrl-C, which Python cannot set again. It only asks for a
+                # second Ctrl-C to end Blender, as the default does at the first.
+                before[number] = signal.signal(number, arrive) or signal.SIG_DFL
         yield raise_now
     finally:
         for number, handler in before.items():
@@ -56,7 +58,7 @@ def reason_and_code(stop: KeyboardInterrupt) -> tuple[str, int]:
     """What stopped the command, and the exit code by which a shell says so: 130 for Ctrl-C."""
     # Python's own comes where nobody listens: from a thread, from whoever calls `main`.
     number = stop.args[0] if isinstance(stop, Stopped) else signal.SIGINT
-    return REASONS[signal.Signals(number).name], 128 + number
+    return REASONS[number], 128 + number
 
 
 def _stopping() -> bool:

@@ -1,4 +1,4 @@
-"""What each subcommand does and says."""
+"""What each subcommand does and says: of a file of splats, an object, tiles, several files."""
 
 from __future__ import annotations
 
@@ -9,18 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core import (
-    SplatFile,
-    ViewSet,
-    clean_file,
-    convert_files,
-    lod_file,
-    prune_file,
-    prune_tiles,
-    read_splats,
-    score_file,
-)
+from .. import core
 from ..core.execute import in_time
+from ..core.formats.ply_columns import other_properties
 from ..core.formats.registry import without_suffix
 from ..core.pictures import PictureFiles, measured_in_words
 from ..core.quality.curve import UNSEEN, in_views, in_words
@@ -32,60 +23,62 @@ from . import zones
 from .run import Run
 
 
-def prune(run: Run) -> None:
-    """Prune each input, all of them together, or an object."""
+def run_subcommand(run: Run) -> None:
+    """Do what the options say, from input to input; errors are noted in the run."""
     options = run.options
-    if options.object:
-        run.attempt(options.object, _prune_object)
+    work = {"prune": _prune, "score": _score, "clean": _clean, "lod": _lod, "info": _info}
+    if options.command == "render":
+        from .scene import render
+
+        render(run)
+    elif options.command == "convert":
+        run.attempt(_convert, str(options.inputs[0]))
     elif options.together:
-        views = run.views()
-        run.attempt(f"{len(options.inputs)} tiles", _prune_together, views)
+        run.views()
+        run.attempt(_prune_together, f"{len(options.inputs)} tiles")
     else:
-        run.each(_prune_file)
+        run.each(work[options.command])
 
 
 def _how(run: Run, name: str) -> dict[str, Any]:
-    """What files and objects are pruned by; `name` begins the names of the pictures."""
+    """What files and objects are worked on by."""
     options = run.options
-    pictures = options.pictures and PictureFiles(options.pictures, name, options.overwrite)
-    return {
-        "budget": options.budget, "method": options.how, "pictures": pictures,
-        "dry_run": options.dry_run,
+    how = {"overwrite": options.overwrite, "progress": run.progress(name)}
+    if options.object:
+        return how | {"demands": zones.of_object(options)}
+    return how | {"zones": zones.of_files(options), "model": options.model}
+
+
+def _prune(run: Run, source: Path | str, output: Path | None) -> dict[str, Any]:
+    options, views = run.options, run.views()
+    name = source if options.object else source.name
+    how: dict[str, Any] = {
+        "budget": options.budget, "method": options.how, "dry_run": options.dry_run,
+        "output": output, **_how(run, name),
     }  # fmt: skip
+    if options.pictures:
+        how["pictures"] = PictureFiles(options.pictures, without_suffix(name), options.overwrite)
+    if options.object:
+        from ..objects.operation import prune_object
 
-
-def _prune_file(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
-    how = _how(run, without_suffix(source.name)) | run.reading(source.name)
-    done = prune_file(source, output, views, cleaning=run.options.cleaning, **how)
+        return _say_pruned(run, name, prune_object(source, views, save=options.save, **how))
+    done = core.prune_file(source, views=views, cleaning=options.cleaning, **how)
     return _say_pruned(run, str(source), done.report)
 
 
-def _prune_object(run: Run) -> dict[str, Any]:
-    from ..objects.operation import prune_object
-
-    options, name = run.options, run.options.object
-    done = prune_object(
-        name, run.views(), **_how(run, name), demands=zones.of_object(options),
-        output=options.output, save=options.save, overwrite=options.overwrite,
-        progress=run.progress(name),
-    )  # fmt: skip
-    return _say_pruned(run, name, done)
-
-
-def _prune_together(run: Run, views: ViewSet) -> dict[str, Any]:
-    options, label = run.options, f"{len(run.options.inputs)} tiles"
+def _prune_together(run: Run, label: str) -> dict[str, Any]:
+    options, progress = run.options, run.progress(label)
     workers = contextlib.nullcontext() if options.workers is None else cluster(options.workers)
     try:
         with workers as others:
-            done = prune_tiles(
-                options.inputs, options.output, views, options.budget, options.how,
+            done = core.prune_tiles(
+                options.inputs, options.output, run.views(), options.budget, options.how,
                 overwrite=options.overwrite, dry_run=options.dry_run, model=options.model,
-                progress=run.progress(label), workers=others,
+                progress=progress, workers=others,
             )  # fmt: skip
-    except KeyboardInterrupt:
-        run.terminal.clear()
+    except KeyboardInterrupt as stop:
         if not options.dry_run:
-            run.terminal.say("the same command goes on where this one was")
+            stop.add_note("the same command goes on where this one was")
         raise
     tiles = [
         f"{located(tile['input']).name}: {tile['kept']:,} of {tile['before']:,} splats "
@@ -97,22 +90,18 @@ def _prune_together(run: Run, views: ViewSet) -> dict[str, Any]:
 
 
 def _say_pruned(run: Run, label: str, done: dict[str, Any], *more: str) -> dict[str, Any]:
-    splats, files, cleaned = done["splats"], done["files"], done.get("cleaned", {})
-    verb = "would keep" if run.options.dry_run else "kept"
+    splats = done["splats"]
     line = (
-        f"{run.named(label)}: {verb} {splats['kept']:,} of {splats['before']:,} splats "
-        f"({splats['removed'] / splats['before']:.1%} removed){_written(splats)}, "
-        f"{_sizes(files['input_bytes'], files['output_bytes'])}, {_by(done)}, "
-        f"{done['timings']['total_s']:.2f} s{_to(files['output'])}"
+        f"{'would keep' if run.options.dry_run else 'kept'} {splats['kept']:,} of "
+        f"{splats['before']:,} splats ({splats['removed'] / splats['before']:.1%} removed)"
+        f"{_files(done)}, {_by(done)}, {done['timings']['total_s']:.2f} s"
     )
-    lines = [f"cleaned: {cleaned['words']}"] if cleaned else []
+    lines = [f"cleaned: {done['cleaned']['words']}"] if "cleaned" in done else []
     if quality := _quality(done):
         lines.append(f"quality: {quality}")
     if "pictures" in done:
-        measured = measured_in_words(done["pictures"])
-        lines.append(f"pictures: {measured} -> {run.options.pictures}")
-    count = sum(count for count in cleaned.values() if isinstance(count, int))
-    return run.say(done, line, *lines, *more, cleaned=count)
+        lines.append(f"pictures: {measured_in_words(done['pictures'])} -> {run.options.pictures}")
+    return run.say(label, line, done, *lines, *more)
 
 
 def _quality(done: dict[str, Any]) -> str:
@@ -123,163 +112,89 @@ def _quality(done: dict[str, Any]) -> str:
     words = in_views(psnr, done["estimated_psnr_between"])
     if done.get("written_psnr") is not None:
         words += f", {in_words(done['written_psnr'])} as written"
-    if psnr > UNSEEN:
-        return words
-    if method["note"]:
-        return f"{words}; {method['note']}"
-    others = _by_method(method, method["done"])
-    return f"{words} (--method {others})" if others else words
+    if psnr <= UNSEEN and method["note"]:
+        words += f"; {method['note']}"
+    elif psnr <= UNSEEN and (others := _by_method(method, method["done"])):
+        words += f" (--method {others})"
+    return words
 
 
-def clean(run: Run) -> None:
-    """Clean each input."""
-    run.each(_clean)
-
-
-def _clean(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
-    done = clean_file(
-        source, output, views, run.options.cleaning, **run.reading(source.name)
-    ).report
+def _clean(run: Run, source: Path, output: Path | None) -> dict[str, Any]:
+    how = _how(run, source.name)
+    done = core.clean_file(source, output, run.views(), run.options.cleaning, **how).report
     splats = done["splats"]
-    return run.say(
-        done,
-        f"{run.named(str(source))}: {done['cleaned']['words']}; {splats['kept']:,} of "
-        f"{splats['before']:,} splats stay{_written(splats)}, {_by(done)}"
-        f"{_to(output) or '; nothing is written without -o'}",
-    )
+    line = f"{done['cleaned']['words']}; {splats['kept']:,} of {splats['before']:,} splats stay"
+    line += f"{_written(splats)}, {_by(done)}"
+    if output is None:
+        line += "; nothing is written without -o"
+    return run.say(str(source), line, done)
 
 
-def score(run: Run) -> None:
-    """Score each input, or an object."""
+def _score(run: Run, source: Path | str, output: Path) -> dict[str, Any]:
+    method, views = run.options.how, run.views()
     if run.options.object:
-        run.attempt(run.options.object, _score_object)
+        from ..objects.operation import score_object
+
+        done = score_object(source, views, method, output=output, **_how(run, source))
     else:
-        run.each(_score_file)
-
-
-def _score_file(run: Run, source: Path, output: Path, views: ViewSet) -> dict[str, Any]:
-    done = score_file(source, output, views, run.options.how, **run.reading(source.name))
-    return _say_scored(run, str(source), output, done.report)
-
-
-def _score_object(run: Run) -> dict[str, Any]:
-    from ..objects.operation import score_object
-
-    options, name = run.options, run.options.object
-    done = score_object(
-        name, run.views(), options.how, zones.of_object(options),
-        output=options.output, overwrite=options.overwrite, progress=run.progress(name),
-    )  # fmt: skip
-    return _say_scored(run, name, options.output, done)
-
-
-def _say_scored(run: Run, label: str, output: Path, done: dict[str, Any]) -> dict[str, Any]:
+        done = core.score_file(source, output, views, method, **_how(run, source.name)).report
     prices = [f"{price['removed']:.0%} removed: {_by_method(price)}" for price in done["prices"]]
     line = f"scored {done['splats']['before']:,} splats by {done['views']['used']} views"
-    return run.say(done, f"{run.named(label)}: {line}{_to(output)}", *prices)
+    return run.say(str(source), line, done, *prices)
 
 
-def lod(run: Run) -> None:
-    """Make levels of detail of the input."""
-    views, source = run.views(), run.options.inputs[0]
-    run.attempt(str(source), _make_levels, source, views)
-
-
-def _make_levels(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
-    options = run.options
-    done = lod_file(
-        source, options.output, views, options.shares, options.how, **run.reading(source.name)
-    )
+def _lod(run: Run, source: Path, output: Path) -> dict[str, Any]:
+    options, how = run.options, _how(run, source.name)
+    done = core.lod_file(source, output, run.views(), options.levels, options.how, **how)
     count, number = done["splats"]["before"], len(done["levels"])
     levels = [
         f"{entry['file']}: {entry['splats']:,} splats, {size_in_words(entry['bytes'])}"
         + (f", {in_words(entry['psnr'])}" if entry["psnr"] is not None else "")
         for entry in done["levels"]
     ]
-    line = f"{source}: {number} level{'s' if number > 1 else ''} of {count:,} splats, {_by(done)}"
-    line += f", {done['timings']['total_s']:.2f} s{_to(options.output)}"
-    return run.say(done, line, *levels)
+    line = f"{number} level{'s' if number > 1 else ''} of {count:,} splats, {_by(done)}"
+    line += f", {done['timings']['total_s']:.2f} s"
+    return run.say(str(source), line, done, *levels)
 
 
-def convert(run: Run) -> None:
-    """Convert the inputs to one file."""
-    run.attempt(str(run.options.inputs[0]), _convert)
-
-
-def _convert(run: Run) -> dict[str, Any]:
+def _convert(run: Run, _first: str) -> dict[str, Any]:
     options = run.options
-    done = convert_files(
+    done = core.convert_files(
         options.inputs, options.output, degree=options.degree, model=options.model,
         overwrite=options.overwrite,
     ).report  # fmt: skip
-    splats, files = done["splats"], done["files"]
-    size = _sizes(files["input_bytes"], files["output_bytes"])
-    line = f"{' + '.join(map(str, options.inputs))}: {splats['before']:,} splats"
-    return run.say(done, f"{line}{_written(splats)}, {size}{_to(options.output)}")
+    line = f"{done['splats']['before']:,} splats{_files(done)}"
+    return run.say(" + ".join(map(str, options.inputs)), line, done)
 
 
-def info(run: Run) -> None:
-    """Describe each input."""
-    for source in run.options.inputs:
-        run.attempt(str(source), _info, source)
-
-
-def _info(run: Run, source: Path) -> dict[str, Any]:
-    facts = describe(read_splats(source))
-    run.terminal.say(f"{source}")
-    for name, value in facts.items():
-        run.terminal.say(f"  {name.replace('_', ' '):18} {value}")
+def _info(run: Run, source: Path, _output: None) -> dict[str, Any]:
+    facts = describe(core.read_splats(source))
+    lines = [f"  {name.replace('_', ' '):18} {value}" for name, value in facts.items()]
+    run.terminal.say(str(source), *lines)
     return {"input": str(source), **facts}
 
 
-def describe(file: SplatFile) -> dict[str, Any]:
+def describe(file: core.SplatFile) -> dict[str, Any]:
     """Return what ``info`` says of a file: counts, degree, extent, rows that are not finite."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    whole = file.splats()
-    broken = undrawable = 0
-    for start in range(0, len(file), 1 << 16):
-        piece = file.rows[start : start + (1 << 16)]
-        splats = whole.take(slice(start, start + (1 << 16)))
-        finite = np.ones(len(piece), np.bool_)
-        for name in piece.dtype.names or ():
-            finite &= np.isfinite(piece[name])
-        broken += int(np.count_nonzero(~finite))
-        undrawable += int(np.count_nonzero(~drawable(splats)))
-        means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
-        low = np.minimum(low, means.min(axis=0, initial=np.inf))
-        high = np.maximum(high, means.max(axis=0, initial=-np.inf))
-    names = file.rows.dtype.names or ()
-    average: float = file.row_bytes
-    if file.origin is not None:
-        average = round(file.stored_bytes / max(len(file), 1), 1)
-    known = ("x", "y", "z", "nx", "ny", "nz", "opacity")
-    extra = [n for n in names if n not in known and not n.startswith(("f_", "scale_", "rot_"))]
+    splats, names = file.splats(), file.rows.dtype.names or ()
+    pieces = (file.rows[start : start + (1 << 16)] for start in range(0, len(file), 1 << 16))
+    finite = (np.logical_and.reduce([np.isfinite(piece[n]) for n in names]) for piece in pieces)
+    means = splats.means[np.isfinite(splats.means).all(axis=1)]
+    average = round(file.stored_bytes / max(len(file), 1), 1)
     return {
         "splats": len(file),
-        "sh_degree": whole.sh_degree,
+        "sh_degree": splats.sh_degree,
         "bytes": file.stored_bytes,
-        "bytes_per_splat": average,
+        "bytes_per_splat": file.row_bytes if file.origin is None else average,
         "format": file.format,
         "model": file.model,
-        "extent_low": low.tolist() if np.isfinite(low).all() else None,
-        "extent_high": high.tolist() if np.isfinite(high).all() else None,
-        "non_finite_rows": broken,
-        "undrawable": undrawable,
-        "extra_properties": extra,
+        "extent_low": means.min(axis=0).tolist() if len(means) else None,
+        "extent_high": means.max(axis=0).tolist() if len(means) else None,
+        "non_finite_rows": sum(int(np.count_nonzero(~rows)) for rows in finite),
+        "undrawable": int(np.count_nonzero(~drawable(splats))),
+        "extra_properties": other_properties(names),
         **({"notes": list(file.remarks)} if file.remarks else {}),
     }
-
-
-def _render(run: Run) -> None:
-    from .render import render
-
-    render(run)
-
-
-SUBCOMMANDS = {
-    "prune": prune, "score": score, "clean": clean, "lod": lod, "convert": convert, "info": info,
-    "render": _render,
-}  # fmt: skip
 
 
 def _by(done: dict[str, Any]) -> str:
@@ -287,14 +202,15 @@ def _by(done: dict[str, Any]) -> str:
     return f"by {done['views']['used']} of {done['views']['given']} views"
 
 
-def _to(output: object) -> str:
-    """Where the result is; "" where nothing is written."""
-    return f" -> {output}" if output else ""
-
-
 def _written(splats: Mapping[str, Any]) -> str:
     """How many splats a file holds, if its format left some out; else ""."""
     return f", {splats['written']:,} written" if splats["left_out"] and splats["written"] else ""
+
+
+def _files(done: dict[str, Any]) -> str:
+    """The same, and what became of the size."""
+    files = done["files"]
+    return f"{_written(done['splats'])}, {_sizes(files['input_bytes'], files['output_bytes'])}"
 
 
 def _sizes(before: int, after: int | None) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
 from typing import Literal, TextIO
 
 from ..core.errors import printable, reason_of
@@ -42,34 +41,19 @@ class Terminal:
         self._quiet = quiet
         self._draws = not quiet and _is_terminal(sys.stderr)
 
-    def say(self, text: str) -> None:
-        """Print a line, unless quiet."""
+    def say(self, *lines: str) -> None:
+        """Print lines, unless quiet."""
         if not self._quiet:
-            _write("stdout", f"{printable(text)}\n")
+            _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
 
-    def progress(self, label: str, left: Callable[[float], str]) -> Callable[[float, str], None]:
-        """Return a callback that draws on a terminal and is silent elsewhere.
-
-        Parameters
-        ----------
-        label : str
-            What is worked on.
-        left : callable
-            Returns how much time the rest takes, in words, for the fraction done.
-        """
-        if not self._draws:
-            return lambda _fraction, _what: None
-        label = printable(label)
-
-        def draw(fraction: float, what: str) -> None:
-            _write("stderr", f"{_CLEAR}{label}: {what} {fraction:4.0%}{left(fraction)}")
-
-        return draw
+    def draw(self, text: str) -> None:
+        """Show a line until the next takes its place; on a terminal alone."""
+        if self._draws:
+            _write("stderr", f"{_CLEAR}{printable(text)}")
 
     def clear(self) -> None:
         """Wipe away what was drawn."""
-        if self._draws:
-            _write("stderr", _CLEAR)
+        self.draw("")
 
 
 def _is_terminal(stream: TextIO | None) -> bool:

@@ -252,7 +252,7 @@ def test_levels_do_not_stand_on_top_of_each_other(quarter, room_cameras):
 
 def test_a_blend_that_blender_could_not_open_is_named(addon, tmp_path):
     """Blender goes on with an empty scene; words behind the command are its own."""
-    check = importlib.import_module(f"{addon.__name__}.command.scene").refuse_unopened
+    check = importlib.import_module(f"{addon.__name__}.command.scene").opened
     refine_error = addon.core.RefineError
     words = ["blender", "-b", "gone.blend", "--command", "refine", "prune", "--object", "a"]
 

@@ -69,7 +69,7 @@ def test_wrong_usage_ends_before_any_work(files, capsys, options, word):
 def test_a_folder_for_the_files_is_required(files, capsys):
     """The option is named."""
     assert call(files, "lod") == 2
-    assert "expected -o OUT\n" in capsys.readouterr().err
+    assert "expected -o OUT" in capsys.readouterr().err
 
 
 def test_files_that_exist_are_replaced_when_told_alone(files, capsys):

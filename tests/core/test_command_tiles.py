@@ -86,7 +86,7 @@ def test_a_tile_that_is_missing_stops_all(folder, capsys):
             [*CLOSED, "-o", "out", "--protect", "sphere:0,0,0,1"],
             "--protect does not go with --together",
         ),
-        (CLOSED, "expected -o OUT, --save or --dry-run"),
+        (CLOSED, "expected -o OUT; instead of it prune takes --save or --dry-run"),
     ],
 )
 def test_what_does_not_go_with_tiles_is_wrong_usage(folder, capsys, options, words):
@@ -117,7 +117,7 @@ def test_after_ctrl_c_it_says_how_to_go_on(folder, capsys, monkeypatch):
 
         patched.setattr(storage, "publish", stop)
         assert call(*CLOSED, "-o", "out") == 130
-    assert "the same command goes on where this one was" in capsys.readouterr().out
+    assert "the same command goes on where this one was" in capsys.readouterr().err
 
     assert call(*CLOSED, "-o", "out") == 0
     assert {path.name for path in (folder / "out").iterdir()} == set(COUNTS)

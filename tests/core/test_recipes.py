@@ -29,11 +29,10 @@ def test_a_recipe_for_blender_is_understood_and_refused_by_no_check(line, tmp_pa
     shutil.copy(ROOM / "point_cloud.ply", tmp_path / "in.ply")
     shutil.copy(ROOM / "cameras.json", tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(checks, "open_blend", lambda: "scene.blend")
     words = shlex.split(line.replace("*.ply", "in.ply"))
 
     options = make_parser().parse_args(words)
-    options.scene = True
+    options.scene, options.blend = True, "scene.blend"
     complete(options)
     checks.check(options)
 
