@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zlib
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -18,8 +16,6 @@ from ..core.pictures import AMPLIFIED, KINDS, Comparison, compare
 from ..core.prune import prune
 from ..core.quality.curve import in_words
 from ..core.views import ViewSet
-from ..mesh import scores as mesh_scores
-from ..mesh.records import parsed
 from ..objects import splat_group
 from ..objects.splat_group import Members
 from . import plans
@@ -29,9 +25,6 @@ from .operators import apply_arguments, selected
 
 NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 """The pictures as images of the file, made anew by each comparison."""
-
-MEASURED = "refine_measured"
-"""Custom property of the mesh: what was measured last, and of which plan, as JSON."""
 
 
 class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
@@ -64,7 +57,9 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
     def put(self, context: Context, _group: Members, _job: Any, result: Any) -> None:
         """Put the pictures into images, show them, and say how close they are."""
         comparison, estimated = result
-        _note(context, comparison)
+        plan = plans.stored(context.object, context.scene.refine)
+        if plan is not None:
+            plan["measured"] = comparison
         images = [put(NAMES[kind], getattr(comparison, kind) / np.float32(255.0)) for kind in KINDS]
         if not bpy.app.background and context.window is not None:
             _show(context, images)
@@ -77,30 +72,9 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
 
 
 def measured(obj: bpy.types.Object, settings: Any) -> str:
-    """Return a sentence on what was measured of the plan of the moment, "" if nothing was."""
-    try:
-        noted = parsed(obj.data[MEASURED])
-        plan = plans.stored(obj, settings)
-        if plan is not None and noted["of"] == _identity(obj, plan):
-            return f"Measured in '{noted['view']}': {noted['psnr']:.1f} dB"
-    except (KeyError, TypeError, ValueError):
-        pass
-    return ""
-
-
-def _note(context: Context, comparison: Comparison) -> None:
-    """Keep what was measured, for the panel to show as long as the plan is this one."""
-    obj = context.object
-    plan = plans.stored(obj, context.scene.refine)
-    if plan is not None and not obj.data.library:
-        noted = {"psnr": comparison.psnr, "view": comparison.view.name}
-        obj.data[MEASURED] = json.dumps(noted | {"of": _identity(obj, plan)})
-
-
-def _identity(obj: bpy.types.Object, plan: dict[str, Any]) -> list[Any]:
-    """Return what tells a plan, and the scores it goes by, from others."""
-    scoring = zlib.crc32(str(obj.data.get(mesh_scores.RECORD)).encode())
-    return [plan["key"], plan["splats"], scoring]
+    """A sentence on what was measured of the plan of the moment, "" if nothing was."""
+    measured: Comparison | None = (plans.stored(obj, settings) or {}).get("measured")
+    return f"Measured in '{measured.view.name}': {measured.psnr:.1f} dB" if measured else ""
 
 
 def _show(context: Context, images: list[bpy.types.Image]) -> None:

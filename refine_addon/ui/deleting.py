@@ -24,7 +24,6 @@ class Deleting(AtOnce, OnSplats):
         """Delete them, drop the plan that was made with them, and say how many they were."""
         checked = mesh_layout.check(context.object)
         outcome = splat_group.delete_splats(checked, ~self.going(context, checked))
-        plans.forget(checked.mesh)
         plans.refresh(context)
         self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")
         return {"FINISHED"}

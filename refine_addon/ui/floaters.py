@@ -33,7 +33,7 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
         """The arguments of `clean`, in the world."""
         checked, settings = mesh_layout.check(context.object), context.scene.refine
         mesh_edit.check_writable(checked.obj)
-        cleaning = Cleaning(tuple(settings.reasons), settings.views)
+        cleaning = Cleaning(settings.to_reasons(), settings.views)
         forced = splat_group.forced(context.scene, [checked])
         masks = {"protected": forced.protected, "removed": forced.removed}
         return [checked], ((splat_group.gather([checked]), chosen_views(context), cleaning), masks)
@@ -47,7 +47,7 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
     def put(self, context: Context, group: list[SplatObject], _job: Any, cleaned: Any) -> None:
         """Store what was found, mark it as what goes, and say it."""
         floaters.store(group[0], cleaned)
-        floaters.mark(group[0], context.scene.refine.reasons)
+        floaters.mark(group[0], context.scene.refine.to_reasons())
         self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")
 
 
@@ -57,7 +57,7 @@ def _searched(context: Context) -> str:
 
 
 class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
-    """Delete the floaters that were found, for the reasons that are switched on"""
+    """Delete the floaters that were found, as many as the strength says"""
 
     bl_idname = "refine.delete_floaters"
     bl_label = "Delete Floaters"
@@ -68,7 +68,7 @@ class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: Context) -> Answer:
         """Delete them, but for those that must stay by now."""
         checked = mesh_layout.check(context.object)
-        floating = floaters.mask(checked, context.scene.refine.reasons)
+        floating = floaters.mask(checked, context.scene.refine.to_reasons())
         protected = Demands.of_scene(context.scene).forced(checked).protected
         spared = ""
         if protected is not None and (stays := int(np.count_nonzero(floating & protected))):
@@ -78,7 +78,6 @@ class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
             self.report({"INFO"}, f"There are no floaters to delete{spared}")
             return {"CANCELLED"}
         outcome = splat_group.delete_splats(checked, ~floating)
-        plans.forget(checked.mesh)
         plans.refresh(context)
         self.report(
             {"INFO"}, f"Deleted {outcome.removed:,} floaters, {outcome.kept:,} splats stay{spared}"

@@ -48,26 +48,15 @@ class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_PT_instances(bpy.types.Panel):
-    """What can be done with instances."""
-
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "REFINE"
-    bl_label = "Instances"
-    bl_parent_id = "REFINE_PT_splats"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the active object instances splats."""
-        return not _instances(context)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw what they are, and the button."""
-        count = sum(splat_count(place.obj.data) for place in placings([context.object]))
-        text = f"{count:,} splats of collection '{context.object.instance_collection.name}'"
-        wrapped.label(self.layout, context, text, icon="OUTLINER_OB_GROUP_INSTANCE")
-        self.layout.operator("refine.make_real")
+def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
+    """Draw what the active object instances, and the button; whether it instances splats."""
+    if _instances(context):
+        return False
+    count = sum(splat_count(place.obj.data) for place in placings([context.object]))
+    text = f"{count:,} splats of collection '{context.object.instance_collection.name}'"
+    wrapped.label(layout, context, text, icon="OUTLINER_OB_GROUP_INSTANCE")
+    layout.operator("refine.make_real")
+    return True
 
 
 CLASSES = (REFINE_OT_make_real,)

@@ -172,11 +172,9 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
         if arguments["method"].changes:  # on a thread, while volumes can be moved
             splat_group.check_forced(context.scene, group, forced)
         decided = arguments["budget"].needs_scores or not result.merged  # by the scores
-        changed = _changes_since_scoring(context, group, arguments) if decided else []
+        changed = staleness.changes(context, *(each.obj for each in group)) if decided else []
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
         outcome = splat_group.apply(group, applied.changes)
-        for member in group:
-            plans.forget(member.mesh)
         plans.refresh(context)
         psnr = result.report["estimated_psnr"]
         known = scoring_notes(result.scores)  # said when they were scored
@@ -197,15 +195,6 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
                 f"The scores were from before a change ({', '.join(changed)}); undo and "
                 "score again if it is to count",
             )
-
-
-def _changes_since_scoring(
-    context: Context, group: Members, arguments: dict[str, Any]
-) -> list[str]:
-    """What changed since the objects were scored, in a few words each."""
-    protected = splat_group.parts_of(arguments["protected"], group)
-    pairs = zip((member.obj for member in group), protected, strict=True)
-    return staleness.changes_of(context, dict(pairs))
 
 
 class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):

@@ -1,12 +1,15 @@
-"""The panel REFINE in the 3D view's sidebar: it draws settings and stored results."""
+"""The tab REFINE in the 3D view's sidebar, by what an artist does: it draws what is stored."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import bpy
 
 from ..cameras.sets import CameraChoice, known_turn
+from ..core.errors import RefineError
+from ..core.formats.ply import stated_model
 from ..core.quality.alignment import Alignment
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
@@ -17,24 +20,22 @@ from ..objects import demands, level_objects, splat_group
 from ..viewport import draw as viewport_draw
 from . import (
     camera_list,
+    chart,
     compare,
+    instances,
     plans,
-    price,
     render_operators,
     running,
     staleness,
     transforms,
     wrapped,
 )
-from .instances import REFINE_PT_instances
 from .panel_cache import cached
-from .properties import FLOATERS, RefineSettings
+from .properties import HINTS, METHODS
 from .select_panel import REFINE_PT_select
 from .view_operators import MODES
-from .volumes import ROLES, RefineVolume
+from .volumes import ROLES
 from .wrapped import counted
-
-_NONE = "Select an object that holds splats"
 
 
 class _InSidebar:
@@ -44,7 +45,7 @@ class _InSidebar:
 
 
 def _named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
-    """Return a column of settings with their names beside them."""
+    """A column of settings with their names beside them."""
     column = layout.column()
     column.use_property_split = True
     column.use_property_decorate = False
@@ -52,36 +53,23 @@ def _named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
 
 
 class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
-    """What is to be pruned."""
+    """What is to be pruned, and how it is seen."""
 
     bl_label = "1 Splats"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the import and what the active object holds."""
-        layout = self.layout
+        """Draw the import, what the active object holds, and the ways to see it."""
+        layout, obj = self.layout, context.object
         layout.operator("refine.import_ply", icon="IMPORT")
-        obj = context.object
-        if not mesh_layout.looks_like_splats(obj):
-            lost = obj is not None and native.lost_base(obj)
-            text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
-            wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
-            _draw_progress(layout, context, "refine.import_ply")
-            return
-        objects = splat_group.chosen(context.view_layer, obj)
-        count = sum(mesh_layout.splat_count(each.data) for each in objects)
-        several = len(objects) > 1
-        degree = max(mesh_layout.sh_degree(each.data) for each in objects)
-        text = f"{counted(len(objects), 'object') if several else obj.name}: {count:,} splats"
-        size = None
-        if not several:
-            size = cached("bytes", context, lambda: mesh_layout.export_bytes(obj))
-        text += f", SH degree {degree}" + (f", {size_in_words(size)}" if size is not None else "")
-        wrapped.label(layout, context, text, icon="OUTLINER_OB_POINTCLOUD")
-        transforms.draw(layout, context, objects)
-        if several:
-            wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
-            return
-        _named_column(layout).prop(context.scene.refine, "model")
+        if mesh_layout.looks_like_splats(obj):
+            _draw_objects(layout, context, splat_group.chosen(context.view_layer, obj))
+        elif obj is not None and native.lost_base(obj):
+            text = "Colours were lost: open it in Blender 5.2"
+            wrapped.label(layout, context, text, icon="ERROR")
+        elif not instances.draw(layout, context):
+            text = "Select an object that holds splats"
+            wrapped.label(layout, context, text, icon="INFO")
+        _draw_modes(layout, obj if mesh_layout.looks_like_splats(obj) else None)
         _draw_progress(layout, context, "refine.import_ply")
 
 
@@ -91,7 +79,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
     bl_label = "2 Cameras"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the choice of cameras."""
+        """Draw the choice of cameras, and what each sees."""
         layout, settings = _named_column(self.layout), context.scene.refine
         row = layout.row(align=True)
         row.operator("refine.import_cameras", icon="IMPORT")
@@ -100,71 +88,90 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         if settings.source == "COLLECTION":
             layout.prop(settings, "collection", text="")  # room for its name
         if settings.source == "FRAMES":
-            _draw_frames(layout, settings, context.scene)
+            layout.prop(settings, "frame_step")
+            frames = counted(len(settings.to_frames(context.scene)), "frame")
+            layout.label(text=frames, icon="CAMERA_DATA")
         elif settings.source != "ACTIVE":
             count = cached("cameras", context, lambda: len(_cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
         obj = context.object
-        if mesh_layout.looks_like_splats(obj) and _record(obj) is None:
+        if not mesh_layout.looks_like_splats(obj):
+            return
+        record = _record(obj)
+        if record is None:
             turn = cached("turn", context, lambda: known_turn(context, obj))
-            if turn:
-                _draw_warning(self.layout, context, plans.turned(Alignment(turn, known=True)))
+            alignment = Alignment(turn, known=True)
+        else:
+            alignment = Alignment.from_facts(record.get("alignment"))
+        if text := alignment.turned():
+            wrapped.label(self.layout, context, text[:1].upper() + text[1:], icon="ERROR")
+            button = self.layout.operator("refine.turn_cameras")
+            button.quarter = str(alignment.turn)
+        if record:
+            plan = plans.shown(obj, settings) or {}
+            camera_list.draw(self.layout, record, plan.get("views", {}))
 
 
-class REFINE_PT_camera_list(_InSidebar, bpy.types.Panel):
-    """Who sees how much."""
+class REFINE_PT_prune(_InSidebar, bpy.types.Panel):
+    """The dial: how, how much, and what that costs."""
 
-    bl_label = "What Each Sees"
-    bl_parent_id = "REFINE_PT_cameras"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether there is a scoring to tell of."""
-        return _record(context.object) is not None
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw the list."""
-        record = _record(context.object) or {}
-        if text := camera_list.warning(record):
-            wrapped.label(self.layout, context, text, icon="ERROR")
-        if price.shows(context.object.data):  # the list is of the object whose chart there is
-            camera_list.draw(self.layout, context)
-
-
-class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
-    """What the cameras see through."""
-
-    bl_label = "Floaters"
-    bl_options = {"DEFAULT_CLOSED"}
+    bl_label = "3 Prune"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the reasons, how many splats each takes, and the buttons."""
-        layout = self.layout
-        settings = context.scene.refine
-        layout.operator("refine.find_floaters", icon="VIEWZOOM")
-        obj = context.object
-        counts = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
-        sure = {} if counts is None else floaters.surety(obj.data)
+        """Draw the methods with their price, the budget, and the buttons."""
+        layout, settings, obj = self.layout, context.scene.refine, context.object
+        record, plan = _record(obj), None
+        if record:
+            plans.ask(context)
+            plan = plans.shown(obj, settings)
         column = layout.column(align=True)
-        for name, text, _ in FLOATERS:
-            shown = text if counts is None else f"{text}: {counts[name]:,}"
-            if sure.get(name) is not None:
-                shown += f" ({100.0 * sure[name]:.0f} %)"
-            column.prop_enum(settings, "reasons", name, text=shown)
+        for name, text, _ in METHODS:
+            price = plans.price(plan, name) or HINTS[name]
+            column.prop_enum(settings, "method", name, text=f"{text} · {price}")
+        column = _named_column(layout)
+        column.prop(settings, "budget")
+        column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
+        row = layout.row(align=True)
+        row.operator("refine.score", icon="CAMERA_DATA")
+        apply = row.row(align=True)
+        apply.enabled = record is not None
+        apply.operator("refine.apply", icon="TRASH")
+        _draw_plan(layout, context, record, plan)
+        layout.operator("refine.compare", icon="IMAGE_DATA")
+        if record and (text := compare.measured(obj, settings)):
+            wrapped.label(layout, context, text, icon="CHECKMARK")
+        if plan and plan.get("quality"):
+            chart.draw(layout, plan["quality"])
+        _draw_progress(layout, context, "refine.score", "refine.apply", "refine.compare")
+
+
+class REFINE_PT_clean(_InSidebar, bpy.types.Panel):
+    """What the cameras see past."""
+
+    bl_label = "Clean"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the strength, how many splats float by that, and the buttons."""
+        layout, settings, obj = self.layout, context.scene.refine, context.object
+        layout.row(align=True).prop(settings, "strength", expand=True)
+        layout.operator("refine.find_floaters", icon="VIEWZOOM")
+        counts = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if counts is not None:
-            total = sum(counts[name] for name in settings.reasons)
-            layout.label(
-                text=f"Go: {total:,} of {mesh_layout.splat_count(obj.data):,}", icon="TRASH"
-            )
+            reasons, sure = settings.to_reasons(), floaters.surety(obj.data)
+            total = sum(counts[name] for name in reasons)
+            text = f"{total:,} of {mesh_layout.splat_count(obj.data):,} float"
+            known = sum(counts[name] * sure.get(name, 0.0) for name in reasons)
+            text += f", {100.0 * known / total:.0f} % sure" if known else ""
+            layout.label(text=text, icon="TRASH")
             layout.operator("refine.delete_floaters", icon="TRASH")
         _draw_progress(layout, context, "refine.find_floaters")
 
 
-class REFINE_PT_volumes(_InSidebar, bpy.types.Panel):
+class REFINE_PT_protect(_InSidebar, bpy.types.Panel):
     """What must stay and what must go."""
 
-    bl_label = "Protect and Crop"
+    bl_label = "Protect"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -172,16 +179,19 @@ class REFINE_PT_volumes(_InSidebar, bpy.types.Panel):
         layout, settings, obj = self.layout, context.scene.refine, context.object
         facts = demands.facts(obj.data) if mesh_layout.looks_like_splats(obj) else {}
         layout.prop(settings, "protect", text="", icon="GROUP_VERTEX", placeholder="Vertex group")
-        row = layout.row(align=True)
-        row.operator("refine.protect", text="Protect Selected", icon="LOCKED").mode = "ADD"
-        row.operator("refine.protect", text="", icon="REMOVE").mode = "SUBTRACT"
-        row.operator("refine.protect", text="", icon="X").mode = "CLEAR"
         column = layout.column(align=True)
         for role, text, _, icon, _ in ROLES:
             button = column.operator_menu_enum("refine.add_volume", "shape", text=text, icon=icon)
             button.role = role
+        counts = facts.get("volumes", {})
         for index, item in enumerate(settings.volumes):
-            _draw_volume(layout, index, item, facts.get("volumes", {}))
+            row = layout.row(align=True)
+            row.prop(item, "role", text="", icon_only=True)
+            row.prop(item, "object", text="")
+            count = counts.get(f"object '{item.object.name}'") if item.object else None
+            if count is not None:
+                row.label(text=f"{count:,}")
+            row.operator("refine.drop_volume", text="", icon="X").index = index
         if "error" in facts:
             wrapped.label(layout, context, facts["error"], icon="ERROR")
             return
@@ -192,106 +202,23 @@ class REFINE_PT_volumes(_InSidebar, bpy.types.Panel):
             layout.operator("refine.crop", icon="TRASH")
 
 
-def _draw_volume(
-    layout: bpy.types.UILayout, index: int, item: RefineVolume, counts: dict[str, int]
-) -> None:
-    """Draw a volume of the list, and below its name how many splats lie in it, if known."""
-    column = layout.column(align=True)
-    row = column.row(align=True)
-    row.prop(item, "role", text="", icon_only=True)
-    row.prop(item, "object", text="")
-    count = counts.get(f"object '{item.object.name}'") if item.object else None
-    row = column.row()
-    row.label(text="" if count is None else f"{count:,} inside")
-    row.operator("refine.drop_volume", text="", icon="X").index = index
+class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):
+    """The ways out."""
 
-
-class REFINE_PT_score(_InSidebar, bpy.types.Panel):
-    """The scoring."""
-
-    bl_label = "3 Score"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw the method, the button and what came of it."""
-        layout = self.layout
-        settings = context.scene.refine
-        column = _named_column(layout)
-        column.prop(settings, "method")
-        if settings.method == "refit":
-            column.prop(settings, "rounds")
-        column.prop(settings, "views")
-        layout.operator("refine.score", icon="CAMERA_DATA")
-        obj = context.object
-        record = _record(obj)
-        if record:
-            views = counted(record["views_given"], "view")
-            layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
-            if changed := _changes(context, obj):
-                text = f"Score again: {', '.join(changed)}"
-                wrapped.label(layout, context, text, icon="ERROR")
-        elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
-            wrapped.label(layout, context, "Splats were deleted: score again", icon="INFO")
-        _draw_progress(layout, context, "refine.score")
-
-
-class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
-    """Looking before deleting."""
-
-    bl_label = "4 Preview"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw the ways to look at the splats."""
-        layout = self.layout
-        obj = context.object
-        splats = mesh_layout.looks_like_splats(obj)
-        _draw_modes(layout, obj if splats else None)
-        render_operators.draw_buttons(layout)
-
-
-class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
-    """How much goes."""
-
-    bl_label = "5 Apply"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw the budget, what it would do, and the button."""
-        layout = self.layout
-        settings = context.scene.refine
-        column = _named_column(layout)
-        column.prop(settings, "budget")
-        column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
-        obj = context.object
-        record = _record(obj)
-        if record:
-            _draw_price(layout, context)
-            _draw_plan(layout, context, record)
-            layout.operator("refine.compare", icon="IMAGE_DATA")
-            if text := compare.measured(obj, settings):
-                wrapped.label(layout, context, text, icon="CHECKMARK")
-            _draw_progress(layout, context, "refine.compare")
-        row = layout.row()
-        row.enabled = record is not None
-        row.operator("refine.apply", icon="TRASH")
-        _draw_progress(layout, context, "refine.apply")
-
-
-class REFINE_PT_export(_InSidebar, bpy.types.Panel):
-    """The way out."""
-
-    bl_label = "6 Export"
+    bl_label = "Deliver"
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the buttons."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.operator("refine.export_ply", icon="EXPORT")
+        render_operators.draw_buttons(layout)
         column = _named_column(layout)
         column.prop(settings, "levels")
         column.operator("refine.levels", icon="MOD_DECIM")
         if level_objects.has_levels(obj):
             column.operator("refine.export_levels", icon="EXPORT")
-        _draw_progress(
-            layout, context, "refine.export_ply", "refine.levels", "refine.export_levels"
-        )
+        names = ("refine.export_ply", "refine.levels", "refine.export_levels")
+        _draw_progress(layout, context, *names)
 
 
 def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
@@ -305,27 +232,61 @@ def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *name
         wrapped.label(layout, context, now.sentence)
 
 
-def _draw_frames(
-    layout: bpy.types.UILayout, settings: RefineSettings, scene: bpy.types.Scene
+def _draw_objects(
+    layout: bpy.types.UILayout, context: bpy.types.Context, objects: Sequence[bpy.types.Object]
 ) -> None:
-    layout.prop(settings, "scene_frames")
-    if not settings.scene_frames:
-        column = layout.column(align=True)
-        column.prop(settings, "frame_start")
-        column.prop(settings, "frame_end")
-    layout.prop(settings, "frame_step")
-    layout.label(text=counted(len(settings.to_frames(scene)), "frame"), icon="CAMERA_DATA")
+    """Draw what the objects hold that are worked on."""
+    obj = context.object
+    count = sum(mesh_layout.splat_count(each.data) for each in objects)
+    degree = max(mesh_layout.sh_degree(each.data) for each in objects)
+    several = len(objects) > 1
+    name = f"{len(objects)} objects, one scene" if several else obj.name
+    text = f"{name}: {count:,} splats, SH degree {degree}"
+    size = None if several else cached("size", context, lambda: mesh_layout.export_bytes(obj))
+    text += f", {size_in_words(size)}" if size is not None else ""
+    wrapped.label(layout, context, text, icon="OUTLINER_OB_POINTCLOUD")
+    transforms.draw(layout, context, objects)
+    if not several and cached("model", context, lambda: _model_is_open(obj)):
+        _named_column(layout).prop(context.scene.refine, "model")
+
+
+def _draw_plan(
+    layout: bpy.types.UILayout,
+    context: bpy.types.Context,
+    record: dict[str, Any] | None,
+    plan: dict[str, Any] | None,
+) -> None:
+    """Draw what the budget comes to, and what the cameras do not know of it."""
+    obj = context.object
+    if record is None:
+        lost = mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes
+        text = "Splats were deleted: score again" if lost else "Score to see what it costs"
+        wrapped.label(layout, context, text, icon="INFO")
+        return
+    if changed := _changes(context, obj):
+        text = f"Score again: {', '.join(changed)}"
+        wrapped.label(layout, context, text, icon="ERROR")
+    if plan is None:
+        return  # it is being made
+    if "error" in plan:
+        wrapped.label(layout, context, plan["error"], icon="ERROR")
+        return
+    views = f"by {record['views_used']} of {counted(record['views_given'], 'view')}"
+    wrapped.label(layout, context, f"{plans.sentence(plan)}, {views}", icon="CHECKMARK")
+    if plan["remark"]:
+        wrapped.label(layout, context, plan["remark"], icon="INFO")
+    for text in plans.warnings(plan, record):
+        wrapped.label(layout, context, text, icon="ERROR")
 
 
 def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
     """Draw the ways to see splats as splats; those that need scores wait for them."""
-    now = viewport_draw.mode()
+    now, attributes = viewport_draw.mode(), obj.data.attributes if obj else ()
     needs = {"HEAT": mesh_scores.RANK, "STAYS": mesh_edit.REMOVE, "GOES": mesh_edit.REMOVE}
-    column = layout.column(align=True)
-    rows = [column.row(align=True), column.row(align=True)]
-    for place, (mode, text, _) in enumerate(MODES[1:]):
-        cell = rows[place // 2].row(align=True)
-        cell.enabled = mode == now or mode not in needs or _has(obj, needs[mode])
+    grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
+    for mode, text, _ in MODES[1:]:
+        cell = grid.row(align=True)
+        cell.enabled = mode == now or mode not in needs or needs[mode] in attributes
         button = cell.operator("refine.view", text=text, depress=mode == now)
         button.mode = "OFF" if mode == now else mode
     if viewport_draw.failure():
@@ -333,12 +294,17 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
 
 
 def _record(obj: bpy.types.Object | None) -> dict[str, Any] | None:
-    """Return the record of an object's scoring, None without."""
+    """The record of an object's scoring, None without."""
     return mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
 
 
-def _has(obj: bpy.types.Object | None, attribute: str) -> bool:
-    return obj is not None and attribute in obj.data.attributes
+def _model_is_open(obj: bpy.types.Object) -> bool:
+    """Whether the file of splats did not say how they are drawn."""
+    try:
+        layout = mesh_layout.layout_of(obj)
+    except RefineError:
+        return False
+    return mesh_layout.MODEL in obj.data or not stated_model(layout.header, layout.row_dtype)
 
 
 def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -346,70 +312,18 @@ def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 
 def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
-    """Return what changed since the objects that are worked on were scored."""
+    """What changed since the objects that are worked on were scored."""
     objects = splat_group.chosen(context.view_layer, obj)
     question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
-    marked = dict.fromkeys(objects)  # what is protected of them is marked
-    return cached(question, context, lambda: staleness.changes_of(context, marked))
-
-
-def _draw_price(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw the chart of the active object, and have it made if it is missing."""
-    plans.ask(context, context.object)
-    if price.shows(context.object.data):
-        header, body = layout.panel("REFINE_price")
-        header.label(text="Price")
-        if body:
-            row = body.row()
-            row.alignment = "CENTER"
-            row.template_icon(icon_value=price.icon(), scale=price.WIDTH)
-
-
-def _draw_plan(
-    layout: bpy.types.UILayout, context: bpy.types.Context, record: dict[str, Any]
-) -> None:
-    """Draw what the budget comes to, and what the cameras do not know of it."""
-    obj, settings = context.object, context.scene.refine
-    plan = plans.stored(obj, settings)
-    if plan is None:
-        return  # it is being made
-    if "error" in plan:
-        wrapped.label(layout, context, plan["error"], icon="ERROR")
-        return
-    wrapped.label(layout, context, plans.sentence(plan))
-    if remark := plans.remark(plan, record):
-        wrapped.label(layout, context, remark, icon="INFO")
-    for warning in plans.warnings(plan, record):
-        remedy = not _changes(context, obj)  # else it may be put right
-        _draw_warning(layout, context, warning, remedy=remedy)
-
-
-def _draw_warning(
-    layout: bpy.types.UILayout,
-    context: bpy.types.Context,
-    warning: plans.Warned,
-    *,
-    remedy: bool = True,
-) -> None:
-    """Draw a warning, with the button that helps."""
-    wrapped.label(layout, context, warning.text, icon="ERROR")
-    if warning.remedy and remedy:
-        button = layout.operator(warning.remedy)
-        for name, value in warning.options.items():
-            setattr(button, name, value)
+    return cached(question, context, lambda: staleness.changes(context, *objects))
 
 
 CLASSES = (
     REFINE_PT_splats,
-    REFINE_PT_instances,
     REFINE_PT_cameras,
-    REFINE_PT_camera_list,
+    REFINE_PT_prune,
+    REFINE_PT_clean,
     REFINE_PT_select,
-    REFINE_PT_floaters,
-    REFINE_PT_volumes,
-    REFINE_PT_score,
-    REFINE_PT_preview,
-    REFINE_PT_apply,
-    REFINE_PT_export,
+    REFINE_PT_protect,
+    REFINE_PT_deliver,
 )
-"""In the order of the sidebar."""

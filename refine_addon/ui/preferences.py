@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
+from bpy.props import BoolProperty, EnumProperty, IntProperty
 
-from .properties import AMOUNTS, UPRIGHT_TEXT, VIEWS, RefineSettings
+from .properties import METHOD, UPRIGHT_TEXT, VIEWS, RefineSettings
 
 PACKAGE = __package__.rpartition(".")[0]
 """The name under which the extension is enabled, such as ``bl_ext.user_default.refine_addon``."""
 
-DEFAULTS = ("method", "views", "budget", "percent", "psnr")
+DEFAULTS = ("method", "views")
 """The preferences that are settings of a scene, by the same names."""
 
 
@@ -21,11 +21,8 @@ class RefinePreferences(bpy.types.AddonPreferences):
 
     bl_idname = PACKAGE
 
-    method: EnumProperty(**AMOUNTS["method"])
+    method: EnumProperty(**METHOD)
     views: IntProperty(**VIEWS)
-    budget: EnumProperty(**AMOUNTS["budget"])
-    percent: FloatProperty(**AMOUNTS["percent"])
-    psnr: FloatProperty(**AMOUNTS["psnr"])
     upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -48,8 +45,7 @@ def give_defaults(context: bpy.types.Context) -> None:
 def fill(settings: RefineSettings, chosen: RefinePreferences) -> None:
     """Set what a user prefers, and has not set in these settings yet."""
     for name in DEFAULTS:
-        stored = "ratio" if name == "percent" else name
-        if chosen.is_property_set(name) and not settings.is_property_set(stored):
+        if chosen.is_property_set(name) and not settings.is_property_set(name):
             setattr(settings, name, getattr(chosen, name))
 
 

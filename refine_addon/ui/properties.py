@@ -9,7 +9,6 @@ from typing import Any
 import bpy
 import numpy as np
 from bpy.props import (
-    BoolProperty,
     CollectionProperty,
     EnumProperty,
     FloatProperty,
@@ -23,7 +22,7 @@ from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from ..core.lod import Levels
 from ..core.methods import METHODS as CORE_METHODS
-from ..core.methods import Merge, Method, Refit
+from ..core.methods import Merge, Method
 from ..core.selection import Budget
 from ..core.splats import MODELS
 from ..mesh import floaters
@@ -54,12 +53,18 @@ METHODS = (
 )
 """The dial, from instant to best, by the names of core."""
 
+HINTS = {
+    "closed-form": "rows stay as they were",
+    "occlusion": "rows stay as they were",
+    "merge": "what goes is merged",
+    "refit": "merged, then fitted",
+}
+"""What the panel says of each before there are scores."""
+
 BUDGETS = (
     ("ratio", "Share", "Remove this share of the splats"),
     ("keep", "Count", "Keep this many splats"),
     ("max_mb", "File Size", "Keep as many splats as fit in a file of this size"),
-    ("threshold", "Score", "Remove splats that score below this"),
-    ("min_seen", "Views", "Remove splats that lie in fewer than this share of the views"),
     ("psnr", "Quality", "Remove as many splats as leave the pictures this close to the unpruned"),
 )
 """Kinds of budget, by the names that core gives them."""
@@ -76,71 +81,12 @@ VIEWS: dict[str, Any] = {
     "min": 0,
 }
 
-AMOUNTS: dict[str, dict[str, Any]] = {
-    "budget": {
-        "name": "Budget",
-        "description": "How the number of splats that go is given",
-        "items": BUDGETS,
-    },
-    "percent": {
-        "name": "Remove",
-        "description": "Share of the splats to remove, in per cent",
-        "subtype": "PERCENTAGE",
-        "precision": 1,
-        "default": 50.0,
-        "min": 0.0,
-        "max": 99.99,
-    },
-    "keep": {
-        "name": "Keep",
-        "description": "How many splats stay",
-        "default": 100_000,
-        "min": 1,
-    },
-    "max_mb": {
-        "name": "MB",
-        "description": "Size of the exported file, in megabytes of a million bytes",
-        "default": 100.0,
-        "min": 1e-6,
-    },
-    "threshold": {
-        "name": "Score",
-        "description": "Splats that score below this are removed",
-        "default": 0.01,
-        "precision": 5,
-    },
-    "min_seen": {
-        "name": "Seen by",
-        "description": "Splats that lie in fewer than this share of the views are removed",
-        "subtype": "PERCENTAGE",
-        "default": 1.0,
-        "min": 0.0,
-        "max": 100.0,
-    },
-    "psnr": {
-        "name": "PSNR (dB)",
-        "description": "How close the pictures of the cameras stay to those of all splats, in dB: "
-        "40 is hard to tell apart, 30 is visible",
-        "default": 40.0,
-        "min": 1.0,
-        "max": 99.0,
-    },
-    "method": {
-        "name": "Method",
-        "description": "How splats are pruned, from instant to best",
-        "items": METHODS,
-        "default": Merge.name,
-    },
-    "rounds": {
-        "name": "Rounds",
-        "description": "Refit so many times at most, each time to other rays. 0: 2 to 4 times, "
-        "fewer of more splats; more rounds bring up to 1 dB, and take longer",
-        "default": 0,
-        "min": 0,
-        "max": 100,
-    },
+METHOD: dict[str, Any] = {
+    "name": "Method",
+    "description": "How splats are pruned, from instant to best",
+    "items": METHODS,
+    "default": Merge.name,
 }
-"""How much is removed, and how: properties of the panel and of *Apply*."""
 
 DRAWN = (
     ("default", "Default", "As ordinary 3D Gaussian splats"),
@@ -153,16 +99,18 @@ DRAWN = (
 )
 """How splats are drawn, by the names of `rendering.MODELS` and in their order."""
 
-FLOATERS = (
-    ("front", "In Front", "Stands in front of a surface, and cameras see past it"),
-    ("isolated", "Isolated", "Is in a small cluster that touches nothing else"),
-    ("giant", "Giant", "Is a huge veil across the pictures"),
-    ("needle", "Needle", "Is long and thin, and crosses the pictures"),
-    ("transparent", "Transparent", "Floats, but no picture changes visibly without it"),
-    ("haze", "Haze", "Floats near a camera, faint; no picture changes visibly without one of it"),
-    ("outside", "Outside", "Lies outside all views: none of the cameras can judge it"),
+STRENGTHS = (
+    ("CAREFUL", "Careful", "What stands in front of surfaces, and small clusters by themselves"),
+    ("USUAL", "Usual", "Also huge veils, and needles that cross the pictures"),
+    ("STRONG", "Strong", "Also what floats and changes no picture visibly, near cameras too"),
 )
-"""Reasons why a splat floats, by the names that core gives them."""
+"""How much of what floats goes."""
+
+_REASONS = {
+    "CAREFUL": ("front", "isolated"),
+    "USUAL": DEFAULT_REASONS,
+    "STRONG": (*DEFAULT_REASONS, "transparent", "haze"),
+}
 
 SOURCES = (
     ("VISIBLE", "Visible", "All cameras that are visible in the scene"),
@@ -203,14 +151,14 @@ def _set_model(_settings: RefineSettings, value: int) -> None:
 
 
 def _mark_floaters(settings: RefineSettings, context: bpy.types.Context) -> None:
-    """Mark the floaters of the reasons chosen as what goes, if they were looked for."""
+    """Mark what floats by the strength chosen as what goes, if it was looked for."""
     obj = getattr(context, "object", None)  # not in every editor
     if not mesh_layout.looks_like_splats(obj) or floaters.counts(obj.data) is None:
         return
     if obj.mode == "EDIT":
         return
     with contextlib.suppress(RefineError):  # *Delete Floaters* says what is wrong
-        floaters.mark(mesh_layout.check(obj), settings.reasons)
+        floaters.mark(mesh_layout.check(obj), settings.to_reasons())
 
 
 def _protectable(
@@ -243,7 +191,7 @@ def decimal(value: float) -> float:
 class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
-    method: EnumProperty(**AMOUNTS["method"], update=_plan_again)
+    method: EnumProperty(**METHOD, update=_plan_again)
     model: EnumProperty(
         name="Drawn As",
         description="How the splats of the active object are drawn, in all of the panel and in the "
@@ -257,21 +205,20 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     collection: PointerProperty(
         name="Collection", description="The collection of the cameras", type=bpy.types.Collection
     )
-    scene_frames: BoolProperty(
-        name="Scene Range", description="Use the frame range of the scene", default=True
-    )
-    frame_start: IntProperty(name="Start", description="First frame", default=1)
-    frame_end: IntProperty(name="End", description="Last frame", default=250)
     frame_step: IntProperty(name="Step", description="Every how many frames", default=10, min=1)
-    reasons: EnumProperty(
-        name="Floaters",
-        description="What counts as a floater",
-        items=FLOATERS,
-        options={"ENUM_FLAG"},
-        default=set(DEFAULT_REASONS),
+    strength: EnumProperty(
+        name="Strength",
+        description="How much of what floats goes",
+        items=STRENGTHS,
+        default="USUAL",
         update=_mark_floaters,
     )
-    budget: EnumProperty(**AMOUNTS["budget"], update=_plan_again)
+    budget: EnumProperty(
+        name="Budget",
+        description="How the number of splats that go is given",
+        items=BUDGETS,
+        update=_plan_again,
+    )
     ratio: FloatProperty(
         name="Remove",
         description="Share of the splats to remove",
@@ -281,13 +228,39 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         max=0.9999,
         update=_plan_again,
     )
-    percent: FloatProperty(**AMOUNTS["percent"], get=_percent, set=_set_percent)
-    keep: IntProperty(**AMOUNTS["keep"], update=_plan_again)
-    max_mb: FloatProperty(**AMOUNTS["max_mb"], update=_plan_again)
-    threshold: FloatProperty(**AMOUNTS["threshold"], update=_plan_again)
-    min_seen: FloatProperty(**AMOUNTS["min_seen"], update=_plan_again)
-    psnr: FloatProperty(**AMOUNTS["psnr"], update=_plan_again)
-    rounds: IntProperty(**AMOUNTS["rounds"], update=_plan_again)
+    percent: FloatProperty(
+        name="Remove",
+        description="Share of the splats to remove, in per cent",
+        subtype="PERCENTAGE",
+        precision=1,
+        min=0.0,
+        max=99.99,
+        get=_percent,
+        set=_set_percent,
+    )
+    keep: IntProperty(
+        name="Keep",
+        description="How many splats stay",
+        default=100_000,
+        min=1,
+        update=_plan_again,
+    )
+    max_mb: FloatProperty(
+        name="MB",
+        description="Size of the exported file, in megabytes of a million bytes",
+        default=100.0,
+        min=1e-6,
+        update=_plan_again,
+    )
+    psnr: FloatProperty(
+        name="PSNR (dB)",
+        description="How close the pictures of the cameras stay to those of all splats, in dB: "
+        "40 is hard to tell apart, 30 is visible",
+        default=40.0,
+        min=1.0,
+        max=99.0,
+        update=_plan_again,
+    )
     protect: StringProperty(
         name="Protect",
         description="Vertex group, or boolean or float point attribute: the splats in it stay",
@@ -307,8 +280,6 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
 
     def to_method(self) -> Method:
         """The method of core; raises `RefineError` where a value cannot be."""
-        if self.method == Refit.name:
-            return Refit(self.views, self.rounds or None)
         return CORE_METHODS[self.method](self.views)
 
     def to_budget(self) -> Budget:
@@ -341,9 +312,11 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
 
     def to_frames(self, scene: bpy.types.Scene) -> range:
         """Return the frames whose views count."""
-        if self.scene_frames:
-            return range(scene.frame_start, scene.frame_end + 1, self.frame_step)
-        return range(self.frame_start, self.frame_end + 1, self.frame_step)
+        return range(scene.frame_start, scene.frame_end + 1, self.frame_step)
+
+    def to_reasons(self) -> tuple[str, ...]:
+        """Why a splat counts as a floater, by the names of core."""
+        return _REASONS[self.strength]
 
 
 CLASSES = (RefineSettings,)

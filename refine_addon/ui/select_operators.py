@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 import numpy as np
-from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from bpy.props import BoolProperty, EnumProperty
 from bpy.types import Context
 from numpy.typing import NDArray
 
 from ..core import picking
 from ..core.errors import RefineError
 from ..core.execute import Progress
-from ..core.picking import Axis
 from ..core.splats import opacity
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, selection
 from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
@@ -38,25 +36,13 @@ ACTIONS = (
 )
 
 SETS = (
-    ("FLOATERS", "Floaters", "Those that Find Floaters found, for the reasons that are on"),
-    ("OUTSIDE", "Must Go", "Those that must go: outside or inside of volumes, or marked"),
-    ("STAYING", "Must Stay", "Those that must stay: inside of volumes, or marked"),
+    ("FLOATERS", "Floaters", "Those that Find Floaters found, by the strength of Clean"),
+    ("OUTSIDE", "Go", "Those that must go: outside or inside of volumes, or marked"),
+    ("STAYING", "Stay", "Those that must stay: inside of volumes, or marked"),
     ("GOING", "What Goes", "Those that Apply would remove"),
-    ("RANGE", "Range", "Those in the range of the histogram"),
+    ("FAINT", "Opacity Below", "Those that are less opaque than the field says"),
+    ("LARGE", "Size Above", "Those whose longest standard deviation is more than the field says"),
 )
-
-QUANTITIES = (
-    ("SCORE", "Score", "What the cameras would miss of it"),
-    ("OPACITY", "Opacity", "From 0 to 1"),
-    ("SIZE", "Size", "Its longest standard deviation, in units of the object"),
-)
-
-
-class Quantity(NamedTuple):
-    """What a histogram shows: a value of each splat, (N,), and the axis."""
-
-    values: NDArray[Any]
-    axis: Axis
 
 
 class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
@@ -100,9 +86,6 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
 
     what: EnumProperty(name="What", description="Which splats are taken", items=SETS)
     mode: EnumProperty(name="Mode", description="What becomes of those taken", items=MODES)
-    quantity: EnumProperty(name="By", description="What the range is of", items=QUANTITIES)
-    low: FloatProperty(name="From", description="Place on the axis", min=0.0, max=1.0)
-    high: FloatProperty(name="To", description="Place on the axis", min=0.0, max=1.0, default=1.0)
 
     @classmethod
     def description(cls, _context: Context, properties: bpy.types.AnyType) -> str:
@@ -120,11 +103,15 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
 
     def _taken(self, context: Context, checked: SplatObject) -> NDArray[np.bool_]:
         """Return which splats are taken, (N,)."""
-        if self.what == "RANGE":
-            values, axis = quantity(checked, self.quantity)
-            return in_range(axis.places(values), self.low, self.high)
+        settings, columns = context.scene.refine, mesh_attributes.stored_columns(checked)
+        if self.what == "FAINT":
+            return opacity(columns["opacity"]) < settings.select_opacity
+        if self.what == "LARGE":
+            names = (column.name for column in checked.layout.columns)
+            scales = [columns[name] for name in names if name.startswith("scale_")]
+            return np.max(scales, axis=0) > np.log(settings.select_size)
         if self.what == "FLOATERS":
-            return floaters.mask(checked, context.scene.refine.reasons)
+            return floaters.mask(checked, settings.to_reasons())
         if self.what == "GOING":
             if mesh_edit.REMOVE not in checked.mesh.attributes:
                 raise RefineError(
@@ -134,39 +121,6 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
         forced = Demands.of_scene(context.scene).forced(checked)
         mask = forced.removed if self.what == "OUTSIDE" else forced.protected
         return np.zeros(len(checked), np.bool_) if mask is None else mask
-
-
-def quantity(checked: SplatObject, name: str) -> Quantity:
-    """Return one of `QUANTITIES` of an object.
-
-    Raises
-    ------
-    RefineError
-        If it is the score and there is none.
-    """
-    columns = mesh_attributes.stored_columns(checked)
-    if name == "OPACITY":
-        return Quantity(opacity(columns["opacity"]), Axis(0.0, 1.0))
-    if name == "SIZE":
-        axes = [
-            column.name for column in checked.layout.columns if column.name.startswith("scale_")
-        ]
-        logs = np.max([columns[name] for name in axes], axis=0)
-        sizes = np.exp(np.clip(logs.astype(np.float64), -80.0, 80.0))
-        return Quantity(sizes, Axis.of(sizes, logarithmic=True))
-    record = mesh_scores.record(checked.mesh)
-    if record is None:
-        raise RefineError(f"object '{checked.obj.name}': has no scores; score the splats first")
-    values = mesh_attributes.read_attribute(checked.mesh, mesh_scores.SCORE)
-    by_place = record["settings"]["method"] != "closed-form"  # scores are then places in an order
-    return Quantity(values, Axis.of(values, logarithmic=not by_place))
-
-
-def in_range(places: NDArray[np.float64], low: float, high: float) -> NDArray[np.bool_]:
-    """Return which places on an axis, (N,), lie between two, whichever is the lower one."""
-    ends = sorted((low, high))
-    rounded = places.astype(np.float32)  # as Blender keeps the ends
-    return np.asarray((rounded >= ends[0]) & (rounded <= ends[1]))
 
 
 class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
@@ -241,7 +195,6 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
             raise
         selection.select(apart, np.zeros(mesh_layout.splat_count(apart.data), np.bool_))
         apart.select_set(True)
-        plans.forget(checked.mesh)
         plans.refresh(context)
         self.report({"INFO"}, f"'{apart.name}' has {mesh_layout.splat_count(apart.data):,} splats")
         return {"FINISHED"}

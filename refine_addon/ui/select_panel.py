@@ -1,22 +1,14 @@
-"""The box *Select* of the panel, its settings, and its histogram."""
+"""The box *Select* of the panel, and its settings."""
 
 from __future__ import annotations
 
 import bpy
-import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty
-from numpy.typing import NDArray
 
-from ..core.errors import RefineError
 from ..mesh import layout as mesh_layout
-from . import price, wrapped
-from .chart import BINS, Chart, Histogram
-from .panel_cache import cached_soon
-from .select_operators import ACTIONS, QUANTITIES, SETS, Quantity, in_range, quantity
+from . import wrapped
+from .select_operators import ACTIONS
 from .select_tools import MODES, SHAPES, selected_count
-
-_ICON = "selection"
-"""Name of the histogram among the previews of `price`."""
 
 _ICONS = (
     *("CHECKBOX_HLT", "CHECKBOX_DEHLT", "SELECT_DIFFERENCE"),
@@ -53,16 +45,16 @@ class SelectSettings:
     select_mode: EnumProperty(
         name="Mode", description="What becomes of the splats that a button takes", items=MODES
     )
-    select_by: EnumProperty(
-        name="By", description="What the histogram shows", items=QUANTITIES, default="OPACITY"
+    select_opacity: FloatProperty(
+        name="Opacity", description="Less opaque splats are taken", default=0.1, min=0.0, max=1.0
     )
-    select_low: FloatProperty(
-        name="From", description="Where the range begins", subtype="FACTOR", min=0.0, max=1.0
+    select_size: FloatProperty(
+        name="Size",
+        description="Splats with a longer standard deviation are taken, units of the object",
+        default=0.1,
+        min=1e-6,
+        precision=3,
     )
-    select_high: FloatProperty(
-        name="To", description="Where the range ends", subtype="FACTOR", default=0.1,
-        min=0.0, max=1.0,
-    )  # fmt: skip
 
 
 class REFINE_PT_select(bpy.types.Panel):
@@ -99,78 +91,19 @@ class REFINE_PT_select(bpy.types.Panel):
         row.operator("refine.grow_selection", text="Grow", icon="ADD").shrink = False
         row.operator("refine.grow_selection", text="Shrink", icon="REMOVE").shrink = True
         layout.row(align=True).prop(settings, "select_mode", expand=True, icon_only=True)
-        column = layout.column(align=True)
-        for what, text, _ in SETS[:-1]:
-            button = column.operator("refine.select_by", text=text)
-            button.what, button.mode = what, settings.select_mode
-        _draw_range(layout, context)
+        menu = layout.operator_menu_enum("refine.select_by", "what", text="Select By")
+        menu.mode = settings.select_mode
+        row = layout.row(align=True)
+        row.prop(settings, "select_opacity")
+        row.prop(settings, "select_size")
         _draw_uses(layout)
-
-
-def _draw_range(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw the histogram and the range on it."""
-    header, body = layout.panel("REFINE_range", default_closed=True)
-    header.label(text="Histogram")
-    if not body:
-        return
-    settings = context.scene.refine
-    body.row(align=True).prop(settings, "select_by", expand=True)
-    shown = cached_soon("histogram", context, _shown)
-    if shown is None:  # drawn again when it is known
-        return
-    if isinstance(shown, str):
-        wrapped.label(body, context, shown, icon="INFO")
-        return
-    row = body.row()
-    row.alignment = "CENTER"
-    row.template_icon(icon_value=price.icon(_ICON), scale=price.WIDTH)
-    column = body.column(align=True)
-    column.prop(settings, "select_low")
-    column.prop(settings, "select_high")
-    low, high, count = shown
-    body.label(text=f"{low:.3g} to {high:.3g}: {count:,}")
-    button = body.operator("refine.select_by", text="Select Range")
-    button.what, button.mode, button.quantity = "RANGE", settings.select_mode, settings.select_by
-    button.low, button.high = settings.select_low, settings.select_high
-
-
-def _shown(
-    obj: bpy.types.Object, settings: bpy.types.PropertyGroup
-) -> tuple[float, float, int] | str:
-    """Make the histogram; return the range's values and its splats, or why there is none."""
-    try:
-        found = quantity(mesh_layout.check(obj), settings.select_by)
-    except RefineError as error:
-        return str(error)
-    places = found.axis.places(found.values)
-    taken = in_range(places, settings.select_low, settings.select_high)
-    look = price.look_of(bpy.context.preferences)
-    name = next(text for name, text, _ in QUANTITIES if name == settings.select_by)
-    histogram = _histogram(found, places, name.lower())
-    price.upload(Chart(look, None, histogram).picture(None, histogram.going(~taken)), _ICON)
-    ends = sorted((settings.select_low, settings.select_high))
-    low, high = (found.axis.value(end) for end in ends)
-    return low, high, int(np.count_nonzero(taken))
-
-
-def _histogram(found: Quantity, places: NDArray[np.float64], name: str) -> Histogram:
-    bins = (places * BINS).clip(0, BINS - 1).astype(np.uint8)
-    ticks = tuple((place, f"{found.axis.value(place):.2g}") for place in (0.0, 0.5, 1.0))
-    total = np.bincount(bins, minlength=BINS)
-    return Histogram(bins, total, ticks, name, ("in range", "others"))
 
 
 def _draw_uses(layout: bpy.types.UILayout) -> None:
     """Draw what is done with what is selected."""
+    row = layout.row(align=True)
+    for mark, text, icon in (("STAY", "Stay", "LOCKED"), ("GO", "Go", "TRASH"), ("NONE", "", "X")):
+        row.operator("refine.protect", text=text, icon=icon).mark = mark
     column = layout.column(align=True)
-    for mark, text, icon in (("STAY", "Stays", "LOCKED"), ("GO", "Must Go", "TRASH")):
-        row = column.row(align=True)
-        for mode, name, sign in (
-            ("ADD", text, icon),
-            ("SUBTRACT", "", "REMOVE"),
-            ("CLEAR", "", "X"),
-        ):
-            button = row.operator("refine.protect", text=name, icon=sign)
-            button.mode, button.mark = mode, mark
     column.operator("refine.separate_selected", text="Separate", icon="MOD_EXPLODE")
     column.operator("refine.delete_selected", text="Delete", icon="X")

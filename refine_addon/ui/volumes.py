@@ -11,7 +11,7 @@ from ..core.errors import RefineError
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from ..objects import demands
-from . import demand_changes
+from . import plans
 from .deleting import Deleting
 from .operator_bases import Answer, AtOnce, Needing, idle, on_splats
 
@@ -47,7 +47,7 @@ SHAPES = (
 
 
 def _changed(_volume: RefineVolume, context: bpy.types.Context) -> None:
-    demand_changes.mark_again(context)
+    plans.mark_again(context)
 
 
 def _fits(_volume: RefineVolume, obj: bpy.types.Object) -> bool:
@@ -150,7 +150,7 @@ class REFINE_OT_drop_volume(Needing, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Answer:
         """Take it off."""
         context.scene.refine.volumes.remove(self.index)
-        demand_changes.mark_again(context)
+        plans.mark_again(context)
         return {"FINISHED"}
 
 

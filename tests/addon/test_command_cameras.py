@@ -35,7 +35,7 @@ def animated(room, room_cameras, tmp_path):
     scene.camera = cameras[0]
     cameras[1].select_set(True)
     settings = scene.refine
-    settings.scene_frames, settings.frame_start, settings.frame_end = False, 1, 21
+    scene.frame_start, scene.frame_end = 1, 21
     settings.frame_step = 5
     scene.frame_set(1)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
@@ -189,11 +189,6 @@ def _no_camera():
     scene.camera, scene.refine.source = None, "ACTIVE"
 
 
-def _no_frame():
-    settings = bpy.context.scene.refine
-    settings.source, settings.frame_start = "FRAMES", 22
-
-
 def _nothing_chosen():
     settings = bpy.context.scene.refine
     settings.source, settings.collection = "COLLECTION", None
@@ -211,7 +206,6 @@ REFUSED = {
         ["--source", "frames:1:2"],
         "no active camera at frame 1",
     ),
-    "no frame": (_no_frame, [], "room: no frames: the range starts at 22 and ends at 21"),
     "no collection chosen": (_nothing_chosen, [], "room: no cameras: choose the collection"),
 }
 

@@ -72,20 +72,18 @@ def test_floaters_of_native_splats_are_those_of_the_mesh(addon, polluted):
     assert addon.mesh.layout.splat_count(cloud.data) == np.count_nonzero(~on_cloud)
 
 
-def test_a_reason_that_is_switched_off_spares_its_floaters(addon, polluted):
-    """What stands in front is not looked for again: the marks follow the switches."""
+def test_marks_follow_the_strength(addon, polluted):
+    """Nothing is looked for again: each strength goes for reasons of its own."""
     room, _ = polluted
     bpy.ops.refine.find_floaters()
-    found = addon.mesh.floaters.counts(room.data)
-    settings = bpy.context.scene.refine
+    found, counts = addon.mesh.floaters.counts(room.data), {}
+    for strength in ("CAREFUL", "USUAL", "STRONG"):
+        bpy.context.scene.refine.strength = strength
+        counts[strength] = np.count_nonzero(marked(addon, room))
 
-    settings.reasons = {"front"}
-    front = np.count_nonzero(marked(addon, room))
-    settings.reasons = {"isolated", "giant", "needle"}
-    others = np.count_nonzero(marked(addon, room))
-
-    assert front == found["front"] > 0
-    assert others == found["isolated"] + found["giant"] + found["needle"]
+    assert counts["CAREFUL"] == found["front"] + found["isolated"] > 0
+    assert counts["USUAL"] == counts["CAREFUL"] + found["giant"] + found["needle"]
+    assert counts["STRONG"] == counts["USUAL"] + found["transparent"] + found["haze"]
 
 
 def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):

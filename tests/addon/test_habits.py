@@ -22,15 +22,14 @@ def preferred(addon):
 
 
 def test_preferences_are_the_defaults_of_what_a_scene_has_not_set(addon, preferred):
-    """The scene has chosen its number of views; share and method it takes over."""
+    """The scene has chosen its number of views; the method it takes over."""
     settings = bpy.context.scene.refine
-    preferred.method, preferred.percent, preferred.views = "closed-form", 70.0, 16
+    preferred.method, preferred.views = "closed-form", 16
     settings.views = 32
 
     addon.ui.preferences.fill(settings, preferred)
 
-    assert (settings.method, settings.budget, settings.views) == ("closed-form", "ratio", 32)
-    assert settings.ratio == pytest.approx(0.7)
+    assert (settings.method, settings.views) == ("closed-form", 32)
 
 
 def test_scripts_get_what_they_ask_for(preferred):

@@ -141,7 +141,7 @@ def test_apply_deletes_points_and_leaves_all_else(addon, cloud, room_cameras):
 
     assert len(cloud.data.points) == 9939
     assert after["radiance:base"] == bases[stay].tobytes()
-    gone = {"refine_scores", "refine_plan", "refine_remove"}  # as of a mesh
+    gone = {"refine_scores", "refine_remove"}  # as of a mesh
     assert before.keys() - after.keys() <= gone
     assert after["note"] == "mine"
     assert tuple(cloud.location) == (1.0, 2.0, 3.0)

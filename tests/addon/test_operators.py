@@ -70,8 +70,8 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
 
 @pytest.mark.parametrize(
     ("kind", "value"),
-    [("ratio", 0.29), ("ratio", 0.7), ("keep", 1234), ("max_mb", 2.5), ("threshold", 0.1),
-     ("min_seen", 20.0), ("ratio", 0.0), ("psnr", 38.5)],
+    [("ratio", 0.29), ("ratio", 0.7), ("keep", 1234), ("max_mb", 2.5), ("ratio", 0.0),
+     ("psnr", 38.5)],
 )  # fmt: skip
 def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, kind, value):
     """Blender stores 0.29 as 0.28999999165534973; floor(.29 * 39755) must still go."""
@@ -99,10 +99,10 @@ def test_settings_reach_core_as_they_were_typed(addon):
     assert settings.to_method() == core.Merge()
     assert settings.to_budget() == core.Budget(ratio=0.5)
 
-    settings.views, settings.rounds = 7, 3
+    settings.views = 7
     for name, kind in core.METHODS.items():
         settings.method = name
-        assert settings.to_method() == (core.Refit(7, 3) if name == "refit" else kind(7))
+        assert settings.to_method() == kind(7)
 
 
 def test_scoring_writes_scores_ranks_and_views(addon, room, room_cameras):
@@ -241,14 +241,14 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
     room_cameras,
     unchanged,
 ):
-    """A threshold above every score would remove all."""
+    """Not one splat fits into so small a file."""
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
-    settings.budget, settings.threshold = "threshold", 1e9
+    settings.budget, settings.max_mb = "max_mb", 1e-6
     unchanged.start()
 
-    assert "would remove all" in addon.ui.plans.stored(room, settings)["error"]
-    with pytest.raises(RuntimeError, match="would remove all"):
+    assert "too small for one splat" in addon.ui.plans.stored(room, settings)["error"]
+    with pytest.raises(RuntimeError, match="too small for one splat"):
         bpy.ops.refine.apply()
     unchanged()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from types import SimpleNamespace
 
 import bpy
@@ -63,13 +64,8 @@ class Layout:
         self.drawn.append(text)
 
     def template_icon(self, icon_value, **_options):
-        """Note the chart; without a screen Blender numbers no icons."""
-        assert icon_value == 0
+        """Note the chart."""
         self.drawn.append("chart")
-
-    def template_list(self, _kind, _name, data, items, *_active, **_options):
-        """Note the lines of a list."""
-        self.drawn.extend(f"{item.name}: {item.seen}" for item in getattr(data, items))
 
     def progress(self, *, text, **_options):
         """Note a bar."""
@@ -119,29 +115,45 @@ def test_each_step_shows_what_came_of_it(draw, room, room_cameras):
 
     assert "room: 39,755 splats, SH degree 3, 9.9 MB" in " ".join(imported)
     assert "72 cameras" in imported
-    assert "Scored by 64 of 72 views" in scored
-    assert "Keeps 19,878 of 39,755, 4.9 of 9.9 MB" in " ".join(scored)
-    assert "chart" in scored
+    assert "Keeps 19,878 of 39,755, 4.9 of 9.9 MB, by 64 of 72 views" in " ".join(scored)
     assert "room: 19,878 splats, SH degree 3" in " ".join(applied)
-    assert not [text for text in applied if text.startswith(("Keeps", "chart", "Scored"))]
+    assert not [text for text in applied if text.startswith(("Keeps", "chart"))]
+    assert "Splats were deleted: score again" in applied
 
 
-def test_each_reason_of_floaters_is_told_with_how_sure_it_is(draw, addon, room, room_cameras):
-    """Per cent are the mean over what goes for the reason; where nothing goes there are none."""
+def test_what_floats_is_told_with_how_sure_that_is(draw, addon, room, room_cameras):
+    """More by a higher strength; per cent are the mean over what goes."""
     splats = addon.objects.splat_group.gather([addon.mesh.layout.check(room)])
     views = addon.ui.operators.chosen_views(bpy.context)
     expected = addon.core.clean(splats, views, addon.core.Cleaning())
+    counts, sure, told = expected.counts(), expected.surety(), []
 
     bpy.ops.refine.find_floaters()
-    drawn = draw()
+    for strength in ("CAREFUL", "USUAL", "STRONG"):
+        bpy.context.scene.refine.strength = strength
+        told += [text for text in draw() if " of 39,755 float" in text]
 
-    counts, sure = expected.counts(), expected.surety()
-    assert counts["front"]
-    assert f"In Front: {counts['front']:,} ({100.0 * sure['front']:.0f} %)" in drawn
-    none = [name for name, count in counts.items() if not count]
-    texts = {name: text for name, text, _ in addon.ui.properties.FLOATERS}
-    for name in none:
-        assert f"{texts[name]}: 0" in drawn
+    careful = counts["front"] + counts["isolated"]
+    known = sum(counts[name] * (sure[name] or 0.0) for name in ("front", "isolated"))
+    assert told[0] == f"{careful:,} of 39,755 float, {100.0 * known / careful:.0f} % sure"
+    totals = [int(text.split()[0].replace(",", "")) for text in told]
+    assert 0 < totals[0] <= totals[1] == sum(counts.values()) <= totals[2]
+
+
+def test_each_method_is_drawn_with_its_price(draw, room, room_cameras):
+    """Before there are scores with what it means; then dB, in between too, and seconds."""
+    settings = bpy.context.scene.refine
+    settings.method, settings.views = "occlusion", 8
+    before = draw()
+    bpy.ops.refine.score()
+    prices = [text for text in draw() if " · " in text]
+
+    assert "Merge · what goes is merged" in before
+    assert prices[0] == "Closed Form · rows stay as they were"
+    assert re.fullmatch(r"Occlusion · about \d\d dB(, \d\d in between)?", prices[1])
+    assert re.fullmatch(r"Merge · about \d\d dB(, \d\d in between)? · \d+ .*", prices[2])
+    assert re.fullmatch(r"Refit · about \d\d dB.* · \d+ .*", prices[3])
+    assert "chart" in draw()
 
 
 def test_after_deletion_by_hand_the_panel_asks_for_scores_and_says_why(
@@ -156,7 +168,7 @@ def test_after_deletion_by_hand_the_panel_asks_for_scores_and_says_why(
     bpy.ops.refine.delete_selected()
 
     drawn = []
-    panel = addon.ui.panel.REFINE_PT_score
+    panel = addon.ui.panel.REFINE_PT_prune
     panel.draw(SimpleNamespace(layout=Layout(drawn)), bpy.context)
 
     assert "Splats were deleted: score again" in " ".join(drawn)
@@ -212,7 +224,7 @@ def test_a_plan_that_no_longer_holds_is_not_drawn(draw, room, room_cameras):
 
 
 def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_cameras):
-    """In one line, below what they were made by."""
+    """In one line."""
     bpy.ops.refine.score()
     fresh = draw()
     room.location.x = 1.0
@@ -266,16 +278,16 @@ def test_nothing_is_asked_of_the_scene_twice_until_it_changes(
     assert sorted(asked) == sorted(3 * first)
 
 
-def test_each_camera_is_listed_with_what_it_sees(draw, addon, room, room_cameras, room_views):
-    """Those that see least first: one turned away sees nothing, and that is said twice."""
+def test_the_cameras_that_say_most_are_listed(draw, addon, room, room_cameras, room_views):
+    """First one that is turned away, and sees nothing, which is said too; then what sees least."""
     camera = room_cameras.objects[7]
     camera.location.z += 1000.0
     bpy.context.view_layer.update()
     before = draw()
     bpy.ops.refine.score()
     drawn = draw()
-    lines = [text for text in drawn if text.startswith("0") and ": " in text]
-    counts = [int(line.split(": ")[1]) for line in lines]
+    lines = [text for text in drawn if re.match(r"\d+: ", text)]
+    counts = dict(addon.mesh.scores.record(room.data)["cameras"])
     means = addon.objects.splat_group.gather([addon.mesh.layout.check(room)]).means
     local = room_views[0].rotation @ (means - room_views[0].center).T
     x = room_views[0].fx * local[0] / local[2] + room_views[0].cx
@@ -283,12 +295,12 @@ def test_each_camera_is_listed_with_what_it_sees(draw, addon, room, room_cameras
     there = (local[2] > 0) & (x >= 0) & (x <= room_views[0].width) & (y >= 0)
     sees = int((there & (y <= room_views[0].height)).sum())
 
-    assert not [text for text in before if text.startswith("0") and ": " in text]
-    assert len(lines) == 72
-    assert counts == sorted(counts)
-    assert counts[0] == 0 < counts[1]
-    assert f"{room_views[0].name}: {sees}" in lines
-    assert " ".join(drawn).count("No splat lies in the view of 1 camera") == 2
+    assert not [text for text in before if re.match(r"\d+: ", text)]
+    assert counts[room_views[0].name] == sees
+    least = sorted(counts.items(), key=lambda pair: pair[1])[1:8]
+    assert lines == [f"{camera.name}: nothing", *(f"{name}: {seen:,}" for name, seen in least)]
+    assert "and 64 that change less" in drawn
+    assert " ".join(drawn).count("No splat lies in the view of 1 camera") == 1
 
 
 def test_one_is_not_counted_as_many(draw, room, room_cameras):
@@ -328,15 +340,6 @@ def test_one_bar_is_drawn_in_the_box_of_the_button_that_was_clicked(draw, at_wor
     assert drawn.count("43%") == 1
     assert drawn.count("Working (looking); Esc cancels") == 1
     assert f"refine.{name}" in buttons <= set(drawn)
-
-
-def test_rounds_are_drawn_where_splats_are_refitted(draw):
-    """In the box of *Score*, where the method is chosen."""
-    bpy.context.scene.refine.method = "merge"
-    without = draw().count("rounds")
-    bpy.context.scene.refine.method = "refit"
-
-    assert (without, draw().count("rounds")) == (0, 1)
 
 
 @pytest.mark.parametrize("source", ["VISIBLE", "ACTIVE", "SELECTED", "COLLECTION", "FRAMES"])

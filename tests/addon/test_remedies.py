@@ -1,4 +1,4 @@
-"""Guard rails: what each camera's picture loses, warnings beside Apply, and their remedies."""
+"""Guard rails: what each camera's picture loses, warnings beside Apply, a ring and a turn."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import bpy
 import mathutils
 import numpy as np
 import pytest
-
-from tests.e2e.inside.clouds import as_cloud
 
 from .conftest import ROOM
 
@@ -43,56 +41,65 @@ def read(addon, obj, name):
     return addon.mesh.attributes.read_attribute(obj.data, name)
 
 
-def remedies(warnings):
-    """Return the names of the operators that help."""
-    return [warning.remedy for warning in warnings]
+def turn(addon):
+    """Return by how many quarters the cameras that scored the active object are to be turned."""
+    record = addon.mesh.scores.record(bpy.context.object.data)
+    return addon.core.quality.alignment.Alignment.from_facts(record["alignment"]).turn
+
+
+def told(warnings, words):
+    """Tell whether a warning has these words."""
+    return any(words in text for text in warnings)
+
+
+def cameras(addon):
+    """Return what the panel lists of each camera of the active object, by its name."""
+    obj, ui = bpy.context.object, addon.ui
+    plan = ui.plans.stored(obj, bpy.context.scene.refine)
+    listed = ui.camera_list.cameras(addon.mesh.scores.record(obj.data), plan["views"])
+    return {camera.name: camera for camera in listed}
 
 
 def test_the_list_tells_how_close_each_picture_stays(addon, room, room_cameras):
-    """What the curve says of each view that scored, at the budget of the moment; most changes one.
+    """What the curve says of each view that scored, at the budget of the moment; lowest first.
 
     Eight of the 72 views score; of the others nothing is known. A larger share brings all down.
     """
-    settings, manager = bpy.context.scene.refine, bpy.context.window_manager
+    settings = bpy.context.scene.refine
     settings.method, settings.views, settings.percent = "occlusion", 8, 30.0
     bpy.ops.refine.score()
-    few = {item.name: item.psnr for item in manager.refine_cameras}
+    few = cameras(addon)
     curve = addon.mesh.scores.stored_scores([addon.mesh.layout.check(room)]).quality
     settings.percent = 80.0
-    many = {item.name: item.psnr for item in manager.refine_cameras}
-    told = [name for name, psnr in few.items() if psnr >= 0.0]
+    many = cameras(addon)
+    told = [name for name, camera in few.items() if camera.psnr is not None]
 
     assert len(few) == len(room_cameras.objects) == 72
-    assert len(told) == 8
-    removed = int(0.3 * 39755) / 39755
-    assert [few[name] for name in told] == pytest.approx(
-        [curve.of_views(removed)[name] for name in told], abs=1e-4
-    )
-    assert all(many[name] < few[name] for name in told)
-    assert manager.refine_changes_most == min(told, key=many.__getitem__)
+    assert told == list(few)[:8]
+    expected = curve.of_views(int(0.3 * 39755) / 39755)
+    assert [few[name].psnr for name in told] == sorted(expected.values())
+    assert all(many[name].psnr < few[name].psnr for name in told)
 
 
-def test_merging_changes_less(room, room_cameras):
+def test_merging_changes_less(addon, room, room_cameras):
     """Each picture gains what all of them gain on average: 39,755 splats are enough to foretell."""
-    settings, manager = bpy.context.scene.refine, bpy.context.window_manager
+    settings = bpy.context.scene.refine
     settings.method, settings.views, settings.percent = "occlusion", 4, 50.0
     bpy.ops.refine.score()
-    deleted = {item.name: item.psnr for item in manager.refine_cameras}
+    deleted = cameras(addon)
     settings.method = "merge"
-    gains = {i.name: i.psnr - deleted[i.name] for i in manager.refine_cameras if i.psnr >= 0.0}
+    gains = [c.psnr - deleted[c.name].psnr for c in cameras(addon).values() if c.psnr is not None]
 
     assert len(gains) == 4
-    assert np.ptp(list(gains.values())) < 1e-3
-    assert min(gains.values()) > 3.0
+    assert np.ptp(gains) < 1e-3
+    assert min(gains) > 3.0
 
 
-def test_nothing_is_told_of_pictures_without_an_estimate(room, room_cameras):
+def test_nothing_is_told_of_pictures_without_an_estimate(addon, room, room_cameras):
     """The closed form makes none."""
     bpy.ops.refine.score()
-    manager = bpy.context.window_manager
 
-    assert {item.psnr for item in manager.refine_cameras} == {-1.0}
-    assert manager.refine_changes_most == ""
+    assert {camera.psnr for camera in cameras(addon).values()} == {None}
 
 
 @pytest.mark.parametrize(
@@ -105,8 +112,8 @@ def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
     obj = imported(splats=splats, cameras=cameras)
     first = warned()
     wrong = read(addon, obj, "refine_score")
-    turn = next(warning for warning in first if warning.remedy == "refine.turn_cameras")
-    bpy.ops.refine.turn_cameras(**turn.options)
+    turned = turn(addon)
+    bpy.ops.refine.turn_cameras(quarter=quarter)
     second = warned()
     right = read(addon, obj, "refine_score")
     matrix = bpy.context.scene.refine.collection.objects[0].matrix_world.copy()
@@ -114,9 +121,9 @@ def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
     alike = imported(splats=splats, cameras=splats)
     bpy.ops.refine.score()
 
-    assert turn.options == {"quarter": quarter}
-    assert "imported upright" in turn.text
-    assert "refine.turn_cameras" not in remedies(second)
+    assert turned == int(quarter)
+    assert told(first, "imported upright")
+    assert not told(second, "up axis")
     assert np.allclose(right, read(addon, alike, "refine_score"), rtol=2e-3)
     assert not np.allclose(wrong, right, rtol=0.1)
     other = bpy.context.scene.refine.collection.objects[0].matrix_world
@@ -138,27 +145,26 @@ def test_the_command_notes_what_the_panel_warns_of(addon, imported):
 def test_imports_that_are_alike_are_not_warned_of(imported, warned, upright):
     """Nor once both are moved together, nor by a shot that the cameras' file does not have."""
     obj = imported(splats=upright, cameras=upright)
-    before = remedies(warned())
+    before = warned()
     motion = mathutils.Matrix.Translation((3.0, 4.0, 5.0)) @ mathutils.Matrix.Rotation(1.0, 4, "Z")
     for item in (obj, *bpy.context.scene.refine.collection.objects):
         item.matrix_world = motion @ item.matrix_world
     bpy.context.view_layer.update()
-    after = remedies(warned())
+    after = warned()
 
-    assert "refine.turn_cameras" not in before + after
+    assert not told(before + after, "up axis")
 
 
-def test_cameras_of_unknown_origin_are_measured(imported, warned):
+def test_cameras_of_unknown_origin_are_measured(addon, imported, warned):
     """Without their note, cameras that were not turned upright see coarse pictures."""
     imported(splats=True, cameras=False)
     settings = bpy.context.scene.refine
     for camera in settings.collection.objects:
         del camera["refine_view"]
     settings.method, settings.views = "occlusion", 12
-    found = [warning for warning in warned() if warning.remedy == "refine.turn_cameras"]
 
-    assert [warning.options for warning in found] == [{"quarter": "1"}]
-    assert "times as fine" in found[0].text
+    assert told(warned(), "times as fine")
+    assert turn(addon) == 1
 
 
 def test_animated_cameras_are_turned_with_their_motion(room, room_cameras):
@@ -205,94 +211,56 @@ def ring():
     return bpy.data.collections["Ring of Cameras"]
 
 
-def test_a_ring_sees_all_and_joins_the_collection_that_decides(room, room_cameras, warned):
+def test_a_ring_sees_all_and_joins_the_collection_that_decides(addon, room, room_cameras, warned):
     """One camera decides; with the ring 17 do, and each of the ring sees nine tenths at least."""
     for camera in list(room_cameras.objects)[1:]:
         room_cameras.objects.unlink(camera)
-    assert "refine.add_ring" in remedies(warned())
+    assert told(warned(), "One camera decides")
     room.location = (30.0, 0.0, 5.0)
     room_cameras.objects[0].location.x += 30.0
     bpy.context.view_layer.update()
     bpy.ops.refine.add_ring()
     found = warned()
-    seen = {item.name: item.seen for item in bpy.context.window_manager.refine_cameras}
+    seen = {camera.name: camera.seen for camera in cameras(addon).values()}
 
     assert bpy.context.scene.refine.collection == room_cameras
     assert len(room_cameras.all_objects) == len(seen) == 17
     assert min(seen[camera.name] for camera in ring().objects) > 0.9 * 39755
-    assert "refine.add_ring" not in remedies(found)
-    assert "refine.keep_unseen" not in remedies(found)
+    assert not told(found, "One camera decides")
+    assert not told(found, "in no view")
 
 
-@pytest.mark.usefixtures("room")
-def test_views_between_join_the_cameras_that_decide(room_cameras):
-    """Each stands halfway between two cameras, and the panel's limit leaves room for all."""
-    settings = bpy.context.scene.refine
-    settings.views = 64
-    where = [np.array(camera.location) for camera in room_cameras.objects]
-    bpy.ops.refine.add_between(count=10)
-
-    added = bpy.data.collections["Views Between"].objects
-    halves = [(one + other) / 2 for one in where for other in where]
-    assert len(added) == 10
-    assert len(room_cameras.all_objects) == 82
-    assert settings.views == 74
-    for camera in added:
-        place = np.array(camera.location)
-        assert min(np.abs(half - place).max() for half in halves) < 1e-5
-
-
-@pytest.mark.usefixtures("room")
-def test_where_nothing_is_between_no_camera_is_added(room_cameras, unchanged):
-    """One camera has no neighbour; a shot has frames, not cameras."""
-    for camera in list(room_cameras.objects)[1:]:
-        room_cameras.objects.unlink(camera)
-    bpy.context.view_layer.update()
-    unchanged.start()
-    with pytest.raises(RuntimeError, match="nothing is between them"):
-        bpy.ops.refine.add_between()
-    bpy.context.scene.refine.source = "FRAMES"
-    with pytest.raises(RuntimeError, match="a shot decides"):
-        bpy.ops.refine.add_between()
-    bpy.context.scene.refine.source = "COLLECTION"
-    unchanged()
-
-
-def test_where_views_between_lose_more_they_are_offered(addon):
-    """The plan's sentence says both, and the warning's button adds them."""
-    plans = addon.ui.plans
-    plan = {"splats": 100, "unseen": 0, "psnr_between": 36.2, "parted": True}
-
-    found = plans.warnings(plan, {"views_used": 8, "cameras": []})
-
-    assert remedies(found) == ["refine.add_between"]
-    assert "about 36 dB" in found[0].text
-
-
-def test_where_few_splats_lie_in_two_views_a_ring_is_offered(addon):
-    """But not beside the warning that many lie in none, which says more."""
-    plan = {"splats": 100, "unseen": 4, "little_seen": "21% of the splats lie in one view or none"}
-
-    few, none = (
-        addon.ui.plans.warnings(plan | {"unseen": unseen}, {"views_used": 8, "cameras": []})
-        for unseen in (4, 5)
+@pytest.fixture
+def plan(addon):
+    """Give a plan of 100 splats, of which half go: 50 dB in the views, 36 in between."""
+    curve = addon.core.quality.curve.Quality(
+        *np.array([[0.2, 0.5], [55.0, 50.0], [57.0, 52.0]]), between=np.array([41.0, 36.2])
     )
+    little = "21% of the splats lie in one view or none"
+    return {
+        "splats": 100, "unseen": 0, "unseen_gone": 0, "little_seen": little, "share": 0.5,
+        "quality": curve, "becomes": "delete",
+    }  # fmt: skip
 
-    assert [warned.text for warned in few] == [plan["little_seen"]]
-    assert remedies(few) == ["refine.add_ring"]
-    assert "in no view" in none[0].text
-    assert len(none) == 1
+
+def test_where_views_between_lose_more_that_is_said(addon, plan):
+    """And where few splats lie in two views, but not beside many in none, which says more."""
+    of_all = {"views_used": 8, "cameras": []}
+    few, none = (addon.ui.plans.warnings(plan | {"unseen": count}, of_all) for count in (4, 5))
+
+    assert few == ["Views between these lose more: about 36 dB", plan["little_seen"]]
+    assert none == [few[0], "5% of the splats lie in no view; 0% of these go"]
 
 
 @pytest.mark.parametrize("size", [(1920, 1080), (600, 900)])
-def test_a_ring_frames_wide_and_tall_pictures(room, size, warned):
+def test_a_ring_frames_wide_and_tall_pictures(addon, room, size, warned):
     """The ball fits into the shorter side."""
     render = bpy.context.scene.render
     render.resolution_x, render.resolution_y = size
     bpy.context.scene.refine.method = "closed-form"
     bpy.ops.refine.add_ring(count=5)
     warned()
-    seen = [item.seen for item in bpy.context.window_manager.refine_cameras]
+    seen = [camera.seen for camera in cameras(addon).values()]
 
     assert len(seen) == 5
     assert min(seen) > 0.9 * len(room.data.vertices)
@@ -330,83 +298,32 @@ def test_a_ring_needs_a_splat_somewhere(addon, room, unchanged):
     unchanged()
 
 
-def test_cameras_that_see_nothing_or_all_from_afar_are_left_out(room, room_cameras, warned):
-    """One looks from 860 m behind, one is beside all: both get weight 0 and are listed no more."""
+def test_cameras_that_see_nothing_or_all_from_afar_are_said(addon, room, room_cameras, warned):
+    """One looks from 860 m behind, one is beside all; with the weight 0 both decide no more."""
     far, beside = list(room_cameras.objects)[:2]
     far.matrix_world = far.matrix_world @ mathutils.Matrix.Translation((0.0, 0.0, 860.0))
     beside.location.z += 1000.0
     bpy.context.view_layer.update()
     found = warned()
-    texts = " ".join(warning.text for warning in found)
-    marks = {item.name: (item.seen, item.far) for item in bpy.context.window_manager.refine_cameras}
-    bpy.ops.refine.leave_out()
+    listed = cameras(addon)
+    far["refine_weight"] = beside["refine_weight"] = 0.0
     again = warned()
 
-    assert "1 camera sees the splats from so far away" in texts
-    assert "No splat lies in the view of 1 camera" in texts
-    assert remedies(found).count("refine.leave_out") == 2
-    assert marks[far.name][0] > 30000
-    assert marks[far.name][1]
-    assert marks[beside.name] == (0, False)
-    assert far["refine_weight"] == beside["refine_weight"] == 0.0
-    assert "refine_weight" not in room_cameras.objects[5]
-    assert len(bpy.context.window_manager.refine_cameras) == 70
+    assert told(found, "1 camera sees the splats from so far away")
+    assert told(found, "No splat lies in the view of 1 camera")
+    assert list(listed)[:2] == [beside.name, far.name]
+    assert listed[far.name].seen > 30000
+    assert listed[far.name].far
+    assert (listed[beside.name].seen, listed[beside.name].far) == (0, False)
+    assert len(cameras(addon)) == 70
     assert again == []
 
 
-def test_the_last_camera_is_not_left_out(room, room_cameras, warned):
-    """Where all are useless the remedy is a ring; nothing is left out of what was not scored."""
-    with pytest.raises(RuntimeError, match="score first"):
-        bpy.ops.refine.leave_out()
-    for camera in list(room_cameras.objects)[1:]:
-        room_cameras.objects.unlink(camera)
-    camera = room_cameras.objects[0]
-    camera.matrix_world = camera.matrix_world @ mathutils.Matrix.Translation((0.0, 0.0, 860.0))
-    bpy.context.view_layer.update()
-
-    assert "refine.leave_out" not in remedies(warned())
-    with pytest.raises(RuntimeError, match="no camera would be left"):
-        bpy.ops.refine.leave_out()
-    assert "refine_weight" not in camera
-
-
-@pytest.mark.parametrize("native", [False, True])
-def test_what_is_unseen_stays_with_what_was_protected(addon, room, room_cameras, warned, native):
-    """A third of the splats were protected; then what no view sees is too, and less else goes."""
-    for camera in list(room_cameras.objects)[1:]:
-        room_cameras.objects.unlink(camera)
-    marks = np.arange(39755) % 3 == 0
-    addon.mesh.attributes.write_attribute(room.data, "mine", "BOOLEAN", marks)
-    settings = bpy.context.scene.refine
-    settings.protect, settings.percent = "mine", 10.0
-    if native:
-        as_cloud(addon, room)
-    obj = bpy.context.object
-    found = warned()
-    unseen = read(addon, obj, "refine_seen") == 0
-    before = read(addon, obj, "refine_remove")
-    bpy.ops.refine.keep_unseen()
-    gone = read(addon, obj, "refine_remove")
-    plan = addon.ui.plans.stored(obj, settings)
-    record = addon.mesh.scores.record(obj.data)
-    after = [w for w in addon.ui.plans.warnings(plan, record) if "in no view" in w.text]
-
-    assert obj.type == ("POINTCLOUD" if native else "MESH")
-    assert "refine.keep_unseen" in remedies(found)
-    assert unseen.mean() > 0.5
-    assert (before & unseen).any()
-    assert np.array_equal(read(addon, obj, addon.mesh.edit.PROTECT), unseen)
-    assert not (gone & (unseen | marks)).any()
-    assert gone.sum() == before.sum() == 3975
-    assert after[0].remedy == ""
-    assert "0% of these go" in after[0].text
-
-
-def test_what_must_go_is_not_kept_and_pictures_are_without_it(addon, room, room_cameras):
-    """A box forces some out: they lie in no view, and their share is none that the curve is of."""
+def test_pictures_are_without_what_must_go(addon, room, room_cameras):
+    """A box forces some out: their share is none that the curve is of."""
     for camera in list(room_cameras.objects)[4:]:
         room_cameras.objects.unlink(camera)
-    settings, manager = bpy.context.scene.refine, bpy.context.window_manager
+    settings = bpy.context.scene.refine
     settings.method, settings.percent = "occlusion", 60.0
     bpy.ops.refine.add_volume(shape="BOX", role="REMOVE")
     bpy.context.view_layer.objects.active = room
@@ -418,23 +335,11 @@ def test_what_must_go_is_not_kept_and_pictures_are_without_it(addon, room, room_
     removed = np.count_nonzero(read(addon, room, "refine_remove"))
     share = (removed - gone.sum()) / (len(gone) - gone.sum())
     expected = curve.of_views(share)
-    listed = {item.name: item.psnr for item in manager.refine_cameras if item.psnr >= 0.0}
-    bpy.ops.refine.keep_unseen()
+    listed = {c.name: c.psnr for c in cameras(addon).values() if c.psnr is not None}
 
     assert 1000 < gone.sum() < 0.5 * len(gone)
     assert listed == pytest.approx({name: expected[name] for name in listed}, abs=0.02)
     assert len(listed) == 4
-    kept = read(addon, room, addon.mesh.edit.PROTECT)
-    assert kept.any()
-    assert not (kept & gone).any()
-
-
-def test_unseen_splats_are_known_of_scores_alone(room, unchanged):
-    """Without scores there is nothing to keep."""
-    unchanged.start()
-    with pytest.raises(RuntimeError, match="score it first"):
-        bpy.ops.refine.keep_unseen()
-    unchanged()
 
 
 def test_each_remedy_goes_with_one_undo(room, room_cameras):
@@ -444,55 +349,14 @@ def test_each_remedy_goes_with_one_undo(room, room_cameras):
     matrix = np.array(room_cameras.objects[0].matrix_world)
     bpy.ops.refine.score()
     bpy.ops.ed.undo_push(message="before")
-    bpy.ops.refine.keep_unseen()
     bpy.ops.refine.turn_cameras(quarter="1")
     bpy.ops.refine.add_ring()
     bpy.ops.ed.undo_push(message="after")
     bpy.ops.ed.undo()
-    room, camera = (bpy.data.objects[name] for name in names)
+    camera = bpy.data.objects[names[1]]
 
     assert np.array_equal(np.array(camera.matrix_world), matrix)
-    assert "refine_protect" not in room.data.attributes
     assert "Ring of Cameras" not in bpy.data.collections
     assert bpy.context.scene.refine.protect == ""
-    for name in ("turn_cameras", "add_ring", "leave_out", "keep_unseen"):
+    for name in ("turn_cameras", "add_ring"):
         assert "UNDO" in getattr(bpy.types, f"REFINE_OT_{name}").bl_options
-
-
-def test_buttons_go_once_the_cameras_have_changed(addon, room, room_cameras, monkeypatch):
-    """A second click would turn twice: the warning stays, the button waits for new scores."""
-    drawn = []
-    panel = addon.ui.panel
-    monkeypatch.setattr(panel.wrapped, "label", lambda *args, **_: drawn.append(args[2]))
-
-    class Layout:
-        """Notes buttons."""
-
-        def panel(self, _name):
-            """Return a part that is closed."""
-            return self, None
-
-        def label(self, **_options):
-            """Draw nothing."""
-
-        def operator(self, name, **_options):
-            """Note a button."""
-            drawn.append(name)
-            return type("Button", (), {})()
-
-    def draw():
-        drawn.clear()
-        panel._draw_plan(Layout(), bpy.context, addon.mesh.scores.record(room.data))
-        return list(drawn)
-
-    for camera in list(room_cameras.objects)[1:]:
-        room_cameras.objects.unlink(camera)
-    bpy.ops.refine.score()
-    fresh = draw()
-    bpy.ops.refine.add_ring()
-    bpy.context.view_layer.update()
-    stale = draw()
-
-    assert {"refine.add_ring", "refine.keep_unseen"} <= set(fresh)
-    assert not [text for text in stale if text.startswith("refine.")]
-    assert any(text.startswith("One camera decides") for text in stale)

@@ -88,47 +88,37 @@ def test_nothing_is_hidden_where_nothing_is_selected(room, unchanged, action, wo
     unchanged()
 
 
-def test_a_range_of_opacity_takes_what_lies_in_it(addon, chosen, either):
-    """From .25 to .5 of an axis from 0 to 1: the logistic function says which."""
-    checked = addon.mesh.layout.check(either)
-    logits = np.asarray(addon.mesh.attributes.stored_columns(checked)["opacity"], np.float64)
-    opacities = (1 / (1 + np.exp(-logits))).astype(np.float32)
-    bpy.ops.refine.select_by(what="RANGE", quantity="OPACITY", low=0.25, high=0.5)
+def test_faint_and_large_splats_are_taken(addon, chosen, either):
+    """Less opaque than .25 by the logistic function; longer than the median of all sizes."""
+    columns = addon.mesh.attributes.stored_columns(addon.mesh.layout.check(either))
+    logits = np.asarray(columns["opacity"], np.float64)
+    logs = np.max([columns[f"scale_{axis}"] for axis in range(3)], axis=0)
+    settings = bpy.context.scene.refine
+    settings.select_opacity, settings.select_size = 0.25, np.exp(np.median(logs))
 
-    inside = (opacities >= 0.25) & (opacities <= 0.5)
-    assert chosen.read(either) == np.flatnonzero(inside).tolist()
+    bpy.ops.refine.select_by(what="FAINT")
+    faint = chosen.read(either)
+    bpy.ops.refine.select_by(what="LARGE", mode="INTERSECT")
+    both = chosen.read(either)
+    bpy.ops.refine.select_by(what="FAINT", mode="SUBTRACT")
 
-
-def test_ranges_combine(chosen, room):
-    """The larger half of all sizes, less the whole range of opacities: none; and intersected."""
-    bpy.ops.refine.select_by(what="RANGE", quantity="SIZE", low=0.5, high=1.0)
-    large = chosen.read(room)
-    bpy.ops.refine.select_by(what="RANGE", quantity="OPACITY", low=0, high=0.5, mode="INTERSECT")
-    faint = chosen.read(room)
-    bpy.ops.refine.select_by(what="RANGE", quantity="OPACITY", mode="SUBTRACT")
-
-    assert 0 < len(faint) < len(large) < COUNT
-    assert set(faint) < set(large)
-    assert chosen.read(room) == []
+    assert faint == np.flatnonzero(logits < np.log(0.25 / 0.75)).tolist()
+    assert 0 < len(both) < len(faint) < COUNT
+    assert set(both) <= set(np.flatnonzero(logs >= np.median(logs)).tolist())
+    assert chosen.read(either) == []
 
 
 @pytest.mark.usefixtures("room_cameras")
-def test_scores_floaters_and_demands_take_splats(addon, chosen, room):
+def test_plans_floaters_and_demands_take_splats(addon, chosen, room):
     """Each is what the attribute, the search and the volumes say of the splats."""
     with pytest.raises(RuntimeError, match="score the splats first"):
-        bpy.ops.refine.select_by(what="RANGE", quantity="SCORE")
+        bpy.ops.refine.select_by(what="GOING")
     with pytest.raises(RuntimeError, match="look for floaters first"):
         bpy.ops.refine.select_by(what="FLOATERS")
     bpy.ops.refine.score()
     bpy.ops.refine.select_by(what="GOING")
     read = addon.mesh.attributes.read_attribute
     assert chosen.read(room) == np.flatnonzero(read(room.data, "refine_remove")).tolist()
-    bpy.ops.refine.select_by(what="RANGE", quantity="SCORE", low=0.5, high=1.0)
-    scores = read(room.data, "refine_score")
-    taken = np.zeros(COUNT, np.bool_)
-    taken[chosen.read(room)] = True
-    assert taken.any()
-    assert scores[taken].min() >= scores[~taken].max()
     bpy.ops.refine.add_volume(role="KEEP", shape="BOX")
     box = bpy.context.scene.refine.volumes[0].object
     box.scale = [0.5 * size for size in box.scale]
@@ -163,7 +153,7 @@ def test_the_selection_grows_and_shrinks(chosen, quarter):
 def test_the_selected_splats_are_deleted_but_for_protected_ones(addon, chosen, room):
     """Of 100 selected, 10 are marked to stay: 39,665 are left, and 10 of them selected."""
     chosen(room, list(range(10)))
-    bpy.ops.refine.protect(mode="ADD", mark="STAY")
+    bpy.ops.refine.protect(mark="STAY")
     chosen(room, list(range(100)))
     bpy.ops.refine.delete_selected()
 
@@ -197,22 +187,6 @@ def test_all_splats_are_not_parted_from_none(chosen, room, unchanged):
 
 
 @pytest.mark.usefixtures("room_cameras")
-def test_each_histogram_is_drawn_with_its_range(addon, chosen, room):
-    """Every name and number has its letters; the count beside it is what the button takes."""
-    settings = bpy.context.scene.refine
-    settings.select_by = "SCORE"
-    assert "score the splats first" in addon.ui.select_panel._shown(room, settings)
-    bpy.ops.refine.score()
-    for name in ("SCORE", "OPACITY", "SIZE"):
-        settings.select_by, settings.select_low, settings.select_high = name, 0.5, 0.9
-        low, high, count = addon.ui.select_panel._shown(room, settings)
-        bpy.ops.refine.select_by(what="RANGE", quantity=name, low=0.5, high=0.9)
-        assert low < high
-        assert len(chosen.read(room)) == count
-    assert addon.ui.pixel_font.drawn("1.2e+05").any()
-
-
-@pytest.mark.usefixtures("room_cameras")
 def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
     """The 100 best of 39,755 are marked; of those that 19,877 remove they are 100.
 
@@ -222,7 +196,7 @@ def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
     scores = addon.mesh.attributes.read_attribute(room.data, "refine_score")
     best = np.argsort(-scores, kind="stable")[:100]
     chosen(room, best)
-    bpy.ops.refine.protect(mode="ADD", mark="GO")
+    bpy.ops.refine.protect(mark="GO")
     assert "what must go changed" in addon.ui.staleness.changes(bpy.context, room)
     assert addon.objects.demands.facts(room.data)["removed_by_user"] == 100
     bpy.ops.refine.score()
@@ -231,7 +205,7 @@ def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
     assert going[best].all()
     assert going.sum() == 19_877
     chosen(room, best[:40])
-    bpy.ops.refine.protect(mode="ADD", mark="STAY")
+    bpy.ops.refine.protect(mark="STAY")
     facts = addon.objects.demands.facts(room.data)
 
     assert (facts["protected"], facts["removed_by_user"]) == (40, 60)

@@ -164,7 +164,7 @@ def test_scores_without_a_note_or_with_a_damaged_one_have_nothing_to_say(
     bpy.ops.refine.score()
     room.location.x = 2.0
     found.append(hints(addon, room))
-    for old, new in (('"matrix": [', '"matrix": ["x", '), ('"sums": ', '"other": ')):
+    for old, new in (('"matrix": ', '"other": '), ('"cameras": [', '"cameras": 3, "x": [')):
         record = room.data["refine_scores"]
         room.data["refine_scores"] = record.replace(old, new)
         found.append(hints(addon, room))

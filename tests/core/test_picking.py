@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from refine_addon.core import picking
-from refine_addon.core.picking import Axis
 from refine_addon.core.splats import SH_C0, Splats
 from refine_addon.core.views import View, pinhole
 
@@ -235,16 +234,6 @@ def test_splats_that_are_not_finite_have_neighbours_that_do_no_harm():
 
     assert picking.grown(nothing, np.zeros(5, np.bool_)).sum() == 0
     assert ((some >= 0) & (some < 3)).all()
-
-
-def test_an_axis_is_the_inverse_of_its_values():
-    """A logarithmic one from .001 to 10: .1 lies in its middle; 0 and NaN at its beginning."""
-    axis = Axis.of(np.geomspace(1e-3, 10.0, 1001), logarithmic=True)
-    places = axis.places(np.array([axis.value(0.25), axis.value(1.0), 0.0, np.nan, 1e9]))
-
-    np.testing.assert_allclose(places, [0.25, 1.0, 0.0, 0.0, 1.0], atol=1e-12)
-    assert Axis.of(np.array([np.nan, 4.0, 2.0])) == Axis(2.0, 4.0)
-    assert Axis.of(np.empty(0)) == Axis(0.0, 1.0)
 
 
 def opengl(camera, near=0.01, far=100.0):

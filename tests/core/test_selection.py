@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -12,9 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import Budget, RefineError, Scores, rank, select
-from refine_addon.core.quality.curve import Quality
 from refine_addon.core.scores import shares_gone
-from refine_addon.core.selection import Tally
 from tests.strategies import masks, scores
 
 
@@ -170,36 +167,6 @@ def test_protected_splats_stay_whatever_the_budget():
     )
 
 
-BUDGETS = st.one_of(
-    st.floats(0.0, 0.999).map(lambda share: Budget(ratio=share)),
-    st.integers(1, 40).map(lambda count: Budget(keep=count)),
-    st.floats(1e-6, 1e-3).map(lambda size: Budget(max_mb=size)),
-    st.floats(-1.0, 1e39).map(lambda score: Budget(threshold=score)),
-    st.sampled_from([0.1, 0.3]).map(lambda score: Budget(threshold=score)),
-    st.floats(0.0, 100.0).map(lambda percentage: Budget(min_seen=percentage)),
-    st.floats(1.0, 99.0).map(lambda psnr: Budget(psnr=psnr)),
-)
-
-
-@given(values=scores(), budget=BUDGETS, data=st.data())
-def test_a_tally_counts_what_a_selection_removes(values, budget, data):
-    """For every kind of budget, with protected splats or none, and refuses what it refuses."""
-    count = len(values)
-    seen = data.draw(st.lists(st.integers(0, 64), min_size=count, max_size=count))
-    protected = data.draw(st.one_of(st.none(), masks(count)))
-    curve = Quality(np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0]), np.zeros(3))
-    known = replace(scored(values, seen), quality=curve)
-    sizes = {"row_bytes": 20.0, "fixed_bytes": 100}
-
-    try:
-        keep = select(known, budget, protected=protected, **sizes)
-    except RefineError as refused:
-        with pytest.raises(RefineError, match=re.escape(str(refused))):
-            Tally(known, protected).removed(budget, **sizes)
-    else:
-        assert Tally(known, protected).removed(budget, **sizes) == count - np.count_nonzero(keep)
-
-
 def test_a_budget_is_exactly_one_number():
     """None, or two, are refused with what was given."""
     with pytest.raises(RefineError, match="expected one of ratio, keep, max_mb, threshold, min_"):
@@ -323,12 +290,3 @@ def test_a_threshold_beyond_the_range_of_scores_removes_all_that_are_finite():
     keep = select(known, Budget(threshold=3.4028235677973366e38))
 
     assert keep.tolist() == [False, True]
-
-
-def test_a_tally_counts_no_protected_splat_and_sorts_what_was_seen():
-    """Of four, .9 are three, but two are free; seen in 0, 60, 1, 50 of 64 views, two miss half."""
-    values = np.arange(1, 5, dtype=np.float32)
-    known = scored(values, [0, 60, 1, 50])
-
-    assert Tally(known, np.arange(4) < 2).removed(Budget(ratio=0.9)) == 2
-    assert Tally(known).removed(Budget(min_seen=50.0)) == 2

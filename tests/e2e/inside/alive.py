@@ -230,7 +230,7 @@ class Draws:
 
     def __init__(self) -> None:
         self.counts = {"view": 0, "panel": 0}
-        self.panel = bpy.types.REFINE_PT_score
+        self.panel = bpy.types.REFINE_PT_prune
         self.plain = plain = self.panel.draw
 
         def draw(panel: bpy.types.Panel, context: bpy.types.Context) -> None:

@@ -186,7 +186,7 @@ class Walk:
         yield from self.hand.press("RET")
         yield 1.0
         yield from self.over()
-        self.show.call(bpy.ops.wm.call_panel, name="REFINE_PT_volumes", keep_open=True)
+        self.show.call(bpy.ops.wm.call_panel, name="REFINE_PT_protect", keep_open=True)
         yield from self.show.settle()
         yield from self.look("13-box")
         region = self.show.region

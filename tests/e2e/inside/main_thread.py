@@ -105,7 +105,7 @@ def selecting(clock: Clock, scored: Scored) -> None:
     """Select, hide and protect splats, part and join them, and crop them."""
     refine = bpy.ops.refine
     scored.again()
-    clock.time("select by range", refine.select_by, what="RANGE", low=0.4)
+    clock.time("select by size", refine.select_by, what="LARGE")
     clock.time("select what goes", refine.select_by, what="GOING")
     clock.time("invert", refine.select, action="INVERT")
     clock.time("grow", refine.grow_selection)

@@ -45,7 +45,7 @@ def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[
     yield from hand.open_tab()
 
     mark(splats, 1000)
-    show.call(bpy.ops.refine.protect, mode="ADD")
+    show.call(bpy.ops.refine.protect, mark="STAY")
     for shape, role in (("SPHERE", "PROTECT"), ("BOX", "REMOVE"), ("BOX", "KEEP")):
         show.call(bpy.ops.refine.add_volume, shape=shape, role=role)
     box = settings.volumes[1].object
@@ -57,7 +57,7 @@ def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[
         found[f"unscored {mode}"] = yield from show.picture(f"unscored-{mode}")
 
     yield from hand.move(500, 500)
-    show.call(bpy.ops.wm.call_panel, name="REFINE_PT_volumes", keep_open=True)
+    show.call(bpy.ops.wm.call_panel, name="REFINE_PT_protect", keep_open=True)
     yield 1.0
     yield from show.picture("panel")
     yield from hand.press("ESC")
@@ -80,7 +80,7 @@ def edit(show: Show, demands: Any, splats: bpy.types.Object) -> Generator[float,
     """Protect all splats in edit mode; return how many the panel counts when it is left."""
     show.call(bpy.ops.object.mode_set, mode="EDIT")
     show.call(bpy.ops.mesh.select_all, action="SELECT")
-    show.call(bpy.ops.refine.protect, mode="ADD")
+    show.call(bpy.ops.refine.protect, mark="STAY")
     yield 0.5
     show.call(bpy.ops.object.mode_set, mode="OBJECT")
     yield from wait(lambda: marked(demands, splats, 0))

@@ -52,7 +52,6 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     yield from picture(pictures, "2-scored")
     found["priced"] = price(name)
     yield from hand.slide("refine.percent", 60)
-    found["sliding"] = price(name)
     yield from until(lambda: price(name)["rested"], "marks follow")
     yield from picture(pictures, "2-slid")
     found["slid"] = price(name)
@@ -94,9 +93,9 @@ def price(name: str) -> dict[str, Any]:
         "percent": settings.percent,
         "ratio": settings.to_budget().ratio,
         "sentence": ui.plans.sentence(plan) if plan else "",
-        "rested": bool(plan) and plan.get("marked", True),
+        "rested": bool(plan),
         "marked": sum(mark.value for mark in marks),
-        "chart": ui.price.shows(obj.data) and ui.price.icon() > 0,
+        "chart": ui.chart.icon("chart") > 0,
         "images": len([image for image in bpy.data.images if image.users]),
     }
 
