@@ -45,14 +45,9 @@ KINDS = {
     "INT8": Kind("value", np.int8, 1),
     "BOOLEAN": Kind("value", np.bool_, 1),
     "FLOAT_VECTOR": Kind("vector", np.float32, 3),
-    "BYTE_COLOR": Kind("color_srgb", np.float32, 4),
     "FLOAT_COLOR": Kind("color", np.float32, 4),
     "FLOAT4": Kind("vector", np.float32, 4),
     "QUATERNION": Kind("value", np.float32, 4),
-    "FLOAT2": Kind("vector", np.float32, 2),
-    "INT16_2D": Kind("value", np.int16, 2),
-    "INT32_2D": Kind("value", np.int32, 2),
-    "FLOAT4X4": Kind("value", np.float32, 16),
 }
 """Attribute type -> field for `foreach_get`, element type, numbers in an element."""
 
