@@ -66,7 +66,8 @@ def as_cloud(addon, obj):
     attributes, checked = addon.mesh.attributes, addon.mesh.layout.check(obj)
     rows, name = attributes.file_from_object(checked).rows, obj.name
     cloud = as_blender_imports(rows, "cloud")
-    taken = (*"xyz", "position", "opacity", "f_", "scale_", "rot_", ".")
+    taken = (*"xyz", "position", "opacity", "f_", "scale_", "rot_", ".", "refine_home")
+    taken += ("refine_shape",)  # a checksum of other numbers
     for attribute in obj.data.attributes:
         if attribute.domain == "POINT" and not attribute.name.startswith(taken):
             values = attributes.read_attribute(obj.data, attribute.name)

@@ -42,7 +42,8 @@ def imported(cloud: str, form: str, place: mathutils.Matrix) -> bpy.types.Object
     """Import a file into an object of a type that stands somewhere."""
     bpy.ops.refine.import_ply(filepath=cloud)
     if form == "POINTCLOUD":
-        clouds.as_cloud(importlib.import_module(extension.MODULE), bpy.context.object)
+        package = importlib.import_module(extension.MODULE)
+        package.mesh.drift.stamp(clouds.as_cloud(package, bpy.context.object).data)
     bpy.context.object.matrix_world = place
     bpy.context.view_layer.update()
     return bpy.context.object
