@@ -81,7 +81,7 @@ def remove_all() -> None:
     found = [scene for scene in bpy.data.scenes if MARK in scene]
     if bpy.context.window is None:  # as in a command: `remove` of 4.3 crashes without a window
         bpy.data.batch_remove(found)
-        return
+        found = []
     for scene in found:
         bpy.data.scenes.remove(scene)
 

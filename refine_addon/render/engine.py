@@ -33,8 +33,6 @@ _FAR = 1e4
 """Scene sizes from which a camera without perspective is seen as one with it: less than .1 pixels
 apart in an image of 1000."""
 
-_KNEE = 0.04045
-
 
 @dataclass(eq=False)
 class Shared:
@@ -54,6 +52,8 @@ class Shared:
         How many were drawn in the last frame.
     frames : list of int
         Those that were drawn.
+    renders : int
+        How many of Blender's renders a frame takes.
     engine : str
         What rendered all but the splats, "" where there is nothing else.
     picture : (4, H, W) or None
@@ -70,6 +70,7 @@ class Shared:
     finished: Path | None = None
     splats: int = 0
     frames: list[int] = field(default_factory=list)
+    renders: int = 1
     engine: str = ""
     picture: NDArray[np.float64] | None = None
     error: BaseException | None = None
@@ -77,8 +78,7 @@ class Shared:
 
     def save(self, folder: Path, frame: int) -> None:
         """Keep the last picture for a movie, in 16 bits."""
-        if self.picture is not None:
-            np.save(folder / f"{frame}.npy", np.rint(self.picture * 65535.0).astype(np.uint16))
+        np.save(folder / f"{frame}.npy", np.rint(self.picture * 65535.0).astype(np.uint16))
 
 
 class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -96,8 +96,8 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.error_set("Use Render > Render with Splats: this engine is a part of it")
             return
         try:
-            frame, folder = depsgraph.scene.frame_current, shared.finished
-            drawn = np.load(folder / f"{frame}.npy") / 65535.0 if folder else None
+            frame = depsgraph.scene.frame_current
+            drawn = shared.finished and np.load(shared.finished / f"{frame}.npy") / 65535.0
             picture = self._picture(depsgraph, shared) if drawn is None else drawn
             result = self.begin_result(0, 0, *picture.shape[:0:-1])
             result.layers[0].passes["Combined"].rect.foreach_set(_linear(picture).ravel())
@@ -203,6 +203,6 @@ def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
     colors, alphas = picture[:3], picture[3]
     straight = (colors / np.maximum(alphas, 1e-6)).clip(0.0, 1.0)
     curved = ((straight + 0.055) / 1.055) ** 2.4
-    linear = alphas * np.where(straight > _KNEE, curved, straight / 12.92)
+    linear = alphas * np.where(straight > 0.04045, curved, straight / 12.92)
     pixels = np.concatenate([linear, picture[3:]]).astype(np.float32)
     return np.moveaxis(pixels, 0, -1)[::-1].reshape(-1, 4)

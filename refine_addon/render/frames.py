@@ -74,7 +74,8 @@ def steps(
     refuse(scene)
     with _made(shared) as folder:
         meshes, whole = Meshes(scene, folder), _whole(scene, "whole")
-        shared.engine, shared.transparent = meshes.engine, scene.render.film_transparent
+        shared.engine, shared.renders = meshes.engine, meshes.renders + 1
+        shared.transparent = scene.render.film_transparent
         movie = write and scene.render.is_movie_format
         kept = not scene.render.use_overwrite, scene.render.use_placeholder
         if movie:  # it is written as one, when all frames are drawn
@@ -107,10 +108,8 @@ def _whole(scene: bpy.types.Scene, what: str) -> str:
 
 def _check(shared: Shared, frame: int) -> None:
     """Raise why a frame was not drawn, if it was not."""
-    if shared.error is not None:
-        raise shared.error
-    if shared.frames[-1:] != [frame]:
-        raise Cancelled
+    if shared.error is not None or shared.frames[-1:] != [frame]:
+        raise shared.error or Cancelled
 
 
 def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:

@@ -74,6 +74,8 @@ class Meshes:
     ----------
     engine : str
         What renders them, "" where there is nothing to render.
+    renders : int
+        How many renders of Blender's a frame takes.
     """
 
     def __init__(self, scene: bpy.types.Scene, folder: Path) -> None:
@@ -102,7 +104,8 @@ class Meshes:
             for linked in (world.collection.children, world.collection.objects):
                 for item in [*linked]:
                     linked.unlink(item)
-        self._any = self._meshes or self._world
+        renders = (self._clear, self._opaque, self._depths, self._world)
+        self.renders, self._any = sum(map(bool, renders)), self._meshes or self._world
         self.engine = bpy.data.scenes[self._any].render.engine if self._any else ""
 
     def layers(self, frame: int) -> Steps:

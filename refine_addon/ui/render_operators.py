@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import bpy
@@ -17,13 +19,11 @@ from ..render.copies import Step
 from ..render.engine import Shared
 from .images import put
 from .operator_bases import FAILURES, Answer, Needing, fail, idle
+from .running import Running, now
 from .wrapped import counted
 
 IMAGE = "Render with Splats"
 """Name of the image that shows the last frame."""
-
-_STEP = 0.05
-"""Seconds between two looks at whether Blender's render is over."""
 
 _ENDS_UNSEEN = bpy.app.version < (5, 0, 0)
 """Whether Blender frees what a render draws with while it goes on, unless a window shows its scene.
@@ -91,6 +91,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     bl_label = "Render with Splats"
     bl_options = {"REGISTER"}
     needs = (idle, no_render)
+    doing, offers = "Rendering", ""
 
     animation: BoolProperty(
         name="Animation",
@@ -98,6 +99,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
     _steps: Any = None
+    _running: Running | None = None
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: REFINE_OT_render) -> str:
@@ -125,9 +127,10 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         self._begin(context)
         answer = self._go_on(context)
         if "RUNNING_MODAL" in answer:  # else Blender would keep the handler of what it frees
-            manager = context.window_manager
-            self._timer = manager.event_timer_add(_STEP, window=context.window)
-            manager.modal_handler_add(self)
+            stop = partial(setattr, self._shared, "stopped", True)
+            worker = SimpleNamespace(fraction=0.0, what="", cancel=stop, end=stop)
+            self._running = Running(self, context, [], None, worker)
+            context.window_manager.modal_handler_add(self)
             _watch_anew()
         return answer
 
@@ -138,6 +141,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             main_thread.serve()
             if not bpy.app.is_job_running("RENDER"):
                 return self._go_on(context)
+            self._running.tell(context)
         return {"PASS_THROUGH"}
 
     def cancel(self, context: bpy.types.Context) -> None:
@@ -151,7 +155,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             chosen = [*range(scene.frame_start, scene.frame_end + 1, scene.frame_step)]
         self._shared, self._frames = Shared(card=card.available()), chosen
         self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
-        self._started, self._timer, self._opened = time.monotonic(), None, False
+        self._started, self._opened, self._done = time.monotonic(), False, 0
         self._next: Step | None = None
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
@@ -185,8 +189,11 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     def _render(self, context: bpy.types.Context, step: Step) -> None:
         """Have Blender render; only the first time it opens what shows renders, as F12 does."""
         number, total = len(self._shared.frames) + 1, len(self._frames)
-        of_all = f" frame {number} of {total}" if total > 1 else ""
-        context.workspace.status_text_set(f"Rendering{of_all}: {step.what}; Esc cancels")
+        worker = self._running.worker
+        worker.what = f"frame {number} of {total}: {step.what}" if total > 1 else step.what
+        worker.fraction = min(self._done / (total * self._shared.renders), 1.0)
+        self._done += 1
+        self._running.tell(context)
         view = context.preferences.view
         display = view.render_display_type
         if self._opened:
@@ -213,9 +220,9 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         image = put(IMAGE, np.moveaxis(straight, 0, -1).clip(0.0, 1.0))
         for window in bpy.context.window_manager.windows:
             for area in window.screen.areas:
-                space = area.spaces.active
-                if area.type == "IMAGE_EDITOR" and _shows_render(space.image):
-                    space.image = image
+                shown = getattr(area.spaces.active, "image", None)
+                if area.type == "IMAGE_EDITOR" and shown and shown.type == "RENDER_RESULT":
+                    area.spaces.active.image = image
 
     def _finished(self, context: bpy.types.Context) -> Answer:
         self._show()
@@ -243,11 +250,9 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             self._steps = None
         if _ENDS_UNSEEN and not bpy.app.background:
             bpy.app.timers.register(_draw_whole, first_interval=_SETTLED)
-        if self._timer is not None:
-            context.window_manager.event_timer_remove(self._timer)
-            self._timer = None
-            for workspace in bpy.data.workspaces:
-                workspace.status_text_set(None)
+        if self._running is not None:
+            self._running.over(context)
+            self._running = None
 
 
 def _draw_whole() -> None:
@@ -256,16 +261,14 @@ def _draw_whole() -> None:
         window.screen.show_statusbar = window.screen.show_statusbar
 
 
-def _shows_render(image: bpy.types.Image | None) -> bool:
-    return image is not None and image.type == "RENDER_RESULT"
-
-
 def draw_buttons(layout: bpy.types.UILayout) -> None:
-    """Draw the buttons of the panel."""
+    """Draw the buttons of the panel, and how far a render is."""
     column = layout.column(align=True)
     column.operator("refine.render", text="Render with Splats", icon="RENDER_STILL")
     text = "Render Animation"
     column.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
+    if (running := now()) is not None and running.operator == "refine.render":
+        column.progress(factor=running.factor, text=f"{running.worker.what}: {running.share}")
 
 
 def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:

@@ -47,18 +47,24 @@ class Running:
     job
         What was gathered from the scene.
     worker : Worker
+        Where given, what stands for one: how far a render is, and how it is stopped.
     waits : str
         What has to happen before the result can be written, "" if nothing.
     """
 
     def __init__(
-        self, operator: Any, context: bpy.types.Context, group: list[SplatObject], job: Any
+        self,
+        operator: Any,
+        context: bpy.types.Context,
+        group: list[SplatObject],
+        job: Any,
+        worker: Any = None,
     ) -> None:
         self.operator, self.doing = type(operator).bl_idname, operator.doing
         self.job, self.waits = job, ""
         self._offers, self._targets = operator.offers, [Target.of(each) for each in group]
         self._left, self._told = TimeLeft(), ""
-        self.worker = Worker(partial(operator.compute, job))
+        self.worker = worker or Worker(partial(operator.compute, job))
         self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
         _now[:] = [self]
         self.tell(context)

@@ -24,6 +24,8 @@ def test_renders_show_splats_among_meshes(binary: Binary, blend: Path, cloud: Pa
     Every setting is as before, also after Esc, which ends an animation and a render of 160,000
     splats: Cycles on two threads within two seconds of processor, the drawing of splats within one,
     what draws the window left out. F12 says that it leaves splats out.
+
+    Meanwhile nothing else can be started, a bar says why, and the scene menu lists no copies.
     """
     try:
         found = binary.window_step("render", blend, simulate=False, pictures=binary.work)
@@ -33,6 +35,11 @@ def test_renders_show_splats_among_meshes(binary: Binary, blend: Path, cloud: Pa
             shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
 
     assert found["size"] == [240, 160]
+    during, afterwards = found["refusal"]
+    assert during.startswith("Rendering: wait until it is over, or press Esc")
+    assert afterwards == ""
+    assert not found["can export"]
+    assert found["scenes"] == ["Scene"]
     assert found["alike"] == [True] * 4
     assert found["began"]
     assert found["stopped"]
