@@ -16,7 +16,7 @@ from .ui.properties import RefineSettings
 from .webp import BlenderImages
 
 _NAMES = """
-    ui.volumes ui.properties ui.preferences ui.render_notice ui.panel_cache
+    ui.volumes ui.properties ui.preferences ui.panel_cache
     ui.chart ui.plans ui.running ui.transforms ui.import_operators
     ui.camera_import ui.floaters ui.protect ui.instances ui.select_tools ui.select_operators
     ui.operators ui.compare ui.view_operators ui.render_operators ui.export_operators ui.remedies

@@ -1,7 +1,11 @@
-"""*Render with Splats*: an operator that has Blender do one render after another, and waits."""
+"""*Render with Splats*: an operator that has Blender do one render after another, and waits.
+
+F12 does not show splats: the status bar says which button does.
+"""
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -10,13 +14,14 @@ from typing import Any
 
 import bpy
 import numpy as np
+from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 
 from .. import main_thread
 from ..core.execute import Cancelled
-from ..render import card, frames
-from ..render.copies import Step
+from ..render import card, copies, frames
 from ..render.engine import Shared
+from ..render.meshes import drawn_by_us, restore
 from .images import put
 from .operator_bases import FAILURES, Answer, Needing, fail, idle
 from .running import Running, now
@@ -33,6 +38,18 @@ See `RE_FreeUnusedGPUResources` in its source; one frame of sixty ended Blender 
 
 _SETTLED = 0.5
 """Seconds after a render in which windows have drawn themselves; see `_draw_whole`."""
+
+
+NOTICE = "Splats are not in this render: use Render > Render with Splats"
+"""What is said."""
+
+IN_BACKGROUND = "refine: splats are not in this render; use --command refine render"
+"""What is said where there is no window."""
+
+_LINGERS = 10.0
+"""Seconds that it stays when the render is over."""
+
+_until: list[float] = []
 
 
 @dataclass
@@ -156,7 +173,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         self._shared, self._frames = Shared(card=card.available()), chosen
         self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
         self._started, self._opened, self._done = time.monotonic(), False, 0
-        self._next: Step | None = None
+        self._next: copies.Step | None = None
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
         """Take what the last render came to, or start the next one.
@@ -186,7 +203,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             raise
         return {"RUNNING_MODAL"}
 
-    def _render(self, context: bpy.types.Context, step: Step) -> None:
+    def _render(self, context: bpy.types.Context, step: copies.Step) -> None:
         """Have Blender render; only the first time it opens what shows renders, as F12 does."""
         number, total = len(self._shared.frames) + 1, len(self._frames)
         worker = self._running.worker
@@ -278,6 +295,59 @@ def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
     layout.operator("refine.render", icon="RENDER_STILL")
     text = "Render Animation with Splats"
     layout.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
+
+
+def register() -> None:
+    """Say it when F12 leaves splats out, and clean up after steps back."""
+    for calls, handler in _handlers():
+        calls.append(handler)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    for calls, handler in _handlers():
+        calls.remove(handler)
+
+
+def _handlers():
+    of = bpy.app.handlers
+    returned = [(calls, _returned) for calls in (of.undo_post, of.redo_post, of.load_post)]
+    return [(of.render_init, _began), *returned]
+
+
+@persistent
+def _began(scene: bpy.types.Scene, *_: object) -> None:
+    """Look whether a render leaves splats out; called on the thread that renders."""
+    if copies.MARK in scene:
+        return
+    shown = (layer.objects for layer in scene.view_layers if layer.use)
+    if not any(drawn_by_us(obj) and not obj.hide_render for group in shown for obj in group):
+        return
+    if bpy.app.background:
+        sys.stderr.write(f"{IN_BACKGROUND}\n")
+    elif not _until:
+        _until.append(time.monotonic() + _LINGERS)
+        bpy.app.timers.register(_say, first_interval=0.0)
+
+
+def _say() -> float | None:
+    """Say it until the render has been over for a while."""
+    if bpy.app.is_job_running("RENDER"):
+        _until[0] = time.monotonic() + _LINGERS
+    over = time.monotonic() > _until[0]
+    for workspace in bpy.data.workspaces:
+        workspace.status_text_set(None if over else NOTICE)
+    if over:
+        _until.clear()
+    return None if over else 0.5
+
+
+@persistent
+def _returned(*_: object) -> None:
+    """Remove what a step back, or a file, has brought of a render that is over."""
+    if not bpy.app.is_job_running("RENDER"):
+        copies.remove_all()
+        restore()
 
 
 CLASSES = (REFINE_OT_render, REFINE_OT_watch_render)

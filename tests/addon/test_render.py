@@ -237,7 +237,7 @@ def test_what_an_undo_brings_back_of_a_render_is_put_right(addon, shot):
     hide = addon.render.meshes.out_of_sight([shown, gone])
     hide.__enter__()
     meanwhile = shown.visible_camera
-    addon.ui.render_notice._returned()
+    addon.ui.render_operators._returned()
 
     assert not meanwhile
     assert settings(shot) == before
@@ -474,8 +474,8 @@ def test_f12_says_that_splats_are_not_in_it(addon, shot, quarter, capfd):
     quarter.hide_render = True
     bpy.ops.render.render()
 
-    assert addon.ui.render_notice.IN_BACKGROUND in said
-    assert addon.ui.render_notice.IN_BACKGROUND not in capfd.readouterr().err
+    assert addon.ui.render_operators.IN_BACKGROUND in said
+    assert addon.ui.render_operators.IN_BACKGROUND not in capfd.readouterr().err
     assert shot.name in bpy.data.scenes
 
 
@@ -497,7 +497,7 @@ def test_splats_that_blender_draws_are_left_to_it(
     meshes = addon.render.meshes.Meshes(shot, tmp_path)
     addon.render.copies.remove_all()
 
-    assert addon.ui.render_notice.IN_BACKGROUND not in said
+    assert addon.ui.render_operators.IN_BACKGROUND not in said
     assert meshes.engine == "CYCLES"
     assert cloud not in meshes._hidden
 

@@ -91,7 +91,7 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
     yield 1.0
     yield from picture(pictures, "f12")
     yield from until(lambda: not rendering(), "F12 is over")  # Blender quits badly amid a render
-    notice = importlib.import_module(f"{extension.MODULE}.ui.render_notice")
+    notice = importlib.import_module(f"{extension.MODULE}.ui.render_operators")
     found["notice"] = bool(notice._until)
     return found
 
