@@ -224,6 +224,7 @@ def test_splats_are_selected_as_they_are_seen(binary: Binary, cloud: Path, camer
     assert 0 < found["brush"] < found["box"]
     assert found["sphere"] > 0
     assert 0 < found["piece"] < found["color"]
+    assert found["radii"] == [48.0, 40.0]
     assert found["all"] == 9_939
     assert found["inverted"] == 9_939 - found["box"]
     assert found["isolated"] == found["box"] < found["drawn"]

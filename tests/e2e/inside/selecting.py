@@ -84,6 +84,11 @@ def shapes(hand: Tools, box: np.ndarray, show: Show) -> Generator[float, None, d
     found["brush"] = yield from hand.drag("brush", (0.3, 0.5), (0.6, 0.5))
     brush = mask()
     yield from show.picture("select-2-brush")
+    found["radii"] = []
+    for key in ("RIGHT_BRACKET", "LEFT_BRACKET"):
+        yield from hand.press(key)
+        yield 0.3
+        found["radii"].append(round(bpy.context.scene.refine.select_radius, 3))
     found["added"] = yield from hand.drag("box", *BOX, shift=True)
     found["added is both"] = bool((mask() == (box | brush)).all())
     found["subtracted"] = yield from hand.drag("brush", (0.3, 0.5), (0.6, 0.5), ctrl=True)
