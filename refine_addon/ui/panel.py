@@ -164,7 +164,8 @@ class REFINE_PT_clean(_InSidebar, bpy.types.Panel):
             known = sum(counts[name] * sure.get(name, 0.0) for name in reasons)
             text += f", {100.0 * known / total:.0f} % sure" if known else ""
             layout.label(text=text, icon="TRASH")
-            layout.operator("refine.delete_floaters", icon="TRASH")
+            text = "Delete Floaters"
+            layout.operator("refine.delete", text=text, icon="TRASH").what = "FLOATERS"
         _draw_progress(layout, context, "refine.find_floaters")
 
 
@@ -199,7 +200,7 @@ class REFINE_PT_protect(_InSidebar, bpy.types.Panel):
             layout.label(text=f"Stay: {facts['protected']:,}", icon="LOCKED")
         if facts.get("removed_by_user"):
             layout.label(text=f"Go: {facts['removed_by_user']:,}", icon="TRASH")
-            layout.operator("refine.crop", icon="TRASH")
+            layout.operator("refine.delete", text="Delete Now", icon="TRASH").what = "VOLUMES"
 
 
 class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):

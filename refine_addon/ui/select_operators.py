@@ -22,7 +22,6 @@ from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
 from . import plans
-from .deleting import Deleting
 from .operator_bases import Answer, AtOnce, Job, OnSplats
 from .select_tools import MODES
 
@@ -153,20 +152,6 @@ class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
         selection.select(group[0].obj, wanted)
 
 
-class REFINE_OT_delete_selected(Deleting, bpy.types.Operator):
-    """Delete the selected splats, but for those that must stay"""
-
-    bl_idname = "refine.delete_selected"
-    bl_label = "Delete Selected"
-    bl_options = {"REGISTER", "UNDO"}
-
-    def going(self, context: Context, checked: SplatObject) -> NDArray[np.bool_]:
-        """Return the selected splats that need not stay."""
-        going = _some(checked.obj, selection.selected(checked.obj))
-        protected = Demands.of_scene(context.scene).forced(checked).protected
-        return going & (True if protected is None else ~protected)
-
-
 class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
     """Make an object of its own of the selected splats"""
 
@@ -211,6 +196,5 @@ CLASSES = (
     REFINE_OT_select,
     REFINE_OT_select_by,
     REFINE_OT_grow_selection,
-    REFINE_OT_delete_selected,
     REFINE_OT_separate_selected,
 )

@@ -80,7 +80,9 @@ class REFINE_PT_select(bpy.types.Panel):
         grid = layout.grid_flow(columns=3, even_columns=True, align=True)
         for shape, text, _ in SHAPES:
             grid.operator("wm.tool_set_by_id", text=text).name = f"refine.select_{shape.lower()}"
-        layout.prop(settings, "select_hidden")
+        row = layout.row()
+        row.prop(settings, "select_hidden")
+        row.prop(settings, "select_connected")
         if obj.mode == "EDIT":
             wrapped.label(layout, context, "More in object mode", icon="INFO")
             return
@@ -106,4 +108,4 @@ def _draw_uses(layout: bpy.types.UILayout) -> None:
         row.operator("refine.protect", text=text, icon=icon).mark = mark
     column = layout.column(align=True)
     column.operator("refine.separate_selected", text="Separate", icon="MOD_EXPLODE")
-    column.operator("refine.delete_selected", text="Delete", icon="X")
+    column.operator("refine.delete", text="Delete", icon="X").what = "SELECTED"

@@ -156,7 +156,7 @@ _OBJECT_KEYS = (
     _key("refine.select", "H", ("action", "REVEAL"), alt=True),
     _key("refine.grow_selection", "NUMPAD_PLUS", ("shrink", False), ctrl=True),
     _key("refine.grow_selection", "NUMPAD_MINUS", ("shrink", True), ctrl=True),
-    _key("refine.delete_selected", "DEL"),
+    _key("refine.delete", "DEL", ("what", "SELECTED")),
 )
 """Keys beside those of the mouse in object mode. Edit mode has its own for these."""
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 import bpy
 import numpy as np
 from bpy.props import EnumProperty, IntProperty, PointerProperty
-from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..mesh import layout as mesh_layout
-from ..mesh.layout import SplatObject
 from ..objects import demands
 from . import plans
-from .deleting import Deleting
 from .operator_bases import Answer, AtOnce, Needing, idle, on_splats
 
 ROLES = (
@@ -154,21 +151,4 @@ class REFINE_OT_drop_volume(Needing, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_crop(Deleting, bpy.types.Operator):
-    """Delete now what the volumes say must go, without scores; nothing else is deleted"""
-
-    bl_idname = "refine.crop"
-    bl_label = "Delete Now"
-    bl_options = {"REGISTER", "UNDO"}
-
-    def going(self, context: bpy.types.Context, checked: SplatObject) -> NDArray[np.bool_]:
-        """Return the splats that must go."""
-        removed = demands.Demands.of_scene(context.scene).forced(checked).removed
-        if removed is None or not removed.any():
-            raise RefineError(
-                f"object '{checked.obj.name}': no volume says of any splat that it must go"
-            )
-        return removed
-
-
-CLASSES = (RefineVolume, REFINE_OT_add_volume, REFINE_OT_drop_volume, REFINE_OT_crop)
+CLASSES = (RefineVolume, REFINE_OT_add_volume, REFINE_OT_drop_volume)

@@ -84,8 +84,8 @@ def test_events_go_on_to_the_window(start, gate, kind):
 
 def test_only_one_operation_works_at_a_time(start, gate, addon):
     """They come back when it is over."""
-    names = ["score", "apply", "levels", "find_floaters", "delete_floaters"]
-    names += ["export_ply", "import_ply", "import_cameras", "crop"]
+    names = ["score", "apply", "levels", "find_floaters", "delete"]
+    names += ["export_ply", "import_ply", "import_cameras"]
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()
 

@@ -68,7 +68,7 @@ def test_floaters_of_native_splats_are_those_of_the_mesh(addon, polluted):
     assert cloud.type == "POINTCLOUD"
     assert on_mesh[moved].any()
     assert np.count_nonzero(on_mesh != on_cloud) <= 2
-    bpy.ops.refine.delete_floaters()
+    bpy.ops.refine.delete(what="FLOATERS")
     assert addon.mesh.layout.splat_count(cloud.data) == np.count_nonzero(~on_cloud)
 
 
@@ -94,13 +94,14 @@ def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     goes = marked(addon, room)
     opacities = addon.mesh.attributes.read_attribute(room.data, "opacity")
 
-    assert bpy.ops.refine.delete_floaters() == {"FINISHED"}
+    assert bpy.ops.refine.delete(what="FLOATERS") == {"FINISHED"}
 
     left = addon.mesh.attributes.read_attribute(room.data, "opacity")
     np.testing.assert_array_equal(left, opacities[~goes])
     assert addon.mesh.scores.record(room.data) is None
     assert addon.mesh.floaters.counts(room.data) is None
-    assert not bpy.ops.refine.delete_floaters.poll()
+    with pytest.raises(RuntimeError, match="look for floaters first"):
+        bpy.ops.refine.delete(what="FLOATERS")
 
 
 def test_protected_splats_are_no_floaters(addon, polluted):
@@ -124,7 +125,7 @@ def test_floaters_that_were_protected_after_the_search_stay(addon, polluted):
     opacities = addon.mesh.attributes.read_attribute(room.data, "opacity")
     addon.mesh.edit.mark_by_hand(room, spared)
 
-    assert bpy.ops.refine.delete_floaters() == {"FINISHED"}
+    assert bpy.ops.refine.delete(what="FLOATERS") == {"FINISHED"}
 
     left = addon.mesh.attributes.read_attribute(room.data, "opacity")
     assert spared.sum() > 10
@@ -138,7 +139,8 @@ def test_with_no_floaters_to_delete_scores_and_findings_stay(addon, polluted):
     bpy.ops.refine.find_floaters()
     addon.mesh.edit.mark_by_hand(room, marked(addon, room))
 
-    assert bpy.ops.refine.delete_floaters() == {"CANCELLED"}
+    with pytest.raises(RuntimeError, match="no splat floats that need not stay"):
+        bpy.ops.refine.delete(what="FLOATERS")
 
     assert len(room.data.vertices) == 9_939
     assert addon.mesh.scores.record(room.data) is not None

@@ -165,7 +165,7 @@ def test_after_deletion_by_hand_the_panel_asks_for_scores_and_says_why(
     bpy.ops.refine.score()
     rows = np.arange(len(room.data.vertices))
     addon.mesh.selection.select(room, rows < 100)
-    bpy.ops.refine.delete_selected()
+    bpy.ops.refine.delete(what="SELECTED")
 
     drawn = []
     panel = addon.ui.panel.REFINE_PT_prune

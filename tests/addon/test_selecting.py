@@ -155,7 +155,7 @@ def test_the_selected_splats_are_deleted_but_for_protected_ones(addon, chosen, r
     chosen(room, list(range(10)))
     bpy.ops.refine.protect(mark="STAY")
     chosen(room, list(range(100)))
-    bpy.ops.refine.delete_selected()
+    bpy.ops.refine.delete(what="SELECTED")
 
     assert addon.mesh.layout.splat_count(room.data) == COUNT - 90
     assert chosen.read(room) == list(range(10))
@@ -209,7 +209,7 @@ def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
     facts = addon.objects.demands.facts(room.data)
 
     assert (facts["protected"], facts["removed_by_user"]) == (40, 60)
-    bpy.ops.refine.crop()
+    bpy.ops.refine.delete(what="VOLUMES")
     assert addon.mesh.layout.splat_count(room.data) == COUNT - 60
 
 

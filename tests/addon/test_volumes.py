@@ -493,13 +493,13 @@ def test_what_must_go_is_deleted_at_once_without_scores(addon, room, crop):
     """And nothing else; the volumes then hold nothing, which is no fault."""
     protected, removed = crop
     opacity = mask(addon, room, "opacity")
-    assert bpy.ops.refine.crop() == {"FINISHED"}
+    assert bpy.ops.refine.delete(what="VOLUMES") == {"FINISHED"}
 
     assert np.array_equal(mask(addon, room, "opacity"), opacity[~removed])
     assert facts(addon, room)["protected"] == protected.sum()
     assert facts(addon, room)["removed_by_user"] == 0
     with pytest.raises(RuntimeError, match="no volume says of any splat that it must go"):
-        bpy.ops.refine.crop()
+        bpy.ops.refine.delete(what="VOLUMES")
     bpy.ops.refine.score()
     assert bpy.ops.refine.apply() == {"FINISHED"}
 
@@ -638,7 +638,7 @@ def test_the_panel_says_what_is_wrong_with_a_volume(addon, room, case):
 
     assert expected in facts(addon, room)["error"]
     with pytest.raises(RuntimeError, match="object 'Odd'"):
-        bpy.ops.refine.crop()
+        bpy.ops.refine.delete(what="VOLUMES")
 
 
 def test_names_that_there_are_not_are_refused(addon, room, room_cameras, capsys):

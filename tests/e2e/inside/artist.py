@@ -193,7 +193,7 @@ class Walk:
         yield from self.hand.move(region.x + region.width // 3, region.y + 20)  # out of the box
         yield from self.hand.press("ESC")
         yield 0.5
-        self.call(bpy.ops.refine.crop)
+        self.call(bpy.ops.refine.delete, what="VOLUMES")
         for item in bpy.context.scene.refine.volumes:
             item.object.hide_set(True)
         yield from self.seen("14-cropped")

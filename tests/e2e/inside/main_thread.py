@@ -120,7 +120,7 @@ def selecting(clock: Clock, scored: Scored) -> None:
     scored.again()
     clock.time("add volume", refine.add_volume, role="REMOVE", shape="BOX")
     clock.time("select outside", refine.select_by, what="OUTSIDE")
-    clock.time("crop", refine.crop)
+    clock.time("crop", refine.delete, what="VOLUMES")
     bpy.context.scene.refine.volumes.clear()
     scored.again()
     clock.time("find floaters", refine.find_floaters)

@@ -150,7 +150,7 @@ def thin(splats: bpy.types.Object) -> None:
     """Delete three of four splats, which leaves 9,939: the test is done sooner."""
     module = importlib.import_module(f"{extension.MODULE}.mesh.selection")
     module.select(splats, np.arange(len(splats.data.vertices)) % 4 != 0)
-    bpy.ops.refine.delete_selected()
+    bpy.ops.refine.delete(what="SELECTED")
 
 
 def mask() -> np.ndarray:

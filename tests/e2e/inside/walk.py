@@ -55,7 +55,7 @@ def main(
     show.call(bpy.ops.refine.find_floaters)
     show.call(bpy.ops.refine.view, mode="GOES")
     yield from show.picture("2-floaters")
-    show.call(bpy.ops.refine.delete_floaters)
+    show.call(bpy.ops.refine.delete, what="FLOATERS")
     found["cleaned"] = size(name)
 
     show.call(bpy.ops.refine.score)
