@@ -39,7 +39,7 @@ from refine_addon.core.splats import SH_C0
 from refine_addon.mesh import scores as mesh_scores
 from refine_addon.mesh.attributes import read_attribute, write_attribute
 from refine_addon.ui.render_operators import IMAGE
-from refine_addon.viewport.heat_map import ramp
+from refine_addon.viewport.arrays import ramp
 
 
 def training_cameras(path: Path) -> int:

@@ -50,6 +50,21 @@ _LARGEST_KEY = 65535.0
 _LARGEST_HALF = 65504.0
 """Of float16."""
 
+_OKLAB_TO_LMS = np.array(
+    [
+        [1.0, 0.3963377774, 0.2158037573],
+        [1.0, -0.1055613458, -0.0638541728],
+        [1.0, -0.0894841775, -1.2914855480],
+    ]
+)
+_LMS_TO_RGB = np.array(
+    [
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ]
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Packed:
@@ -157,6 +172,22 @@ def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
             rgb = colors_along(directions, coefficients[:, 0], coefficients[:, 1:])
         rgba[chunk, :3] = np.clip(rgb, 0.0, _LARGEST_HALF)
     return rgba
+
+
+def ramp() -> NDArray[np.float64]:
+    """Colours of the heat map, dark blue (goes first) to yellow (goes last), (256, 3) sRGB in 0..1.
+
+    Lightness rises evenly in OKLab (Ottosson 2020) from .25 to .93 while the hue goes from blue
+    by magenta and orange to yellow: who sees no hue still sees the order.
+    """
+    t = np.linspace(0.0, 1.0, 256)
+    lightness = 0.25 + 0.68 * t
+    hue = np.radians(265.0 + 200.0 * t)
+    chroma = 0.11 + 0.07 * np.sin(np.pi * t)
+    lab = np.stack([lightness, chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1)
+    linear = np.clip((lab @ _OKLAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T, 0.0, 1.0)
+    # The curve of sRGB (IEC 61966-2-1).
+    return np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
 
 
 def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import bpy
@@ -40,20 +41,10 @@ warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []
 """Who is asked, whenever a view is drawn, for warnings that are written into it."""
 
 
-class _State:
-    """What is kept while splats are drawn, in memory alone."""
-
-    def __init__(self) -> None:
-        self.mode = "OFF"
-        self.failure = ""
-        self.content = Content()
-        self.views: dict[int, View] = {}
-        self.handles: list[Any] = []
-        self.edited_at = 0.0
-        self.reads = False
-
-
-_state = _State()
+_state: Any = SimpleNamespace(
+    mode="OFF", failure="", content=Content(), views={}, handles=[], edited_at=0.0, reads=False
+)
+"""What is kept while splats are drawn, in memory alone; `views` are of regions."""
 
 
 def mode() -> str:

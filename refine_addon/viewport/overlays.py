@@ -20,8 +20,7 @@ from mathutils import Color, Vector
 from numpy.typing import NDArray
 
 from ..mesh.layout import looks_like_splats
-from .arrays import GOES, MARKS, STAYS
-from .heat_map import ramp
+from .arrays import GOES, MARKS, STAYS, ramp
 
 _OPAQUE = 0.995
 """Opacity from which on Blender draws a mesh with its depth."""
@@ -46,7 +45,6 @@ _GAP = 6  # between the bar and the words above it
 
 _WHITE, _BLACK = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
 _WARNING = (1.0, 0.8, 0.2, 1.0)
-_BLUR = 5  # of the shadow: 0, 3 or 5
 
 _TURN = np.linspace(0.0, 2.0 * np.pi, 49)
 
@@ -167,7 +165,7 @@ def draw_legend(
     blf.size(0, _FONT * scale)
     blf.color(0, *_WHITE)
     blf.enable(0, blf.SHADOW)
-    blf.shadow(0, _BLUR, *_BLACK)
+    blf.shadow(0, 5, *_BLACK)  # a blur of 0, 3 or 5
     line, high, wide = y, _HIGH * scale, _WIDE * scale
     if mode == "HEAT":
         _bar(x, y, wide, high, ramp()[::8])

@@ -25,11 +25,11 @@ from .arrays import (
     heat,
     in_front,
     marked,
+    ramp,
     same,
     tinted,
 )
 from .content import Atlas, Content, Marks, Slot
-from .heat_map import ramp
 
 REST = 0.2
 """Seconds without a change after which a view rests."""
