@@ -78,9 +78,10 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         for member in group:
             mesh_edit.check_writable(member.obj)
         quality = method.name != "closed-form" or settings.budget == "psnr"
-        forced = splat_group.forced(context.scene, group)
+        splats = splat_group.gather(group, whole=None if quality else False)
+        forced = splat_group.refresh(context.scene, group)  # marked, as is noted of each origin
         arguments = {
-            "splats": splat_group.gather(group, whole=None if quality else False),
+            "splats": splats,
             "views": views,
             "method": method,
             "protected": forced.protected,

@@ -125,8 +125,9 @@ def price(plan: dict[str, Any] | None, method: str) -> str:
     words = in_words(curve.at(share, way))
     between = curve.at_between(share, way)
     if between is not None and in_words(between) != words:
-        words += f", {in_words(between).removeprefix('about ').removesuffix(' dB')} in between"
-    seconds = plan["seconds"].get(way)
+        words += f", {in_words(between).removeprefix('about ').removesuffix(' dB')} between"
+    seconds = plan["seconds"].get(way, 0.0)
+    seconds = 60.0 * round(seconds / 60.0) if seconds > 60.0 else seconds  # a row is short
     return words + (f" · {in_time(seconds)}" if seconds else "")
 
 

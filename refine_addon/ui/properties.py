@@ -125,14 +125,6 @@ def _plan_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
     plans.changed(context)
 
 
-def _percent(settings: RefineSettings) -> float:
-    return 100.0 * decimal(settings.ratio)
-
-
-def _set_percent(settings: RefineSettings, value: float) -> None:
-    settings.ratio = decimal(value) / 100.0
-
-
 def _model(_settings: RefineSettings) -> int:
     obj = getattr(bpy.context, "object", None)
     if not mesh_layout.looks_like_splats(obj):
@@ -219,24 +211,15 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         items=BUDGETS,
         update=_plan_again,
     )
-    ratio: FloatProperty(
-        name="Remove",
-        description="Share of the splats to remove",
-        subtype="FACTOR",
-        default=0.5,
-        min=0.0,
-        max=0.9999,
-        update=_plan_again,
-    )
     percent: FloatProperty(
         name="Remove",
         description="Share of the splats to remove, in per cent",
         subtype="PERCENTAGE",
         precision=1,
+        default=50.0,
         min=0.0,
         max=99.99,
-        get=_percent,
-        set=_set_percent,
+        update=_plan_again,
     )
     keep: IntProperty(
         name="Keep",
@@ -277,6 +260,15 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         description="Shares of the splats that stay in the levels of detail, the finest first",
         default="0.5, 0.25, 0.12, 0.06",
     )
+
+    @property
+    def ratio(self) -> float:
+        """The share of the splats to remove, 0 to 1, of which `percent` is a hundred times."""
+        return decimal(decimal(self.percent) / 100.0)
+
+    @ratio.setter
+    def ratio(self, value: float) -> None:
+        self.percent = 100.0 * value
 
     def to_method(self) -> Method:
         """The method of core; raises `RefineError` where a value cannot be."""

@@ -16,7 +16,6 @@ from ..cameras.sets import CameraChoice
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
-from ..objects import demands
 
 _NOISE = 1e-6
 """Of the largest number beside it: what another machine may make of the same numbers."""
@@ -26,7 +25,6 @@ _FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
 _WORDS = {
     "matrix": "object moved",
     "cameras": "cameras changed",
-    "volumes": "volumes changed",
     "must_go": "what must go changed",
     "settings": "settings changed",
 }
@@ -39,8 +37,7 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
         "matrix": np.array(obj.matrix_world).tolist(),
         "frame": context.scene.frame_current,
         "cameras": _cameras(context),
-        "volumes": _volumes(context.scene),
-        "must_go": mesh_scores.digest(mesh_edit.marks(obj, mesh_edit.MUST_GO)),
+        "must_go": _marked(obj, 2),
         # All methods but the closed form score by occlusion.
         "settings": [method.name == "closed-form", method.views],
     }
@@ -66,7 +63,7 @@ def changes(context: bpy.types.Context, *objects: bpy.types.Object) -> list[str]
         if source == "SELECTED" and others[:2] == ["SELECTED", 0]:
             then["cameras"] = others  # selecting the splats deselected them
         found |= {_WORDS[name]: None for name in _WORDS if not _same(then[name], now[name])}
-        if record.get("quality") and record.get("protected", [0, 0]) != _protected(obj):
+        if record.get("quality") and record.get("protected") != _marked(obj, 1):
             found["what is protected changed"] = None
     return list(found)
 
@@ -82,32 +79,11 @@ def _same(one: Any, other: Any, scale: float = 0.0) -> bool:
     return bool(one == other)
 
 
-def _protected(obj: bpy.types.Object) -> list[int]:
-    mask = None
-    if mesh_edit.FORCE in obj.data.attributes:
-        mask = mesh_attributes.read_attribute(obj.data, mesh_edit.FORCE) == 1
-    return mesh_scores.digest(mask)
-
-
-def _volumes(scene: bpy.types.Scene) -> list[Any]:
-    """The volumes that decide what has to go, if any: who, where, and of which shape."""
-    listed, depsgraph = demands.listed(scene), bpy.context.evaluated_depsgraph_get()
-    if all(item.role == "PROTECT" for item in listed):
-        return []  # what is protected is scored like the rest; see `_protected`
-    volumes = []
-    for item in listed:
-        obj = item.object
-        places = np.array([[obj.empty_display_size] * 3])
-        if obj.type == "MESH":
-            mesh = obj.evaluated_get(depsgraph).data
-            flat = np.empty(3 * len(mesh.vertices), np.float32)
-            mesh.vertices.foreach_get("co", flat)
-            places = flat.reshape(-1, 3)
-        # With uneven weights any vertex that moves changes the sum.
-        shape = (np.cos(np.arange(len(places))) @ places).tolist()
-        kind = obj.empty_display_type if obj.type == "EMPTY" else obj.type
-        volumes.append([item.role, kind, shape, np.array(obj.matrix_world).tolist()])
-    return volumes
+def _marked(obj: bpy.types.Object, kind: int) -> list[int]:
+    """Which splats are marked to stay, 1, or to go, 2, in short."""
+    if mesh_edit.FORCE not in obj.data.attributes:
+        return mesh_scores.digest(None)
+    return mesh_scores.digest(mesh_attributes.read_attribute(obj.data, mesh_edit.FORCE) == kind)
 
 
 def _cameras(context: bpy.types.Context) -> list[Any]:

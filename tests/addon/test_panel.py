@@ -150,8 +150,8 @@ def test_each_method_is_drawn_with_its_price(draw, room, room_cameras):
 
     assert "Merge · what goes is merged" in before
     assert prices[0] == "Closed Form · rows stay as they were"
-    assert re.fullmatch(r"Occlusion · about \d\d dB(, \d\d in between)?", prices[1])
-    assert re.fullmatch(r"Merge · about \d\d dB(, \d\d in between)? · \d+ .*", prices[2])
+    assert re.fullmatch(r"Occlusion · about \d\d dB(, \d\d between)?", prices[1])
+    assert re.fullmatch(r"Merge · about \d\d dB(, \d\d between)? · \d+ .*", prices[2])
     assert re.fullmatch(r"Refit · about \d\d dB.* · \d+ .*", prices[3])
     assert "chart" in draw()
 

@@ -154,12 +154,12 @@ def test_each_method_has_its_price(addon, curve):
     seen = plan | {"quality": replace(curve, psnr=np.full(3, 70.0)), "seconds": {}}
 
     assert price(plan, "closed-form") == price(None, "merge") == price({"error": ""}, "merge") == ""
-    assert price(plan, "occlusion") == "about 40 dB, 38 in between"
-    assert price(plan, "merge").startswith("about 46 dB, 44 in between · 17 s")
+    assert price(plan, "occlusion") == "about 40 dB, 38 between"
+    assert price(plan, "merge").startswith("about 46 dB, 44 between · 17 s")
     assert price(few, "occlusion") == "about 40 dB"
     assert price(few, "merge") == price(few, "refit") == ""
     assert price(seen, "occlusion") == "more than 60 dB"
-    assert price(plan | {"closed": True}, "closed-form") == "about 40 dB, 38 in between"
+    assert price(plan | {"closed": True}, "closed-form") == "about 40 dB, 38 between"
 
 
 def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):

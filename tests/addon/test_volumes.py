@@ -341,7 +341,7 @@ def test_a_volume_that_moved_asks_for_new_scores(addon, room, crop):
     addon.ui.plans.refresh(bpy.context)
 
     assert before == []
-    assert addon.ui.staleness.changes(bpy.context, room) == ["volumes changed"]
+    assert addon.ui.staleness.changes(bpy.context, room) == ["what must go changed"]
     assert "score it again" in addon.ui.plans.stored(room, bpy.context.scene.refine)["error"]
     with pytest.raises(RuntimeError, match="score it again"):
         bpy.ops.refine.apply()
@@ -386,7 +386,7 @@ def test_a_volume_that_protects_alone_changes_no_score(addon, room, room_cameras
     assert stays.sum() == (np.abs(means(addon, room) - center) < upper - center).all(axis=1).sum()
     assert not mask(addon, room, "refine_remove")[stays].any()
     item.role = "REMOVE"
-    assert addon.ui.staleness.changes(bpy.context, room) == ["volumes changed"]
+    assert addon.ui.staleness.changes(bpy.context, room) == ["what must go changed"]
 
 
 @pytest.fixture
@@ -453,10 +453,11 @@ def test_a_mesh_of_another_shape_is_another_volume(addon, room, room_cameras):
     size = box.dimensions[:]
     box.data.vertices[7].co *= 0.2
     bpy.context.view_layer.update()
+    addon.ui.plans.mark_again(bpy.context)
 
     assert before == []
     assert box.dimensions[:] == size
-    assert addon.ui.staleness.changes(bpy.context, room) == ["volumes changed"]
+    assert addon.ui.staleness.changes(bpy.context, room) == ["what must go changed"]
 
 
 def test_a_volume_that_moves_marks_all_splats_anew(addon, room, room_cameras):
