@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from . import report as reports
 from .errors import RefineError
-from .execute import Cancelled, Progress, report, return_freed, seconds, silent, stages
+from .execute import Cancelled, Progress, part, report, return_freed, seconds, silent, stages
 from .formats.ply import SplatFile
-from .merging.merge import Merged, copied, merge, stage_counts
+from .merging.merge import Merged, copied, merge, stage_counts, stage_seconds
 from .methods import DEFAULT, ClosedForm, Method, Occlusion, Refit
 from .quality.alignment import alignment
 from .quality.curve import AS_GOOD, PLAIN, Way, deletion_will_do, left_to_lose, needed
@@ -115,10 +115,10 @@ def score(
     used, count = views.spread(method.views), len(splats)
     by_formula = isinstance(method, ClosedForm)
     kind = "closed form" if by_formula else "measure"
-    expected = [seconds(kind, count, len(used)), 0.0, seconds("read", count)]
-    if quality or not by_formula:
-        expected[1] = seconds("cast", count, len(used))
-    scoring, casting, estimating = stages(progress, *expected)
+    cast = seconds("cast", count, len(used)) if quality or not by_formula else 0.0
+    scoring, casting, estimating = stages(
+        progress, 1.35 * seconds(kind, count, len(used)), cast if by_formula else 0.0, cast
+    )
     # Numbers that underflow to 0 are negligible in all sums.
     with np.errstate(under="ignore"):
         if by_formula:
@@ -339,8 +339,8 @@ class _Prune:
 
     def delete(self, progress: Progress, tried: Made | None = None) -> Result:
         """Decide by scores alone; `tried` is what merging had made, if it was tried."""
-        scores = self._scores(progress)
-        report(progress, 1.0, "selecting")
+        scores = self._scores(part(progress, 0.0, 0.94))
+        report(progress, 0.94, "selecting")
         keep, psnr = self._select(scores)
         self.clock.lap("select_s")
         between = None
@@ -363,8 +363,11 @@ class _Prune:
         given = None if refits else self.scores  # these decide which splats are deleted instead
         if given is not None and (given.settled is not None or (goal and not given.quality)):
             given = None  # they were made for another budget
+        gone = self.budget.removals(count, *self.sizes)
+        left = count // 2 if gone is None else count - gone
+        expected = self._merging_seconds(left) + self._refitting_seconds(left)
         scoring, making = stages(
-            progress, seconds("measure", count, views), self._making_seconds(count // 2)
+            progress, seconds("measure", count, views), expected * (2.2 if goal else 1.0)
         )
         known = None
         if self.budget.needs_scores:
@@ -472,26 +475,28 @@ class _Prune:
         missed = made.reached < self.budget.psnr - CLOSE and made.reached < plain
         return missed or np.count_nonzero(keep) <= len(made.merged.splats)
 
-    def _making_seconds(self, left: int) -> float:
-        """Expected seconds of merging down to so many splats, and refitting them if asked."""
+    def _merging_seconds(self, left: int) -> float:
+        """Expected seconds of merging down to so many splats, and of the estimate then."""
         count, views = len(self.splats), len(self.used)
-        merged = len(stage_counts(count, left))
-        merge = merged * (seconds("merge", count) + seconds("measure", count / 2, views / PARTS))
+        counts = stage_counts(max(math.ceil((1.0 - FIRST) * count), left), left)
+        return sum(stage_seconds(count, counts, views)) + seconds("compare", left, views)
+
+    def _refitting_seconds(self, left: int) -> float:
+        """Expected seconds of refitting so many splats, if asked."""
         if not isinstance(self.method, Refit):
-            return merge
+            return 0.0
         rounds = expected_rounds(left, self.method.rounds)
-        return merge + rounds * seconds("refit", count + left, views)
+        return rounds * seconds("refit", len(self.splats) + left, len(self.used))
 
     def _to_count(self, keep, scores: Scores, known: Measured, progress: Progress) -> Made:
         """Merge until as many splats are left as deletion keeps, (N,); refit them if asked."""
         origin, used, left = self.origin, self.used, int(np.count_nonzero(keep))
         truth = scores.ray_sample if origin is None else origin.ray_sample
-        total, views = len(self.splats), len(used)
-        merge = seconds("merge", total) + seconds("measure", left, views)
-        refit = self._making_seconds(left) - merge if isinstance(self.method, Refit) else 0.0
+        comparing_seconds = seconds("compare", left, len(used))
         merging_progress, comparing, refitting = stages(
-            progress, merge, seconds("compare", left, views), max(refit, 0.0)
-        )
+            progress, self._merging_seconds(left) - comparing_seconds, comparing_seconds,
+            self._refitting_seconds(left),
+        )  # fmt: skip
 
         def estimated(splats: Splats, told: Progress = silent) -> float | None:
             if truth is None:

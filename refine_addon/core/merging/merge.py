@@ -180,11 +180,7 @@ def merge(
     counting = np.arange(total) if regions else rows
     scene = scene_of(splats.means[counting], drawn[counting], views, threads=threads)
     del rows, drawn, counting
-    expected: list[float] = []
-    for entering in [total, *counts][: len(counts)]:
-        again = seconds("measure", entering, len(views) / 2) if expected else 0.0
-        expected += [again, seconds("merge", entering)]
-    steps = iter(stages(progress, *expected))
+    steps = iter(stages(progress, *stage_seconds(total, counts, len(views))))
     for number, count in enumerate(counts):
         measuring, merging = next(steps), next(steps)
         if left is not splats:
@@ -226,6 +222,15 @@ def stage_counts(count: int, goal: int, alone: float = ALONE) -> list[int]:
     number = 1 if share >= alone else math.ceil(math.log(share) / math.log(STAGE) + FINER)
     shares = [(goal / count) ** ((stage + 1) / number) for stage in range(number)]
     return [max(round(count * share), goal) for share in shares]
+
+
+def stage_seconds(count: int, counts: list[int], views: int) -> list[float]:
+    """Expected seconds of measuring and of merging in each stage; the first need not measure."""
+    expected: list[float] = []
+    for entering in [count, *counts][: len(counts)]:
+        again = seconds("measure", entering, views / 2) if expected else 0.0
+        expected += [again, seconds("merge", entering)]
+    return expected
 
 
 @dataclass(frozen=True, eq=False)
