@@ -15,7 +15,7 @@ from ..core.execute import Cancelled
 from ..objects import splat_group
 from ..render import frames
 from ..render.engine import Shared
-from .run import Run
+from .terminal import Terminal
 
 
 def opened(words: Sequence[str] | None = None) -> str:
@@ -77,13 +77,13 @@ def views(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
     return found, facts | {"words": f"{words[choice.source]}, {why}"}
 
 
-def render(run: Run) -> None:
+def render(options: argparse.Namespace, terminal: Terminal) -> None:
     """Render frames of the open scene, each written where its output settings say."""
     scene, shared = bpy.context.scene, Shared()
     chosen: Any = range(scene.frame_current, scene.frame_current + 1)
-    if run.options.source:
+    if options.source:
         every = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
-        chosen = run.options.source[1] or every
+        chosen = options.source[1] or every
     try:
         for step in filter(None, frames.steps(scene, chosen, shared, write=True)):
             bpy.ops.render.render(scene=step.scene, animation=step.animation)
@@ -91,7 +91,7 @@ def render(run: Run) -> None:
         raise RefineError("a render was stopped") from None
     except RuntimeError as error:  # what Blender reports
         raise RefineError(str(error).strip()) from error
-    drawn, say = set(shared.frames), run.terminal.say
+    drawn, say = set(shared.frames), terminal.say
     for frame in chosen:
         path = scene.render.frame_path(frame=frame)
         there = f"  note: {path}: exists and stays; the scene's Overwrite is off"

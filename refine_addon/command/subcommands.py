@@ -30,7 +30,7 @@ def run_subcommand(run: Run) -> None:
     if options.command == "render":
         from .scene import render
 
-        render(run)
+        render(options, run.terminal)
     elif options.command == "convert":
         run.attempt(_convert, str(options.inputs[0]))
     elif options.together:

@@ -108,7 +108,7 @@ def test_a_json_file_that_is_dropped_is_one_of_splats_by_its_name(addon, monkeyp
         properties=properties, invoke_popup=lambda _: {"ASKED"}, upright=False
     )
 
-    answer = cls.ask(operator, bpy.context, None)
+    answer = cls.invoke(operator, bpy.context, None)
 
     expected = [(("INVOKE_DEFAULT",), {"filepath": name})] if "transf" not in name else []
     assert called == expected
