@@ -1,9 +1,7 @@
-"""Where rays go, which footprints they hit, and a sample of the rays of all views.
+"""Rays through a few hundred pixels of each view, evenly spread, and the footprints that they hit.
 
-Of a few hundred pixels of each view, spread evenly, it is noted which splats their rays hit. What
-these pixels show follows from that, with all splats or with any choice of them, without projecting
-splats again. Two samples are taken, of different pixels: what is chosen by the *scoring rays* would
-look better on them than it is, so the *validation rays* tell how good the pictures are.
+What these pixels show, with all splats or any choice of them, follows without projecting again.
+A choice made by scoring rays looks too good on them: validation rays go through other pixels.
 """
 
 from __future__ import annotations
@@ -25,34 +23,31 @@ from .rays import LOG_OPAQUE, Rays
 from .scene import Scene
 
 VALIDATION_RAYS = 1 << 14
-"""How many validation rays all views together have."""
+"""Validation rays of all views together."""
 
 MAX_VALIDATION_HITS = 1 << 24
-"""About how many hits these may have together; dense scenes get fewer rays."""
+"""About the most hits of these; dense scenes get fewer rays."""
 
 SCORING_RAYS = 1 << 16
-"""How many scoring rays all views together have."""
+"""Scoring rays of all views together."""
 
 MAX_SCORING_HITS = 3 << 24
-"""About how many hits these may have together. Each takes 16 bytes."""
+"""About the most hits of these, 16 bytes each."""
 
 MAX_HITS_OF_VIEW = 1 << 21
-"""About how many hits the rays of one view may have: casting takes 60 bytes for each, and views are
-cast side by side. Only few views of dense scenes reach it."""
+"""About the most hits of one view, which take 60 bytes each while views are cast side by side."""
 
 MAX_RAYS_OF_VIEW = 60_000
-"""A view has at most so many rays: their numbers fit into 16 bits."""
+"""Ray numbers of a view fit into 16 bits."""
 
 VALIDATION_VIEWS = 24
-"""What takes longer to compare than deleted splats (merged ones, written files) is compared in at
-most about so many views."""
+"""About the most views in which merged splats and written files are compared, which is slow."""
 
 MIN_RAYS_OF_VIEW = 16
-"""A view has at least this many rays, if it has as many pixels."""
+"""Fewest rays of a view that has as many pixels."""
 
 BEHIND = 1e-4
-"""Of a disc: a plane that a ray hits behind the camera, or at 1 / this times the centre's depth, is
-not hit."""
+"""A disc's plane is missed behind the camera, or beyond 1 / this times the centre's depth."""
 
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
 _MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
@@ -62,35 +57,17 @@ _CROSSING = 1e-3  # a disc of which this much is left of a plane through the cam
 _NO_END = 1e9  # px; beyond any image
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
-"""1 / p and 1 / p^2 of the plastic number p: their multiples modulo 1 spread evenly over the unit
-square (the R2 sequence, Roberts 2018)."""
+"""1 / p and 1 / p^2, p the plastic number: multiples modulo 1 are even (R2; Roberts 2018)."""
 
 
 class RaySample:
-    """Rays of all views into one scene.
+    """Scoring or validation rays of all views, `ViewSet.by_distance`, into one scene.
 
-    Parameters
-    ----------
-    views : sequence of (View, float)
-        Views and their weights, in an order given by the scene; see `ViewSet.by_distance`.
-    gaussians : Gaussians
-        What the rays may hit.
-    splats : Splats
-        What the Gaussians were made of, for their colours.
-    few_views : bool
-        Whether rays of only about `VALIDATION_VIEWS` of the views are wanted: enough to validate
-        other splats by, not for a curve.
-    scoring : bool
-        Whether these are scoring rays; else they are validation rays.
+    With `few_views` of about `VALIDATION_VIEWS` of them: enough to validate, not for a curve.
 
-    Attributes
-    ----------
-    splat_rows : (M,) int64
-        Which of all splats each Gaussian is.
-    share : float
-        How many rays all views have together, as a part of what they usually have.
-    rays : list of Rays or None
-        Of each view; None where they have not been cast.
+    splat_rows : (M,) int64, the splat of each Gaussian
+    share : number of rays over the usual number
+    rays : list of Rays, None of views that were not cast
     """
 
     def __init__(
@@ -108,17 +85,17 @@ class RaySample:
         self.rays: list[Rays | None] = [None] * len(views)
 
     def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:
-        """Colours in which view `number` sees what its rays hit, (3, u)."""
+        """Colours in which view `number` sees the splats that its rays hit, (3, u)."""
         return colors_from(self.splats, self.splat_rows[rays.hit], self.views[number][0])
 
     def wants(self, number: int) -> bool:
-        """Whether the rays of a view are wanted and have not been cast yet."""
+        """Whether the rays of a view are wanted and not cast yet."""
         return self.rays[number] is None and number % self._step == 0
 
     def cast_all(
         self, gaussians: Gaussians, scene: Scene, progress: Progress, threads: int | None
     ) -> None:
-        """Project all Gaussians into the views, and cast the rays that are wanted."""
+        """Project all Gaussians into the views and cast the rays that are wanted."""
 
         def cast_one(number):
             with np.errstate(under="ignore"):
@@ -137,12 +114,12 @@ class RaySample:
         return [k for k, rays in enumerate(self.rays) if rays is not None and len(rays.ray)]
 
     def validating(self) -> list[int]:
-        """Numbers of the views that validate where comparing in all would take long."""
+        """Numbers of the views that slow comparisons use."""
         seeing = self.seeing()
         return seeing[:: max(math.ceil(len(seeing) / VALIDATION_VIEWS), 1)]
 
     def hits_of_ray(self) -> float:
-        """How many splats a ray hits on average, hidden ones included."""
+        """Mean number of splats that a ray hits, hidden ones included."""
         every = [rays for rays in self.rays if rays is not None]
         return sum(len(rays.ray) for rays in every) / max(sum(rays.count for rays in every), 1)
 
@@ -150,21 +127,7 @@ class RaySample:
 def validation_rays(
     splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
 ) -> RaySample:
-    """Validation rays of all views, for scores that did not project splats.
-
-    Parameters
-    ----------
-    splats : Splats
-        In the frame and unit of the views.
-    views : ViewSet
-    progress : callable, optional
-    threads : int, optional
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
-    """
+    """Validation rays of all views, for scores that did not project splats."""
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
@@ -181,21 +144,7 @@ def cast_view(
     scoring: bool = False,
     share: float = 1.0,
 ) -> Rays:
-    """Rays of one of some views.
-
-    Parameters
-    ----------
-    views : sequence of (View, float)
-        All views of the sample, which share its rays evenly.
-    number : int
-        Which of them.
-    footprints : Footprints
-        In that view.
-    scoring : bool
-        Whether these are scoring rays, which go through other pixels than the validation rays.
-    share : float
-        See `RaySample`.
-    """
+    """Rays of view `number` of the `views` of a sample, which share its rays; see `RaySample`."""
     view = views[number][0]
     rays_of_all, hits_of_all = VALIDATION_RAYS, MAX_VALIDATION_HITS
     if scoring:
@@ -208,18 +157,9 @@ def cast_view(
 
 
 def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
-    """Colours in which a view sees some splats, (3, n), at least 0.
+    """Colours in which a view sees n splats by their rows, (3, n), at least 0.
 
-    All harmonics count. By the constant alone, which the rest of scoring uses, the estimated PSNR
-    was 1.2 dB too high on an outdoor scene.
-
-    Parameters
-    ----------
-    splats : Splats
-        In the frame of the view.
-    rows : (n,) int64
-        Which of them.
-    view : View
+    All harmonics count: by the constant alone the estimated PSNR was 1.2 dB too high outdoors.
     """
     direction = splats.means[rows].astype(np.float64) - view.center
     length = np.linalg.norm(direction, axis=1)
@@ -229,19 +169,9 @@ def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[
 
 
 def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Columns and rows of a view through which about `count` rays go, spread evenly.
+    """Ascending columns and rows, (C,) and (R,), of about `count` pixels, evenly spread.
 
-    Parameters
-    ----------
-    view : View
-    number : float
-        Different numbers give different pixels.
-    count : float
-
-    Returns
-    -------
-    columns, rows : (C,), (R,) int64
-        Ascending; see `Rays`.
+    Different numbers give different pixels.
     """
     count = max(count, MIN_RAYS_OF_VIEW)
     columns = max(round(math.sqrt(count * view.width / view.height)), 1)
@@ -254,13 +184,13 @@ def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], 
 
 
 def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
-    """`count` of `size` pixels, evenly spread and ascending; `start` shifts them, 0 to 1."""
+    """`count` of `size` pixels, evenly spread and ascending; `start`, 0 to 1, shifts them."""
     places = (np.arange(count) + start) * (size / count)
     return np.floor(places).astype(np.int64)
 
 
 def depth_complexity(footprints: Footprints, view: View) -> float:
-    """About how many footprints a ray of a view hits on average, at most all of them."""
+    """About how many footprints a ray hits on average, at most all of them."""
     size = float(view.width * view.height)
     area = _squared_radius(footprints.alphas)  # (n,), px^2
     area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
@@ -270,23 +200,10 @@ def depth_complexity(footprints: Footprints, view: View) -> float:
 def aimed(
     view: View, columns: NDArray[np.int64], rows: NDArray[np.int64], targets: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """Pixel that each ray goes through so that rays pass through targets, (2, P).
+    """Column and row of the pixel of each ray, (2, P), aimed at targets, (2, t) px in the image.
 
-    The columns and rows divide the image into cells of one ray each. A ray goes through the first
-    of the targets that lie in its cell, or where its column and row cross if none does.
-
-    Parameters
-    ----------
-    view : View
-    columns, rows : (C,), (R,) int64
-        See `Rays`; ascending.
-    targets : (2, t) float32
-        Column and row in the image, pixels; what lies outside it is no target.
-
-    Returns
-    -------
-    aims : (2, P) int64
-        Column and row of the pixel of each ray; see `Rays`.
+    Ascending columns and rows make cells of one ray each: it goes through the first target in its
+    cell, or where column and row cross.
     """
     row, column = np.divmod(np.arange(len(columns) * len(rows)), len(columns))
     aims = np.stack([columns[column], rows[row]])
@@ -308,19 +225,9 @@ def cast(
     rows: NDArray[np.int64],
     aims: NDArray[np.int64] | None = None,
 ) -> Rays:
-    """Rays through some pixels with all that they hit.
+    """Rays with all their hits on footprints, front to back, of an alpha of `ALPHA_CUT` or more.
 
-    A ray hits a footprint where its alpha there is at least `ALPHA_CUT`. Discs are hit where the
-    ray meets their plane: see `projection.Footprints.discs`.
-
-    Parameters
-    ----------
-    footprints : Footprints
-        In the view of the pixels, front to back.
-    columns, rows : (C,), (R,) int64
-        See `Rays`; ascending.
-    aims : (2, P) int64, optional
-        See `aimed`.
+    For columns, rows and aims see `Rays`; discs are hit where the ray meets their plane.
     """
     found = hits(footprints, columns, rows, _PAIRS, aims=aims)
     return _front_to_back(footprints, columns, rows, aims, found)
@@ -329,10 +236,7 @@ def cast(
 def cast_visible(
     footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]
 ) -> tuple[Rays, NDArray[np.float32]]:
-    """The same as `Rays.visible` of `cast`, without following rays on behind opaque hits.
-
-    Footprints come front to back, some at a time: it is known of each ray how much is left of it.
-    """
+    """The same as `Rays.visible` of `cast`, but stops rays behind opaque hits."""
     log_left = np.zeros(len(columns) * len(rows))
 
     def found():
@@ -347,7 +251,7 @@ def cast_visible(
 
 
 def _front_to_back(footprints, columns, rows, aims, found):
-    """Rays with their hits, as `hits` yields them; for what they go through see `cast`."""
+    """Rays of the hits that `hits` yields."""
     # The smallest types hold them. A view has fewer than 2^16 rays: NumPy sorts numbers of 16 bits
     # by radix, in linear time.
     types = np.int32, np.uint16, np.float32
@@ -377,30 +281,11 @@ def hits(
     *,
     aims: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
-    """Yield which pixels footprints hit, some footprints at a time.
+    """Yield hits: ascending rows of some footprints at a time, rays, and alphas, (h,) each.
 
-    Parameters
-    ----------
-    footprints : Footprints
-        Front to back.
-    columns, rows : (C,), (R,) int64
-        Of the pixels; ascending.
-    limit : int
-        About how many pairs of a footprint and a pixel in its bounding box are looked at together,
-        which limits temporary memory.
-    wanted : callable, optional
-        Which pairs of a footprint and a pixel are of interest, (p,) bool; by default all.
-    aims : (2, P) int64, optional
-        Pixels in the cells between the columns and rows that are looked at instead; see `aimed`.
-
-    Yields
-    ------
-    footprint : (h,) int64
-        Row of the footprint, ascending.
-    pixel : (h,) int32
-        Number of the pixel, row by row.
-    alpha : (h,) float32
-        Of the footprint there, at most `ALPHA_MAX`.
+    limit : about how many pairs of footprint and pixel in its bounding box are held at once
+    wanted : callable of footprints and pixels, (p,) each: which pairs matter, (p,) bool
+    aims : (2, P) int64, see `Rays`
     """
     squared_radius = _squared_radius(footprints.alphas)  # (n,)
     # Of each footprint: the first column and row in its bounding box, and how many lie in it.
@@ -436,11 +321,7 @@ def hits(
 
 
 def _boxed_pixels(chosen, across, down):
-    """All p pairs of some of n footprints, (b,), and the pixels in their bounding boxes.
-
-    For the boxes of all n see `_bounding_boxes`. Of each pair these are the footprint, and which of
-    the columns and rows the pixel lies in, (p,) each.
-    """
+    """Pairs of footprints and pixels in their boxes: footprint, column and row, (p,) each."""
     (left, wide), (top, tall) = ([each[chosen] for each in axis] for axis in (across, down))
     count = wide * tall
     box = np.repeat(np.arange(len(chosen)), count)  # (p,), as all that follows
@@ -453,7 +334,7 @@ def _boxed_pixels(chosen, across, down):
 
 
 def _bounding_boxes(footprints, squared_radius, axis, places):
-    """The first of some columns or rows in each footprint's bounding box, and how many."""
+    """First of the columns or rows in each footprint's bounding box, and how many."""
     center = footprints.centers[axis] - np.float32(0.5)
     if footprints.discs is None:
         half = np.sqrt(squared_radius * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
@@ -465,12 +346,11 @@ def _bounding_boxes(footprints, squared_radius, axis, places):
 
 
 def _disc_extent(discs, squared_radius, axis):
-    """From where to where discs reach from their centres along an axis, (n,) each, px.
+    """Ends of discs along an axis from their centres, (n,) each, px.
 
-    With C, g and the squared radius r^2 of `projection.Footprints.discs`, the edge
-    ``d' C^-1 d = r^2 (1 + g d)^2`` is an ellipse about ``r^2 C g / s``, ``s = 1 - r^2 g' C g``, and
-    reaches ``sqrt(r^2 / s (C_xx + r^2 (C g)_x^2 / s))`` from there. The low-pass reaches as far as
-    a circle of its variance. A disc with parts behind the camera has no end.
+    The edge ``d' C^-1 d = r^2 (1 + g d)^2``, see `projection._discs`, r^2 the squared radius, is an
+    ellipse about ``r^2 C g / s``, ``s = 1 - r^2 g' C g``, and reaches ``sqrt(r^2 / s (C_xx + r^2 (C
+    g)_x^2 / s))`` from there. The low-pass is a circle; a disc partly behind the camera has no end.
     """
     one, two, tilt = discs[:2], discs[2:4], discs[4:6]
     axes = [each / np.square(each).sum(axis=0) for each in (one, two)]  # half axes, (2, n) each
@@ -496,11 +376,7 @@ def _before(places, edges):
 
 
 def _squared_distances(footprints, owner, column, row):
-    """Squared Mahalanobis distance of pixels to footprints, (p,).
-
-    `owner`, (p,), is the row of the footprint; the centre of a pixel is at + 0.5. Of discs it is
-    that of where the ray meets them, at most that of their low-pass; see `projection`.
-    """
+    """Squared Mahalanobis distance of pixels, centres at + 0.5, to the footprints `owner`, (p,)."""
     across = column.astype(np.float32) + np.float32(0.5) - footprints.centers[0].take(owner)
     down = row.astype(np.float32) + np.float32(0.5) - footprints.centers[1].take(owner)
     if footprints.discs is not None:
@@ -514,7 +390,7 @@ def _squared_distances(footprints, owner, column, row):
 
 
 def _on_discs(discs, across, down):
-    """The same on discs, (7, p), at a step from their centres."""
+    """The same on discs, (7, p), where the ray meets them, at most that of their low-pass."""
     depth = 1.0 + discs[4] * across + discs[5] * down  # of the centre over that of the hit
     first, second = (discs[k] * across + discs[k + 1] * down for k in (0, 2))
     ahead = depth > BEHIND

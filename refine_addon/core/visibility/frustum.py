@@ -1,12 +1,9 @@
-"""Which points lie in a view: the only definition of the frustum, for one view and for many.
-
-A point with camera coordinates ``x, y, z`` lies in a view if it is between the near and the far
-plane and projects into the image, edges included::
+"""The only definition of the frustum. A point with camera coordinates x, y, z lies in it if
 
     near <= z <= far,   0 <= fx x / z + cx <= width,   0 <= fy y / z + cy <= height
 
-Multiplied by z, with the principal point measured from the centre of the image, the latter two are
-``|f x + offset z| <= half z``. This needs no division and excludes points behind the camera.
+The latter are computed as ``|f x + offset z| <= half z``, the offset from the image's centre to the
+principal point: without division, and False behind the camera.
 """
 
 from __future__ import annotations
@@ -24,28 +21,17 @@ _STACK = 16
 """Rows of one matrix product: so few that BLAS starts no threads, which would slow down ours."""
 
 _POINTS = 4096
-"""Points processed at a time: so few that their projections into all views stay in the caches."""
+"""Points processed at a time: their projections into all views stay in the caches."""
 
 _ROUNDING = 1e-14
 """Bound of the rounding error of a sum of four products, over the sum of their absolute values."""
 
 _STEEPEST = 1e100
-"""Limit of a focal length over half the image, so that its product with any length can be squared
-without overflow."""
+"""Largest focal length over half the image, so that squares of its products do not overflow."""
 
 
 class Side(NamedTuple):
-    """An image across or down, pixels.
-
-    Attributes
-    ----------
-    focal : float
-        Focal length.
-    offset : float
-        From the centre of the image to the principal point.
-    half : float
-        Half the image's size.
-    """
+    """An image across or down, px; `offset` is from its centre to the principal point."""
 
     focal: float
     offset: float
@@ -66,15 +52,9 @@ def clip_planes(view: View, near: float) -> tuple[float, float]:
 
 
 def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> NDArray[np.bool_]:
-    """Which points lie in a view, (n,).
+    """Which points, (3, n) in camera coordinates (x right, y down, z forward), lie in a view, (n,).
 
-    Parameters
-    ----------
-    view : View
-    local : (3, n) floating
-        Camera coordinates: x right, y down, z forward.
-    planes : (near, far)
-        In the unit of `local`.
+    `planes` are near and far, in the unit of the points.
     """
     x, y, z = local
     inside: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
@@ -84,24 +64,12 @@ def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> ND
 
 
 class Frustums:
-    """The frustums of V views around a common origin.
+    """The frustums of V views; points are relative to `origin`, (3,), to keep digits far from zero.
 
-    Parameters
-    ----------
-    views : ViewSet
-    origin : (3,) float64
-        Points are given relative to it, world units. It is near the views, so that a scene far from
-        zero keeps its digits.
-    near : float
-        Near plane of views that have none of their own, world units, > 0.
-
-    Attributes
-    ----------
-    centers : (V, 3) float64
-        Of the views, relative to the origin.
-    beyond_per_unit : (V, 1) float64
-        Growth of `beyond` (see `project`) for each world unit that a point moves straight away from
-        a side of the frustum; as if the image were square, of the same area.
+    near : for views that have no near plane of their own, world units, > 0
+    centers : (V, 3) float64, relative to the origin
+    beyond_per_unit : (V, 1) float64, growth of `beyond` of `project` for each world unit straight
+        away from a side, as if the image were square, of the same area
     """
 
     def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:
@@ -119,22 +87,10 @@ class Frustums:
     def classify(
         self, low: NDArray[np.float64], high: NDArray[np.float64], reach: NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which views may see a part of some boxes, and which surely see all of them.
+        """Which views may see part of k boxes, and which surely see all of them, (V, k) bool each.
 
-        Parameters
-        ----------
-        low, high : (3, k) float64
-            Corners of k boxes, relative to the origin.
-        reach : (k,) float64
-            How far outside an image points of each box still count, world units.
-
-        Returns
-        -------
-        touching : (V, k) bool
-            Where it is False, each point of the box lies beyond a plane, or ``beyond`` of `project`
-            is at least `reach` times `beyond_per_unit`.
-        whole : (V, k) bool
-            Where it is True, each point lies in the view.
+        Boxes are low and high corners, (3, k). Points of a box not touched lie beyond a plane, or
+        their ``beyond`` (`project`) is at least `reach`, (k,), times `beyond_per_unit`.
         """
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         x, y, z = self._rows
@@ -157,26 +113,10 @@ class Frustums:
     def project(
         self, points: NDArray[np.float64], views: NDArray[np.int64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """How deep points lie in views, and where in the first of them.
+        """Depth of points (x, y, z, 1), (4, n), in b views, (b, n); in the first c, (c, n) each:
 
-        Parameters
-        ----------
-        points : (4, n) float64
-            x, y, z relative to the origin, and 1.
-        views : (b,) int64
-            Which.
-        count : int
-            For the first c of them, `beyond` and `between` are returned too.
-
-        Returns
-        -------
-        depth : (b, n) float64
-            Along each view's axis, world units.
-        beyond : (c, n) float64
-            ``max(|x'|, |y'|) - depth`` with x' and y' from the centre of the image, in half sizes
-            of it at depth 1, world units: at most 0 in the image, edges included.
-        between : (c, n) bool
-            Between near and far plane, planes included.
+        beyond : ``max(|x'|, |y'|) - depth``, x' and y' in half images at depth 1: <= 0 in the image
+        between : whether they lie between near and far plane
 
         The first two are overwritten by this thread's next call.
         """
@@ -204,22 +144,7 @@ class Frustums:
 def census(
     points: NDArray[np.floating[Any]], views: ViewSet, *, progress: Progress = silent
 ) -> NDArray[np.int64]:
-    """How many of N points lie in each of V views, (V,); those not finite lie in none.
-
-    Parameters
-    ----------
-    points : (N, 3) floating
-        World units.
-    views : ViewSet
-        A view without a near plane of its own begins at its centre.
-    progress : callable, optional
-        ``progress(fraction, what)``; returning ``False`` cancels.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
-    """
+    """How many of N points, (N, 3), lie in each of V views, (V,); those not finite lie in none."""
     origin = views.middle()[0]
     frustums = Frustums(views, origin, float(np.finfo(np.float64).tiny))
     numbers = np.arange(len(views))
@@ -237,11 +162,7 @@ def census(
 
 
 def _rows(views, centers):
-    """Rows, (3, V, 4), whose products with ``(p, 1)`` are x', y' and z of every view.
-
-    x' and y' contain the principal point and the half image size, so a point p lies in the image
-    where ``|x'| <= z`` and ``|y'| <= z``.
-    """
+    """Rows, (3, V, 4): times ``(p, 1)`` x', y' and z; p is in the image if ``|x'|, |y'| <= z``."""
     rows = np.empty((3, len(views), 4))
     for index, (view, center) in enumerate(zip(views, centers, strict=True)):
         *axes, forward = np.column_stack([view.rotation, -view.rotation @ center])  # (4,) each

@@ -1,18 +1,10 @@
-"""What views see of each splat: how much of the picture it makes up, and the error without it.
+"""What views see of each splat, with T the transmittance before it and B the colour behind it:
 
     contribution_i = sum over views of  integral of alpha_i  x  mean T        MesonGS, LightGaussian
     error_i        = sum over views of  integral of alpha_i^2  x  mean of T^2 |c_i - B_i|^2
 
-T is the transmittance in front of the splat, c_i its colour and B_i the colour behind it. The error
-is the squared change of the pictures when this one splat is removed, which REFINE's Hessian
-approximates.
-
-T and B come from froxels: cells of the image times slabs of depth. Points sorted by depth within
-their cell (`points`) are slabs without thickness, so no grid of depths has to be chosen or stored:
-running sums down the column of points of a cell give the optical thickness in front of each point
-and the colour behind it. A point of mass m covers the share ``a = m / A`` of a cell of area A.
-Points that are independent of each other transmit ``prod (1 - a)``, so each has the optical
-thickness ``-log(1 - a)``.
+Points sorted by depth in cells of the image (`points`) replace a grid: one of mass m has the
+optical depth ``-log(1 - m / A)`` in a cell of area A, and running sums down a cell give T and B.
 """
 
 from __future__ import annotations
@@ -38,23 +30,19 @@ from .rays import contrasts, in_front, paired
 from .scene import Scene
 
 VIEW_GROUPS = 8
-"""Views are measured in so many groups; sums are added group by group, so they do not depend on
-threads."""
+"""Sums over views are added group by group, so they do not depend on threads."""
 
 SECONDS = 1.2e-6
-"""About how long one core takes to measure a splat in one view, to tell what is worth a process."""
+"""Seconds of one core for a splat in a view, about; decides whether processes are worth it."""
 
 GAMMA_SHAPE = 2.3
-"""Shape of the gamma distribution of the thickness in front of a point. The larger it is, the
-narrower the distribution: `_transmittance` tends to exp(-mean)."""
+"""Shape of the gamma distribution in `_transmittance`; the larger, the nearer to exp(-mean)."""
 
 _MAX_THICKNESS = 60.0
-"""Behind a larger optical thickness nothing is seen; keeps exponentials in float32's range."""
+"""Nothing is seen behind a larger optical depth; keeps exponentials in float32's range."""
 
 _LEAST_LEFT = 1e-4
-"""The colour behind a point is divided by the transmittance behind it, and at least by this: less
-cannot be seen. Thicknesses of cells are means, so hidden points are not left out before as those of
-rays are."""
+"""Least transmittance that the colour behind a point is divided by; less cannot be seen."""
 
 _ADDED = 1 << 16  # splats of a view that are added to the sums at a time
 
@@ -63,35 +51,21 @@ _ADDED = 1 << 16  # splats of a view that are added to the sums at a time
 class Sampling:
     """How finely images are divided and splats sampled.
 
-    Attributes
-    ----------
-    cell : float
-        Least side of a cell, pixels; `points.cell_size` chooses a larger one where the splats need
-        no finer cells.
-    density : float
-        Points per standard deviation for a splat whose standard deviation is as long as a cell.
+    cell : least side of a cell, px; see `points.cell_size`
+    density : points per standard deviation that is as long as a cell
     """
 
     cell: float = 4.0
     density: float = 3.7
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name, value in vars(self).items():
             if not 0.0 < value < np.inf:
                 raise RefineError(f"{name} is {value}, expected a positive number")
 
 
 class Measured(NamedTuple):
-    """Sums over views, for M Gaussians.
-
-    Attributes
-    ----------
-    contribution, error : (M,) float64
-        As defined at the top of this file; px^2, each view multiplied by its weight.
-    seen : (M,) int32
-        In how many views the centre lies.
-    """
+    """Sums over views, (M,) each: contribution and error, px^2, and views that hold the centre."""
 
     contribution: NDArray[np.float64]
     error: NDArray[np.float64]
@@ -103,7 +77,7 @@ class Measured(NamedTuple):
         return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
 
     def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
-        """Sums of `count` splats: these ones at `index`, 0 for all others."""
+        """Sums of `count` splats: these at `index`, 0 for all others."""
         every = Measured.zero(count)
         for name in self._fields:
             getattr(every, name)[index] = getattr(self, name)
@@ -119,7 +93,7 @@ class Measured(NamedTuple):
             getattr(self, name)[:] += getattr(other, name)
 
     def _add_view(self, measured, weight, threads=1):
-        """Add what one view sees, see `_measure_view`, times its weight."""
+        """Add what one view sees (`_measure_view`), times its weight."""
         rows, inside, contribution, error = measured
 
         def add(piece):
@@ -133,13 +107,7 @@ class Measured(NamedTuple):
 
 
 def view_groups(count: int) -> list[range]:
-    """Numbers of the views of each group: of eight groups, every eighth of so many views.
-
-    Examples
-    --------
-    >>> view_groups(9)[:2], len(view_groups(3))
-    ([range(0, 9, 8), range(1, 9, 8)], 3)
-    """
+    """Numbers of the views of each group: every eighth of `count` views."""
     groups = min(VIEW_GROUPS, count)
     return [range(k, count, groups) for k in range(groups)]
 
@@ -156,30 +124,11 @@ def measure(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Measured, list[Measured], list[NDArray[np.float64]]]:
-    """Sums over views, and of a sample those over each group and the errors in each view.
+    """Sums over the views of groups, and of each group for a sample, with its errors in each view.
 
-    Parameters
-    ----------
-    gaussians : Gaussians
-    scene : Scene
-    views : sequence of (View, float)
-        Views and their weights, see `ViewSet.by_distance`.
-    groups : sequence of range
-        Those to measure, see `view_groups`.
-    sampling : Sampling
-    sample : (m,) int64
-        Rows of the Gaussians.
-    ray_samples : sequence of RaySample
-        They are given those rays of these views that they lack.
-    progress : callable
-    threads : int, optional
-
-    Returns
-    -------
-    Measured
-        Added group by group.
-    list of Measured, list of (views, m) float64
-        Of each group, for the sample.
+    views : sequence of (View, float), with weights, see `ViewSet.by_distance`
+    sample : (m,) int64, rows of Gaussians; the errors are (views, m) for each group
+    ray_samples : sequence of RaySample, which get the rays of these views that they lack
     """
     rows, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
     lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]
@@ -217,11 +166,7 @@ def _measure_and_cast(gaussians, scene, views, sampling, number_and_kinds):
 
 
 def _measure_view(gaussians, scene, view, sampling):
-    """Footprints in a view, and what it sees of the n Gaussians that they are of.
-
-    Their rows, which centres lie in the view's frustum, and contributions and errors: integrals
-    over its image, px^2, see the top of this file; (n,) each.
-    """
+    """Footprints in a view; their rows, which are inside, contributions and errors, (n,) each."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         integrals = np.empty(0), np.empty(0)
@@ -236,9 +181,8 @@ def _measure_view(gaussians, scene, view, sampling):
 def _integrals(footprints, colors, points):
     """Integrals over the image of ``alpha T`` and of ``alpha^2 T^2 |c - B|^2``, (n,) each, px^2.
 
-    Of each the integral of alpha or alpha^2 over the whole footprint is exact, times the mean over
-    its points in the image, weighted alike. S is the product of the two sigmas, A the opacity, and
-    q the squared Mahalanobis distance. The footprint ends where alpha falls to `ALPHA_CUT`::
+    Those of alpha and alpha^2 are exact, times the mean over the points in the image. S is the
+    product of the sigmas, A the opacity and q the squared Mahalanobis distance, up to `ALPHA_CUT`::
 
         integral of A exp(-q / 2) = 2 pi S (A - cut)
         integral of A^2 exp(-q)   =   pi S (A^2 - cut^2)
@@ -278,23 +222,19 @@ def _integrals(footprints, colors, points):
 
 
 def _evenness(footprints, area):
-    """Share of each splat's thickness that counts as uniform over the cell, (n,).
+    """Share of each splat's optical depth that is even over a cell, ``s^2 / (s^2 + area)``, (n,).
 
-    It is ``s^2 / (s^2 + area)``, with s the shorter sigma and the area of the cell: near 0 for a
-    splat much narrower than a cell, which leaves gaps, and near 1 for a much wider one.
+    A splat whose shorter sigma s is much narrower than the cell leaves gaps.
     """
     narrow = footprints.sigmas[1] ** 2
     return narrow / (narrow + np.float32(area))
 
 
 def _transmittance(front, even):
-    """Transmittance in front of each point, (m,), given the mean thickness in front.
+    """Transmittance in front of points, (m,), of mean optical depth `front`, `even` without gaps.
 
-    Splats narrower than a cell leave gaps, so the thickness in front of a point differs from the
-    cell's mean. It is modelled as gamma distributed with shape k, and the transmittance is the
-    expectation ``E[exp(-tau)] = (1 + mean / k)^-k``. (With ``exp(-mean)``, splats that show through
-    foliage would count as hidden and be removed.) The even part, see `_evenness`, has no gaps:
-    ``exp(-even)``.
+    The rest, gamma distributed with shape k, passes ``E[exp(-tau)] = (1 + mean / k)^-k``: with
+    exp(-mean), splats that show through foliage would count as hidden.
     """
     shape = np.float32(GAMMA_SHAPE)
     gaps = np.maximum(front - even, np.float32(0.0))
@@ -302,12 +242,9 @@ def _transmittance(front, even):
 
 
 def _squared_contrast(front, covered, colors, counts):
-    """Squared contrast of each point, (m,), given the thickness in front and the share it covers.
+    """``|c_k - B_k|^2`` of points, (m,), given the depth in front, in columns of `counts` points.
 
-    Point j adds ``T_j a_j c_j`` to the picture; T_j is the transmittance in front of it and a_j the
-    share of the cell that it covers. The colour behind point k, over black, is
-    ``B_k = (sum over j > k of T_j a_j c_j) / T_{k+1}``. The contrast ``c_k - B_k`` is squared and
-    summed over the channels. `counts`, (C,), is how many points each column has.
+    ``B_k = (sum over j > k of T_j a_j c_j) / T_{k+1}``, with a_j the share of the cell `covered`.
     """
     weight = np.exp(-np.minimum(front, np.float32(_MAX_THICKNESS)))  # T_k
     left = np.maximum(weight * (np.float32(1.0) - covered), np.float32(_LEAST_LEFT))  # T_{k+1}

@@ -1,9 +1,7 @@
-"""Points over the footprints of one view, sorted by depth within the cells of the image.
+"""Points over the footprints of a view, sorted by depth within the square cells of the image.
 
-Each footprint is replaced by a lattice of points that stands for the normal distribution, with more
-of them the more cells it covers. Each point has a share of the splat's mass, which is the integral
-of its alpha. The image is divided into square cells. Within a cell the points are
-sorted by depth: `measuring` tells what hides them.
+Lattices of points stand for the normal distribution, with more points the more cells it covers.
+Each has a share of the splat's mass, the integral of its alpha.
 """
 
 from __future__ import annotations
@@ -22,31 +20,28 @@ from ..views import View
 from .projection import Footprints
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""How many points a lattice may have along an axis."""
+"""Numbers of points of a lattice along an axis."""
 
 FLAT = 16
-"""A splat much larger than the image gets this many points across and down the image instead."""
+"""Points across and down the image of a splat much larger than that."""
 
 WIDE_EXTENT = 3.0
 """Standard deviations to which a lattice of many points reaches."""
 
 FEW_CELLS = 10_000
-"""An image may always have this many cells, even with few footprints."""
+"""An image may always have this many cells."""
 
 FOOTPRINTS = 4.0
-"""Beyond `FEW_CELLS` cells, an image has at most one cell for this many footprints: cells that are
-much smaller than the splats only cost points."""
+"""Footprints for each cell beyond `FEW_CELLS`: cells much smaller than splats only cost points."""
 
 MAX_CELLS = 65535
 """Most cells of an image: NumPy sorts numbers of 16 bits by radix, in linear time."""
 
 MAX_POINTS = 1 << 22
-"""Limit of the estimated number of points of a view: cells grow until it holds. A point takes about
-100 bytes."""
+"""Most points of a view, as estimated, about 100 bytes each: cells grow until it holds."""
 
 LEAST_POINTS = 1.25
-"""Point limit of a view: ``max(MAX_POINTS, LEAST_POINTS x footprints)``. A footprint has at least
-one point, however large the cells are."""
+"""At least this many for each footprint: one has a point, however large the cells."""
 
 _EXTENT = 2.4  # standard deviations, of lattices of fewer than `_WIDE` points along an axis
 _WIDE = 8
@@ -77,24 +72,15 @@ class _Lattices(NamedTuple):
 
 
 class Points(NamedTuple):
-    """The m points inside the image, cell by cell, and front to back in each cell.
+    """The m points in an image, cell by cell, front to back, of n footprints in C cells.
 
-    Of several points of one splat in one cell the first has the shares of all, so that a splat does
-    not hide itself; the others have none.
+    Of a splat's points in a cell the first has all shares, so that it does not hide itself.
 
-    Attributes
-    ----------
-    owners : (m,) int32
-        Row of the `Footprints`.
-    shares : (m,) float32
-        Of the splat's mass.
-    counts : (C,) int64
-        How many points lie in each of the C cells that are not empty: the columns of points.
-    share_inside, squares : (n,) float64
-        Of each footprint: the sum of its shares, that is the share of its mass in the image, and
-        the sum of their squares.
-    area : float
-        Of a cell, px^2.
+    owners : (m,) int32, rows of the `Footprints`
+    shares : (m,) float32, of the splat's mass
+    counts : (C,) int64, points of each cell, which make a column
+    share_inside, squares : (n,) float64, sums of the shares in the image, and of their squares
+    area : float, of a cell, px^2
     """
 
     owners: NDArray[np.int32]
@@ -106,10 +92,7 @@ class Points(NamedTuple):
 
 
 def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Yield runs of consecutive groups with about `_BLOCK` members: slices of groups and members.
-
-    `sizes`, (G,), is how many members each group has.
-    """
+    """Yield runs of groups of `sizes` with about `_BLOCK` members: slices of groups and members."""
     ends = np.cumsum(sizes)
     cuts = np.searchsorted(ends, np.arange(_BLOCK, int(sizes.sum()), _BLOCK)) + 1
     start = member = 0
@@ -121,11 +104,7 @@ def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
 
 
 def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
-    """Side of a cell, pixels: `cell`, or larger, which saves points.
-
-    It is larger where the image would have more cells than the footprints need (`FOOTPRINTS`), or
-    more than `MAX_CELLS`, and where the footprints would have more than `MAX_POINTS` points.
-    """
+    """Side of a cell, px: `cell`, or larger by `FOOTPRINTS`, `MAX_CELLS` or `MAX_POINTS`."""
     needed = max(FEW_CELLS, len(footprints.index) / FOOTPRINTS)
     side = max(cell, math.sqrt(view.width * view.height / min(needed, MAX_CELLS)) * _SLACK)
     while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:
@@ -140,18 +119,7 @@ def cell_size(footprints: Footprints, view: View, cell: float, density: float) -
 
 
 def scatter(footprints: Footprints, view: View, side: float, density: float) -> Points:
-    """Points over all footprints, sorted into cells.
-
-    Parameters
-    ----------
-    footprints : Footprints
-        Front to back.
-    view : View
-    side : float
-        Of a cell, pixels.
-    density : float
-        Points per standard deviation that is as long as a cell.
-    """
+    """Points over footprints, front to back, in cells of `side` px; for density see `Sampling`."""
     kinds = _kinds(footprints, view, density / side)  # (n,)
     # Half axes, major, minor, and centre, each across and down, in cells, (6, n).
     axes = np.concatenate([footprints.major, footprints.minor, footprints.centers])
@@ -180,7 +148,7 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
 
 
 def _kinds(footprints, view, scale):
-    """Which lattice each footprint gets, (n,); `scale`: points per pixel of sigma."""
+    """Lattice of each footprint, (n,); `scale` is points per pixel of sigma."""
     place_of = np.searchsorted(COUNTS, np.arange(COUNTS[-1] + 1)).astype(np.uint8)
     wanted = np.ceil((footprints.sigmas * np.float32(scale)).clip(1.0, COUNTS[-1]))  # (2, n)
     index = place_of[wanted.astype(np.int64)]  # (2, n)
@@ -192,11 +160,7 @@ def _kinds(footprints, view, scale):
 
 
 def _patches(axes, size, kinds):
-    """The q patches that may reach into the image, footprint by footprint, by the box around each.
-
-    Rows of their footprints and of the table, (q,) int64 each, and which lie in the image with all
-    of their points, (q,).
-    """
+    """Patches whose boxes reach into the image: footprint, row of the table, and if whole, (q,)."""
     table = _lattices()
     count = table.patches.take(kinds)  # (n,)
     rows = np.repeat(np.arange(len(kinds)), count)  # (q,), as all that follows
@@ -217,11 +181,9 @@ def _patches(axes, size, kinds):
 
 
 def _lay_out(axes, size, rows, patches, whole):
-    """The points of q patches of `_patches`, one after the other.
+    """The p points of q patches: cells, (p,) uint16, and shares, (p,), `_OUTSIDE` and 0 outside.
 
-    Of p points these are the cells, (p,) uint16, `_OUTSIDE` outside the image, and their shares of
-    the mass, (p,) float32, 0 there; of each patch the sums of the shares, and of their squares,
-    (2, q).
+    Also the sums of the shares, and of their squares, of each patch, (2, q).
     """
     table = _lattices()
     sizes = table.sizes.take(patches)  # (q,)
@@ -265,11 +227,7 @@ def _lay_out(axes, size, rows, patches, whole):
 
 
 def _positions(axes, points):
-    """Where points of lattices lie, across and down, in cells.
-
-    `axes`, (6, ...), are those of `scatter`; the points, (2, ...), lie along the major and the
-    minor axis of the lattice.
-    """
+    """Positions of lattice points, (2, ...), in cells; axes, (6, ...), as in `scatter`."""
     across = axes[0] * points[0]
     across += axes[2] * points[1]
     across += axes[4]
@@ -280,10 +238,7 @@ def _positions(axes, points):
 
 
 def _cell_numbers(positions, size):
-    """Number of each point's cell; meaningless for points outside the image.
-
-    The position of each point and the size of the image are across and down, in cells.
-    """
+    """Cell of each position in cells, across and down; meaningless outside the image."""
     number = positions[1].astype(np.int32)
     number *= math.ceil(size[0])
     number += positions[0].astype(np.int32)
@@ -291,10 +246,7 @@ def _cell_numbers(positions, size):
 
 
 def _flat_points(footprints, row, view, side):
-    """Cells, (FLAT^2,), and shares, (r, FLAT^2), for r footprints wider than the image.
-
-    The share of a point is the density of the splat's mass there times the area around the point.
-    """
+    """Cells, (FLAT^2,), and shares, density times area, (r, FLAT^2), of the widest footprints."""
     points = _lattices().points[:, -(FLAT**2) :]
     u = np.float32(view.width / 2) * (points[0] + 1)
     v = np.float32(view.height / 2) * (points[1] + 1)
@@ -312,10 +264,9 @@ def _flat_points(footprints, row, view, side):
 
 
 def _merge(owners, shares, squares, counts):
-    """Give the shares of all points of a splat in a cell to the first of them, in place.
+    """Give the shares of a splat's points in a cell to the first, in place, and update `squares`.
 
-    The others come right behind it. `squares`, (n,), see `Points`, become those after merging;
-    `counts`, (C,), is how many points each cell has.
+    The others come right behind it; `counts`, (C,), is the points of each cell.
     """
     first = np.ones(len(owners), np.bool_)  # whether a point is the first of its splat there
     np.not_equal(owners[1:], owners[:-1], out=first[1:])
@@ -336,8 +287,7 @@ def _merge(owners, shares, squares, counts):
 def _lattices():
     """All lattices: number ``i len(COUNTS) + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points.
 
-    One more at the end has `FLAT` by `FLAT` points over the image; their coordinates are -1 to 1,
-    in half image sizes.
+    The last has `FLAT` by `FLAT` points at -1 to 1, in half image sizes.
     """
     axes = [_axis(count) for count in COUNTS]
     steps = (np.arange(FLAT) + 0.5) / FLAT * 2.0 - 1.0
@@ -358,10 +308,7 @@ def _lattices():
 
 
 def _lattice(major, minor):
-    """Points, (2, k), shares, (k,), and sizes of the patches of a grid without its corners.
-
-    It is scaled to variance 1 again.
-    """
+    """Points, (2, k), shares, (k,), and patch sizes of a grid without corners, of variance 1."""
     product = np.outer(major[1], minor[1])  # (k_major, k_minor), shares
     place = np.broadcast_arrays(major[0][:, None], minor[0])  # (k_major, k_minor) each
     extent = WIDE_EXTENT if max(product.shape) >= _WIDE else _EXTENT
@@ -383,7 +330,7 @@ def _lattice(major, minor):
 
 
 def _axis(count):
-    """Places and shares of the normal distribution: its mean in bins of equal width, variance 1."""
+    """Places and shares of the normal distribution: means of equal bins, variance 1."""
     if count == 1:
         return np.zeros(1), np.ones(1)
     extent = WIDE_EXTENT if count >= _WIDE else _EXTENT

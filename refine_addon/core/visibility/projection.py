@@ -34,8 +34,7 @@ from .scene import Scene, scene_of, spatial_order, splat_fingerprint
 FloatT = TypeVar("FloatT", np.float32, np.float64)
 
 CUT_SIGMAS = 3.3
-"""Standard deviations to which a footprint counts as reaching: alpha = 1 falls to `ALPHA_CUT` at
-3.33."""
+"""Standard deviations to which a footprint reaches: alpha = 1 falls to `ALPHA_CUT` at 3.33."""
 
 BRIGHTEST = 16.0
 """Colours are clipped to this, white being 1; keeps sums finite."""
@@ -62,29 +61,17 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """The M splats that can contribute to a picture, in scene sizes, sorted by `spatial_order`.
+    """The M splats that can contribute to a picture, in scene frame and sizes, by `spatial_order`.
 
-    Attributes
-    ----------
-    index : (M,) int64
-        Rows of the splats.
+    index : (M,) int64, rows of the splats
     means : (3, M) float32
-        In the scene's frame, in scene sizes.
-    covariances : (6, M) float32
-        xx, xy, xz, yy, yz, zz in the scene's frame, squared scene sizes.
-    largest : (M,) float32
-        Longest standard deviation, scene sizes.
-    alphas : (M,) float32
-        Opacity, 0..1.
-    colors : (M, 3) float32
-        The constant of the harmonics as a colour, >= 0: the same from all directions.
-    normals : (3, M) float32 or None
-        Of discs: unit vectors at right angles to them, in the scene's frame.
-    model : {"default", "antialiased", "2dgs"}
-        How they are drawn, see `Model`.
-    boxes : (C, 7) float32 or None
-        Of Gaussians in files (`mapped`), see `boxes_touch`: a box for each `CHUNK` of them, so that
-        a view reads only what it may show. Means, covariances and normals are then (C, k, CHUNK).
+    covariances : (6, M) float32, xx, xy, xz, yy, yz, zz
+    largest : (M,) float32, longest standard deviation
+    alphas : (M,) float32, 0..1
+    colors : (M, 3) float32, of the constant of the harmonics, >= 0
+    normals : (3, M) float32 or None, unit normals of discs
+    boxes : (C, 7) float32 or None, in files: one for each `CHUNK`, see `boxes_touch`; means,
+        covariances and normals are then (C, k, CHUNK), and a view reads only what it may show
     """
 
     index: NDArray[np.int64]
@@ -98,7 +85,6 @@ class Gaussians:
     boxes: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
-        """Number of splats."""
         return len(self.index)
 
     def parts(self, scene: Scene, view: View, window: View) -> Iterator[tuple[int, Gaussians]]:
@@ -122,7 +108,7 @@ class Gaussians:
             )  # fmt: skip
 
     def take(self, keep: NDArray[Any]) -> Gaussians:
-        """Splats at `keep` (a mask or integers)."""
+        """Gaussians at `keep`, a mask or rows."""
         return Gaussians(
             self.index[keep], self.means[:, keep], self.covariances[:, keep], self.largest[keep],
             self.alphas[keep], self.colors[keep],
@@ -132,25 +118,15 @@ class Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """The n splats that may reach into an image, front to back.
+    """The n splats that may reach into an image, front to back; lengths in pixels.
 
-    Attributes
-    ----------
-    index : (n,) int64
-        Rows of the `Gaussians`.
-    centers : (2, n) float32
-        Column and row, pixels.
-    major, minor : (2, n) float32
-        Half axes: one standard deviation along each principal direction, pixels. Of discs: those of
-        an ellipse that covers as much, see `disc_axes`.
-    sigmas : (2, n) float32
-        Their lengths, the longer first.
-    inside : (n,) bool
-        Which centres lie in the view's frustum; see `frustum`.
-    alphas : (n,) float32
-        Of the Gaussians at their centres.
-    discs : (7, n) float32 or None
-        Of discs: what a ray hits of them exactly, see `_discs` and `cast.hits`.
+    index : (n,) int64, rows of the `Gaussians`
+    centers : (2, n) float32, column and row
+    major, minor : (2, n) float32, principal standard deviations; for discs see `disc_axes`
+    sigmas : (2, n) float32, their lengths, the longer first
+    inside : (n,) bool, whether the centre lies in the frustum
+    alphas : (n,) float32, at the centre
+    discs : (7, n) float32 or None, for exact hits, see `_discs`
     """
 
     index: NDArray[np.int64]
@@ -179,25 +155,10 @@ def prepare(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Gaussians, Scene, NDArray[np.bool_]]:
-    """Activate the splats once for all views.
+    """Activate the splats once for all views; `scene` is the frame, by default theirs.
 
-    Parameters
-    ----------
-    splats : Splats
-        In the frame and unit of the views.
-    views : ViewSet
-    scene : Scene, optional
-        The frame to use; by default that of these splats and views.
-    progress : callable, optional
-    threads : int, optional
-
-    Returns
-    -------
-    gaussians : Gaussians
-        Of the splats that can be drawn and whose opacity exceeds `ALPHA_CUT`.
-    scene : Scene
-    good : (N,) bool
-        Which splats can be drawn.
+    Gaussians are those that can be drawn, with an opacity above `ALPHA_CUT`; the last value is
+    which of the N splats can be drawn.
     """
     good, opaque = np.empty((2, len(splats)), np.bool_)
 
@@ -254,7 +215,7 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
 
 
 def _activate(splats, index, positions, scene, progress, threads):
-    """Some splats, (M,) rows, as Gaussians; their positions, (M, 3), are in the scene's frame."""
+    """Splats at `index`, (M,), as Gaussians; positions, (M, 3), are in the scene's frame."""
     count = len(index)
     with np.errstate(under="ignore"):
         means = np.ascontiguousarray(positions.T, np.float32)
@@ -292,20 +253,11 @@ def _activate(splats, index, positions, scene, progress, threads):
 def project(
     gaussians: Gaussians, scene: Scene, view: View, window: View | None = None
 ) -> Footprints:
-    """Footprints of the Gaussians that may reach into the image of a view, front to back.
+    """Footprints that may reach into the image of a view, or its part `window`, front to back.
 
-    The footprint is the Gaussian of covariance ``C + 0.3 I``, ``C = J W S W' J'`` (Zwicker et al.,
-    "EWA splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean. Antialiased ones
-    have the opacity ``o sqrt(det C / det(C + 0.3 I))``. For discs see `_discs`. Of equal depths the
-    first comes first.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-    scene : Scene
-    view : View
-    window : View, optional
-        The part of the image that counts, as a view of its own; by default all of it.
+    The covariance is ``C + 0.3 I``, ``C = J W S W' J'`` (Zwicker et al., "EWA splatting", 2002, Eq.
+    31), J the Jacobian at the mean; antialiased opacity is ``o sqrt(det C / det(C + 0.3 I))``.
+    Equal depths keep their order.
     """
     planes, discs = clip_planes(scene, view), gaussians.normals is not None
     turned = (view.rotation @ scene.axes.T).astype(np.float32)
@@ -379,10 +331,9 @@ def coordinates(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray
 
 
 def _product(matrix, columns):
-    """A matrix times columns, (n, n) and (n, M).
+    """A matrix (n, n) times columns (n, M), each summed in the same order.
 
-    Each is summed in the same order. BLAS rounds by where a column stands and how many there are,
-    so a splat would be seen otherwise among the few of a tile than among all.
+    BLAS rounds by a column's place: a splat would differ in a tile and among all.
     """
     result = np.multiply.outer(matrix[:, 0], columns[0])
     for factors, row in zip(matrix.T[1:], columns[1:], strict=True):
@@ -391,10 +342,9 @@ def _product(matrix, columns):
 
 
 def _touches(local, largest, views, planes, low_pass):
-    """Which footprints may reach into the image, (M,); on the safe side.
+    """Which footprints may reach into the image, (M,): `frustum.contains`, widened to be safe.
 
-    It is `frustum.contains` with the image widened by how far each footprint reaches. Of `views`,
-    the first is drawn, and the second is the part of it that counts; see `project`.
+    Of `views` the first is drawn; the second is the part of it that counts.
     """
     x, y, z = local
     touching = (z >= planes[0]) & (z <= planes[1])
@@ -409,15 +359,9 @@ def _touches(local, largest, views, planes, low_pass):
 def boxes_touch(
     boxes: NDArray[np.float32], scene: Scene, view: View, window: View | None = None
 ) -> NDArray[np.bool_]:
-    """In which of B boxes a Gaussian may lie that reaches into the image of a view, (B,).
+    """Which of B boxes may hold a Gaussian that reaches into a window of a view, (B,).
 
-    Parameters
-    ----------
-    boxes : (B, 7) float32
-        Least and greatest coordinates of the means, and the longest standard deviation, in the
-        scene's frame, in scene sizes.
-    scene, view, window
-        See `project`.
+    Boxes, (B, 7): least and greatest means, longest standard deviation; scene frame and sizes.
     """
     if not _computable(scene, view):
         return np.zeros(len(boxes), np.bool_)
@@ -458,11 +402,7 @@ def _rotation6(r):
 
 
 def _ellipses(across, down, z, shape, view):
-    """Footprints of Gaussians: their axes, and how much of their opacity antialiasing keeps.
-
-    For a centre far outside the image, J is computed at the edge that `_BEYOND` sets, because J
-    grows without bound.
-    """
+    """Axes of the footprints of Gaussians, and the share of opacity that antialiasing keeps."""
     across, down = _near_image(across, down, view)
     variances, direction = _principal(across, down, z, shape, view)
     sigmas = np.sqrt(variances + LOW_PASS)
@@ -471,7 +411,7 @@ def _ellipses(across, down, z, shape, view):
 
 
 def _near_image(across, down, view):
-    """``x / z`` and ``y / z`` of centres, (n,) each, no farther out than `_BEYOND` says."""
+    """``x / z`` and ``y / z``, (n,), at most `_BEYOND` outside: J grows without bound."""
     beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
     return (
         across.clip(-view.cx / view.fx - beyond[0], (view.width - view.cx) / view.fx + beyond[0]),
@@ -482,11 +422,7 @@ def _near_image(across, down, view):
 def jacobian(
     gaussians: Gaussians, scene: Scene, view: View
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """J W of Gaussians in a view: how column and row change with the mean, (M, 3) each.
-
-    In pixels for a step of one scene size along each axis of the scene's frame; see `_principal`
-    for J.
-    """
+    """J W of Gaussians: px of column and row per scene size along the scene's axes, (M, 3) each."""
     x, y, z = coordinates(gaussians.means, scene, view).astype(np.float64)
     across, down = _near_image(x / z, y / z, view)
     turned = view.rotation @ scene.axes.T  # W
@@ -497,16 +433,13 @@ def jacobian(
 
 
 def _principal(across, down, z, shape, view):
-    """Eigenvalues of C, (2, n), the larger first, and the direction of the major axis, (2, n).
+    """Eigenvalues of C, (2, n), the larger first, and direction of the major axis, (2, n).
 
-    C is ``J S J'`` in pixels, without the low-pass. J is the Jacobian of the projection at
-    ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and ``(0, fy / z, -fy y / z^2)``; across and
-    down are ``x / z`` and ``y / z``, (n,) each. `shape` is S: xx, xy, xz, yy, yz, zz, (6, n).
-
-    With ``m = (xx + yy) / 2`` and ``r = hypot((xx - yy) / 2, xy)`` the eigenvalues of C are m + r
-    and m - r; the latter is computed as ``det C / (m + r)``, which loses no digits by cancellation.
-    With h the half difference, ``(h + r, xy)`` and ``(xy, r - h)`` both point along the major axis.
-    The one without cancellation is used, and made to point right; (1, 0) for a circle.
+    ``C = J S J'``, no low-pass; S is `shape`, (6, n), J has the rows ``fx (1 / z, 0, -x / z^2)``
+    and ``fy (0, 1 / z, -y / z^2)``. With m the half sum, h the half difference and ``r = hypot(h,
+    xy)``, the eigenvalues are m + r and ``det C / (m + r)``, which keeps its digits. The axis is
+    ``(h + r, xy)`` or ``(xy, r - h)``, whichever does not cancel, pointing right; (1, 0) for a
+    circle.
     """
     fx, fy = view.fx / z, view.fy / z
     xx = fx * fx * (shape[0] + across * (across * shape[5] - 2 * shape[2]))
@@ -536,11 +469,9 @@ def _half_axes(sigmas, direction):
 def _discs(across, down, z, shape, normals, view, near):
     """Footprints of discs: their axes, and what rays hit.
 
-    The ray through a pixel hits the plane of a disc at ``(u, v)``, in units of its two scales, and
-    its alpha there is ``o exp(-(u^2 + v^2) / 2)``, at least ``o exp(-|d|^2 / (2 DISC_LOW_PASS))``,
-    d the step in pixels from the centre (Huang et al. 2024, Eq. 8 to 11). Since depths on a plane
-    are the inverse of a linear function of the pixel, the intersection is, with ``C = J W S W' J'``
-    as for Gaussians, n the normal and r the ray to the centre, of depth 1, in camera coordinates::
+    A ray hits one at ``(u, v)``, in its scales, with alpha ``o exp(-(u^2 + v^2) / 2)``, at least
+    ``o exp(-|d|^2 / (2 DISC_LOW_PASS))``, d px from the centre (Huang et al. 2024, Eq. 8-11). With
+    ``C = J W S W' J'``, n the normal and r the ray to the centre, of depth 1::
 
         u^2 + v^2 = d' C^-1 d / (1 + g d)^2        g = (n_x / fx, n_y / fy) / (n r)
     """
@@ -561,18 +492,11 @@ def _discs(across, down, z, shape, normals, view, near):
 
 
 def disc_axes(variances: NDArray[FloatT]) -> NDArray[FloatT]:
-    """Half axes, (2, n), of ellipses that cover as much as discs with their low-pass.
+    """Half axes, (2, n), of ellipses that cover as much as discs of variances a >= b, px^2.
 
-    The larger of two Gaussians of variance l along both axes, the low-pass, and of a and b, has the
-    integral ``2 pi l`` where ``a < l``, ``2 pi sqrt(a b)`` where ``b > l``, and else, with t the
-    angle from the major axis at which they are equal::
-
-        4 sqrt(a b) atan(sqrt(a / b) tan t) + l (2 pi - 4 t)
-
-    Parameters
-    ----------
-    variances : (2, n) floating
-        a and b, px^2, the larger first; without the low-pass.
+    The larger of disc and low-pass of variance l has the integral ``2 pi l`` if ``a < l``,
+    ``2 pi sqrt(a b)`` if ``b > l``, else ``4 sqrt(a b) atan(sqrt(a / b) tan t) + l (2 pi - 4 t)``
+    with t the angle from the major axis at which they are equal.
     """
     low = variances.dtype.type(DISC_LOW_PASS)
     first = np.maximum(variances[0], low)
@@ -589,11 +513,7 @@ def disc_axes(variances: NDArray[FloatT]) -> NDArray[FloatT]:
 
 
 def _by_depth(depth):
-    """Order of positive float32 numbers, (n,), nearest first.
-
-    The bits of positive floats, read as integers, sort as the floats do; NumPy sorts 16 bits at a
-    time by radix, in linear time.
-    """
+    """Order of positive float32 numbers, (n,), by their bits as integers: a linear radix sort."""
     bits = np.ascontiguousarray(depth).view(np.uint32)
     order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
     high = (bits >> 16).astype(np.uint16)

@@ -1,8 +1,7 @@
 """The scene's own frame: its middle, its size and its axes.
 
-Everything that is computed in float32 or compared with a fixed number is computed in this frame. It
-moves, turns and grows with the scene, so results depend neither on the frame that a file uses nor
-on the order of its splats.
+Results in float32 or compared with constants are computed in it, so they depend neither on the
+frame of a file nor on the order of its splats.
 """
 
 from __future__ import annotations
@@ -35,17 +34,11 @@ _SPREAD_BITS = (
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The frame of a scene.
+    """The frame of a scene, world units.
 
-    Attributes
-    ----------
-    origin : (3,) float64
-        Geometric median of the views' centres, world units.
-    size : float
-        The square root of S + V, world units, > 0. S and V are the medians of the squared distance
-        to the origin over drawable splats and over views.
-    axes : (3, 3) float64
-        Rotation from the world to the frame: its rows are the principal axes of the splats.
+    origin : (3,) float64, geometric median of the views' centres
+    size : float > 0, ``sqrt(S + V)``, median squared distances to it of drawable splats and views
+    axes : (3, 3) float64, rotation to the frame: rows are the principal axes of the splats
     """
 
     origin: NDArray[np.float64]
@@ -55,20 +48,7 @@ class Scene:
     def positions(
         self, means: NDArray[Any], rows: NDArray[np.int64] | None = None, *, threads: int | None = 1
     ) -> NDArray[np.float64]:
-        """Positions in the frame, in scene sizes.
-
-        Parameters
-        ----------
-        means : (N, 3) floating
-            World units.
-        rows : (M,) int64, optional
-            Which of them; by default all.
-        threads : int, optional
-
-        Returns
-        -------
-        (M, 3) float64
-        """
+        """Positions in the frame, scene sizes, (M, 3), of means, (N, 3), or of M of their rows."""
         count, turn = len(means) if rows is None else len(rows), self.axes.T / self.size
         places = np.empty((count, 3))
 
@@ -85,34 +65,14 @@ class Scene:
 
 
 def size_of(median: float) -> float:
-    """Size of a scene, or 1 if the whole scene is one point.
-
-    Parameters
-    ----------
-    median : float
-        S + V of `Scene.size`.
-    """
+    """Size of a scene from S + V of `Scene`; 1 if the whole scene is one point."""
     return float(np.sqrt(median)) or 1.0
 
 
 def scene_of(
     means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet, *, threads: int | None = 1
 ) -> Scene:
-    """Frame of a scene.
-
-    Parameters
-    ----------
-    means : (N, 3) floating
-        Centres of the splats, world units.
-    drawable : (N,) bool
-        Which splats count.
-    views : ViewSet
-    threads : int, optional
-
-    Returns
-    -------
-    Scene
-    """
+    """Frame of drawable splats, means (N, 3) in world units, and views."""
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
 
@@ -148,15 +108,9 @@ def _moments(means, scene):
 
 
 def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Principal axes of splats as the rows of a rotation, the least variance first.
+    """Principal axes as the rows of a rotation, least variance first, towards the more splats.
 
-    Axes point to where more of the splats lie. If two variances are equal, two axes are arbitrary.
-
-    Parameters
-    ----------
-    total : (4, 3) float64
-        Weighted sums over the splats: of the products of coordinates, and in the last row of the
-        coordinates; see `_moments`.
+    `total`, (4, 3), are sums of products of coordinates and, last, of coordinates (`_moments`).
     """
     _, vectors = np.linalg.eigh(total[:3])  # in columns
     axes = (vectors * np.where(total[3] @ vectors < 0.0, -1.0, 1.0)).T
@@ -166,13 +120,9 @@ def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
-    """A hash of each row's values, (N,): the same number wherever the row stands.
+    """A hash of each row of columns, (N,) each, as float32: the same wherever the row stands.
 
-    Parameters
-    ----------
-    columns : (N,) floating
-        Values that a motion of the scene does not change, such as opacity and base colour; they
-        are compared in float32.
+    Use values that a motion of the scene does not change, such as opacity and base colour.
     """
     key = np.zeros(len(columns[0]), np.uint64)
     for values in columns:
@@ -184,7 +134,7 @@ def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
 
 
 def splat_fingerprint(splats: Splats, rows: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """The `fingerprint` of opacity and base colour of splats by their rows, (n,)."""
+    """`fingerprint` of opacity and base colour of splats by their rows, (n,)."""
     return fingerprint(splats.opacity_logits[rows], *splats.sh_dc[rows].T)
 
 
@@ -194,21 +144,9 @@ def spatial_order(
     *,
     threads: int | None = 1,
 ) -> NDArray[np.int64]:
-    """Order of positions along a Z-shaped curve: neighbours follow (Morton, 1966).
+    """Order of positions, (N, 3) scene sizes, along a Z-curve (Morton, 1966): neighbours follow.
 
-    Parameters
-    ----------
-    positions : (N, 3) float64
-        As `Scene.positions` returns them.
-    ties : callable, optional
-        ``ties(rows)`` returns numbers that order rows at the same place.
-    threads : int, optional
-
-    Returns
-    -------
-    (N,) int64
-        Positions that agree in 21 bits of each coordinate are at the same place; without `ties`
-        they keep their order.
+    Those that agree in 21 bits a coordinate are ordered by ``ties(rows)``, or keep their order.
     """
     code, cells = np.empty(len(positions), np.int64), float(1 << _BITS)
 
