@@ -1,11 +1,8 @@
-"""Formats without a signature, which only the name of a file tells: ``.splat`` and ``.ksplat``.
+"""Formats known only by the file's name: ``.splat`` and ``.ksplat``.
 
-``.splat`` by antimatter15 is 32 bytes a splat and nothing else: mean and linear scale are float32,
-colour, opacity and rotation 8 bits each.
-
-``.ksplat`` of GaussianSplats3D (mkkellogg) is read: levels 0 to 2, degrees 0 to 2. A header, a
-header for each section, then the sections. In levels 1 and 2 the splats of a section lie in
-buckets: a coordinate is 16 bits around the centre of the bucket, scales and rotations are float16.
+``.splat`` (antimatter15) is 32 bytes a splat. ``.ksplat`` (GaussianSplats3D by mkkellogg), levels
+0 to 2, is only read: a header, a header for each section, then the sections. In levels 1 and 2 a
+section has buckets; a coordinate is 16 bits around the bucket's centre.
 """
 
 from __future__ import annotations
@@ -21,28 +18,22 @@ from .format import Format, color_codes, new_file, pieces, refuse_short, set_col
 
 _SPLAT = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
-)
-"""What a ``.splat`` holds of one: colour is red, green, blue and opacity, rotation is w x y z."""
+)  # color: red, green, blue, opacity; rotation: w x y z
 
 _NO_TURN = 128.0  # code of 0 in its rotation, and the step from 0 to 1
 
 _HEADER = struct.Struct("<BBxxI4x4xIHxx12xff")
-"""Of a ``.ksplat``: version in two parts, section headers, splats, level; least and largest
-harmonic of level 2."""
+"""``.ksplat``: version (2 numbers), section headers, splats, level, level 2's harmonics' range."""
 
-_SECTION = struct.Struct("<IIIIfHxxI4xIIH")
-"""See `_Section`, but for its place and start."""
+_SECTION = struct.Struct("<IIIIfHxxI4xIIH")  # the fields of `_Section` from `splats` on
 
-_HEADER_BYTES, _SECTION_BYTES = 4096, 1024
-"""What the two take in a file; the rest of each is not used."""
+_HEADER_BYTES, _SECTION_BYTES = 4096, 1024  # of the two in a file; the rest of each is unused
 
 _LEVELS, _DEGREES = 3, 3
 
-_HARMONICS = 1.5
-"""Level 2: harmonics lie between this and minus this where the header says nothing."""
+_HARMONICS = 1.5  # level 2: harmonics lie between -1.5 and 1.5 unless the header says otherwise
 
-_MIDDLE = 32767
-"""Levels 1 and 2: code of the middle of a bucket where a section says nothing."""
+_MIDDLE = 32767  # levels 1 and 2: code of a bucket's middle unless the section says otherwise
 
 
 def _read_splat(path, data):
@@ -78,7 +69,7 @@ def _write_splat(stream, splats):
 
 
 class _Section(NamedTuple):
-    """What the header of a section says, and where the section stands."""
+    """The header of a section, and where the section begins."""
 
     place: Place
     start: int
@@ -95,12 +86,12 @@ class _Section(NamedTuple):
 
     @property
     def rows(self) -> int:
-        """Where its rows begin: behind lengths and centres of buckets."""
+        """Byte at which its rows begin: behind lengths and centres of buckets."""
         return self.start + 4 * self.partial + self.bucket_bytes * self.bucket_count
 
 
 def _row(level, degree):
-    """What is stored of a splat: rotation is w x y z, colour has opacity behind."""
+    """Dtype of one splat: rotation is w x y z, colour ends with opacity."""
     mean, number = ("<f4", "<f4") if level == 0 else ("<u2", "<f2")
     rest = ("<f4", "<f2", "u1")[level], 3 * above_constant(degree)
     fields = [("mean", mean, 3), ("scale", number, 3), ("rotation", number, 4)]
@@ -179,10 +170,7 @@ def _fill(splats, level, limits, section, data):
 
 
 def _buckets(section, data):
-    """Centres of the buckets (B, 3), and in which bucket each splat lies.
-
-    Full buckets come first; the lengths of the others stand before the centres.
-    """
+    """Centres of the buckets (B, 3) and the bucket of each splat; full buckets come first."""
     middle = section.start + 4 * section.partial
     lengths = data[section.start : middle].view("<u4").astype(np.int64)
     centers = data[middle : section.rows].view("<f4").reshape(-1, 3)
@@ -198,7 +186,7 @@ def _buckets(section, data):
 
 
 def _named(suffix):
-    """`Format.matches` of files of this name, unless they are PLY."""
+    """`Format.matches` of files with this suffix that are no PLY."""
     return lambda path, head: (
         path.suffix.lower() == suffix and bool(head) and not head.startswith(b"ply")
     )

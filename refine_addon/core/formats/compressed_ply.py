@@ -1,10 +1,8 @@
 """SuperSplat's compressed PLY: 16 bytes a splat, in chunks of 256 that share their ranges.
 
-A chunk stores the least and the largest position, log scale and colour of its splats. Each splat
-stores its position and log scale as fractions of these ranges, in 11, 10 and 11 bits for x, y and
-z, its colour likewise, in 8 bits a channel, its opacity in 8 bits, and the three smaller components
-of its rotation in 10 each. Harmonics have 8 bits each. Splats are sorted, so that those of a chunk
-are near each other and their ranges small.
+Position (11, 10, 11 bits), log scale (11, 10, 11) and colour (8 each) are fractions of the chunk's
+ranges; opacity has 8 bits, the three smaller components of the rotation 10 each, harmonics 8 each.
+Splats are sorted, so that those of a chunk are near each other and its ranges small.
 """
 
 from __future__ import annotations
@@ -19,35 +17,29 @@ from .ply_columns import REST_COUNTS
 
 NAME = "compressed PLY"
 
-SPLATS = 256
-"""Splats of a chunk."""
+SPLATS = 256  # of a chunk
 
 _NAMES = [(end, axis) for end in ("min", "max") for axis in "xyz"]
 _POSITION = tuple(f"{end}_{axis}" for end, axis in _NAMES)
 _SCALE = tuple(f"{end}_scale_{axis}" for end, axis in _NAMES)
 _COLOR = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
-"""Properties of a chunk, each group the lower ends of its three ranges and then the upper ones."""
+"""Properties of a chunk: in each group the three lower ends, then the three upper."""
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
-_PLACES = ((21, 0x7FF), (11, 0x3FF), (0, 0x7FF))
-"""Of x, y and z in 32 bits: how far to shift, and the largest code."""
+_PLACES = ((21, 0x7FF), (11, 0x3FF), (0, 0x7FF))  # of x, y, z: shift, largest code
 
-_CHANNELS = ((24, 0xFF), (16, 0xFF), (8, 0xFF), (0, 0xFF))
-"""Of red, green, blue and opacity: how far to shift, and the largest code."""
+_CHANNELS = ((24, 0xFF), (16, 0xFF), (8, 0xFF), (0, 0xFF))  # of red, green, blue, opacity: likewise
 
 _TURNS = ((20, 0x3FF), (10, 0x3FF), (0, 0x3FF))
-"""Of the three smaller components of a rotation; the two bits above say which is the largest."""
+"""Of a rotation likewise; the two bits above name the largest component."""
 
-SCALE_LIMIT = 20.0
-"""Log scales beyond this, above or below, are written as this."""
+SCALE_LIMIT = 20.0  # log scales are clipped to ±20
 
-REST_RANGE = 8.0
-"""Harmonics are written between -4 and 4, in 256 steps."""
+REST_RANGE = 8.0  # harmonics are written between -4 and 4, in 256 steps
 
 
 def _matches(_path, head):
-    """Whether this is a PLY whose header has packed positions."""
     header = ply.raw_header(head) or b""
     words = (line.split() for line in header.splitlines())
     return any(line[:1] == [b"property"] and line[2:] == [b"packed_position"] for line in words)
@@ -117,7 +109,7 @@ def _read(path, data):
 
 
 def _chunks_of(piece):
-    """Which chunks the splats of a piece are in; pieces begin with a chunk."""
+    """Chunks of the splats of a piece; pieces begin with a chunk."""
     return slice(piece.start // SPLATS, -(-piece.stop // SPLATS))
 
 
@@ -139,7 +131,7 @@ def _packed(shares, fields):
 
 
 def _between(shares, chunks, names):
-    """Vectors (n, 3) of shares of the ranges of their chunks, which replace the shares."""
+    """Vectors (n, 3) from shares of their chunks' ranges; overwrites the shares."""
     for axis, share in enumerate(shares.T):
         ends = (chunks[name].astype(np.float64) for name in (names[axis], names[axis + 3]))
         low, high = (np.repeat(end, SPLATS)[: len(shares)] for end in ends)
@@ -148,7 +140,7 @@ def _between(shares, chunks, names):
 
 
 _REST = np.concatenate([[0.0], (np.arange(1, 255) + 0.5) / 256.0, [1.0]]) * REST_RANGE - 4.0
-"""Code -> coefficient: the middle of its step, the ends of the range at either end."""
+"""Code -> coefficient: the middle of its step; codes 0 and 255 are the ends of the range."""
 
 
 def _write(stream, splats):
@@ -179,7 +171,7 @@ def _write(stream, splats):
 
 
 def _places(values, ranges):
-    """Values (n, 3) as fractions of the ranges of their chunks; set `ranges` (C, 6)."""
+    """Values (n, 3) as fractions of their chunks' ranges; sets `ranges` (C, 6)."""
     # Rounded once: of ends in float32, all values in between are in between.
     with np.errstate(under="ignore"):
         values = np.asarray(values, np.float32)
@@ -202,10 +194,7 @@ def _header(count, rest):
 
 
 def _sizes(count, degree):
-    """How large a file is, at most: the last chunk may have fewer splats than the others.
-
-    The header has a comment unless the splats are of the default model.
-    """
+    """Largest size: the last chunk may be shorter, and the default model needs no comment."""
     rest = 3 * above_constant(degree)
     chunk, header = 18 * 4, ply.with_model(_header(count, rest), "antialiased")
     return 16 + rest + chunk / SPLATS, len(header) + chunk

@@ -1,4 +1,4 @@
-"""What a splat format other than plain PLY is to the rest: how it is known, read and written."""
+"""The interface of a splat format other than plain PLY, and conversions that formats share."""
 
 from __future__ import annotations
 
@@ -18,34 +18,30 @@ from .ply import Origin, SplatFile, new_header, with_model
 from .ply_columns import empty_rows
 
 CHUNK = 1 << 15
-"""Splats that are converted at a time: 8 MB at degree 3. A multiple of `compressed_ply.SPLATS`."""
+"""Splats converted at a time: 8 MB at degree 3. A multiple of `compressed_ply.SPLATS`."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of splat files; an output is known by its suffix.
+    """A format of splat files; `write` is None if it is only read.
 
     Attributes
     ----------
-    name : str
-        For messages.
     suffix : str
-        Ending of its files, lower case.
+        In lower case; names the format of an output.
     matches : callable
         ``matches(path, head)``: whether a file with these first bytes is of this format.
-    read : callable
-        ``read(path, data)`` returns a `SplatFile`; `data` is the file, (M,) uint8.
     write : callable or None
-        ``write(stream, splats)``; all of the splats can be drawn. None if it is only read.
+        ``write(stream, splats)``; all of the splats can be drawn.
     degree : int
         Highest degree of harmonics that it holds.
     loss : str
         What it does to splats, as a sentence without its subject.
     sizes : callable or None
-        ``sizes(count, degree)`` returns the bytes of one splat, and of everything else at most;
-        None if a file is compressed as a whole.
+        ``sizes(count, degree)``: bytes of one splat, and of everything else at most; None if
+        files are compressed as a whole.
     models : tuple of str
-        Which of `rendering.MODELS` its files can tell: what `write` finds in `Splats.model`.
+        Models that a file can name.
     """
 
     name: str
@@ -62,23 +58,9 @@ class Format:
 def new_file(
     path: Path, origin: tuple[str, int], count: int, degree: int, model: Model = "default"
 ) -> tuple[SplatFile, Splats]:
-    """Make a file of `count` splats whose values are still to be set.
+    """New plain PLY of `count` splats in memory, and its splats as views to be assigned to.
 
-    Parameters
-    ----------
-    path : Path
-    origin : str, int
-        See `Origin`.
-    count, degree : int
-    model : {"default", "antialiased", "2dgs"}
-        The splats have a third scale, whatever this is.
-
-    Returns
-    -------
-    file : SplatFile
-        The plain PLY of the splats, in memory.
-    splats : Splats
-        Views of its rows, to be assigned to.
+    `origin` holds the fields of `Origin`. The splats have a third scale in every model.
     """
     rows, splats = empty_rows(count, degree)
     header = with_model(new_header(rows.dtype, count), model)
@@ -86,47 +68,37 @@ def new_file(
 
 
 def pieces(count: int) -> list[slice]:
-    """Slices of ``range(count)`` that are converted at a time."""
+    """Slices of ``range(count)``, `CHUNK` long."""
     return chunks(count, CHUNK)
 
 
 def codes(shares: NDArray[Any]) -> NDArray[np.uint8]:
-    """Shares of 0..1 as the nearest of 0..255; those outside count as the nearer end."""
+    """Shares as the nearest of 0..255, clipped to 0..1 before."""
     return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * 255), np.uint8)
 
 
 def color_codes(splats: Splats) -> NDArray[np.uint8]:
-    """Colours and opacities of splats in 8 bits each, (N, 4)."""
+    """Colours and opacities in 8 bits each, (N, 4)."""
     return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
 
 
 def set_colors(splats: Splats, shares: NDArray[Any]) -> None:
-    """Set colours and opacities to these of 0..1, (N, 4)."""
+    """Set colours and opacities from shares of 0..1, (N, 4)."""
     splats.sh_dc[:] = (shares[:, :3] - 0.5) / SH_C0
     splats.opacity_logits[:] = opacity_logits(shares[:, 3])
 
 
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
-    """Raise `RefineError` if a file of `available` bytes is too short for what it announces."""
+    """Raise `RefineError` if a file of `available` bytes is shorter than it announces."""
     if needed > available:
         problem = f"{what} need {needed} bytes, the file has {available}"
         raise RefineError(f"{path}: truncated: {problem}")
 
 
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Three smaller components of unit quaternions, which tell the largest.
+    """Index (N,) of the largest component of unit quaternions (N, 4), the others (N, 3) in order.
 
-    Parameters
-    ----------
-    q : (N, 4) float64
-        Length 1.
-
-    Returns
-    -------
-    largest : (N,) intp
-        Which component is left out: the first of the largest.
-    others : (N, 3) float64
-        The other three in their order, negated where the largest is negative.
+    The first of equal components counts. Signs are flipped where the largest is negative.
     """
     largest = np.abs(q).argmax(axis=1)
     others = np.take_along_axis(q, _OTHERS[largest], axis=1)
@@ -135,7 +107,7 @@ def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def join_largest(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternions of `split_largest`, (N, 4)."""
+    """Quaternions (N, 4), the reverse of `split_largest`."""
     left = np.maximum(1.0 - np.einsum("ij,ij->i", others, others), 0.0)
     q = np.empty((len(others), 4))
     np.put_along_axis(q, _OTHERS[largest], others, axis=1)
@@ -143,12 +115,11 @@ def join_largest(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDAr
     return q
 
 
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Left-out component -> the other three."""
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # left-out component -> the others
 
 
 def nearby_order(means: NDArray[Any]) -> NDArray[np.int64]:
-    """Order of finite positions (N, 3), (N,), in which neighbours in space follow."""
+    """Order (N,) of finite positions (N, 3) along a curve that keeps neighbours together."""
     sample = np.asarray(means[:: max(len(means) // _SAMPLE, 1)], np.float64)
     middle = np.median(sample, axis=0)
     size = float(np.median(np.abs(sample - middle))) or 1.0

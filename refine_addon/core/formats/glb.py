@@ -1,8 +1,8 @@
 """Binary glTF (``.glb``) with KHR_gaussian_splatting: plain accessors, activated values.
 
-A primitive of points has float positions, rotations x y z w, linear scales, opacities of 0..1 and
-harmonics as attributes. glTF's y points up where that of captures points down: both are turned half
-about z into each other, which changes signs only. What nodes do to a primitive is applied.
+Rotations are x y z w, scales linear, opacities 0..1. glTF's y points up where that of captures
+points down: half a turn about z, which changes signs only, takes one to the other. The transforms
+of nodes are applied.
 """
 
 from __future__ import annotations
@@ -32,17 +32,14 @@ _JSON, _BINARY = b"JSON", b"BIN\0"
 _LONGEST = (1 << 32) - 1
 _DEGREES = 3
 
-_KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-"""glTF's component types that splats may have -> NumPy's."""
+_KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}  # glTF's types -> NumPy's
 
-_SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-"""Numbers of a value -> the type of its accessor."""
+_SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # width -> type of accessor
 
 _FLOAT, _BYTE = 5126, 5121
 _POINTS, _VERTICES = 0, 34962
 
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Between the frame of captures and that of glTF, either way."""
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # between the frames of captures and glTF, either way
 
 
 class _Document(NamedTuple):
@@ -62,7 +59,7 @@ class _Document(NamedTuple):
         return where.members(items[index]), where
 
     def values(self, index: Any, place: Place, width: int) -> tuple[NDArray[Any], float]:
-        """Values of an accessor as they are stored, (n, width), and what they are multiples of."""
+        """Stored values of an accessor, (n, width), and the unit they count in."""
 
         def whole(key: str, default: int | None = None) -> int:
             return where.at(key).whole(view.get(key, default))
@@ -156,7 +153,6 @@ def _read(path, data):
 
 
 def _opened(path, data):
-    """Parse a file's chunks and its JSON."""
     refuse_short(path, _HEADER.size + _CHUNK.size, len(data), "the first bytes of a GLB file")
     _, version, length = _HEADER.unpack(data[: _HEADER.size].tobytes())
     if version != _VERSION:
@@ -180,7 +176,7 @@ def _listed(holder, key, place):
 
 
 def _moved(frame, node, place):
-    """Frame of a node, (4, 4), in that of the scene; `frame` is that of the node above."""
+    """Frame of a node, (4, 4), in that of the scene; `frame` is that of its parent."""
     if "matrix" in node:
         return frame @ np.reshape(place.at("matrix").numbers(node["matrix"], 16), (4, 4)).T
     if node.keys().isdisjoint(("translation", "rotation", "scale")):
@@ -217,7 +213,6 @@ def _parts(document, mesh, place):
 
 
 def _part(document, attributes, place):
-    """Look up the attributes of a primitive of splats."""
     attributes = place.members(attributes)
     degree, count, held = 0, 0, {}
     while degree < _DEGREES and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
@@ -241,7 +236,7 @@ def _part(document, attributes, place):
 
 
 def _fill(target, part, piece):
-    """Set splats to those of a piece of a primitive; harmonics that are absent are 0."""
+    """Set splats to those of a piece of a primitive; absent harmonics are 0."""
     target.means[:] = part.values("POSITION", piece)
     sizes = part.values("SCALE", piece)
     target.log_scales[:] = sizes if part.logs else np.log(sizes, dtype=np.float32)
@@ -254,7 +249,7 @@ def _fill(target, part, piece):
 
 
 def _half_turned(splats):
-    """Splats turned half about z, to the bit: see `_HALF_TURN`."""
+    """Splats turned by `_HALF_TURN`, exact to the bit."""
     w, x, y, z = splats.quaternions.T
     # Half a turn multiplies the harmonic of order m by (-1)^m.
     bands = range(1, splats.sh_degree + 1)
@@ -271,10 +266,7 @@ def _harmonics(degree):
 
 
 def _attributes(degree):
-    """What is written, in the order of the binary chunk.
-
-    Name, component type, numbers of one splat, and these, (n, width), in the frame of glTF.
-    """
+    """Name, type, width and values (n, width) of each attribute, in file order and glTF's frame."""
     constant, *others = (f"{EXTENSION}:{name}" for name in _harmonics(degree))
     harmonics = [lambda splats, k=k: splats.sh_rest[:, k] for k in range(len(others))]
     return [
@@ -293,7 +285,7 @@ def _rotations(splats):
 
 
 def _write(stream, splats):
-    """Write splats as a file with one node; refuse more than 4 GiB, which it cannot say."""
+    """Write splats as a file with one node; refuse more than 4 GiB, the format's limit."""
     attributes = _attributes(splats.sh_degree)
     with np.errstate(under="ignore", over="ignore"):  # doubles that are no floats
         means = np.asarray(splats.means, np.float32) * np.array([-1.0, -1.0, 1.0], np.float32)
@@ -312,7 +304,7 @@ def _write(stream, splats):
 
 
 def _json(attributes, count, low, high):
-    """JSON of a file, padded with spaces to a multiple of 4 bytes, and the bytes behind it."""
+    """JSON padded with spaces to a multiple of 4 bytes, and the bytes behind it."""
     views, accessors, at = [], [], 0
     for index, (_, kind, width, _) in enumerate(attributes):
         length = width * np.dtype(_KINDS[kind]).itemsize * count
@@ -340,7 +332,7 @@ def _json(attributes, count, low, high):
 
 
 def _sizes(count, degree):
-    """Bytes of a splat and of the rest, at most: its JSON has numbers of unknown length."""
+    """Bytes of a splat and of the rest, at most: the numbers in the JSON have varying length."""
     longest = [-1.1754943508222875e-38] * 3
     text, _ = _json(_attributes(degree), count, longest, longest)
     _, row = _json(_attributes(degree), 1, longest, longest)

@@ -1,9 +1,8 @@
-"""Plain 3DGS PLY: read through a memory map, and written with the kept rows unchanged.
+"""Plain 3DGS PLY: read through a memory map, written with the kept rows unchanged.
 
-Only the columns that are used are read from the disk. Text is parsed into memory and written as
-binary. plyfile parses the header. It gets the header without comments (which may be in any
-encoding), with plain line ends, and with row counts of 0, since it would allocate memory for the
-rows.
+Only the columns used are read from the disk. ASCII is parsed into memory and written as binary.
+plyfile parses the header, without comments (of any encoding), with plain line ends and with row
+counts of 0, since it would allocate memory for the rows.
 """
 
 from __future__ import annotations
@@ -32,24 +31,19 @@ from ..whole_file import Url, expanded, refuse_mapped, whole_file
 from . import ply_columns
 from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, Changes, Keep
 
-HEADER_LIMIT = 1 << 20
-"""Longest header that is read, bytes."""
+HEADER_LIMIT = 1 << 20  # longest header that is read, bytes
 
-TEXT = "="
-"""Byte order for ASCII files: their numbers are stored in that of the machine."""
+TEXT = "="  # "byte order" of ASCII files: numbers in memory have the machine's
 
 PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort"}
-PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
-"""Names of types in NumPy -> in PLY."""
+PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # NumPy's names -> PLY's
 
-INDEXING = ("edge", "face", "tristrips")
-"""Elements that by convention hold indices of vertices."""
+INDEXING = ("edge", "face", "tristrips")  # elements that by convention hold indices of vertices
 
 _NAMES_SHOWN = 12
 
 _MODES: dict[Model, bytes] = {"default": b"default", "antialiased": b"mip", "2dgs": b"2dgs"}
-"""Model -> Brush's word for it, in a comment ``SplatRenderMode: WORD``. Postshot's is
-``antialiased 0`` or ``1``."""
+"""Model -> WORD in Brush's ``SplatRenderMode: WORD``; Postshot has ``antialiased 0`` or ``1``."""
 
 _MODEL_COMMENT = re.compile(
     rb"comment[ \t]+(?:splatrendermode:[ \t]*(default|mip|2dgs)|antialiased[ \t]+([01]))[ \t\r]*",
@@ -58,21 +52,19 @@ _MODEL_COMMENT = re.compile(
 
 _ENDS = {b"\n": rb"\n[ \t]*end_header[ \t]*\r?\n"}
 _ENDS |= {end: end + rb"[ \t]*end_header[ \t]*" + end for end in (b"\r\n", b"\r")}
-"""End of a header, for each kind of line end. Only that of the first line is looked for, since
-bytes of the body may look like another."""
+"""Line end -> end of a header. Only the first line's kind counts: the body may hold others."""
 
 _ROWS = 1 << 12
 """Rows copied at a time: 1 MB at degree 3, which stays in the L2 cache until it is written."""
 
 _CHANGED_ROWS = 1 << 14
-"""Rows copied at a time where columns are set, which takes a few calls for each of them."""
+"""Rows copied at a time where columns are set, at a few calls a column."""
 
-_AHEAD = 16
-"""So many chunks may wait for those before them to be written."""
+_AHEAD = 16  # chunks that may wait for earlier ones to be written
 
 
 class Origin(NamedTuple):
-    """Format and bytes of the file that rows come from, where it is no binary PLY."""
+    """Format and bytes of the source file, where it is no binary PLY."""
 
     format: str
     size: int
@@ -84,20 +76,18 @@ class SplatFile:
 
     Attributes
     ----------
-    path : Path
-        Where it was read from.
     rows : (N,) structured
         The vertex element, one field for each property; read-only and mapped if binary.
     header : bytes
-        The bytes of the header, with ``end_header`` and its line end.
+        With ``end_header`` and its line end.
     before, after : (M,) uint8
         Bytes of the body before and after the vertex rows.
     indexing : tuple of str
         Names of other elements whose rows hold indices of splats.
     origin : Origin or None
-        What the file is, where it is no binary PLY; `write` writes a binary PLY.
+        Set where the file is no binary PLY; `write` writes a binary PLY.
     remarks : tuple of str
-        What the user should know of how it was read, in sentences.
+        Sentences for the user about how it was read.
     """
 
     path: Path
@@ -110,7 +100,6 @@ class SplatFile:
     remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        """Return the number of splats."""
         return len(self.rows)
 
     @property
@@ -125,7 +114,7 @@ class SplatFile:
 
     @property
     def format(self) -> str:
-        """Format as in the header, such as ``binary_little_endian 1.0``, or of the `origin`."""
+        """Format in the header, such as ``binary_little_endian 1.0``, or of the `origin`."""
         return format_of(self.header) if self.origin is None else self.origin.format
 
     @property
@@ -139,12 +128,12 @@ class SplatFile:
         return stated_model(self.header, self.rows.dtype) or "default"
 
     def drawn_as(self, model: Model | None) -> SplatFile:
-        """File with splats that are drawn in another way; None leaves it as it is.
+        """The file with its splats drawn as another model; None leaves it as it is.
 
         Raises
         ------
         RefineError
-            If there is no such model, or splats without a third scale are to be anything but discs.
+            For an unknown model, or if splats without a third scale are to be other than discs.
         """
         if model is None or model == self.model:
             return self
@@ -155,7 +144,7 @@ class SplatFile:
         return replace(self, header=with_model(self.header, model))
 
     def without_third_scale(self) -> SplatFile:
-        """Discs without a third scale; splats that are no discs stay as they are."""
+        """Discs without a third scale; other splats unchanged."""
         names = self.rows.dtype.names or ()
         if self.model != "2dgs" or THIRD_SCALE not in names:
             return self
@@ -168,13 +157,7 @@ class SplatFile:
         return drawn_as(ply_columns.splats_from_columns(self.rows), self.model)
 
     def size(self, keep: Keep = None, columns: Changes = None) -> int:
-        """Bytes that `write` would write.
-
-        Parameters
-        ----------
-        keep, columns
-            See `write`.
-        """
+        """Bytes that `write` would write."""
         header, row, count = self._layout(keep, columns or {})
         return len(header) + len(self.before) + count * row.itemsize + len(self.after)
 
@@ -192,22 +175,21 @@ class SplatFile:
         Parameters
         ----------
         path : path-like
-            The file to write, completely or not at all. ``~`` is the home folder.
+            Written completely or not at all. ``~`` is the home folder.
         keep : (N,) bool, optional
-            Which rows to write; all by default.
+            Rows to write; all by default.
         columns : mapping of str to (N,), optional
-            Properties to set. Properties that the file has keep their place and type; new ones are
-            appended with the type of their array (float32 -> ``float``).
+            Properties to set. Existing ones keep their place and type; new ones are appended with
+            the type of their array (float32 -> ``float``).
         overwrite : bool
-            Whether an existing file may be replaced, even this one.
+            Whether an existing file may be replaced, even the one that was read.
         threads : int, optional
-            How many gather rows, while others are written.
+            Number of threads that gather rows, while others are written.
 
         Raises
         ------
         RefineError
-            If the file cannot be written, or exists and may not be replaced; if the shape or type
-            of `keep` or of a column is wrong.
+            If the file exists, cannot be written, or `keep` or a column has a wrong shape or type.
         """
         path, columns = expanded(path), columns or {}
         if keep is not None and (keep.shape != self.rows.shape or keep.dtype != np.bool_):
@@ -223,7 +205,7 @@ class SplatFile:
             stream.write(self.after.data)
 
     def _layout(self, keep, columns):
-        """Header, row and splats of a file with these columns; refuse what none can be."""
+        """Header, row dtype and number of splats of the output; refuse columns that do not fit."""
         count = len(self) if keep is None else int(np.count_nonzero(keep))
         header, names = with_count(self.header, count), self.rows.dtype.names or ()
         if isinstance(columns, ChangedColumns):
@@ -254,36 +236,19 @@ class SplatFile:
 
 
 def read_ply(path: Path | str) -> SplatFile:
-    """Open a 3DGS PLY file: binary of either byte order, or ASCII.
-
-    Parameters
-    ----------
-    path : path-like
-        ``~`` is the home folder.
-
-    Returns
-    -------
-    SplatFile
-        It may have no splats.
+    """Open a 3DGS PLY file: binary of either byte order, or ASCII; it may have no splats.
 
     Raises
     ------
     RefineError
-        If the file does not exist, is not a PLY, is truncated, or does not hold splats; the message
-        names the file, the place, what was found and what was expected.
+        If the file is missing, damaged or holds no splats; with the place in the file.
     """
     path = expanded(path)
     return read_plain(path, file_bytes(path))
 
 
 def file_bytes(path: Path) -> NDArray[np.uint8]:
-    """Bytes of a file of splats, which are read when they are used.
-
-    Raises
-    ------
-    RefineError
-        If it does not exist, is no file or may not be read.
-    """
+    """Bytes of a file, memory-mapped; `RefineError` if it is no file or may not be read."""
     try:
         state = path.stat()
         if not stat.S_ISREG(state.st_mode):  # opening a pipe would wait for a writer
@@ -321,13 +286,7 @@ class Header(NamedTuple):
 
 
 def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
-    """Header of a file of splats that begins so, and which element they are.
-
-    Raises
-    ------
-    RefineError
-        See `read_ply`.
-    """
+    """Header of a file of splats from its first bytes, and the index of the element of splats."""
     header = read_header(path, head)
     names = [element.name for element in header.elements]
     if "vertex" not in names:
@@ -366,13 +325,7 @@ def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
 
 
 def read_header(path: Path | Url, head: bytes) -> Header:
-    """Header of a file that begins so; `HEADER_LIMIT` bytes are enough.
-
-    Raises
-    ------
-    RefineError
-        If the file has no header, or the header is wrong; with the line.
-    """
+    """Header from a file's first `HEADER_LIMIT` bytes; errors name the line."""
     raw, problem = raw_header(head), ""
     if not head:
         problem = "the file is empty, expected a PLY"
@@ -396,7 +349,7 @@ def read_header(path: Path | Url, head: bytes) -> Header:
 
 
 def raw_header(head: bytes) -> bytes | None:
-    """Header at the beginning of a file; None if this is no PLY, or the header has no end."""
+    """Bytes of the header; None if this is no PLY, or the header has no end."""
     if not re.match(rb"ply[\r\n]", head):
         return None
     end = re.search(_ENDS[_line_end(head)], head)
@@ -404,7 +357,7 @@ def raw_header(head: bytes) -> bytes | None:
 
 
 def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
-    """Header as plyfile gets it, see the top of this file, and the counts of rows."""
+    """The header that plyfile gets (see the top of this file), and the counts of rows."""
     lines: list[bytes] = []
     counts: list[int] = []
     names, elements = set[bytes](), set[bytes]()
@@ -430,25 +383,14 @@ def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
 
 
 def has_lists(element: Any) -> bool:
-    """Whether an element of a header has lists, so that its rows differ in length."""
+    """Whether an element has lists, so that its rows differ in length."""
     return any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties)
 
 
 def row_ranges(header: Header, available: int) -> list[slice]:
-    """Where in a binary body the rows of each element lie, up to the first that has lists.
+    """Bytes of each element's rows in a body of `available` bytes, up to the first with lists.
 
-    A header that announces more rows than the file can hold is refused, before memory is allocated.
-
-    Parameters
-    ----------
-    header : Header
-    available : int
-        Bytes after the header.
-
-    Raises
-    ------
-    RefineError
-        If that many rows would not fit even if each were as short as possible.
+    `RefineError` for more rows than the body can hold, before memory is allocated for them.
     """
     ranges, least, text = [], 0, header.order == TEXT
     for element, count in zip(header.elements, header.counts, strict=True):
@@ -484,7 +426,7 @@ def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> S
 
 
 def _numbers(path, dtype, lines):
-    """Numbers in lines of text; the first line that is wrong is refused."""
+    """Numbers in lines of text; refuse the first wrong line."""
     if (rows := _parsed(lines, dtype)) is not None:
         return rows
     wrong = next(part for part in chunks(len(lines), _ROWS) if _parsed(lines[part], dtype) is None)
@@ -533,15 +475,7 @@ def _listed(names: list[str]) -> str:
 
 
 def new_header(rows: np.dtype[Any], count: int) -> bytes:
-    """Header of a binary PLY of one element, ``vertex``.
-
-    Parameters
-    ----------
-    rows : structured dtype
-        Of a row, little-endian.
-    count : int
-        How many vertices.
-    """
+    """Header of a binary PLY of one element, ``vertex``, with rows of a little-endian dtype."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {PLY_TYPES[rows[name].str[1:]]} {name}" for name in rows.names or ()]
     return "\n".join([*lines, "end_header", ""]).encode()
@@ -568,7 +502,7 @@ def vertex_header(raw: bytes) -> bytes:
 
 
 def with_count(raw: bytes, count: int) -> bytes:
-    """Header with this number of vertices; nothing else in it changes."""
+    """Header with this number of vertices, otherwise unchanged."""
     announced = re.search(_line_end(raw) + rb"[ \t]*element[ \t]+vertex[ \t]+(\d+)", raw)
     if not announced or int(announced[1]) == count:
         return raw
@@ -576,10 +510,7 @@ def with_count(raw: bytes, count: int) -> bytes:
 
 
 def model_of(raw: bytes) -> Model | None:
-    """How the comments of a header say that its splats are drawn; None if they do not.
-
-    Of several comments the last counts, as in Brush and splat-transform.
-    """
+    """Model in the comments of a header; the last counts, as in Brush and splat-transform."""
     model: Model | None = None
     for match in filter(None, map(_MODEL_COMMENT.fullmatch, _lines(raw))):
         word = match[1].lower() if match[1] else (b"default", b"mip")[int(match[2])]
@@ -588,22 +519,14 @@ def model_of(raw: bytes) -> Model | None:
 
 
 def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:
-    """How a PLY says that its splats are drawn; None if it does not.
-
-    Parameters
-    ----------
-    header : bytes
-    rows : structured dtype
-        Of its splats: without a third scale they are discs, whatever comments say.
-    """
+    """Model that a PLY states, or None; discs if `rows`, the dtype of a row, has no third scale."""
     return model_of(header) if THIRD_SCALE in (rows.names or ()) else "2dgs"
 
 
 def with_model(raw: bytes, model: Model) -> bytes:
-    """Header with a comment on how its splats are drawn, in place of what it says.
+    """Header with a comment that states the model; unchanged if it says so already.
 
-    A header that says so already stays as it is, and so does one that says nothing where `model` is
-    "default".
+    A header that says nothing stays unchanged for "default".
     """
     if (model_of(raw) or "default") == model:
         return raw
@@ -659,7 +582,7 @@ def write_rows(
 
 
 def _grown(dtype, columns):
-    """Row with further columns behind, in the byte order of x, which has several bytes."""
+    """Row dtype with columns appended, in the byte order of x, which has several bytes."""
     names, order = dtype.names or (), dtype["x"].byteorder
     more = [(name, values.dtype.newbyteorder(order)) for name, values in columns.items()]
     fields = [(name, dtype[name]) for name in names]

@@ -14,27 +14,16 @@ _NAMES = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1
 REQUIRED = tuple(_NAMES.split())
 """Properties that every splat has."""
 
-THIRD_SCALE = "scale_2"
-"""The one of them that discs (2DGS) lack."""
+THIRD_SCALE = "scale_2"  # the only one that discs (2DGS) may lack
 
-REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
-"""Number of ``f_rest_*`` properties -> spherical-harmonics degree."""
+REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}  # number of ``f_rest_*`` -> degree
 
 
 def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> Splats:
-    """Splats from arrays named as the properties of a 3DGS PLY.
+    """Splats from all of `REQUIRED` and any ``f_rest_*``, (N,) each; discs without ``scale_2``.
 
-    Parameters
-    ----------
-    columns : structured array or mapping of str to (N,)
-        All of `REQUIRED`, and ``f_rest_*`` if there are any: all coefficients of red, then of
-        green, then of blue, as the reference implementation stores them. Without ``scale_2`` they
-        are discs (2DGS).
-
-    Returns
-    -------
-    Splats
-        Views of a structured array where the fields of a group are adjacent, otherwise copies.
+    The harmonics are all of red, then green, then blue, as in the reference implementation. Arrays
+    are views of a structured array where the fields of a group are adjacent, otherwise copies.
     """
     names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
     count = sum(name.startswith("f_rest_") for name in names)
@@ -57,27 +46,13 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
 
 
 def other_properties(names: Iterable[str]) -> list[str]:
-    """Which of the names of a file's properties say nothing of splats, nor are normals."""
+    """Names that belong neither to splats nor to normals."""
     known = ("nx", "ny", "nz", *REQUIRED)
     return [name for name in names if name not in known and not name.startswith("f_rest_")]
 
 
 def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
-    """Rows of float32 in the layout of a plain 3DGS PLY without normals, to be filled.
-
-    Parameters
-    ----------
-    count : int
-    degree : int
-        Of the harmonics, 0 to 4.
-
-    Returns
-    -------
-    rows : (count,) structured
-        Values are not set.
-    splats : Splats
-        Views of the rows; what is assigned to them is in the rows.
-    """
+    """Unset float32 rows (count,) of a 3DGS PLY without normals, and their splats as views."""
     rest = 3 * above_constant(degree)
     names = [*REQUIRED[:6], *(f"f_rest_{index}" for index in range(rest)), *REQUIRED[6:]]
     table = np.empty((count, len(names)), "<f4")
@@ -89,10 +64,9 @@ def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
 
 
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
-    """Views of splats, (N,) each, by the names of properties in a 3DGS PLY.
+    """Views of splats, (N,) each, by the names and in the order of a 3DGS PLY without normals.
 
-    The order is that of the reference implementation, without normals; types are those of `splats`.
-    Discs (2DGS) have no third scale.
+    Types are those of `splats`; discs (2DGS) have no third scale.
     """
     coefficients = splats.sh_rest.shape[1]
     axes = 2 if splats.model == "2dgs" else 3
@@ -105,39 +79,29 @@ def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
 
 
 Keep: TypeAlias = "NDArray[np.bool_] | None"
-"""Which of N rows of a file are kept, (N,); None stands for all."""
+"""Kept rows among N, (N,); None stands for all."""
 
 Changes: TypeAlias = "Mapping[str, NDArray[Any]] | None"
-"""Properties of N splats by their names, (N,) each, to be set or appended; None for none."""
+"""Properties of N splats by name, (N,) each, to be set or appended."""
 
 
 class Columns(Protocol):
-    """Stored properties of N splats by their names, such as a mapping or a structured array."""
+    """Properties of N splats by name, such as a mapping or a structured array."""
 
     def __getitem__(self, name: str, /) -> NDArray[Any]:
         """A property, (N,)."""
 
 
 class ChangedColumns(Mapping[str, "NDArray[Any]"]):
-    """Stored columns with the values of some splats put in, each rounded once to the stored type.
+    """Stored columns in which M `rows` (ascending) get new values, rounded once to the stored type.
 
-    A column is made when it is asked for, as a copy; a binary PLY is written without that (`put`).
-
-    Parameters
-    ----------
-    stored : mapping of str to (N,), or structured array
-        All properties of N splats; not changed.
-    rows : (M,) int64
-        Those that change, ascending.
-    splats : Splats
-        What these M become.
+    A column is copied when it is read; `put` writes a binary PLY without such copies.
     """
 
     def __init__(self, stored: Columns, rows: NDArray[np.int64], splats: Splats) -> None:
         self._stored, self._rows, self._values = stored, rows, values_by_name(splats)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """A property as it becomes, (N,)."""
         values = self._values[name]
         column: NDArray[Any] = self._stored[name].copy()
         with np.errstate(over="ignore", under="ignore"):  # a double may be no float
@@ -145,25 +109,15 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
         return column
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names."""
         return iter(self._values)
 
     def __len__(self) -> int:
-        """The number of properties."""
         return len(self._values)
 
     def put(self, chunk: NDArray[Any], dtype: np.dtype[Any], piece: slice, kept: Keep) -> None:
-        """Put the values into rows of a file.
+        """Put the values into the bytes of the kept rows of a piece, (n,) void.
 
-        Parameters
-        ----------
-        chunk : (n,) void
-            The bytes of the kept rows of a piece.
-        dtype : structured
-            Of a row; it has all these properties.
-        piece : slice
-        kept : (m,) bool or None
-            Which rows of the piece are in the chunk; all by default.
+        `dtype` is a row's, with all these properties; `kept` selects among the piece's rows.
         """
         low, high = np.searchsorted(self._rows, (piece.start, piece.stop))
         rows, taken = self._rows[low:high] - piece.start, np.arange(low, high)

@@ -26,18 +26,15 @@ FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, by_name.SP
 READERS = (*FORMATS, by_name.KSPLAT, streamed_sog.READER, sog.META_READER)
 """Every format that is read, but plain PLY, in the order in which an input is tried."""
 
-SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
-"""Endings of the files that are written."""
+SUFFIXES = (".ply", *(form.suffix for form in FORMATS))  # of outputs
 
-READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))
-"""Endings of the files that are read."""
+READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))  # of inputs
 
-INDEX_NAMES = (streamed_sog.INDEX, sog.META)
-"""Names of files that stand for a folder."""
+INDEX_NAMES = (streamed_sog.INDEX, sog.META)  # files that stand for their folder
 
 NOT_WRITTEN: tuple[str, ...] = (".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
 NOT_WRITTEN += tuple(form.suffix for form in READERS if form.write is None)
-"""Endings of other splat formats and of compressed files: a PLY of such a name would mislead."""
+"""Suffixes of other splat formats and of compressed files: a PLY of such a name would mislead."""
 
 _HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed PLY has fewer
 
@@ -45,26 +42,22 @@ _HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed 
 def read_splats(path: Path | str, model: Model | None = None, level: int = 0) -> SplatFile:
     """Open a file of splats of any format, known by its content.
 
+    A plain PLY is mapped. Any other format becomes, in memory, the plain PLY that holds the same
+    splats; `SplatFile.origin` names the format.
+
     Parameters
     ----------
     path : path-like
         ``~`` is the home folder.
     model : {"default", "antialiased", "2dgs"}, optional
-        How its splats are drawn, where it does not say or is wrong.
+        Overrides the model that the file states.
     level : int
-        Which level of a streamed SOG, 0 being the finest; other files have none but 0.
-
-    Returns
-    -------
-    SplatFile
-        A plain PLY is mapped as it is; a file of another format becomes the rows of the plain PLY
-        that holds the same splats, in memory, and `SplatFile.origin` says what it was.
+        Level of a streamed SOG, 0 being the finest; other files have only 0.
 
     Raises
     ------
     RefineError
-        If the file does not exist, is of no known format, or is damaged; the message names the
-        file, the place, what was found and what was expected. See also `SplatFile.drawn_as`.
+        If the file is missing, damaged or of no known format; see also `SplatFile.drawn_as`.
     """
     path = expanded(path)
     data = file_bytes(path)
@@ -80,13 +73,7 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
 
 
 def format_named(path: Path | Url) -> Format | None:
-    """Format that an output of this name is written in; None for a plain PLY.
-
-    Raises
-    ------
-    RefineError
-        If the name is that of a format which is not written.
-    """
+    """Format of an output of this name, None for plain PLY; `RefineError` if it is not written."""
     name = path.name.lower()
     form = next((form for form in FORMATS if name.endswith(form.suffix)), None)
     if form is None and name.endswith(NOT_WRITTEN):
@@ -103,13 +90,13 @@ def names_file(path: Path | Url) -> bool:
 
 
 def without_suffix(name: str) -> str:
-    """File name without the ending of a format of splats, if it has one."""
+    """File name without the suffix of a splat format, if it has one."""
     ends = (end for end in READ_SUFFIXES if name.lower().endswith(end))
     return name[: len(name) - len(max(ends, key=len, default=""))]
 
 
 def scene_name(path: Path) -> str:
-    """What the splats of a file are called: as the file, or the folder of an index.
+    """Name of the splats of a file: that of the file, or of the folder of an index.
 
     Examples
     --------
@@ -132,20 +119,13 @@ def write_splats(
 ) -> None:
     """Write the kept splats of a file in the format that the suffix of `path` names.
 
-    A plain PLY keeps all rows and properties; see `SplatFile.write`. The other formats hold no
-    splats that cannot be drawn: those are left out.
-
-    Parameters
-    ----------
-    path, keep, columns, overwrite, threads
-        See `SplatFile.write`.
-    file : SplatFile
+    A plain PLY keeps all rows and properties, see `SplatFile.write` also for the parameters. Other
+    formats leave out splats that cannot be drawn.
 
     Raises
     ------
     RefineError
-        See `format_named` and `SplatFile.write`; if no splat is left, or a column is none that the
-        format holds.
+        As `SplatFile.write`; if no splat is left, or the format lacks a column or is not written.
 
     Examples
     --------
@@ -165,7 +145,7 @@ def write_splats(
 
 
 def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: Changes) -> Splats:
-    """Splats that a file of a format gets, see `write_splats`; errors name `path`."""
+    """Splats that an output of a format holds, see `write_splats`; errors name `path`."""
     rows = file.rows if keep is None else file.rows[keep]
     if columns:
         rows = rows.copy()
@@ -182,17 +162,14 @@ def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: 
 
 
 def _tame(colors):
-    """Colours of which none is larger than files that name numbers in text may hold."""
+    """Colours clipped to the largest number that formats with numbers in text may hold."""
     if not colors.size or -LARGEST_NUMBER <= colors.min() <= colors.max() <= LARGEST_NUMBER:
         return colors
     return np.clip(colors, -LARGEST_NUMBER, LARGEST_NUMBER)
 
 
 def row_sizes(file: SplatFile, form: Format | None, count: int | None = None) -> tuple[float, int]:
-    """Bytes of one splat in a file of a format, and of everything else at most.
-
-    None is plain PLY. Both are 0 where a file is compressed as a whole.
-    """
+    """Bytes of one splat in a format, and of the rest at most; both 0 if compressed as a whole."""
     if form is None:
         return file.row_bytes, file.fixed_bytes
     degree, count = min(file.splats().sh_degree, form.degree), len(file) if count is None else count
@@ -202,7 +179,7 @@ def row_sizes(file: SplatFile, form: Format | None, count: int | None = None) ->
 def written_size(
     file: SplatFile, form: Format | None, keep: NDArray[np.bool_], columns: Changes = None
 ) -> int | None:
-    """Bytes of the file that `write_splats` makes, at most; None where only writing tells."""
+    """Bytes that `write_splats` would write, at most; None if compressed as a whole."""
     if form is None:
         return file.size(keep, columns)
     count = int(np.count_nonzero(keep))
@@ -211,12 +188,12 @@ def written_size(
 
 
 def left_out(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> int:
-    """How many of the kept splats a file of a format does not hold: they cannot be drawn."""
+    """Number of kept splats that cannot be drawn, which formats other than plain PLY leave out."""
     return 0 if form is None else int(np.count_nonzero(keep & ~drawable(file.splats())))
 
 
 def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list[str]:
-    """What the user should know about a file of the kept splats in a format, in sentences."""
+    """Sentences for the user about writing the kept splats in a format."""
     if form is None:
         kept = "beside the splats is kept as it is; its indices may point past the end"
         indexing = () if keep.all() else file.indexing
@@ -238,10 +215,7 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
 
 
 def refuse_unknown_size(output: Path | None) -> None:
-    """Raise `RefineError` if the size of an output does not follow from the number of its splats.
-
-    See also `format_named`.
-    """
+    """Raise `RefineError` if the output is of a format compressed as a whole, or not written."""
     form = None if output is None else format_named(output)
     if form is not None and form.sizes is None:
         problem = f"a size cannot be kept to in {form.suffix}, which is compressed as a whole"

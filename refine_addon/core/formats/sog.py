@@ -1,11 +1,9 @@
-"""SOG files by PlayCanvas: ``meta.json`` and WebP images, in a ZIP archive or in a folder.
+"""SOG by PlayCanvas: ``meta.json`` and WebP images, in a ZIP archive or in a folder.
 
-A pixel of each image belongs to a splat: 16 bits of the logarithm of each coordinate, three
-components of the rotation in 8, scales and colours as places in a table of 256 values, opacity in
-8. Harmonics are one of up to 65,536 palettes' entries, whose values are places in a third table.
-
-In version 1, which names no version and is only read, a table is even steps between two ends, one
-table for each axis or channel, and opacity is a logit.
+A splat is one pixel in each image: 16 bits of the logarithm of each coordinate, three components
+of the rotation in 8, opacity in 8, scales and colours as places in tables of 256 values, harmonics
+as an entry of a palette. Version 1, only read, names no version: a table is even steps between two
+ends, one for each axis or channel, and opacity is a logit.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ GENERATOR = "REFINE for Blender"
 META = "meta.json"
 _PARTS = ("means_l", "means_u", "quats", "scales", "sh0", "shN_labels", "shN_centroids")
 IMAGES = tuple(f"{part}.webp" for part in _PARTS)
-"""Names of the files that are written; those of harmonics where there are any."""
+"""Names of the files written; those of harmonics only where there are any."""
 
 _DEGREES = 3
 _ACROSS = 64  # entries of the palette in a row of its image
@@ -51,29 +49,19 @@ _META_LIMIT = 1 << 20
 """Bytes of the longest ``meta.json`` that is read; with four tables it has some 20,000."""
 
 _SPARE_PIXELS = 1 << 16
-"""An image has at most four times the pixels that are needed, and these: writers pad images."""
+"""An image has at most four times the pixels needed, and these: writers pad images."""
 
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, ArithmeticError)
-_BROKEN = (*_DAMAGED, RuntimeError, KeyError, OSError)
-"""What reading a damaged archive raises."""
+_BROKEN = (*_DAMAGED, RuntimeError, KeyError, OSError)  # raised by damaged archives
 
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""How files of an archive may be compressed: the other ways take any memory, raise anything."""
+"""Compressions accepted in an archive: the others take any memory and raise anything."""
 
 
 class Bundle:
-    """A ``meta.json``, what it says and the files that it names.
+    """A ``meta.json`` and the files that it names; `files` holds the size of each, bytes.
 
-    Parameters
-    ----------
-    place : Place
-        Of the ``meta.json``.
-    meta : dict
-        What that holds.
-    opened : callable
-        ``opened(name, limit)`` returns what a file beside it holds; more bytes are refused.
-    files : dict
-        Bytes of each file that it is made of, by its path.
+    ``opened(name, limit)`` gives the bytes of a file beside it and refuses more than `limit`.
     """
 
     def __init__(
@@ -91,7 +79,7 @@ class Bundle:
 
     @property
     def count(self) -> int:
-        """How many splats it holds; each takes more than a byte."""
+        """Number of splats; each takes more than a byte."""
         if self.version == VERSION:
             return self.place.at("count").whole(self.meta.get("count"), 1, self.size)
         section, place = self.section("means")
@@ -113,17 +101,17 @@ class Bundle:
         return widths.index(across) + 1
 
     def section(self, name: str) -> tuple[dict[str, Any], Place]:
-        """What is said of an attribute, and its place."""
+        """The JSON object of an attribute, and its place."""
         place = self.place.at(name)
         return place.members(self.meta.get(name)), place
 
     def numbers(self, name: str, key: str, count: int) -> NDArray[np.float64]:
-        """List of numbers."""
+        """`count` numbers under a key of an attribute."""
         section, place = self.section(name)
         return np.array(place.at(key).numbers(section.get(key), count))
 
     def tables(self, name: str, channels: int) -> NDArray[np.float64]:
-        """Values of which pixels of an attribute are places, (256, channels)."""
+        """Table to which the pixels of an attribute point, (256, channels)."""
         if self.version == VERSION:
             return self.numbers(name, "codebook", _TABLE)[:, None].repeat(channels, axis=1)
         low, high = (self.numbers(name, key, channels) for key in ("mins", "maxs"))
@@ -132,10 +120,7 @@ class Bundle:
     def pixels(
         self, name: str, index: int, least: int, most: int, width: int = 0
     ) -> NDArray[np.uint8]:
-        """Image of `least` to `most` pixels, (height, width, 4): a file of an attribute.
-
-        Another width than `width` is refused, unless that is 0.
-        """
+        """Image of `least` to `most` pixels, (height, width, 4); `width` of 0 accepts any width."""
         section, place = self.section(name)
         files = place.at("files").items(section.get("files"))
         if len(files) <= index:
@@ -190,7 +175,7 @@ class Bundle:
         return file
 
     def _harmonics(self):
-        """Palette of harmonics, (P, K, 3), and which entry each splat has."""
+        """Palette of harmonics, (P, K, 3), and the entry of each splat."""
         coefficients, most = above_constant(self.degree), 1 << _LABEL_BITS
         width, (section, place) = _ACROSS * coefficients, self.section("shN")
         if self.version == VERSION:
@@ -214,7 +199,7 @@ class Bundle:
 
 
 def _held(place, label, limit, opened):
-    """What a file holds; one that cannot be read, or has more bytes, is refused."""
+    """Bytes of a file; refuse one that cannot be read or has more than `limit`."""
     try:
         with opened() as stream:
             content = stream.read(limit + 1)
@@ -254,11 +239,8 @@ def _read_archive(path, data):
 def bundle_beside(path: Path) -> Bundle:
     """Open a ``meta.json`` with the images beside it.
 
-    Raises
-    ------
-    RefineError
-        If it is damaged or of another version, names a file that lies elsewhere, or there is no
-        library for images; reading it may raise the same.
+    `RefineError`, here or in `Bundle.read`, for damage, another version, a file that lies
+    elsewhere, or no library for images.
     """
     place = Place(path)
 
@@ -274,13 +256,7 @@ def bundle_beside(path: Path) -> Bundle:
 
 
 def beside(place: Place, name: str) -> Path:
-    """Path of a file that a JSON file names, in its folder or one below.
-
-    Raises
-    ------
-    RefineError
-        If it lies elsewhere, as an absolute path or one up, or is no file; with `place`.
-    """
+    """Path of a file named in a JSON file; refused unless in its folder or one below."""
     steps = PurePosixPath(name).parts
     if not steps or name.startswith("/") or ".." in steps or not set("\\:\0").isdisjoint(name):
         place.fail(f"{described(name)}, expected a file in this folder or one below")
@@ -295,7 +271,7 @@ def beside(place: Place, name: str) -> Path:
 
 
 def named_json(end: str) -> Callable[[Path, bytes], bool]:
-    """`Format.matches` of JSON files whose names end so, which all readers go by."""
+    """`Format.matches` of JSON files whose names end so: no reader looks further."""
     return lambda path, head: path.name.lower().endswith(end) and head.lstrip().startswith(b"{")
 
 
@@ -309,19 +285,9 @@ def _write(stream, splats):
 
 
 def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
-    """Yield the files that hold splats, with their names: `META`, then the images.
+    """Yield name and bytes of `META`, then of the images; rows keep the order of `splats`.
 
-    Parameters
-    ----------
-    path : Path
-        What errors name.
-    splats : Splats
-        In the order in which the file has them.
-
-    Raises
-    ------
-    RefineError
-        If there is no library for images, or there are more splats than pixels in them.
+    `RefineError`, naming `path`, if there is no library for images, or too many splats for one.
     """
     count, codec = len(splats), codec_for(path)
     across = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)  # nearly square, divisible by 4
@@ -329,7 +295,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
         raise RefineError(f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}")
 
     def image(values):
-        """Image of a pixel for each splat, of which `values`, (N, C), are the first channels."""
+        """Image with a pixel for each splat; `values`, (N, C), are the first channels."""
         pixels = np.zeros((-(-count // across), across, 4), np.uint8)
         pixels[..., 3] = 255
         pixels.reshape(-1, 4)[:count, : values.shape[1]] = values
@@ -382,8 +348,8 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
 def _tabulated(values):
     """Table of 256 values, and the place of the nearest for each of `values`.
 
-    Half of the table are equal steps from the least to the largest value, so that no value is off
-    by more than half a step; the other half are quantiles of the values.
+    Half are equal steps over the range, so that the error is at most half a step; half are
+    quantiles.
     """
     flat = np.sort(values, axis=None)
     half = _TABLE // 2
@@ -396,10 +362,10 @@ def _tabulated(values):
 
 
 def _grouped(rows):
-    """Group for each of N rows (N, D): similar rows share one. Numbers start at 0.
+    """Group from 0 on for each of N rows (N, D): similar rows share one.
 
-    All rows are one group first; every group is halved at its mean along the axis in which it
-    varies most, again and again, until there are 65,536 or as many as half of the rows.
+    Every group is halved at its mean along the axis of largest variance, until there are 65,536
+    groups or half as many as rows.
     """
     columns = np.ascontiguousarray(np.asarray(rows, np.float32).T)  # (D, N)
     labels = np.zeros(rows.shape[0], np.int64)

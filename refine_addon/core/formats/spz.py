@@ -1,7 +1,7 @@
 """SPZ files by Niantic: 16 to 20 bytes a splat and one for each harmonic, compressed as a whole.
 
-Versions 2 and 3 are one gzip stream. Version 4 is a header, a table and a zstd stream for each
-attribute; it is read where a module for zstd is there, which Blender brings. Version 3 is written.
+Versions 2 and 3 are one gzip stream; version 3 is written. Version 4, only read, is a header, a
+table and a zstd stream for each attribute; it needs a module for zstd, which Blender brings.
 """
 
 from __future__ import annotations
@@ -23,11 +23,9 @@ from .format import Format, codes, join_largest, new_file, pieces, refuse_short,
 NAME, SUFFIX = "SPZ", ".spz"
 
 _HEADER = struct.Struct("<4sIIBBBB")
-"""Magic, version, splats, degree, fractional bits, flags; then 0, or in version 4 how many streams
-there are."""
+"""Magic, version, splats, degree, fractional bits, flags, streams (version 4, else 0)."""
 
-_TABLE_AT = struct.Struct("<I12x")
-"""Behind the header in version 4: the byte at which the table of streams begins."""
+_TABLE_AT = struct.Struct("<I12x")  # behind it in version 4: byte of the table of streams
 
 _STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, and of what is in it
 
@@ -39,26 +37,23 @@ _DEGREES = 5
 
 _COLOR_STEP = 0.15  # of f_dc: colours a bit outside of 0..1 have codes too
 _SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
-_BUCKETS = (8, 16)
-"""Harmonics are rounded to multiples of these, in 1/128: of degree 1, and of all others."""
+_BUCKETS = (8, 16)  # / 128: harmonics are rounded to multiples of it: degree 1, all others
 
 _USUAL_FRACTION, _LEAST_STEPS = 12, 18
-"""Bits of a position behind the point in most files, and of the largest coordinate at least."""
+"""Bits of a position behind the point in most files; least bits of the largest coordinate."""
 
 _LARGEST_CODE = (1 << 23) - 1  # of a position: of its 24 bits, one is the sign
 
 _INFLATION = 1032
-"""A file holds no more than this many times its bytes: gzip makes nothing smaller. Zstd does, but
-not of splats that differ."""
+"""Most bytes unpacked from one: gzip's limit; zstd exceeds it only for equal splats."""
 
 _PIECE = 1 << 20  # bytes that a zstd stream is unpacked to at a time
 
-_STEP = 1 << 12
-"""Bytes of a gzip stream that are unpacked at a time, to 4 MB at most."""
+_STEP = 1 << 12  # bytes of gzip unpacked at a time, into at most 4 MB
 
 
 class _Header(NamedTuple):
-    """What the first bytes say."""
+    """The fields of the header."""
 
     magic: bytes
     version: int
@@ -69,7 +64,7 @@ class _Header(NamedTuple):
     streams: int
 
     def widths(self) -> dict[str, int]:
-        """Bytes of each attribute of a splat by its name, in their order."""
+        """Bytes of each attribute of a splat by name, in file order."""
         turn, rest = 3 if self.version == _ONE_TURN else 4, 3 * above_constant(self.degree)
         return {"mean": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": turn, "rest": rest}
 
@@ -79,10 +74,7 @@ class _Header(NamedTuple):
 
 
 def _matches(path, head):
-    """Whether the signature stands in the open or in a gzip stream.
-
-    A gzip stream of its name is one that may be damaged at its beginning.
-    """
+    """Whether it has the signature, or is a gzip file of this name, maybe a damaged one."""
     return is_spz(head) or (path.suffix.lower() == SUFFIX and head.startswith(GZIP))
 
 
@@ -114,7 +106,7 @@ def _read(path, data):
 
 
 def _parsed(path, head, size):
-    """What the first bytes of a file of `size` bytes say; refuse what it cannot hold."""
+    """Header of a file of `size` bytes; refuse more than such a file can hold."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
     header = _Header(*_HEADER.unpack(head))
     problem = ""
@@ -156,7 +148,7 @@ def _unpacked(path, data):
 
 
 def _streams(path, data, header):
-    """Attributes of version 4, one behind the other."""
+    """Attributes of version 4, concatenated."""
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
     (at,) = _TABLE_AT.unpack(data[_HEADER.size : first].tobytes())
@@ -181,7 +173,7 @@ def _streams(path, data, header):
 
 
 def _zstd(path, name, packed, length):
-    """What is in a zstd stream; refuse it if that has another length."""
+    """Bytes of a zstd stream; refuse another length."""
     try:
         try:
             module = importlib.import_module("compression.zstd")  # Python 3.14 and later
@@ -205,7 +197,7 @@ def _zstd(path, name, packed, length):
 
 
 def _positions(block, fraction):
-    """Positions (n, 3) of 24-bit numbers, (n, 9) bytes."""
+    """Positions (n, 3) from 24-bit numbers, (n, 9) bytes."""
     parts = block.reshape(-1, 3, 3).astype(np.int32)
     whole = parts[..., 0] | (parts[..., 1] << 8) | (parts[..., 2] << 16)
     # Shifting up and down again repeats the sign.
@@ -254,10 +246,9 @@ def _write(stream, splats):
 
 
 def _fraction(splats):
-    """How many bits a position has behind the point.
+    """Bits of a position behind the point: 12 as in other writers, where coordinates allow.
 
-    Usually 12, as other writers have it: 4096 steps a unit. Fewer where coordinates are too large
-    for that, more where the largest is below 32, so that it is still some 2^17 steps.
+    Fewer for the largest coordinates, more below 32, where the largest has some 2^17 steps.
     """
     farthest = float(np.abs(splats.means).max())
     _, bits = math.frexp(farthest)  # before the point

@@ -1,13 +1,9 @@
 """Streamed SOG by PlayCanvas: levels of detail of a scene in chunks, as viewers load them.
 
-``lod-meta.json`` holds a tree over space. A leaf, a *chunk*, says for each level which rows of
-which SOG have its splats: folders below of ``meta.json`` and images. A level is read, 0 being the
-finest, with the environment, which viewers always show.
-
-All levels are written. The tree follows the finest; the splats of every other level go where they
-lie in it. As splat-transform has it, consecutive chunks share a folder until it holds `UNIT`
-splats, and rows of a chunk are sorted along a curve. Viewers choose a level for each chunk by its
-size in the image, so a chunk is no wider than the distance from which the cameras saw the scene.
+``lod-meta.json`` holds a tree over space, which follows the finest level. Each leaf, a chunk, names
+for each level the rows of a SOG folder with its splats. As in splat-transform, consecutive chunks
+share a folder of up to `UNIT` splats. Viewers choose a chunk's level by its size in the image, so
+a chunk is no wider than the distance from which the cameras saw the scene.
 """
 
 from __future__ import annotations
@@ -38,35 +34,20 @@ NAME, VERSION = "streamed SOG", 1
 INDEX = "lod-meta.json"
 
 UNIT = 1 << 19
-"""A folder is closed once it holds more splats than this; a chunk of the finest level has at most
-as many. The default of splat-transform."""
+"""Splats after which a folder is closed; most of a finest chunk. splat-transform's default."""
 
 LEAST = 1 << 13
-"""A chunk with fewer splats of the finest level is not split for its width, as in splat-transform:
-chunks cost the viewer the same, however little they hold."""
+"""Smaller chunks are not split for width, as in splat-transform: each costs viewers the same."""
 
 _MOST_LEVELS = 1 << 10
 
-_FOLDER = re.compile(rf"(\d+_\d+)/{re.escape(META)}")
-"""A folder as an index names it, as splat-transform has it: of the level, and counted."""
+_FOLDER = re.compile(rf"(\d+_\d+)/{re.escape(META)}")  # LEVEL_NUMBER, as in splat-transform
 
 
 def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
-    """Read a level of a streamed SOG, with the environment.
+    """Read a level of a streamed SOG (0 is the finest), with the environment.
 
-    Parameters
-    ----------
-    path : Path
-    data : (M,) uint8
-        What the file holds.
-    level : int
-        0 is the finest.
-
-    Raises
-    ------
-    RefineError
-        If it is damaged or of another version, has no such level, or names a file that lies
-        elsewhere; see also `sog.bundle_beside`.
+    `RefineError` if it is damaged, has no such level, or names a file that lies elsewhere.
     """
     place = Place(path)
     meta = place.members(place.parsed(data.tobytes()))
@@ -101,7 +82,7 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
 
 
 def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[tuple[Bundle, list[range]]]:
-    """Yield which rows of which SOG are of a level, and the environment."""
+    """Yield each SOG of a level with its rows, then the environment."""
     names = place.at("filenames").items(meta.get("filenames"))
     spans = _spans(place.at("tree"), meta.get("tree"), level, len(names))
     opened: set[Path] = set()
@@ -127,7 +108,7 @@ def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[tuple[Bun
 
 
 def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[range]]:
-    """Rows of a level by the number of their file; those without splats do not count."""
+    """Rows of a level by the number of their file, without empty ones."""
     spans: dict[int, list[range]] = {}
     left, number = [tree], 0
     while left:
@@ -146,12 +127,11 @@ def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[ra
 
 
 def _planted(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
-    """Tree over positions (N, 3), and how many chunks it has.
+    """Tree over positions (N, 3), and its number of chunks.
 
-    A leaf is the number of a chunk. A branch is an axis, a place on it, the tree of what lies below
-    that and the tree of the others. A chunk is halved across its longest side at the median of its
-    splats while it has more than `UNIT` of them, or is wider than `width` and has more than
-    `LEAST`.
+    A leaf is a chunk's number; a branch is axis, value, subtree below, subtree of the rest. Chunks
+    of more than `UNIT` splats, or of more than `LEAST` and wider than `width`, are halved across
+    their longest side at the median.
     """
     numbers = itertools.count()
 
@@ -173,16 +153,11 @@ def _planted(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
 
 
 class StreamedSog:
-    """A streamed SOG that is written level by level.
+    """A streamed SOG, written level by level.
 
-    Parameters
-    ----------
-    finest : (N, 3) floating
-        Positions of the finest level, which the chunks follow.
-    width : float
-        Of a chunk, at most, where it holds many splats.
-    folder : Path
-        Where SOG folders are made until they are published; see `folder_for`.
+    The chunks follow `finest`, the positions (N, 3) of the finest level, and are at most `width`
+    wide where they hold many splats. SOG folders are made in `folder`, see `folder_for`, until
+    `publish`.
     """
 
     def __init__(self, finest: NDArray[Any], width: float, folder: Path) -> None:
@@ -194,12 +169,9 @@ class StreamedSog:
         self._counts: list[int] = []  # splats of each level
 
     def add(self, splats: Splats) -> int:
-        """Write the next level, the finest first; return the bytes of its files.
+        """Write the next level, the finest first, and give the bytes of its files.
 
-        Raises
-        ------
-        RefineError, OSError
-            If there is no library for images, or a file cannot be written; see `folder_for`.
+        `RefineError` if there is no library for images, `OSError` if a file cannot be written.
         """
         level, size = len(self._counts), 0
         self._counts.append(len(splats))
@@ -233,17 +205,11 @@ class StreamedSog:
         return size
 
     def publish(self, path: Path, *, overwrite: bool) -> None:
-        """Move the folders beside `path`, under names that are free, and write the index there.
+        """Move the folders beside `path`, under free names, and write the index there.
 
-        An index that is replaced, and the folders that it names, stay until the new index is in
-        their place, so that one of the two is whole whenever this is stopped.
-
-        Raises
-        ------
-        RefineError, OSError
-            If the index may not be replaced, or the system cannot write it; see `folder_for`.
-        Cancelled
-            See `execute.checkpoint`; all is as it was.
+        A replaced index and its folders stay until the new index is in place: one of the two is
+        whole whenever this stops. `RefineError` if it may not be replaced, `OSError` if it cannot
+        be written, `Cancelled` with everything as it was.
         """
         checkpoint()
         refuse_existing(path, overwrite=overwrite)
@@ -272,7 +238,7 @@ class StreamedSog:
                 folder.rmdir()
 
     def _index(self, names: list[str]) -> dict[str, Any]:
-        """What ``lod-meta.json`` says, with folders of these names."""
+        """Content of ``lod-meta.json``, with folders of these names."""
         return {
             "version": VERSION,
             "asset": {"generator": GENERATOR},
@@ -285,7 +251,7 @@ class StreamedSog:
         }
 
     def _branch(self, node: Any) -> dict[str, Any]:
-        """What the index says of a part of the tree."""
+        """JSON of a part of the tree."""
         if isinstance(node, int):
             bound = {"min": self._low[node].tolist(), "max": self._high[node].tolist()}
             return {"bound": bound, "lods": self._rows[node]}
@@ -297,19 +263,9 @@ class StreamedSog:
 
 @contextlib.contextmanager
 def folder_for(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Yield an empty folder in which to make a `StreamedSog`; remove what is left of it.
+    """Yield an empty folder, removed at the end, to make the `StreamedSog` of index `path` in.
 
-    Parameters
-    ----------
-    path : Path
-        The index to make, ``lod-meta.json``; its folder is made if it is not there.
-    overwrite : bool
-        Whether an index there, and the folders that it names, may be replaced.
-
-    Raises
-    ------
-    RefineError
-        If something is there that may not be replaced, or the system cannot write there.
+    `RefineError` if `path` may not be replaced or written; its folder is made if missing.
     """
     with new_folder(path.parent):
         refuse_existing(path, overwrite=overwrite)

@@ -1,1 +1,1 @@
-"""Merging: kept splats take over what goes."""
+"""Merging: splats become one with their neighbours, or are deleted, whichever costs less."""

@@ -1,4 +1,4 @@
-"""Splats as merging needs them: covariance, what the views see of each, and from which side."""
+"""The quantities of splats that merging needs: covariance, visibility, viewing direction."""
 
 from __future__ import annotations
 
@@ -19,15 +19,11 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64] | NDArray[np.int32]
 Footprint = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 
-DIRECTION_VIEWS = 32
-"""At most so many views, spread evenly, decide from which directions splats are viewed."""
+DIRECTION_VIEWS = 32  # most views, spread evenly, that decide the viewing directions
 
-BESIDE = 1e-6
-"""Factor on the weight of views that a splat's centre does not lie in. Such views decide the
-viewing direction only of splats that lie in no view."""
+BESIDE = 1e-6  # weight of views without the splat's centre: they count only if no view has it
 
-LARGEST_LENS = 1e18
-"""Largest product of the focal lengths of a view, px^2, and one over the smallest."""
+LARGEST_LENS = 1e18  # largest product of a view's focal lengths, px^2; the smallest is its inverse
 
 _CHUNK = 1 << 14  # splats at a time: some MB of temporary memory a thread
 _LOG_RANGE = 80.0  # of log scales, either way, so that squares of scales stay finite
@@ -37,48 +33,22 @@ _BRIGHTEST = 1e18  # its square is a float32
 
 @dataclass(eq=False)
 class Field:
-    """Splats as merging needs them; a splat that another is merged into becomes the merged splat.
+    """N splats as merging needs them, in float64; a row becomes the merged splat."""
 
-    Attributes
-    ----------
-    means : (N, 3) float64
-        World units.
-    covariances : (N, 6) float64
-        xx, xy, xz, yy, yz, zz; world units squared.
-    opacity : (N,) float64
-        0..1.
-    contribution : (N,) float64
-        W, the sum over pixels of T alpha, >= 0.
-    error : (N,) float64
-        E, the sum of (T alpha)^2 times the squared contrast, >= 0; in the same unit, such as
-        pixels.
-    direction : (N, 3) float64
-        Mean direction along which the views see each splat, hidden or not; length 1.
-    deviation : (N, 3) float64
-        Standard deviation of the viewing directions along the axis where they vary most; its sign
-        is arbitrary.
-    color : (N, 3) float64
-        As viewed along `direction`.
-    blur : (N,) float64
-        Variance of the low-pass at the splat, world units squared.
-    model : {"default", "antialiased", "2dgs"}
-        How they are drawn, see `Model`.
-    """
-
-    means: Array
-    covariances: Array
-    opacity: Array
-    contribution: Array
-    error: Array
-    direction: Array
-    deviation: Array
-    color: Array
-    blur: Array
+    means: Array  # (N, 3), world units
+    covariances: Array  # (N, 6): xx, xy, xz, yy, yz, zz; world units squared
+    opacity: Array  # (N,), 0..1
+    contribution: Array  # (N,): W, the sum of T alpha over pixels, >= 0
+    error: Array  # (N,): E, the sum of (T alpha)^2 times the squared contrast, >= 0
+    direction: Array  # (N, 3): mean direction in which views look at it, hidden or not; length 1
+    deviation: Array  # (N, 3): standard deviation of these along their widest axis; sign arbitrary
+    color: Array  # (N, 3), as viewed along `direction`
+    blur: Array  # (N,): variance of the low-pass at the splat, world units squared
     _: KW_ONLY
     model: Model = "default"
 
     def put(self, rows: Index, other: Field) -> None:
-        """Overwrite `rows` with the rows of `other`."""
+        """Overwrite rows."""
         for item in fields(self)[:-1]:
             getattr(self, item.name)[rows] = getattr(other, item.name)
 
@@ -92,38 +62,18 @@ class Field:
 
 
 class MeasuredField(NamedTuple):
-    """Splats as merging needs them, but without the bias for views that were not given.
+    """A field without the bias for views that were not given.
 
-    If nothing were hidden, each view would see the whole mass of every splat whose centre lies in
-    it. The given views saw a share of that, summed over all splats, and another view is expected to
-    see the same share. If none of the n views that a splat lies in showed it, the next one shows it
-    with a probability of about 1 / (n + 1), by the rule of succession. So the bias of a splat is
-    what a view sees of it if nothing hides it, times that share, over n + 1.
-
-    Attributes
-    ----------
-    field : Field
-        Contribution and error are as measured, summed over views.
-    mass : (M,) float64
-        What one view adds to a splat's contribution if nothing hides it. To its error it adds
-        ``mass opacity``, for a contrast of 1.
-    seen : (M,) float64
-        In how many views each centre lies.
+    The bias is the mass that one more view would show unhidden, times the share of such mass that
+    the views did see, over n + 1 for n views with the splat's centre (rule of succession).
     """
 
-    field: Field
-    mass: Array
-    seen: Array
+    field: Field  # contribution and error as measured, summed over views
+    mass: Array  # (M,): unhidden contribution to one view; unhidden error: mass opacity
+    seen: Array  # (M,): number of views that the centre lies in
 
     def seen_and_whole(self) -> Array:
-        """Sums over all splats of contribution and error, as seen and if none is hidden.
-
-        Returns
-        -------
-        (2, 2) float64
-            ``[[contribution, its sum if nothing hid anything], [error, the same of it]]``. The sums
-            of the parts of a scene add up to those of the scene.
-        """
+        """Sums: ``[[contribution, unhidden contribution], [error, unhidden error]]``."""
         seen = self.field.contribution.sum(), self.field.error.sum()
         whole = self.seen @ self.mass, self.seen @ (self.mass * self.field.opacity)
         return np.stack([seen, whole], axis=1)
@@ -150,31 +100,10 @@ def measured_field(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> MeasuredField:
-    """Some splats as merging needs them, but for the bias.
+    """The drawable splats `rows` as merging needs them, from `sums` (2, N): contribution and error.
 
-    Each view has the weight 1 / distance^2, in proportion to the pixels that a splat covers in it,
-    and nearly none where the splat's centre does not lie in it (`frustum`).
-
-    Parameters
-    ----------
-    splats : Splats
-        In the frame and unit of the views.
-    rows : (M,) int
-        Which of them; all must be drawable.
-    views : ViewSet
-        At most `DIRECTION_VIEWS` of them tell from where splats are viewed.
-    scene : Scene
-        Of splats and views. A camera is at least `NEAR_RELATIVE` of its size away from a splat.
-    sums : (2, N) float64
-        Contribution and error of all splats.
-    progress : callable, optional
-        See `refine_addon.core.execute.Progress`.
-    threads : int, optional
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
+    A view weighs 1 / distance^2, as the pixels that a splat covers, or `BESIDE` of that. Cameras
+    count as at least `NEAR_RELATIVE` scene sizes away.
     """
     count = len(rows)
     shapes = (3,), (6,), (), (), (), (3,), (3,), (3,), ()
@@ -209,10 +138,9 @@ def measured_field(
 
 
 def _viewing(means, views, closest):
-    """From where views, with their weights, see splats, hidden or not; all (M,) or (M, 3).
+    """Direction, deviation (`Field`), area of a pixel at the splat, count of views with its centre.
 
-    Direction and deviation (`Field`), the area of a pixel at the splat, world units squared, and in
-    how many of the views the centre lies. A camera counts as at least `closest` away.
+    Areas are in world units squared. Cameras count as at least `closest` away.
     """
     points = means.T
     rows, columns = np.triu_indices(3)
@@ -252,10 +180,7 @@ def packed(matrices: Array) -> Array:
 
 
 def across(normal: Array) -> tuple[Array, Array]:
-    """Two unit vectors, (3, M), at right angles to `normal`, (M, 3), and to each other.
-
-    Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
-    """
+    """Orthogonal unit vectors, (3, M), across `normal`, (M, 3) (Duff et al. 2017)."""
     x, y, z = normal.T
     sign = np.where(z >= 0.0, z.dtype.type(1.0), z.dtype.type(-1.0))
     a = -1.0 / (sign + z)
@@ -266,10 +191,7 @@ def across(normal: Array) -> tuple[Array, Array]:
 
 
 def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
-    """xx, xy, yy of ``(u, v)' C (u, v) + blur I``, (M,) each: C projected to a plane.
-
-    `plane` holds the unit vectors u and v, (3, M) each.
-    """
+    """xx, xy, yy of ``(u, v)' C (u, v) + blur I``, (M,) each; `plane` holds u and v, (3, M)."""
     u, v = plane
     xx, xy, xz, yy, yz, zz = covariances.T
     cu, cv = (

@@ -1,11 +1,8 @@
 """Merges and deletions of splats, cheapest first, on a graph of neighbouring splats.
 
-Near neighbours of every point of a cloud are found with NumPy alone. Points are sorted along a few
-space-filling curves, each turned and shifted against the others. Most points near a given one are
-within a few places of it on at least one curve, so only those places are searched (Liao, Lopez and
-Leutenegger 2001, "High dimensional similarity search with space filling curves"). The work is the
-same for every point of any cloud. In trained scenes 87 to 89 % of the 8 nearest are found, and 97
-to 98 % of the very nearest.
+Neighbours come from NumPy alone: points are sorted along a few turned and shifted space-filling
+curves, and only near places on these are searched (Liao, Lopez and Leutenegger 2001). In trained
+scenes that finds 87 to 89 % of the 8 nearest, and 97 to 98 % of the very nearest.
 """
 
 from __future__ import annotations
@@ -22,42 +19,34 @@ from .field import Array, Field, Index
 Rows = NDArray[np.int32]
 Costs = NDArray[np.float32]
 
-NEIGHBOURS = 8
-"""How many nearest neighbours each splat may be merged with."""
+NEIGHBOURS = 8  # neighbours that each splat may be merged with
 
-BATCH = 0.1
-"""Share of the splats that one round removes at most; then costs are computed again. Rounds of a
-third of that leave pictures as close, and take longer."""
+BATCH = 0.1  # most that a round removes; a third of that takes longer and looks the same
 
 LOOKED_AT = 0.03
-"""A round looks at the cheapest operations of at least twice this share of the splats, however few
-it may remove: else the last few splats of a stage would take as many rounds as all before."""
+"""A round considers at least twice this share of the splats, however few it may remove: otherwise
+the last few splats of a stage would take as many rounds as all before."""
 
 FILLED = 0.25
-"""A round that removes less than this share of its quota, or of `LOOKED_AT`, also merges pairs that
-are not the cheapest operation for both of their splats. Ordinary scenes remove more. Of copies of a
-splat, each costs less than the one before it, so that only one pair would merge in a round."""
+"""A round that removes less than this share of its quota also merges pairs that are not both
+splats' cheapest operation: of many copies of a splat, one pair a round would merge."""
 
 DISC_PENALTY = 0.5
-"""Factor on the cost of merging discs (2DGS): on `room_small` half of them removed by merging at
-full cost is 1.6 dB worse, and a quarter or .7 of it .1 dB."""
+"""Factor on the merge cost of discs (2DGS): on `room_small` at 50 %, 1.0 is 1.6 dB worse, 0.25 or
+0.7 is 0.1 dB worse."""
 
-CONNECTING = 0.65
-"""Share of the time of a stage's graph until its pairs are priced; the rest are its rounds."""
+CONNECTING = 0.65  # share of a stage's time until its pairs are priced
 
 CURVES = np.array(
     [[1.0, 0, 0, 0], [0.8, 0.3, 0.4, 0.3], [0.5, -0.6, 0.1, 0.6], [0.3, 0.5, -0.7, 0.4]]
-)
-"""How each curve is turned, w x y z."""
+)  # rotation of each curve, w x y z
 
 SHIFTS = np.array([[0.0, 0, 0], [0.21, 0.13, 0.17], [-0.11, 0.23, -0.19], [0.15, -0.27, 0.07]])
-"""How far each curve is moved, scene sizes, so that their cells do not meet in one place."""
+"""Offset of each curve, scene sizes, so that their cells do not meet in one place."""
 
-WINDOW = 6
-"""Places before and behind a point on each curve whose points are its candidates."""
+WINDOW = 6  # candidates: this many places before and behind, on each curve
 
-SMALL = 128
-"""Up to this many points, all are compared with all."""
+SMALL = 128  # up to this many points, all are compared with all
 
 _CHUNK = 1 << 14  # pairs or points at a time: some MB of temporary memory a thread
 _SCANNED = 1 << 18  # pairs at a time that are only looked at
@@ -69,31 +58,8 @@ _ROUNDED = np.uint32(4)  # last bits of a distance in float32, in which equal on
 class MergeGraph:
     """Splats, the pairs of them that may be merged, and the cost of each operation.
 
-    Parameters
-    ----------
-    field : Field
-        Changed in place: a splat that another is merged into is overwritten by the merged splat.
-    scene : Scene
-        Neighbours are those in its frame.
-    penalty : float
-        Factor on the cost of merging, of discs times `DISC_PENALTY`.
-    threads : int, optional
-
-    Attributes
-    ----------
-    alive : (N,) bool
-        Which splats are neither deleted nor merged into another.
-    merges : list of (into, gone, share)
-        For each round: rows of the splats merged into and of those that were, (M,) each, and the
-        share of the former in the colour, (M,).
-    deleted : int
-        How many splats were deleted.
-    first, second : (E,) int32
-        Rows of the pairs that may be merged.
-    cost : (E,) float32
-        Of merging each pair; infinite where it is not less than that of deleting one of the two.
-    connected : int
-        How many splats were alive when neighbours were last searched; 0 before.
+    `field` is changed in place; neighbours are those in the frame of `scene`; `penalty` is the
+    merge penalty, times `DISC_PENALTY` for discs.
     """
 
     def __init__(
@@ -103,12 +69,13 @@ class MergeGraph:
         self.penalty = penalty * (DISC_PENALTY if field.model == "2dgs" else 1.0)
         # A splat of unknown error is not merged: without contribution it gets no pairs.
         field.contribution[~np.isfinite(field.error)] = 0.0
-        self.alive = np.ones(len(field.means), np.bool_)
+        self.alive = np.ones(len(field.means), np.bool_)  # (N,): neither deleted nor merged
+        # Of each round: rows merged into, rows merged, share of the former in the colour.
         self.merges: list[tuple[Index, Index, Array]] = []
         self.deleted = 0
-        self.first = self.second = np.empty(0, np.int32)
-        self.cost = np.empty(0, np.float32)
-        self.connected = 0
+        self.first = self.second = np.empty(0, np.int32)  # (E,), rows of the pairs
+        self.cost = np.empty(0, np.float32)  # (E,), infinite where deleting one costs no more
+        self.connected = 0  # splats alive when neighbours were last searched
 
     def best(self) -> tuple[Costs, NDArray[np.bool_]]:
         """Cost of each splat's cheapest operation, (N,) float32, and whether it is a merge."""
@@ -117,13 +84,7 @@ class MergeGraph:
         return best, best < error
 
     def reduce(self, goal: int, progress: Progress = silent) -> None:
-        """Merge and delete until `goal` splats are alive; call it once.
-
-        Raises
-        ------
-        Cancelled
-            If `progress` answers ``False``.
-        """
+        """Merge and delete until `goal` splats are alive; call it once."""
         start = count = len(self.alive)
         if count > goal and not self.connected:
             self.connect(part(progress, 0.0, CONNECTING))
@@ -177,10 +138,9 @@ class MergeGraph:
         run_all(price, pieces, progress=progress, what="merging", threads=self.threads)
 
     def _round(self, quota: int, progress: Progress = silent) -> int:
-        """Carry out the cheapest operations that share no splat; return how many, 1 to `quota`.
+        """Carry out the cheapest operations that share no splat; their number is 1 to `quota`.
 
-        A pair is merged if it is the cheapest operation for both of its splats. A splat is deleted
-        if that is cheaper than all of its pairs. If these are few, see `FILLED`.
+        A merge must be the cheapest operation of both splats, unless few are (`FILLED`).
         """
         error = self._errors()  # (N,)
         least = max(int(LOOKED_AT * np.count_nonzero(self.alive)), 1)
@@ -211,11 +171,7 @@ class MergeGraph:
         return len(order)
 
     def _errors(self) -> Costs:
-        """Costs of deleting splats, (N,) float32; infinite where unknown.
-
-        So the cheapest operation is always carried out, and every round removes a splat; a
-        comparison with NaN would choose none.
-        """
+        """Costs of deleting splats, (N,) float32; infinite for NaN, which no comparison chooses."""
         with np.errstate(over="ignore", under="ignore"):
             error = self.field.error.astype(np.float32)
         error[~self.alive | np.isnan(error)] = np.inf
@@ -268,7 +224,7 @@ class MergeGraph:
 
 
 def _least_costs(error: Costs, first: Rows, second: Rows, cost: Costs) -> Costs:
-    """Cost of each splat's cheapest operation, (N,): deleting it, or merging one of some pairs."""
+    """Cost of each splat's cheapest operation, (N,)."""
     best = error.copy()
     np.minimum.at(best, first, cost)
     np.minimum.at(best, second, cost)
@@ -276,10 +232,7 @@ def _least_costs(error: Costs, first: Rows, second: Rows, cost: Costs) -> Costs:
 
 
 def _disjoint(first: Index, second: Index) -> Index:
-    """Indices of pairs that share no splat, ascending, (k,); each other pair shares one.
-
-    The rows of the pairs are `first` and `second`, (m,) each.
-    """
+    """Ascending indices of pairs that share no splat; each other pair shares one with these."""
     count = len(first)
     chosen = np.zeros(count, np.bool_)
     _, ends = np.unique(np.concatenate([first, second]), return_inverse=True)  # (2 m,)
@@ -308,22 +261,9 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Near neighbours of every point, most of them the nearest.
+    """Most of the nearest neighbours of points (N, 3), in scene sizes: (N, min(count, N - 1)).
 
-    Parameters
-    ----------
-    points : (N, 3) float64
-        In scene sizes (`Scene.positions`).
-    count : int
-        How many neighbours, up to 16; fewer where there are not as many other points.
-    progress : callable, optional
-        See `refine_addon.core.execute.Progress`.
-    threads : int, optional
-
-    Returns
-    -------
-    (N, min(count, N - 1)) int32
-        Nearest first, equal distances by index; a point is not its own neighbour.
+    Nearest first, ties by index; `count` is at most 16.
 
     Examples
     --------
@@ -349,10 +289,7 @@ def nearest(
 
 
 def _candidates(points, window, progress, threads):
-    """Callable: the candidates of a slice of n points, (n, C) indices.
-
-    A candidate may appear more than once, and a point is among its own.
-    """
+    """Callable: candidates (n, C) of a slice of n points, with repetitions and the point itself."""
     total = len(points)
     if total <= max(SMALL, 2 * window + 1):
         everyone = np.arange(total, dtype=np.int32)

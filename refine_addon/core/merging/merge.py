@@ -1,13 +1,9 @@
 """Merging: reduce splats to a number by the cheapest merges and deletions.
 
-`pairs` prices a merge and makes the merged splat, `graph` carries out the cheapest operations. What
-is hidden changes as splats go, so the work is done in stages: before each but the first, the splats
-left are measured again. Kept splats that nothing is merged into stay as they were, to the bit.
-
-Of splats in files, larger than memory, a stage goes region by region: they are divided into boxes
-of about equally many, and each box is merged by itself. How many of a region stay is decided by one
-ranking of the cheapest merges and deletions of all. The next stage divides along other planes, so
-neighbours that a plane separates can merge then.
+`pairs` prices a merge and makes the merged splat, `graph` carries out operations. Before each
+stage but the first the kept splats are measured again, as visibility changes. Splats in files,
+larger than memory, are divided into boxes, along other planes in each stage. One ranking of the
+operations of all boxes decides how many each keeps. Splats that merge nothing keep their bits.
 """
 
 from __future__ import annotations
@@ -31,56 +27,34 @@ from .graph import MergeGraph
 from .pairs import as_splats
 
 Measure = Callable[[Splats, Array, Progress], Array]
-"""``measure(splats, expected, progress)`` returns the sums of the splats left, (2, n).
+"""``measure(splats, expected, progress)``: sums (2, n) of the kept splats, with degree 0.
 
-Their harmonics have degree 0. `expected`, (2, n), is what the stage before predicts: right, but for
-what is now hidden or no longer hidden by others.
-"""
+`expected`, (2, n), is the prediction of the stage before, right but for changed visibility."""
 
 STAGE = 0.5
-"""Share of its splats that each of very many stages leaves; fewer stages leave more.
-
-At least a half: regions count a splat whose cheapest operation is a merge as half a splat, and
-would run out of splats to remove beyond that.
-"""
+"""Share that each of very many stages leaves. At least a half: regions count a splat whose cheapest
+operation is a merge as half a splat, and would run out of splats to remove."""
 
 FINER = 0.8
-"""By how many stages more the way is divided than if each left `STAGE`: with three instead of two
-70 % of a park lose 1.4 dB less, with five instead of four 90 % gain nothing."""
+"""Stages more than if each left `STAGE`: three instead of two for 70 % of a park gain 1.4 dB, five
+instead of four for 90 % nothing."""
 
 ALONE, ALONE_BY_REGIONS = 0.55, 0.6
-"""Least share that a stage leaves where one is enough; at least a half, as `STAGE`.
+"""Least share that a single stage leaves, at least a half. Below 5/9: one stage for half of all
+after a tenth was deleted. By regions that takes two: four regions in one stage lost 0.5 dB."""
 
-Just below 5/9, so that one stage removes half of all splats of which a tenth was deleted before. By
-regions half goes in two stages: four regions in one stage lost 0.5 dB.
-"""
-
-PENALTY = 2.0
-"""Factor on the cost of merging if half of the splats go; see `merge_penalty`."""
+PENALTY = 2.0  # merge penalty if half of the splats are removed
 
 _CHUNK = 1 << 14  # splats copied at a time: some MB
 
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """The result of merging N splats.
+    """The result of merging N splats to K."""
 
-    Attributes
-    ----------
-    splats : Splats
-        The K kept splats, in the order of the N splats, in float64; harmonics above the constant
-        one in the type that they had.
-    keep : (N,) bool
-        Which splats are kept.
-    changed : (K,) bool
-        Which of them others were merged into; all others are equal to the bit to what they were.
-    merged, deleted : int
-        How many splats were merged into a kept one, and how many were deleted.
-    """
-
-    splats: Splats
-    keep: NDArray[np.bool_]
-    changed: NDArray[np.bool_]
+    splats: Splats  # the K kept, in order; float64, but `sh_rest` in its old type
+    keep: NDArray[np.bool_]  # (N,)
+    changed: NDArray[np.bool_]  # (K,): others were merged into these; the rest keep their bits
     merged: int
     deleted: int
 
@@ -98,19 +72,11 @@ class Merged:
 
 
 def merge_penalty(share: float) -> float:
-    """Factor on the cost of merging, given the share of the splats that goes.
+    """Factor on the cost of merging, from the share of the splats that is removed, 0 to 1.
 
-    It is `PENALTY` times the square root of the odds of staying, (1 - share) / share.
-
-    If few splats go, the squared errors of their deletions add up. If neighbours go together, their
-    errors add up before they are squared, which costs more: a surface thins out. Merging keeps the
-    mass, so it does not have this problem, and is made cheaper the more splats go. The result
-    hardly depends on the factor: half or twice of it costs at most 0.3 dB on three scenes.
-
-    Parameters
-    ----------
-    share : float
-        Of the splats that go, 0 to 1.
+    `PENALTY` times the square root of (1 - share) / share. Errors of neighbours that are deleted
+    together add up before they are squared; merging keeps the mass, so it gets cheaper the more are
+    removed. Half or twice the factor costs at most 0.3 dB on three scenes.
 
     Examples
     --------
@@ -138,31 +104,14 @@ def merge(
 
     Parameters
     ----------
-    splats : Splats
-        In the frame and unit of the views.
-    views : ViewSet
-        From where the splats are seen.
     sums : (2, N) floating
-        What the views see of each splat: contribution and error, see `field.Field`.
-    measure : callable
-        Returns the same of the splats left, see `Measure`; called before each stage but the first.
+        Contribution and error of each splat, see `field.Field`.
     keep_count : int
-        How many are kept, or more if more are protected. Undrawable splats go first.
+        More are kept if more are protected. Undrawable splats go first.
     began : int, optional
-        How many splats there were before some of them became these; `merge_penalty` goes by the
-        share that has gone of those. By default these are the first.
-    deleted : (N,) bool, optional
-        Splats that are deleted before anything is merged.
-    protected : (N,) bool, optional
-        Splats that are neither removed nor changed.
-    progress : callable, optional
-        See `refine_addon.core.execute.Progress`.
-    threads : int, optional
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
+        Number of splats before any were removed, which decides `merge_penalty`; by default N.
+    deleted, protected : (N,) bool, optional
+        Splats deleted before anything is merged; splats neither removed nor changed.
     """
     total, left = len(splats), splats
     # Of each splat left: which of the N it is, and for how many of them it stands, 0 if deleted.
@@ -207,9 +156,7 @@ def merge(
 
 
 def stage_counts(count: int, goal: int, alone: float = ALONE) -> list[int]:
-    """How many of `count` splats are left after each stage; `goal` after the last.
-
-    If at least the share `alone` is left, one stage does.
+    """Splats left after each stage, `goal` after the last; one stage if it leaves `alone`.
 
     Examples
     --------
@@ -235,7 +182,7 @@ def stage_seconds(count: int, counts: list[int], views: int) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """What a stage begins with: N splats, or those of a region; the rest is as in `merge`."""
+    """Input of a stage: N splats, or those of a region; see `merge`."""
 
     splats: Splats
     members: NDArray[np.int64]  # (N,), for how many of the first splats each stands, 0 if deleted
@@ -247,17 +194,14 @@ class _Stage:
     threads: int | None
 
     def at_once(self, keep_count, progress):
-        """What `reduced` makes of all splats together."""
+        """`reduced` for all splats together."""
         rows, measured = self.measured(part(progress, 0.0, 0.3))
         graph = self.graph(measured, measured.seen_and_whole())
         del measured
         return self.reduced(rows, graph, keep_count, part(progress, 0.3, 1.0))
 
     def measured(self, progress):
-        """Rows of the splats that may merge, (M,), and these as merging needs them.
-
-        By their place in the scene, so that ties do not depend on the order of the file.
-        """
+        """Rows (M,) that may merge, their field; in spatial order, so ties ignore file order."""
         splats, threads = self.splats, self.threads
         excluded = self.protected | (self.members == 0)
         rows = np.flatnonzero(drawable(splats, threads=threads) & ~excluded)
@@ -276,11 +220,9 @@ class _Stage:
         return MergeGraph(measured.with_bias(whole), self.scene, self.penalty, threads=self.threads)
 
     def reduced(self, rows, graph, keep_count, progress):
-        """The K kept splats, at least `keep_count`; which these are, (N,); their members and sums.
+        """Kept splats, at least `keep_count`; which of N they are; members; predicted sums.
 
-        Undrawable splats go first, then the cheapest operations of the graph of the splats in
-        `rows`, (M,), are carried out. Sums, (2, K), are predicted from those before and the errors
-        of the merges.
+        Undrawable splats go first, then the graph of the splats in `rows`, (M,), is reduced.
         """
         splats, threads = self.splats, self.threads
         keep = self.members > 0
@@ -319,10 +261,10 @@ class _Stage:
 
 
 def _blend(splats, members, share, left, into, progress, threads):
-    """Write the harmonics of merged splats: means of those of all that went into one, by shares.
+    """Write harmonics of merged splats: means of those of their members, by shares of the colour.
 
-    `members`, (m,), are the rows of these, group by group; `into` are those of the merged splats in
-    `left`. Rounded to float32, whatever type they have, so that tiles and files give the same.
+    `members`, (m,), are grouped; `into` are the rows in `left`. Rounded to float32, so that tiles
+    and files give the same.
     """
     starts, largest = np.flatnonzero(np.diff(into, prepend=-1)), np.finfo(np.float32).max
 
@@ -338,10 +280,7 @@ def _blend(splats, members, share, left, into, progress, threads):
 
 
 def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) -> Splats:
-    """Copies of some splats as `Merged` has them: merged ones merge again, in float64.
-
-    Of splats in files, more than a region go into files again.
-    """
+    """Copies of some splats, float64 as merged ones merge again; more than a region on disk."""
     if in_regions(splats, len(rows)):
         some = pieces(splats, rows)
         return on_disk(new_folder(splats), (copied(each, np.arange(len(each))) for each in some))
@@ -360,7 +299,7 @@ def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) 
 
 
 def _by_regions(stage, keep_count, askew, progress):
-    """What `_Stage.reduced` makes of splats in files, region by region; the kept ones lie there."""
+    """`_Stage.reduced` of splats in files, region by region; the kept ones stay in files."""
     folder, there = new_folder(stage.splats), np.flatnonzero(stage.members)
     boxes = [there[box] for box in divided(stage.splats.means[there], askew=askew)]
     for number, rows in enumerate(boxes):
@@ -387,7 +326,6 @@ def _by_regions(stage, keep_count, askew, progress):
 
 
 def _measure(folder, number):
-    """`MeasuredField.seen_and_whole` of a region."""
     rows, stage = noted(folder, f"region-{number}")[1]
     stage = replace(stage, splats=copied(stage.splats, rows, stage.threads))
     measured = note(folder, f"measured-{number}", stage.measured(look))[1]
@@ -395,7 +333,7 @@ def _measure(folder, number):
 
 
 def _price(folder, whole, number):
-    """Of each splat's cheapest operation its cost, and how many splats go by it, 1 or .5."""
+    """Cost of each splat's cheapest operation, and how many splats that removes, 1 or 0.5."""
     _, stage = noted(folder, f"region-{number}")[1]
     rows, measured = noted(folder, f"measured-{number}")[1]
     graph = stage.graph(measured, whole)
@@ -410,7 +348,7 @@ def _price(folder, whole, number):
 
 
 def _merge(folder, item):
-    """Rows kept of a region that is merged down to a count, their members and sums, and they."""
+    """Kept rows of a region that is merged down to a count, their members, sums and splats."""
     number, count = item
     origin, stage = noted(folder, f"region-{number}")[1]
     stage = replace(stage, splats=copied(stage.splats, origin, stage.threads))
@@ -421,12 +359,7 @@ def _merge(folder, item):
 
 
 def _staying(priced, left):
-    """How many splats of each region stay, of `left` that do of all, by what `_price` says of each.
-
-    As many go as a region has among the cheapest merges and deletions of all. All merges together
-    count half of the splats; so a stage has to leave half of them, or there would not be enough to
-    go.
-    """
+    """Number kept of each region, of `left` in all, by one ranking of all operations."""
     ends = np.cumsum([len(costs) for costs, _ in priced])
     costs, weights = (np.concatenate(each) for each in zip(*priced, strict=True))
     order, goal = np.argsort(costs, kind="stable"), len(costs) - left

@@ -1,32 +1,9 @@
 """Where two splats become one: what it costs the pictures, and the merged splat, colours included.
 
-`price` and `costs` are the cost of a pair, `merge` is the merged splat, and `as_splats` what a file
-stores of it; its harmonics are in `merge.py`.
-
-Splat i changes the picture by its footprint ``f_i = alpha_i exp(-q_i / 2)`` times the contrast
-``s_i = c_i - B`` between its colour and the colour behind it. The views measure two sums over all
-of their pixels; T is the transmittance in front of the splat::
-
-    contribution  W_i = sum of T alpha              error  E_i = sum of (T alpha)^2 |s_i|^2
-
-E is the cost of deleting the splat. The cost of replacing i and j by m is the squared error of the
-picture. The inner products ``<f, g>`` of Gaussians have a closed form, in a plane at right angles
-to the direction that the pair is viewed along (derived in docs/method.md, section 7)::
-
-    p = f_i - l_i f_m,  q = f_j - l_j f_m                l: share of the colour, l_i + l_j = 1
-    cost = tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> + |s_j|^2 <q, q>)
-    tau  = (W_i + W_j) / (A_i + A_j)                     A: mass, the integral of f
-    |s_i|^2 = E_i / (tau_i <f_i, f_i>),   2 s_i.s_j = |s_i|^2 + |s_j|^2 - |c_i - c_j|^2
-
-The merged splat has the mean and covariance of the mixture of the two, weighted by mass, and their
-mean colour, weighted by contribution. Its mass, which of antialiased splats is the integral without
-the low-pass, since they keep that, is ``A_m = A_i + A_j - <f_i, f_j>``, since the area
-that both cover is covered only once; its opacity follows from that mass. Where the opacity would
-exceed `ALPHA_MAX`, the covariance grows instead.
-
-Seen along the mean viewing direction, merging two splats one behind the other costs nothing, though
-views from aside see both. So the cost of a pair is the mean of its costs from two directions: one
-standard deviation of the viewing directions to either side of their mean (`costs`).
+docs/method.md, section 7, derives it: ``cost = tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> +
+|s_j|^2 <q, q>)`` with ``p = f_i - l_i f_m``, ``q = f_j - l_j f_m``; f are the footprints in a plane
+across the viewing direction, s the contrasts, l the shares of the colour, m the merged splat.
+`price` and `costs` give the cost, `merge` the merged splat, `as_splats` its values in files.
 """
 
 from __future__ import annotations
@@ -44,12 +21,11 @@ from .field import Array, Field, Footprint, Index, across, footprint, normalized
 
 Real = NDArray[np.floating[Any]]
 
-FLATTEST = 1e-14
-"""Least eigenvalue of a covariance over the sum of the three; rounding hides smaller ones."""
+FLATTEST = 1e-14  # least eigenvalue of a covariance over their sum; rounding hides smaller ones
 
 ASIDE = 0.1
-"""Least standard deviation of viewing directions that discs are made for, about radians: other
-views than those given look from aside, too. Results hardly depend on it between 0.03 and 0.3."""
+"""Least standard deviation, about radians, of viewing directions that discs are made for: other
+views look from aside. Results hardly depend on it from 0.03 to 0.3."""
 
 _CHUNK = 1 << 14  # splats at a time: some MB of temporary memory a thread
 _CANCELLED = 1e-6  # a mean of two unit vectors with a smaller squared length counts as 0
@@ -61,55 +37,28 @@ _FARTHEST = 160.0  # standard deviations, squared: exp(-80) is as good as 0 and 
 
 
 class Pairs(NamedTuple):
-    """Merges of M pairs: their costs and results.
+    """Merges of M pairs, (M,) each."""
 
-    Attributes
-    ----------
-    cost : (M,) float64
-        Squared error of the pictures that the merge causes, in the unit of `Field.error`.
-    position, color : (M,) float64
-        Share of the first splat in the mean and covariance, and in the colour.
-    opacity, growth : (M,) float64
-        Of the merged splat; growth is the factor on its covariance that keeps its opacity at most
-        `ALPHA_MAX`.
-    error : (M,) float64
-        Cost of deleting the merged splat.
-    """
-
-    cost: Array
-    position: Array
-    color: Array
-    opacity: Array
-    growth: Array
-    error: Array
+    cost: Array  # squared error of the pictures that it causes, unit of `Field.error`
+    position: Array  # share of the first splat in mean and covariance
+    color: Array  # share of the first splat in the colour
+    opacity: Array  # of the merged splat
+    growth: Array  # factor on its covariance that keeps its opacity at most `ALPHA_MAX`
+    error: Array  # cost of deleting the merged splat
 
 
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
-    """Costs and results of merges, by the equations at the top of this file.
+    """Costs and results of merging pairs of rows (M,), all of contribution above 0.
 
-    Parameters
-    ----------
-    splats : Field
-    first, second : (M,) int
-        Rows; all splats have a contribution above 0.
-    tilt : float
-        How many standard deviations of the viewing directions to add to their mean.
+    `tilt` standard deviations of the viewing directions are added to their mean.
     """
     return _price(_gather(splats, first, second, np.float64), tilt)
 
 
 def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Real:
-    """Costs of merges, (M,) float32: the mean over two viewing directions.
+    """Costs of merges, (M,) float32: means over two viewing directions; infinite from `limit` on.
 
-    They are computed in float32 from the steps between means on; those of discs in float64, since
-    discs have a thickness of 0. `price` tells what a merge makes.
-
-    Parameters
-    ----------
-    splats, first, second
-        See `price`.
-    limit : (M,) floating, or float
-        Costs of at least this much are given as infinity, which takes less time.
+    Computed in float32 from the steps between means on; for discs, of thickness 0, in float64.
     """
     # What leaves the range of float32 costs infinity, or NaN: it is not merged.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
@@ -123,8 +72,6 @@ def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> R
 
 
 class _Side(NamedTuple):
-    """One splat of each of M pairs."""
-
     covariances: Real
     opacity: Real
     contribution: Real
@@ -134,8 +81,8 @@ class _Side(NamedTuple):
 class _Ends(NamedTuple):
     """The two splats of M pairs, and means over the two; all in float32, or all in float64.
 
-    Costs and results of merges do not depend on the unit of length. That of a pair is the root of
-    the sum of its variances, low-pass included, so that squares of areas fit into float32.
+    The unit of length, of which results are independent, is the root of the sum of a pair's
+    variances, so that squares of areas fit into float32.
     """
 
     model: Model
@@ -150,7 +97,6 @@ class _Ends(NamedTuple):
     apart: Real
 
     def take(self, rows: Index) -> _Ends:
-        """Ends of some pairs."""
         one, two = (
             _Side(*(values.take(rows, axis=-1) for values in side)) for side in (self.one, self.two)
         )
@@ -193,10 +139,9 @@ def _gather(splats: Field, first: Index, second: Index, kind: type[np.floating[A
 
 
 def _price(ends: _Ends, tilt: float) -> Pairs:
-    """Costs and results of merges, viewed from one direction.
+    """Costs and results of merges, (M,) each, viewed from one direction.
 
-    Masses and inner products here are divided by 2 pi, a factor that cancels; inner products are
-    named by the signals i, j and m of the equations. All arrays are (M,).
+    Masses and inner products are over 2 pi, which cancels; i, j and m name the signals.
     """
     color, rest, blur = ends.color, ends.rest, ends.blur
     direction = _unit(ends.direction + tilt * ends.deviation) if tilt else ends.direction
@@ -276,10 +221,7 @@ def _signal(covariances, opacity, plane, blur, model):
 
 
 def _inner(one: _Signal, other: _Signal, step: Footprint, factor: Real | float) -> Real:
-    """Inner products ``<f, g>``, (M,), given xx, xy, yy of the step between, times a factor.
-
-    That of two normal densities is one at the step, whose covariance is the sum of the two.
-    """
+    """Inner products ``<f, g>``, (M,), given xx, xy, yy of the step in between, times a factor."""
     xx, xy, yy = (a + b for a, b in zip(one.footprint, other.footprint, strict=True))
     determinant = _determinant((xx, xy, yy))
     square = (yy * step[0] - 2.0 * xy * step[1] + xx * step[2]) * factor / determinant
@@ -288,7 +230,7 @@ def _inner(one: _Signal, other: _Signal, step: Footprint, factor: Real | float) 
 
 
 def _base(ellipse: Footprint, area: Real, blur: Real, model: Model) -> Real:
-    """Area that opacity is meant for, (M,): of antialiased splats it is without the low-pass."""
+    """Area that opacity is meant for, (M,): without the low-pass for antialiased splats."""
     if model != "antialiased":
         return area
     (xx, xy, yy), (tiny, _) = ellipse, _least(area)
@@ -296,10 +238,9 @@ def _base(ellipse: Footprint, area: Real, blur: Real, model: Model) -> Real:
 
 
 def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
-    """Ellipses that cover as much as discs with their low-pass, along the same axes.
+    """Ellipses that cover as much as discs with their low-pass (`disc_axes`), along the same axes.
 
-    `sharp` is without the low-pass, whose variance in `blur` is that of other splats; see
-    `disc_axes`.
+    `sharp` is without the low-pass; `blur` is the low-pass variance of other splats.
     """
     xx, xy, yy = sharp
     pixel = blur / LOW_PASS
@@ -313,16 +254,9 @@ def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
 
 
 def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
-    """Merged splats; each has the mean and covariance of the mixture of its pair.
+    """Merged splats, with mean and covariance of the mixture of each pair, from `price`'s `pairs`.
 
-    ``mu = w mu_i + w' mu_j`` and ``C = w C_i + w' C_j + w w' d d'``, w + w' = 1, d = mu_j - mu_i.
-
-    Parameters
-    ----------
-    splats, first, second
-        See `price`.
-    pairs : Pairs
-        What `price` returns of them.
+    ``mu = w mu_i + w' mu_j``, ``C = w C_i + w' C_j + w w' d d'``, w + w' = 1, d = mu_j - mu_i.
     """
     one, two = splats.take(first), splats.take(second)
     position, color = pairs.position[:, None], pairs.color[:, None]
@@ -349,10 +283,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
 
 
 def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[Array, Array, Array]:
-    """Log scales, (M, 3), quaternions, (M, 4), and logits of the opacity, (M,), of merged splats.
-
-    Discs are those of their two longest axes, with the mass that they had; the third scale is 0.
-    """
+    """Log scales (M, 3), quaternions (M, 4), opacity logits (M,); third scales of discs are 0."""
     count = len(merged.opacity)
     stored = np.empty((count, 3)), np.empty((count, 4)), np.empty(count)
 
@@ -390,10 +321,7 @@ def axes(covariances: Array) -> tuple[Array, Array]:
 
 
 def _mixture(one: Real, two: Real, step: Real, share: Real) -> Array:
-    """Covariances of mixtures of pairs, (6, M), given theirs; `share`, (M,), is that of the first.
-
-    `step`, (3, M), is from the mean of the first to that of the second.
-    """
+    """Covariances of mixtures, (6, M); `step` (3, M) is between the means, `share` the first's."""
     rows, columns = np.triu_indices(3)
     between = step[rows] * step[columns] * (share * (1.0 - share))  # (6, M)
     return np.asarray(share * one + (1.0 - share) * two + between, np.float64)
@@ -402,17 +330,9 @@ def _mixture(one: Real, two: Real, step: Real, share: Real) -> Array:
 def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Array:
     """Covariances, (M, 6), of discs that look like given ones from where they are viewed.
 
-    A disc with the normal n that a covariance C is projected to along a, ``E C E'`` with
-    ``E = I - a n' / (n' a)``, looks like C along a, however thick C is. With M the mean of
-    ``v v'`` over viewing directions v, ``n' C n`` is least for ``n' M n = 1`` where
-    ``C n = l M n``, and projected along ``a = M n`` it leaves ``C - l a a'``. That is `flat` in
-    coordinates in which M is I; where C is viewed from all sides alike it is `flat` itself.
-
-    Parameters
-    ----------
-    covariances : (M, 6) float64
-    direction, deviation : (M, 3) float64
-        See `field.Field`; `ASIDE` is the least standard deviation.
+    With M the mean of ``v v'`` over viewing directions v, the disc's normal n minimizes ``n' C n``
+    for ``n' M n = 1``: ``C n = l M n``. Projected along ``a = M n`` it leaves ``C - l a a'``. That
+    is `flat` in coordinates in which M is I.
     """
     beside = deviation - np.einsum("ij,ij->i", deviation, direction)[:, None] * direction
     size = np.maximum(np.sqrt(np.einsum("ij,ij->i", beside, beside)), ASIDE)
@@ -435,11 +355,10 @@ def _full(covariances: Array) -> Array:
 
 
 def flat(covariances: Array) -> Array:
-    """Covariances, (M, 6), without what they have along their shortest axis.
+    """Covariances, (M, 6), without their shortest axis n: ``P C P``, ``P = I - n n'``.
 
-    That axis n is the eigenvector of the least eigenvalue, which is
-    ``t / 3 + 2 p cos((acos(det(B / p) / 2) + 2 pi) / 3)`` with t the trace, ``B = C - t / 3 I`` and
-    ``p^2 = tr(B^2) / 6`` (Smith 1961); what is left is ``P C P``, ``P = I - n n'``.
+    The least eigenvalue is ``t / 3 + 2 p cos((acos(det(B / p) / 2) + 2 pi) / 3)``, t the trace,
+    ``B = C - t / 3 I``, ``p^2 = tr(B^2) / 6`` (Smith 1961).
     """
     total = np.maximum(covariances[:, [0, 3, 5]].sum(axis=1), _TINY)
     full = _full(covariances) / total[:, None, None]
@@ -473,10 +392,7 @@ def _null(matrices: Array) -> Array:
 
 
 def _dot(one: Real, other: Real) -> Real:
-    """Inner products of vectors, (M,), given (3, M) each.
-
-    Written out, so that rounding does not depend on where they lie in memory.
-    """
+    """Inner products (M,) of (3, M), written out: rounding must not depend on the memory layout."""
     return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
 
 
@@ -488,28 +404,24 @@ def _unit(vectors: Real) -> Real:
 
 
 def _shares(one: Real, two: Real) -> tuple[Real, Real]:
-    """Shares of two positive amounts in their sum, (M,) each."""
     total = one + two
     return one / total, two / total
 
 
 def _squared_contrast(error: Real, whole: Real) -> Real:
-    """Squared contrast that a measured error implies, (M,); `whole` is the error for |s| = 1.
-
-    Colours are in 0..1, so it is at most 1 for each of three channels.
-    """
+    """Squared contrast of a measured error, at most 3; `whole` is the error for |s| = 1."""
     return np.asarray(np.minimum(error, 3 * whole) / np.maximum(whole, _least(whole)[0]))
 
 
 def _mean_deviation(one: Real, two: Real, share: Real) -> Real:
-    """Mean of deviations, (3, M), whose signs are arbitrary, so they are made alike."""
+    """Mean of deviations, (3, M), with their arbitrary signs made alike."""
     rest = 1.0 - share
     np.negative(rest, where=_dot(one, two) < 0.0, out=rest)
     return np.asarray(share * one + rest * two)
 
 
 def _least(values: Real) -> tuple[float, float]:
-    """What replaces 0 as a divisor, and the least determinant over xx yy: see `_LEAST`."""
+    """Least divisor, and least determinant over xx yy: see `_LEAST`."""
     return _LEAST[values.dtype.itemsize]
 
 
@@ -522,5 +434,5 @@ def _determinant(footprint: Footprint) -> Real:
 
 
 def _area(footprint: Footprint) -> Real:
-    """Area of the ellipse of one standard deviation, divided by pi, (M,)."""
+    """Area of the ellipse of one standard deviation over pi, (M,)."""
     return np.asarray(np.sqrt(_determinant(footprint)))
