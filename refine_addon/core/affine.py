@@ -1,5 +1,4 @@
-"""Splats transformed by an affine matrix, such as a Blender object's; and which such maps took
-points from where they were to where they are."""
+"""Splats transformed by affine matrices, such as an object's; maps found from moved points."""
 
 from __future__ import annotations
 
@@ -17,35 +16,27 @@ from .splats import Splats, rotation_matrices
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
 
-QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}
-"""No turn, a quarter turn about x and one back, by how many quarters they are."""
+QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}  # turns about x by number of quarters
 
-_UNIFORM = 1e-4
-"""Relative difference between the scales of a matrix that still counts as uniform scaling."""
+_UNIFORM = 1e-4  # relative difference between the scales of a matrix that still counts as uniform
 
 _FLAT = 1e-9  # least over largest scale of a matrix that cannot be inverted in practice
 
 _SMALLEST, _LARGEST = 1e-30, 1e30
-"""Scales of a matrix that is applied: its determinant is in the range of float64, and usual splats
-stay in that of float32."""
+"""Scales of a matrix that is applied: its determinant fits float64, usual splats float32."""
 
-LEAST = 6
-"""Points that a map is found of at least: any four have one in common."""
+LEAST = 6  # least points a map is found of: any four have one in common
 
-_MOST = 32
-"""Maps that are looked for."""
+_MOST = 32  # maps that are looked for
 
-_NOISE = 4e-6
-"""Rounding of float32, relative to the terms that make a coordinate: 32 times its precision."""
+_NOISE = 4e-6  # rounding of float32, relative to the terms of a coordinate: 32 times its precision
 
-_PLANAR = 1e-5
-"""Thickness over extent of points that count as lying in a plane."""
+_PLANAR = 1e-5  # thickness over extent of points that count as lying in a plane
 
 _SAMPLE, _FITTED = 2048, 16384
 """Points by which candidates are compared, and to which a map is fitted at last; evenly spread."""
 
-_ROWS = 1 << 14
-"""Points that are mapped at a time."""
+_ROWS = 1 << 14  # points that are mapped at a time
 
 _TRIES, _DRAWN = 240, 4
 """Candidates for each map, and points that each is fitted to: the fewest that determine one."""
@@ -58,7 +49,7 @@ _CHUNK = 1 << 16  # splats whose covariances are computed together, which limits
 
 
 def scales_of(matrix: NDArray[Any]) -> NDArray[np.float64]:
-    """By how much a (4, 4) or (3, 3) matrix scales along its three axes, largest first."""
+    """Scales of a (4, 4) or (3, 3) matrix along its three axes, largest first."""
     linear = np.asarray(matrix, np.float64)[:3, :3]
     return np.asarray(np.linalg.svd(linear, compute_uv=False))
 
@@ -82,30 +73,11 @@ def moved(means: NDArray[Any], matrix: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True) -> Splats:
-    """Splats transformed by an affine matrix.
+    """Splats transformed by an invertible affine matrix, (4, 4).
 
-    Parameters
-    ----------
-    splats : Splats
-    matrix : (4, 4) floating
-        From the frame of the splats to the new one; any invertible affine matrix.
-    rotate_sh : bool
-        Whether harmonics are rotated with the splats. If not, they stay those of the old frame
-        (enough for the closed form, which only uses the constant), and non-uniform matrices are
-        allowed: means and covariances are transformed exactly.
-
-    Returns
-    -------
-    Splats
-        Transformed values are in float64. Rounded to float32 they would differ in the last digits
-        from the splats in the old frame, and so might the kept set.
-
-    Raises
-    ------
-    RefineError
-        If the matrix is not finite, not invertible or not affine, or scales by less than 1e-30 or
-        more than 1e30; or if, with `rotate_sh`, it scales directions differently, which harmonics
-        cannot express.
+    Values are float64: rounded, they and so the kept set might differ from those in the old frame.
+    Without `rotate_sh`, harmonics stay those of the old frame (the closed form uses only the
+    constant) and the matrix may be non-uniform. `RefineError`: see `check_affine`.
     """
     matrix = np.asarray(matrix, np.float64)
     check_affine(matrix, with_sh=rotate_sh)
@@ -135,16 +107,7 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
 
 
 def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
-    """Splats transformed by any affine matrix that can be inverted, harmonics as well.
-
-    As `transformed`, but where the matrix scales directions differently, harmonics become the
-    nearest to what is seen (`spherical_harmonics.stretched`); the rest is exact.
-
-    Raises
-    ------
-    RefineError
-        See `transformed`.
-    """
+    """Like `transformed`, by non-uniform matrices, too: harmonics become the nearest ones."""
     uniform = is_uniform(matrix)
     result = transformed(splats, matrix, rotate_sh=uniform)
     if uniform or not splats.sh_degree:
@@ -155,13 +118,9 @@ def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
 
 
 def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
-    """Refuse a matrix that splats, or with `with_sh` their harmonics, cannot follow.
+    """Raise `RefineError` unless a matrix is affine, not flat, and scales within float32.
 
-    Raises
-    ------
-    RefineError
-        If it is not an affine (4, 4) matrix, or flat, or scales by what float32 does not hold; with
-        `with_sh` also if it scales directions differently.
+    With `with_sh` it must be uniform, too: harmonics cannot follow others.
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise RefineError(f"expected a finite (4, 4) matrix, got {matrix.tolist()}")
@@ -183,10 +142,10 @@ def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternion w x y z of rotation matrices, (..., 3, 3) -> (..., 4).
+    """Unit quaternions w x y z of rotation matrices, (..., 3, 3) -> (..., 4).
 
-    It is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack 2000).
-    This needs no case distinction and is as accurate for half a turn as for other angles.
+    The largest eigenvalue's eigenvector of a symmetric 4 x 4 matrix (Bar-Itzhack 2000): without
+    cases, and as accurate for half a turn as for other angles.
     """
     m = np.asarray(rotation, np.float64)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -224,14 +183,9 @@ def _stretched(splats, means, linear):
 
 
 class Move(NamedTuple):
-    """Points that one affine map moved.
+    """Rows, (M,), of points that one affine map, (4, 4), moved.
 
-    Attributes
-    ----------
-    rows : (M,) int64
-    matrix : (4, 4) float64
-        From where they were. Its linear part is exactly the identity where they were not moved, or
-        moved alike.
+    Its linear part is exactly the identity where they were moved alike or not at all.
     """
 
     rows: NDArray[np.int64]
@@ -239,22 +193,11 @@ class Move(NamedTuple):
 
 
 def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
-    """Maps that explain how points moved, those that did not move first.
+    """Maps that explain how points, (N, 3), moved, those that did not move first.
 
-    A map is fitted to all points, and where it does not fit, to a few that are drawn at random, of
-    which the map is taken that most points agree with (RANSAC, Fischler and Bolles 1981); then the
-    rest is looked at. The draws are the same at each call.
-
-    Parameters
-    ----------
-    before, after : (N, 3) floating
-        Rounded to float32 once or a few times.
-
-    Returns
-    -------
-    list of Move
-        Each point is in one of them at most: none explains those that were moved one by one, or
-        into a plane, and those that are not finite.
+    A map is fitted to all, then to random draws, of which most agree with one (RANSAC, Fischler and
+    Bolles 1981), then to the rest; draws are the same at each call. None explains points moved one
+    by one, into a plane, or not finite.
     """
     before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
     finite = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
@@ -320,11 +263,11 @@ def _fits(matrix, before, after, *, slack=1.0):
 
 
 def _fitted(before, after):
-    """Affine map of least squares between points, (4, 4); a translation where that explains them.
+    """Affine least-squares map between points, (4, 4); a translation where that explains them.
 
-    Points in a plane say nothing of the direction across it. It is mapped across the plane that
-    they lie in now, by the mean scale within it, and not mirrored. None for points on a line,
-    and where they lie in a plane only now, as what Blender's *Mirror* merges.
+    Points in a plane do not tell the direction across it: mapped across their plane by the mean
+    scale, not mirrored. None for points on a line, or in a plane only now (Blender's *Mirror*
+    merges).
     """
     shift = np.eye(4)
     shift[:3, 3] = (after - before).mean(axis=0)

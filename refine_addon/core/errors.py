@@ -9,10 +9,8 @@ _OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
 def printable(text: str) -> str:
-    r"""Return text on one line, with control characters escaped.
+    r"""Text on one line, with control characters escaped.
 
-    Examples
-    --------
     >>> print(printable("in\x1b[2J.ply"))
     in\x1b[2J.ply
     """
@@ -23,7 +21,7 @@ def printable(text: str) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """Return why the system refuses, such as "Permission denied"."""
+    """Why the system refuses, such as "Permission denied"."""
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
@@ -31,5 +29,5 @@ class RefineError(Exception):
     """Bad input. The message is for the user: file, place, what was got, what was expected."""
 
     def __str__(self) -> str:
-        """Return the message, made `printable`, since it may hold names out of files."""
+        """Message made `printable`, since it may hold names out of files."""
         return printable(super().__str__())

@@ -1,16 +1,10 @@
-"""The one way to run work: in this thread, on threads, in processes; and how far it is.
+"""The one way to run work, in this thread, on threads or in processes, and its progress.
 
-NumPy's loops run without Python's lock, so threads share large arrays and speed them up. Work of
-many short loops keeps passing the lock on: two threads of it are a fifth faster than one, two
-processes nearly twice as fast. The processes run this same Python and this same package under the
-name that it has here (in Blender an extension is part of other packages), and nothing of the
-calling program, so no script needs a guard around its main part. They are kept for the next call
-and end when they have had nothing to do for `IDLE` seconds, or when this process ends.
-`concurrent.futures.ProcessPoolExecutor` would import the caller's main module in each, and cannot
-find an extension's modules.
-
-Progress is told as ``progress(fraction, what)``. A run is divided into stages (`stages`), each as
-long as `seconds` expects by a constant times what it works through.
+NumPy releases Python's lock in its loops; many short loops keep passing it on (two threads 1.2
+times as fast as one, two processes 2). Processes run this Python and package under its name here
+(an extension's is Blender's), nothing of the calling program (`ProcessPoolExecutor` imports its
+main module), and end after `IDLE` seconds. Progress is divided into `stages`, as long as `seconds`
+expects.
 """
 
 from __future__ import annotations
@@ -56,18 +50,17 @@ SECONDS = {
     "draw": 1e-6,
     "write": 0.5e-6,
 }
-"""Seconds of one core for each splat, of the lower kinds for each splat in each view. By processor
-time of runs of 40,000 to 2 million splats."""
+"""Seconds of one core for each splat, of the lower kinds in each view. By processor time of runs of
+40,000 to 2 million splats."""
 
 REPLACES_MAPPED = os.name != "nt"
 """Whether a file that is mapped into memory can be replaced; Windows refuses."""
 
-IDLE = 8.0
-"""Seconds without work after which a process ends, and gives back its memory; others start fast."""
+IDLE = 8.0  # seconds without work after which a process ends, to free its memory; others start fast
 
 WORTH, WORTH_READY = 2.0, 0.2
-"""Seconds of work, on one core, from which on it is worth doing in processes: if they are yet to be
-started, which takes each a third of a second, and if they are there."""
+"""Seconds of work on one core that are worth processes: yet to be started, a third of a second
+each, or there."""
 
 _HEAPS = -8  # M_ARENA_MAX of glibc's malloc.h
 _HELD = 30_000_000  # bytes; above 32 MB, freeing a block does not raise glibc's threshold
@@ -88,8 +81,7 @@ for package, place in places.items():
     module.__path__ = place
 importlib.import_module(name + ".core.execute").serve()
 """
-"""What a process runs: it finds modules under the names that they have here, and runs none of the
-packages' own code."""
+"""What a process runs: it finds modules under their names here, without the packages' code."""
 
 
 class _Own(threading.local):
@@ -136,8 +128,6 @@ def seconds(kind: str, splats: float, views: float = 1) -> float:
 def stages(progress: Progress, *expected: float) -> list[Progress]:
     """Divide `progress` into consecutive stages, each with its share of the expected seconds.
 
-    Examples
-    --------
     >>> first, second = stages(lambda fraction, what: print(what, fraction), 1.0, 3.0)
     >>> first(1.0, "reading"), second(0.5, "scoring")
     reading 0.25
@@ -149,13 +139,7 @@ def stages(progress: Progress, *expected: float) -> list[Progress]:
 
 
 class TimeLeft:
-    """How long a run still takes, from the share that is done; rises only if it was far too low.
-
-    Parameters
-    ----------
-    clock : callable, optional
-        Returns seconds.
-    """
+    """How long a run still takes, from the share that is done; rises only if it was far too low."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock, self._start, self._last = clock, clock(), math.inf
@@ -187,13 +171,7 @@ def in_time(duration: float) -> str:
 
 
 def checkpoint() -> None:
-    """Let work be cancelled here; work with long pieces calls this several times a second.
-
-    Raises
-    ------
-    Cancelled
-        If the progress callback given to `run` answers ``False``. Outside of `run` nothing happens.
-    """
+    """Raise `Cancelled` if `run` was cancelled; long work calls this several times a second."""
     _own.check()
 
 
@@ -214,27 +192,21 @@ def checked_by(check: Callable[[], None]) -> AbstractContextManager[None]:
 
 
 def on(cluster: Any) -> AbstractContextManager[None]:
-    """Have `run` in this thread, within the block, give what is worth processes to a cluster.
+    """Have `run` in this thread, within the block, send long work to a `Cluster` if not None.
 
-    Parameters
-    ----------
-    cluster : tiles.cluster.Cluster or None
-        None leaves it to this machine. Work that holds large arrays is not sent.
+    Work that holds large arrays is not sent.
     """
     return _with(cluster=cluster)
 
 
 def alone(work: Callable[[Item], Outcome], items: Iterable[Item]) -> list[Outcome]:
-    """Do the same as `run_all` in this thread alone, and whatever the work runs, too."""
+    """`run_all` in this thread alone, with whatever the work runs."""
     with _with(cores=1):
         return run_all(work, items, threads=1)
 
 
 def default_threads() -> int:
-    """How many threads to use: the cores that this process may run on, at most 8.
-
-    In a thread whose work is one of several pieces that a cluster does it is one.
-    """
+    """Cores that this process may use, at most 8; 1 in a thread that does a cluster's work."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return _own.cores or min(there or 1, 8)
 
@@ -247,10 +219,9 @@ def return_freed() -> None:
 
 
 def share_heap() -> None:
-    """Let all threads of this process allocate from one heap, for a process of our own.
+    """Let all threads allocate from one heap, in a process of our own; only glibc has several.
 
-    Each thread would have one of its own, which keeps what the thread freed even if all others need
-    memory: 70 MB of 300 while 160,000 splats are merged. Only glibc does that.
+    A thread's own heap keeps what it freed: 70 MB of 300 while 160,000 splats are merged.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another C library
@@ -260,8 +231,6 @@ def share_heap() -> None:
 def chunks(total: int, size: int) -> list[slice]:
     """Divide ``range(total)`` into consecutive slices, all but the last of one length.
 
-    Examples
-    --------
     >>> chunks(5, 2)
     [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
     """
@@ -269,7 +238,7 @@ def chunks(total: int, size: int) -> list[slice]:
 
 
 def run_all(work: Callable[[Item], Outcome], items: Iterable[Item], **how: Any) -> list[Outcome]:
-    """Do the same as `run`, and return all results at once."""
+    """`run`, with all results at once."""
     return list(run(work, items, **how))
 
 
@@ -282,32 +251,18 @@ def run(
     threads: int | None = None,
     cost: float = 0.0,
 ) -> Iterator[Outcome]:
-    """Call ``work(item)`` for each item, and yield the results in order.
+    """Call ``work(item)`` for each item, and yield the results in order, as soon as they are there.
 
     Parameters
     ----------
-    work : callable
-        Its results must not depend on where it runs.
-    items : iterable
+    work : callable, whose results must not depend on where it runs
     progress, what
-        Called from this thread between items, and ten times a second while one takes long; in one
-        thread, the latter only if the work calls `checkpoint`.
-    threads : int, optional
-        How many cores to use; 1 does everything in this thread. By default `default_threads`.
+        Called in this thread between items and, on threads or if work calls `checkpoint`, ten times
+        a second. When it cancels, running items end at their next `checkpoint`, processes at once.
+    threads : int, optional; 1 does everything in this thread, by default `default_threads`
     cost : float
-        About how many seconds all of it takes on one core, where it is worth doing in processes;
-        `work`, items and results are then pickled, and what the work changes is lost.
-
-    Yields
-    ------
-    object
-        Each result as soon as those before it are there.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``. Items that have not begun are dropped; those that have
-        begun end at their next `checkpoint`, processes at once.
+        About how many seconds it takes on one core, if it may run in processes. Work, items and
+        results are pickled then, and what work changes is lost.
     """
     # Freeing one 30 MB block raises glibc's mmap threshold, so that buffers are reused instead of
     # page-faulted. No effect on other systems.
@@ -338,7 +293,6 @@ def run(
 
 
 def _in_turn(work, items, tell):
-    """Do work in this thread; `tell` of how many items are done."""
     step, told = max(len(items) // 100, 1), 0.0  # enough reports for a progress bar
 
     def check():
@@ -391,7 +345,7 @@ def _side_by_side(work, items, threads, tell, stop=lambda: None):
 
 
 def start(cost: float, threads: int | None = None) -> None:
-    """Start the processes that `run` will want soon, so that they are there by then."""
+    """Start the processes that `run` will want soon."""
     number = default_threads() if threads is None else threads
     if _worth(cost, number):
         with suppress(_LostError):
@@ -409,7 +363,7 @@ def _worth(cost, number):
 
 
 def _in_processes(work, items, number, tell):
-    """Do work in `number` processes; raise `_LostError` if they, or their file, cannot be had."""
+    """Do work in `number` processes; `_LostError` if they, or their file, cannot be had."""
     with _lost(OSError):
         folder = tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
     with folder:
@@ -461,7 +415,7 @@ def _tell_all(team: list[_Process], message: tuple[str, Any]) -> None:
 
 
 def _taken(number: int) -> list[_Process]:
-    """Processes that nobody else uses: idle ones, and new ones; or raise `_LostError`."""
+    """Processes nobody else uses, idle or new; or raise `_LostError`."""
     with _lock:
         team = [process for process in _idle if process.ready]
         for process in set(_idle) - set(team):
@@ -513,14 +467,14 @@ class _Process:
         return self._popen.poll() is None and time.monotonic() - self._used < IDLE / 2
 
     def tell(self, message: tuple[str, Any]) -> None:
-        """Send a task or an item; see `answer`. Raise `_LostError` if the process has ended."""
+        """Send a task or an item; `_LostError` if the process has ended."""
         self._used = time.monotonic()
         with _lost(OSError, ValueError):  # ended, or killed here
             pickle.dump(message, self._popen.stdin, protocol=5)
             self._popen.stdin.flush()
 
     def answer(self) -> Any:
-        """Wait for what the work returns; raise its error, or `_LostError` if the process ended."""
+        """Result of the work; raises its error, or `_LostError` if the process ended."""
         with _lost(Exception):
             done, result = pickle.load(self._popen.stdout)
         self._used = time.monotonic()
@@ -529,13 +483,12 @@ class _Process:
         return result
 
     def kill(self) -> None:
-        """End it now, whatever it does."""
         with suppress(OSError), self._popen:  # closes pipes and waits; of what was yet to be told
             self._popen.kill()
 
 
 def _stored(work, path):
-    """What a process needs to have `work`, whose arrays are written to a file that all map."""
+    """What a process needs to have `work`, whose arrays go to a file that all map."""
     arrays: list[pickle.PickleBuffer] = []
     pickled = pickle.dumps(work, protocol=5, buffer_callback=arrays.append)
     places = []

@@ -1,13 +1,8 @@
-"""Image files: PNG, OpenEXR and WebP, and the size of a PNG or JPEG, read from its header.
+"""PNG, OpenEXR and WebP images, and the size of a PNG or JPEG, read from its header.
 
-PNG is written with 8 bits a channel (ISO/IEC 15948). OpenEXR is read as Blender writes it
-for us, in one part without compression (Academy Software Foundation, "OpenEXR File Layout"): a
-header of named attributes, a table of offsets, and then for each line its number, its size and its
-channels one after another, in the order of their names.
-
-Lossless WebP is read and written by Blender's own library or by Pillow, since core has no codec of
-its own. `use` names one, as the extension does in Blender; without, Pillow is imported when an
-image is read or written.
+PNG has 8 bits a channel (ISO/IEC 15948); OpenEXR is read as Blender writes it for us, one part
+without compression ("OpenEXR File Layout"). Core has no codec for lossless WebP: `use` names
+Blender's, else Pillow is imported when needed.
 """
 
 from __future__ import annotations
@@ -37,25 +32,17 @@ _TYPES = {1: "<f2", 2: "<f4"}  # of numbers in a channel
 
 _JPEG_START = b"\xff\xd8"
 
-_MOST_SEGMENTS = 4096
-"""Most segments and fill bytes that are skipped; no camera writes more."""
+_MOST_SEGMENTS = 4096  # most segments and fill bytes that are skipped; no camera writes more
 
 _FILL = 0xFF
 _LAST = 0xDA, 0xD9  # start of scan and end of image
-_STANDALONE = {0x01, *range(0xD0, 0xD9)}
-"""JPEG markers that no segment follows."""
+_STANDALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers that no segment follows
 _FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""JPEG start-of-frame markers: a segment with precision (1 byte), height, width (2 bytes each)."""
+"""JPEG start-of-frame markers: a segment with precision (1 byte), height, width (2 each)."""
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
-    r"""PNG image of pixels (H, W, 3), the top row first.
-
-    Examples
-    --------
-    >>> png(np.zeros((1, 1, 3), np.uint8))[:4]
-    b'\x89PNG'
-    """
+    """PNG image of pixels (H, W, 3), the top row first."""
     height, width = pixels.shape[:2]
     rows = pixels.reshape(height, -1)
     filtered = np.full((height, 1 + rows.shape[1]), _UP, np.uint8)
@@ -69,22 +56,7 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Channels of an image by their names.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    mapping of str to (H, W) float32
-        The top row first.
-
-    Raises
-    ------
-    RefineError
-        If the file cannot be read, or is packed, has several parts, or channels of integers.
-    """
+    """Channels of an image by name, (H, W) float32, top row first; or `RefineError`."""
     try:
         return _channels(path.read_bytes())
     except OSError as error:
@@ -122,24 +94,13 @@ def _channels(data):
 
 
 def _text(data: bytes, start: int) -> tuple[str, int]:
-    """Text that begins here, and where it is over."""
+    """Text that begins here, and where it ends."""
     end = data.index(b"\0", start)
     return data[start:end].decode(errors="replace"), end + 1
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Width and height as stored (before any EXIF rotation), pixels.
-
-    Parameters
-    ----------
-    path : Path
-        An image, or anything else.
-
-    Returns
-    -------
-    tuple of int or None
-        ``None`` if the file does not exist, is neither PNG nor JPEG, or is truncated.
-    """
+    """Width and height as stored, before EXIF rotation, pixels; None if no whole PNG or JPEG."""
     try:
         if not path.is_file():  # a pipe would be waited for
             return None
@@ -171,16 +132,16 @@ def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
 
 
 class Codec(Protocol):
-    """What reads and writes images."""
+    """What reads and writes WebP images."""
 
     def size(self, data: bytes) -> tuple[int, int]:
-        """Return width and height of an image, without unpacking it; raise `ValueError`."""
+        """Width and height, without unpacking; raises `ValueError`."""
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
-        """Return the pixels of an image, (height, width, 4), the top row first; see `size`."""
+        """Pixels, (height, width, 4), the top row first; raises `ValueError`."""
 
     def encode(self, pixels: NDArray[np.uint8]) -> bytes:
-        """Return a WebP image that holds these pixels, (height, width, 4), to the bit."""
+        """WebP image that holds these pixels, (height, width, 4), to the bit."""
 
 
 class _Pillow:
@@ -190,12 +151,10 @@ class _Pillow:
         self._image: Any = importlib.import_module("PIL.Image")
 
     def size(self, data: bytes) -> tuple[int, int]:
-        """See `Codec`."""
         with self._opened(data) as image:
             return image.size
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
-        """See `Codec`."""
         with self._opened(data) as image:
             return np.array(image.convert("RGBA"))
 
@@ -211,7 +170,6 @@ class _Pillow:
             raise ValueError(str(error)) from error
 
     def encode(self, pixels: NDArray[np.uint8]) -> bytes:
-        """See `Codec`."""
         stream = io.BytesIO()
         # Without `exact`, the colours of pixels whose alpha is 0 would be lost.
         image = self._image.fromarray(pixels, "RGBA")
@@ -228,13 +186,7 @@ def use(codec: Codec | None) -> None:
 
 
 def codec_for(path: Path) -> Codec:
-    """Return what reads and writes images.
-
-    Raises
-    ------
-    RefineError
-        If there is nothing; `path` is the file that needs it.
-    """
+    """Codec in use; `RefineError`, naming `path`, if there is none."""
     if _named:
         return _named[0]
     try:

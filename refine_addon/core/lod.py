@@ -1,8 +1,7 @@
 """Levels of detail: the same scene with ever fewer splats, in memory or as files.
 
-Where kept splats may change, each level is made from the one before. What they then become does not
-depend on which levels are asked for after them. Where splats are deleted, one ranking decides all
-levels. Either way the rows of a level are among those of the level before.
+Where kept splats may change, each level is made from the one before, independent of later ones.
+Where splats are deleted, one ranking decides all. A level's rows are among those of the one before.
 """
 
 from __future__ import annotations
@@ -46,11 +45,9 @@ from .whole_file import (
     refuse_one_file,
 )
 
-MAX_LEVELS = 16
-"""No more levels than this: the last of so many halvings would hold 0.0015 % of the splats."""
+MAX_LEVELS = 16  # the last of so many halvings would hold 0.0015 % of the splats
 
-SHARES = (0.5, 0.25, 0.12, 0.06)
-"""Shares that stay, by default."""
+SHARES = (0.5, 0.25, 0.12, 0.06)  # shares kept, by default
 
 _SAMPLE = 4096  # splats that tell how far away what the views see is
 _VIEWS = 8  # views that tell it
@@ -58,15 +55,12 @@ _VIEWS = 8  # views that tell it
 
 @dataclass(frozen=True)
 class Levels:
-    """Which levels to make: by the share of the splats that stays, or by a PSNR.
+    """Which levels to make: by the share of the splats that is kept, or by a PSNR.
 
     Attributes
     ----------
-    shares : tuple of float
-        Shares that stay, each in (0, 1) and less than the one before.
-    psnr : tuple of float
-        Instead, how close the pictures of the views stay to those of all splats, dB, each less than
-        the one before; see `Budget`.
+    shares : tuple of float, each in (0, 1) and less than the one before
+    psnr : tuple of float, instead; each less than the one before, dB, see `Budget`
 
     Examples
     --------
@@ -106,15 +100,8 @@ class Levels:
         return self.shares or self.psnr
 
     def notes(self, remarks: Mapping[float, str]) -> list[str]:
-        """Which levels were not made, and what is remarked of the others, in sentences.
+        """Which levels were not made, and `remarks` (`Level.remark` by `asked`), in sentences.
 
-        Parameters
-        ----------
-        remarks : mapping of float to str
-            `Level.remark` of those that were made, by `Level.asked`.
-
-        Examples
-        --------
         >>> Levels(psnr=(99.0, 40.0)).notes({40.0: ""})
         ['no level for 99 dB: it would be a copy of the input']
         """
@@ -130,7 +117,7 @@ class Levels:
         return notes
 
     def budgets(self, count: int) -> list[Budget]:
-        """The budgets of the levels for so many splats; at least one splat stays."""
+        """Budgets of the levels for so many splats; each keeps at least one."""
         if self.psnr:
             return [Budget(psnr=psnr) for psnr in self.psnr]
         # The decimals as written, as `Budget.removals`; as many as with `ratio` of 1 - share.
@@ -144,14 +131,10 @@ class Level:
 
     Attributes
     ----------
-    number : int
-        From 1; level 0 is the original.
-    asked : float
-        The share that stays or the PSNR that was asked for.
-    result : Result
-        Of all splats: what is kept, as it became; its report is that of the last step.
-    scores : Scores
-        What the views saw of all splats, the same for all levels.
+    number : int, from 1; level 0 is the original
+    asked : float, the share or the PSNR
+    result : Result, of all splats; its report is that of the last step
+    scores : Scores, of all splats, the same for all levels
     """
 
     number: int
@@ -161,7 +144,7 @@ class Level:
 
     @property
     def psnr(self) -> float | None:
-        """The estimated PSNR of the views against all splats, dB."""
+        """Estimated PSNR of the views against all splats, dB."""
         return self.result.report["estimated_psnr"]
 
     @property
@@ -170,7 +153,7 @@ class Level:
         return self.result.report["budget_remark"]
 
     def facts(self) -> dict[str, Any]:
-        """What is to be known of it as plain JSON values."""
+        """Its report as plain JSON values."""
         report = self.result.report
         return {
             "level": self.number,
@@ -193,34 +176,20 @@ def lod(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Iterator[Level]:
-    """Make levels of detail one by one, when they are asked for.
+    """Make levels of detail one by one, when they are asked for, the finest first.
+
+    A level with as many splats as the one before is left out; see `Levels.notes`.
 
     Parameters
     ----------
-    splats : Splats
-        In the frame of the views.
-    views : ViewSet
-    levels : Levels
-    method : Method
-    protected : (N,) bool, optional
-        Splats that are in all levels, unchanged.
+    splats, views, method, progress, threads : see `prune`
+    protected : (N,) bool, optional; in all levels, unchanged
     removed : (N,) bool, optional
-        Splats that are in no level, unless they are protected. They count as removed, and levels
-        are compared with the pictures of the others.
-    progress : callable, optional
-        ``progress(fraction, what)``; returning ``False`` cancels.
-    threads : int, optional
-
-    Yields
-    ------
-    Level
-        The finest first. One that would have as many splats as the one before, or as the original,
-        is not among them; see `Levels.notes`.
+        In no level unless protected. They count as removed; levels are compared with the others.
 
     Raises
     ------
-    RefineError, Cancelled
-        See `prune`; also if no level would have fewer splats than the original.
+    RefineError, Cancelled : see `prune`; also if no level has fewer splats than the original
 
     Examples
     --------
@@ -276,7 +245,7 @@ def _results(splats, views, budgets, method, protected, progress, threads):
 
 
 def _both(first, second):
-    """What two steps make of the splats of the first, one after the other."""
+    """Two steps as one; the second is of what the first kept."""
     keep, one, merged = among_all(second.keep, first.keep), first.merged, second.merged
     if one is not None and merged is None:
         splats, changed = one.splats.take(second.keep), one.changed[second.keep]
@@ -291,10 +260,8 @@ def _both(first, second):
 
 
 def level_paths(source: Path, target: Path, count: int) -> list[Path]:
-    """The names of the files of `count` levels, by that of `target` if it is a file, else `source`.
+    """Files of `count` levels, named by `target` if it is a file, else by `source`.
 
-    Examples
-    --------
     >>> from pathlib import Path
     >>> [path.as_posix() for path in level_paths(Path("a/b.compressed.ply"), Path("out"), 2)]
     ['out/b.lod1.ply', 'out/b.lod2.ply']
@@ -315,10 +282,10 @@ def is_streamed(target: Path) -> bool:
 
 @contextlib.contextmanager
 def _into_folder(source, target, count, overwrite):
-    """A file of each level; level 0 is not written again. New files go if the block fails.
+    """A file of each level but 0. New files are deleted if the block fails.
 
-    Yields ``add(scene, level)``, which writes a level and returns the name and size of its file, of
-    how many splats there is none in it, and sentences; and ``finish()``, which returns sentences.
+    Yields ``add(scene, level)``, which writes one and returns its file's name and size, how many
+    splats it lacks, and notes; and ``finish()``, which returns notes.
     """
     paths, written = level_paths(source, target, count), list[Path]()
 
@@ -351,10 +318,7 @@ def _into_folder(source, target, count, overwrite):
 
 @contextlib.contextmanager
 def _streamed(target, views, overwrite):
-    """A streamed SOG of all levels, with level 0: what the user did not remove of the source.
-
-    Yields as `_into_folder`.
-    """
+    """A streamed SOG of all levels, 0 without what the user removed; see `_into_folder`."""
     codec_for(target)  # refuses where no library for images is
     made: list[StreamedSog] = []
     with folder_for(target, overwrite=overwrite) as folder:
@@ -381,9 +345,9 @@ def _streamed(target, views, overwrite):
 
 
 def viewing_distance(splats: Splats, views: ViewSet) -> float:
-    """Median distance from views to what lies in their pictures, world units; inf if nothing does.
+    """Median distance from views to what they see, world units; inf if nothing.
 
-    A chunk of a streamed SOG is as wide, so that its far end is at most twice as far as its near.
+    A streamed SOG's chunks are as wide, so their far ends are at most twice as far as their near.
     """
     means = splats.means[:: max(len(splats) // _SAMPLE, 1)].astype(np.float64)
     distances = [np.empty(0)]
@@ -410,32 +374,21 @@ def lod_file(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Make levels of detail of a file of splats: a file each, or a streamed SOG of all.
+    """Make levels of detail of a file: a file each, or a streamed SOG of all. Returns the report.
 
     Parameters
     ----------
-    source : path-like
-        The file to read, of any format (`read_splats`); level 0, which is not written again but in
-        a streamed SOG.
+    source : path-like, of any format; level 0, which only a streamed SOG holds again
     target : path-like
-        The folder where the files go; or a file there, by which they are named (`level_paths`); or
-        the index of a streamed SOG, ``lod-meta.json``. The folder is made if it is not there.
-    views, levels, method, progress, threads
-        See `lod`.
-    zones, model
-        See `read_scene`.
-    overwrite : bool
-
-    Returns
-    -------
-    dict
-        The report.
+        A folder, made if missing; a file in it that gives the names (`level_paths`); or the index
+        of a streamed SOG, ``lod-meta.json``.
+    views, levels, method, progress, threads : see `lod`
+    zones, model : see `prune_file`
 
     Raises
     ------
     RefineError, Cancelled
-        See `lod`, `read_scene` and `Result.write`. Files that were new are removed again then; a
-        streamed SOG that was to be replaced is as it was.
+        New files are deleted again then; a streamed SOG that was to be replaced is as it was.
     """
     clock, path, file = Clock(), expanded(target), expanded(source)
     output = (

@@ -1,14 +1,9 @@
-"""What lies in files: arrays, splats and regions of these, and what a job has done.
+"""Arrays, splats and regions in files, and what a job has done.
 
-Indexing an array reads it, so scenes larger than memory are pruned by the same code. Each access
-maps the file, copies what is asked for and lets the map go: pages that stay mapped count as memory
-of the process. Pickled, an array is its file's name, type and shape, so processes that see the file
-share it.
-
-The files lie in the folder of a job. It also keeps what its finished stages returned (`once`), so
-that the same job goes on from there after a kill. Splats that are too many to be merged or refitted
-at once are divided into regions; each is worked on by itself, by any process, and what belongs to
-it waits in that folder.
+Indexing maps the file, copies and unmaps, as mapped pages count as memory of the process; pickled,
+an array is its file's name, type and shape. A job's folder holds these files and the results of its
+stages (`once`), so it continues after a kill. Splats too many to merge or refit at once are divided
+into regions, each worked on by any process.
 """
 
 from __future__ import annotations
@@ -33,8 +28,7 @@ from .splats import ARRAYS, Splats
 
 Result = TypeVar("Result")
 
-REGION = 1 << 20
-"""Splats of a region at most; merging takes about 900 bytes of each."""
+REGION = 1 << 20  # most splats of a region; merging takes about 900 bytes of each
 
 _ROWS = 1 << 16  # splats copied at a time
 _SAMPLE = 1 << 14  # splats that decide along which axis a box is divided
@@ -46,19 +40,7 @@ class Interrupted(RefineError):
 
 
 class Mapped:
-    """An array in a file, read-only, in C order.
-
-    Parameters
-    ----------
-    path : Path
-    dtype : dtype
-    shape : tuple of int
-
-    Raises
-    ------
-    Interrupted
-        If the file is not as long as the array; from indexing also if it cannot be read.
-    """
+    """An array in a file, read-only, in C order; `Interrupted` if damaged or unreadable."""
 
     def __init__(self, path: Path, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         self.path, self.dtype, self.shape = path, dtype, shape
@@ -89,23 +71,9 @@ class Mapped:
 
 
 def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, Any]:
-    """Write arrays into a new folder, a piece of each at a time along the first axis.
+    """Write arrays, a piece of each at a time, into a folder that is replaced whole or not at all.
 
-    Parameters
-    ----------
-    folder : Path
-        It is there with all arrays or not at all; one that is there already is replaced.
-    pieces : iterable of dict of str to array
-        At least one, all with the names, types and further axes of the first.
-
-    Returns
-    -------
-    dict of str to Mapped
-
-    Raises
-    ------
-    Interrupted
-        If the disk is full or fails.
+    All pieces have the names, types and further axes of the first.
     """
     unfinished = folder.with_name(f"{folder.name}-{secrets.token_hex(4)}.tmp")
     files: dict[str, BinaryIO] = {}
@@ -134,19 +102,7 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
 
 
 def once(job: Path, stage: str, make: Callable[[], Result]) -> Result:
-    """Result of a stage of a job: that of an earlier run, or what `make` returns, which is kept.
-
-    Parameters
-    ----------
-    job : Path
-    stage : str
-    make : callable
-
-    Raises
-    ------
-    Interrupted
-        If the disk is full or fails.
-    """
+    """Result of a stage of a job: that of an earlier run, or of `make`, which is kept."""
     done, result = noted(job, stage)
     return result if done else note(job, stage, make())
 
@@ -203,20 +159,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def on_disk(folder: Path, parts: Iterable[Splats]) -> Splats:
-    """Splats in files of a new folder, see `write`.
-
-    Parameters
-    ----------
-    folder : Path
-        In that of a job, in which what is made of the splats goes too.
-    parts : iterable of Splats
-        At least one; all have the types, degree and model of the first.
-
-    Raises
-    ------
-    Interrupted
-        If the disk is full or fails.
-    """
+    """Splats in files of a new folder in that of a job; parts have one type, degree and model."""
     model: Any = None
 
     def columns() -> Iterator[dict[str, NDArray[Any]]]:
@@ -235,12 +178,12 @@ def pieces(splats: Splats, rows: NDArray[np.int64]) -> Iterator[Splats]:
 
 
 def folder_of(splats: Splats) -> Path | None:
-    """The folder of a job in whose files the splats lie; None of those in memory."""
+    """Folder of the job in whose files the splats lie; None if in memory."""
     return splats.means.path.parents[1] if isinstance(splats.means, Mapped) else None
 
 
 def new_folder(splats: Splats) -> Path:
-    """A new folder for what is made of splats in files, in that of their job."""
+    """A new folder, in that of their job, for what is made of splats."""
     job = folder_of(splats)
     assert job is not None
     folder = job / f"regions-{secrets.token_hex(4)}"
@@ -252,28 +195,17 @@ def new_folder(splats: Splats) -> Path:
 
 
 def in_regions(splats: Splats, count: int) -> bool:
-    """Whether so many of some splats are too many at once: they lie in files, not in memory."""
+    """Whether so many of some splats are too many at once: in files, not in memory."""
     return folder_of(splats) is not None and count > REGION
 
 
 def divided(
     means: NDArray[np.floating[Any]], share: float = 1.0, *, askew: bool = False
 ) -> list[NDArray[np.int64]]:
-    """Divide splats into boxes of about equally many, by planes at right angles to where they vary.
+    """Rows, ascending, of boxes of about equally many splats, at most `share` of a `REGION` each.
 
-    Parameters
-    ----------
-    means : (n, 3) floating
-        Where they are; what is not finite counts as the origin.
-    share : float
-        How many there may be in a box, in `REGION`.
-    askew : bool
-        Whether the planes lie askew.
-
-    Returns
-    -------
-    list of (m,) int64
-        Rows of each box, ascending.
+    Planes are at right angles to, or `askew` of, where `means`, (n, 3), vary; non-finite ones count
+    as the origin.
     """
     with np.errstate(over="ignore"):  # doubles that are no floats
         place = np.asarray(means, np.float32)
@@ -303,9 +235,9 @@ def look(_fraction: float, _what: str) -> None:
 def in_one(
     folder: Path, regions: Sequence[Splats], boxes: Sequence[NDArray[np.int64]]
 ) -> tuple[Splats, NDArray[np.int64]]:
-    """Splats of all regions, ascending by their rows, and the order, (N,), that makes them ascend.
+    """Splats of all regions, ascending by rows (`boxes`), and the order, (N,), that sorts them.
 
-    `boxes` are the rows of each region. The folder of the regions is removed.
+    The folder of the regions is deleted.
     """
     every, order = on_disk(folder / "every", regions), np.argsort(np.concatenate(boxes))
     result = on_disk(folder.with_name(f"{folder.name}-done"), pieces(every, order))

@@ -11,24 +11,11 @@ from .refit import refit
 
 @dataclass(frozen=True)
 class Method:
-    """What all methods share.
+    """What all methods share; `views` are spread evenly, 0 uses all."""
 
-    Attributes
-    ----------
-    views : int
-        Use at most this many views, spread evenly; 0 uses all.
+    name: ClassVar[str]  # the word for it in panel, command and report
 
-    Raises
-    ------
-    RefineError
-        If a value is out of range.
-    """
-
-    name: ClassVar[str]
-    """The word for it in panel, command and report."""
-
-    changes: ClassVar[bool] = False
-    """Whether kept splats may change; else their rows stay to the bit."""
+    changes: ClassVar[bool] = False  # whether kept splats may change; else rows stay to the bit
 
     views: int = 64
 
@@ -62,13 +49,9 @@ class Merge(Method):
 
 @dataclass(frozen=True)
 class Refit(Method):
-    """Merge, then what stays is fitted to what all splats looked like.
+    """Merge, then fit the kept splats to what all splats looked like.
 
-    Attributes
-    ----------
-    rounds : int or None
-        Fit up to so many times, each time to other rays; None ends where a round takes long for
-        what it brings.
+    `rounds` is the most, each to other rays; None ends where a round brings little for its time.
     """
 
     name = "refit"

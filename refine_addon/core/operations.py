@@ -35,41 +35,20 @@ from .views import ViewSet
 from .volumes import Forced, Zone, forced
 from .whole_file import expanded, refuse_existing, refuse_mapped
 
-PROPERTY = "refine_score"
-"""The property of a PLY that holds the scores."""
+PROPERTY = "refine_score"  # the property of a PLY that holds the scores
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Splats in memory, what must stay and go, and the rows that are written.
+    """Splats in memory, which of them are forced, and the rows that are written."""
 
-    Attributes
-    ----------
-    name : str
-        What the report calls the source.
-    bytes : int
-        Its size.
-    splats : Splats
-        In the frame of the views.
-    demands : Forced
-        Which of them must stay, and which must go.
-    file : callable
-        Returns the `SplatFile` that is written, in the frame of the source.
-    sizes : (float, int)
-        Bytes of a splat in the output and of everything else there.
-    matrix : (4, 4) float64 or None
-        From the frame of the source to that of the views, where they differ.
-    notes : tuple of str
-        What the user should know about the source, in sentences.
-    """
-
-    name: str
-    bytes: int
-    splats: Splats
+    name: str  # in the report
+    bytes: int  # of the source
+    splats: Splats  # in the frame of the views
     demands: Forced
-    file: Callable[[], SplatFile]
-    sizes: tuple[float, int]
-    matrix: NDArray[np.float64] | None = None
+    file: Callable[[], SplatFile]  # what is written, in the source's frame
+    sizes: tuple[float, int]  # bytes of a splat in the output, and of the rest
+    matrix: NDArray[np.float64] | None = None  # (4, 4), source to views
     notes: tuple[str, ...] = ()
 
 
@@ -79,17 +58,10 @@ def read_scene(
     model: Model | None = None,
     form: Format | None = None,
 ) -> Scene:
-    """Read a file of any format; its frame is that of the views.
+    """Read a file of any format, whose frame is that of the views.
 
-    Parameters
-    ----------
-    path : path-like
-    zones : sequence of Zone
-        Volumes that say which splats must stay and which must go.
-    model : {"default", "antialiased", "2dgs"}, optional
-        How the splats are drawn, where the file does not say or is wrong.
-    form : Format, optional
-        Of the output; by default plain PLY.
+    `model` tells how splats are drawn where the file is silent or wrong; `form` is the output's
+    format, by default plain PLY.
     """
     file = read_splats(path, model)
     splats = file.splats()
@@ -117,30 +89,18 @@ def run(
 
     Parameters
     ----------
-    read : callable
-        ``read(form)`` returns the scene; `form` is the format of the output, None for plain PLY.
-    decide : callable
-        ``decide(scene, clock, progress)``.
-    output : Path or None
-        Its suffix names the format. None writes nothing.
-    source : Path, optional
-        The file that is read meanwhile.
-    overwrite, dry_run : bool
-        Whether files may be replaced; whether to decide as for the output, and write no splats.
-    views : ViewSet, optional
-        Those that decide: what a lossy file costs, and pictures, are told by these.
-    pictures : PictureFiles, optional
-        Where pictures before and after go.
-    save : callable, optional
-        ``save(result, written)`` does what is left once the file is written.
-    progress, threads
-        See `prune`.
+    read : ``read(form)`` returns the scene; `form` is the format of the output, None for plain PLY
+    decide : ``decide(scene, clock, progress)`` returns the result
+    output : its suffix names the format; None writes nothing
+    source : the file that is read meanwhile
+    dry_run : decide as for the output, and write no splats
+    views : those that decide; they tell what a lossy file costs, and are drawn
+    save : ``save(result, written)`` does what is left once the file is written
 
     Raises
     ------
     RefineError, Cancelled
-        Nothing is written then; but what was written before comparing fails stays, and where
-        refitting is cancelled, what it had reached is written.
+        Nothing is written then, unless comparing fails or a refit with partial result is cancelled.
     """
     clock, written = Clock(), None if dry_run else output
     with contextlib.nullcontext() if pictures is None or views is None else pictures.opened(views):
@@ -214,10 +174,10 @@ def run(
 
 
 def _reread(path: Path, matrix: NDArray[np.float64] | None) -> Splats | None:
-    """What a lossy file holds, in the frame of the views; None where that cannot be told.
+    """Splats of a lossy file in the frame of the views; None where that cannot be told.
 
-    It cannot of a file that may not be read, since it has the permissions of the one it replaced;
-    and where `matrix` scales directions differently.
+    It cannot of an unreadable file, which has its predecessor's permissions, nor where `matrix` is
+    not uniform.
     """
     matrix = np.eye(4) if matrix is None else matrix
     try:
@@ -282,20 +242,18 @@ def prune_file(
 
     Parameters
     ----------
-    source, output : path-like
-        Of any format; that of the output is named by its suffix. None writes nothing.
-    views, budget, method, progress, threads
-        See `prune`.
-    zones, model
-        See `read_scene`.
-    cleaning : Cleaning, optional
-        What to clean away first. The budget then counts what is left.
-    pictures, overwrite, dry_run
-        See `run`.
+    source, output : path-like, of any format; the suffix of the output names it, None writes
+    nothing
+    views, budget, method, progress, threads : see `prune`
+    zones : sequence of Zone, which splats to protect and remove
+    cleaning : Cleaning, optional; what to clean away first, the budget then counts the rest
+    pictures : PictureFiles, optional; where pictures before and after go
+    model : Model, optional; where the file does not say how splats are drawn, or is wrong
+    dry_run : bool, whether to decide as for the output and write no splats
 
     Examples
     --------
-    To leave half of the splats, with what was merged into them::
+    To keep half of the splats, with the others merged into them::
 
         prune_file("in.ply", "out.ply", views, Budget(ratio=0.5))
     """
@@ -309,7 +267,6 @@ def prune_file(
 
 
 def _run_file(source, output, decide, zones, model, **how: Any) -> Result:
-    """`run` for a file."""
     return run(
         lambda form: read_scene(source, zones, model, form), decide,
         None if output is None else expanded(output), source=expanded(source), **how,
@@ -328,7 +285,7 @@ def clean_file(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Clean a file of splats, and write what is left to another; see `prune_file` and `clean`."""
+    """Clean a file of splats, and write the rest to another; see `prune_file` and `clean`."""
 
     def decide(scene: Scene, clock: Clock, told: Progress) -> Result:
         demands = scene.demands
@@ -357,7 +314,7 @@ def clean_file(
 def score_scene(
     views: ViewSet, method: Method, threads: int | None = None
 ) -> Callable[[Scene, Clock, Progress], Result]:
-    """For `run`: all splats stay, with their scores as a property."""
+    """For `run`: all splats are kept, with their scores as a property."""
 
     def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands = scene.demands
@@ -408,16 +365,9 @@ class Move:
 
     Attributes
     ----------
-    translate : tuple of three float
-        In the unit of the file.
-    rotate : tuple of three float
-        Degrees about the axes of the file.
-    scale : float
-
-    Raises
-    ------
-    RefineError
-        If a number is not finite, or the scale is not above 0.
+    translate : three float, in the unit of the file
+    rotate : three float, degrees about the axes of the file
+    scale : float, above 0
     """
 
     translate: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -434,8 +384,6 @@ class Move:
     def matrix(self) -> NDArray[np.float64]:
         """The move as (4, 4).
 
-        Examples
-        --------
         >>> quarter = Move((1.0, 0.0, 0.0), (0.0, 0.0, 90.0), 2.0)
         >>> (quarter.matrix @ [1.0, 0.0, 0.0, 1.0]).round(6).tolist()
         [1.0, 2.0, 0.0, 1.0]
@@ -467,30 +415,22 @@ def convert_files(
 ) -> Result:
     """Write the splats of files to another, in the format that its suffix names.
 
-    A single file of which nothing else is asked stays what it is, every property of a PLY included.
+    A single file of which nothing else is asked keeps every property of a PLY.
 
     Parameters
     ----------
-    sources : sequence of path-like
-        Of any format, one at least; the first comes first.
-    output : path-like
-    moves : sequence of Move
-        One for each file, or none.
-    degree : int, optional
-        Harmonics above this degree are left out.
-    morton : bool
-        Whether splats are sorted along a Z-shaped (Morton) curve, so that near ones follow.
-    level : int
-        Of a streamed SOG, 0 being the finest.
-    model : {"default", "antialiased", "2dgs"}, optional
-        See `read_scene`.
-    overwrite : bool
+    sources : sequence of path-like, one at least; the first comes first
+    moves : sequence of Move, one for each file, or none
+    degree : int, optional; harmonics above it are left out
+    morton : bool, whether splats are sorted along a Z-shaped (Morton) curve, so that near ones
+    follow
+    level : int, of a streamed SOG; 0 is the finest
+    model : Model, optional; see `prune_file`
 
     Raises
     ------
-    RefineError
-        See `read_splats` and `affine.transformed`; if the files are of different models, or a level
-        is asked of files that have none.
+    RefineError : see `read_splats`; also if models differ, or files without levels are asked for
+    one
 
     Examples
     --------

@@ -1,8 +1,7 @@
-"""Splats picked by hand: what a view shows of them, which of these areas of the picture, places and
-colours take, and how selections are combined, painted, grown, and bounded on a histogram.
+"""Splats picked by hand: visible ones, by area, place and colour; selections painted and grown.
 
-A splat is visible unless it lies behind a surface: behind the depth at which a ray has lost all but
-`LIGHT_LEFT` of its light. A splat lies where its centre does.
+A splat, at its centre, is visible unless it lies behind a surface: behind the depth at which a ray
+has lost all but `LIGHT_LEFT` of its light.
 """
 
 from __future__ import annotations
@@ -27,18 +26,14 @@ from .visibility.rays import in_front
 from .visibility.scene import Scene
 
 LIGHT_LEFT = 0.1
-"""Transmittance at whose depth a surface ends. Surfaces are made of several layers of splats: those
-in front of where it is 0.5 make up a third of the picture, where it is 0.1 two thirds, and with
-`THICKNESS` four fifths."""
+"""Transmittance at whose depth a surface ends: splats in front of 0.5 make up a third of the
+picture, of 0.1 two thirds, with `THICKNESS` four fifths."""
 
-THICKNESS = 2.0
-"""So many standard deviations, along the view's axis, a visible splat may lie behind that depth."""
+THICKNESS = 2.0  # standard deviations along the view's axis that a visible splat may lie behind it
 
-RAYS = 25_000
-"""About how many rays find surfaces."""
+RAYS = 25_000  # about how many rays find surfaces
 
-LEAST_STEP = 4
-"""Pixels between two of these rays, at least."""
+LEAST_STEP = 4  # pixels between two of these rays, at least
 
 _EMPTY = 0.1  # alpha of all that a ray hits, below which it meets nothing
 _PAIRS = 1 << 17  # see `hits`
@@ -46,26 +41,15 @@ _PAIRS = 1 << 17  # see `hits`
 Mode = Literal["SET", "ADD", "SUBTRACT", "INTERSECT"]
 """What becomes of a selection when some splats are taken."""
 
-NEIGHBOURS = 8
-"""So many nearest splats are the neighbours by which a selection grows and shrinks."""
+NEIGHBOURS = 8  # nearest splats by which a selection grows and shrinks
 
 
 class Surface(NamedTuple):
-    """What lies under a pixel.
+    """What lies under a pixel."""
 
-    Attributes
-    ----------
-    place : (3,) float64
-        Where half of what the pixel shows lies in front; in the frame of the view.
-    color : (3,) float64
-        Blended from the splats' constant colours, display-referred.
-    scale : float
-        Pixels that a length of 1 takes there.
-    """
-
-    place: NDArray[np.float64]
-    color: NDArray[np.float64]
-    scale: float
+    place: NDArray[np.float64]  # (3,), in front of it half of the pixel; in the view's frame
+    color: NDArray[np.float64]  # (3,), of constant harmonics, display-referred
+    scale: float  # pixels of a length of 1 there
 
 
 class Prepared(NamedTuple):
@@ -78,39 +62,17 @@ class Prepared(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a view shows of N splats.
-
-    Attributes
-    ----------
-    prepared : Prepared
-    view : View
-    footprints : Footprints
-        Front to back.
-    rows : (n,) int64
-        The splats whose centres lie in the image.
-    pixels : (2, n) int64
-        Column and row of each centre.
-    visible : (n,) bool
-        See the top of this file.
-    """
+    """What a view shows of N splats."""
 
     prepared: Prepared
     view: View
-    footprints: Footprints
-    rows: NDArray[np.int64]
-    pixels: NDArray[np.int64]
-    visible: NDArray[np.bool_]
+    footprints: Footprints  # front to back
+    rows: NDArray[np.int64]  # (n,), splats whose centres lie in the image
+    pixels: NDArray[np.int64]  # (2, n), column and row of each centre
+    visible: NDArray[np.bool_]  # (n,), see the top of this file
 
     def in_area(self, area: NDArray[np.bool_], *, hidden: bool = False) -> NDArray[np.bool_]:
-        """Splats whose centre lies in an area of the image, (N,) bool.
-
-        Parameters
-        ----------
-        area : (H, W) bool
-            The top row first.
-        hidden : bool
-            Whether those that are not visible count too.
-        """
+        """Splats, (N,) bool, with centres in an area, (H, W) bool; `hidden` ones if asked."""
         return self._of(area[self.pixels[1], self.pixels[0]], hidden)
 
     def in_ball(
@@ -123,17 +85,7 @@ class Sight:
     def of_color(
         self, color: NDArray[np.float64], tolerance: float, *, hidden: bool = False
     ) -> NDArray[np.bool_]:
-        """Splats in the image that have nearly a colour, (N,) bool.
-
-        Parameters
-        ----------
-        color : (3,) float64
-            Display-referred.
-        tolerance : float
-            Greatest difference of red, green or blue.
-        hidden : bool
-            See `in_area`.
-        """
+        """Splats in the image whose red, green and blue are within a tolerance, (N,) bool."""
         gaussians = self.prepared.gaussians
         place = np.full(len(self.prepared.splats), -1)
         place[gaussians.index] = np.arange(len(gaussians))
@@ -141,10 +93,9 @@ class Sight:
         return self._of(np.abs(colors - color).max(axis=1) <= tolerance, hidden)
 
     def piece(self, chosen: NDArray[np.bool_], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Those of the chosen splats, (N,), that hang together at a place.
+        """Those of the chosen splats, (N,), that hang together at a place, (3,).
 
-        Two do if they are neighbours among the chosen and touch. Of the pieces of the `NEIGHBOURS`
-        that are nearest to the place it is the largest.
+        Neighbours that touch do. Of the pieces of the `NEIGHBOURS` nearest to it, the largest.
         """
         gaussians = self.prepared.gaussians
         picked = gaussians.take(np.flatnonzero(chosen[gaussians.index]))
@@ -213,21 +164,10 @@ def look(prepared: Prepared, view: View) -> Sight:
 def surfaces(
     footprints: Footprints, depths: NDArray[np.float32], view: View, step: int
 ) -> NDArray[np.float32]:
-    """Depth of the hit behind which a ray has `LIGHT_LEFT`, infinite where none is.
+    """Depth of the hit behind which a ray has `LIGHT_LEFT`, infinite without one.
 
-    Parameters
-    ----------
-    footprints : Footprints
-        Front to back.
-    depths : (n,) float32
-        Theirs.
-    view : View
-    step : int
-        Pixels of a cell of the image; a ray goes through the middle of each.
-
-    Returns
-    -------
-    (rows of cells, columns of cells) float32
+    One ray through each cell of `step` pixels: (rows, columns) float32. `footprints` are front to
+    back, `depths` theirs, (n,).
     """
     columns, rows = (
         np.minimum(np.arange(0, size, step) + step // 2, size - 1)
@@ -252,8 +192,6 @@ def surfaces(
 def combined(before: NDArray[np.bool_], taken: NDArray[np.bool_], mode: Mode) -> NDArray[np.bool_]:
     """A selection, (N,), once some splats were taken, (N,).
 
-    Examples
-    --------
     >>> before, taken = np.array([True, True, False]), np.array([True, False, True])
     >>> combined(before, taken, "SUBTRACT").tolist()
     [False, True, False]
@@ -266,17 +204,8 @@ def combined(before: NDArray[np.bool_], taken: NDArray[np.bool_], mode: Mode) ->
 
 
 def polygon(corners: Sequence[tuple[float, float]], width: int, height: int) -> NDArray[np.bool_]:
-    """Pixels whose centres lie in a polygon, (height, width), by the even-odd rule.
+    """Pixels with centres in a polygon of (column, row) corners, (height, width), even-odd rule.
 
-    Parameters
-    ----------
-    corners : sequence of (float, float)
-        Column and row, pixels; the last is joined to the first.
-    width, height : int
-        Of the image.
-
-    Examples
-    --------
     >>> polygon([(1, 0), (3, 0), (3, 2), (1, 2)], 4, 3).astype(int).tolist()
     [[0, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
     """
@@ -296,17 +225,7 @@ def polygon(corners: Sequence[tuple[float, float]], width: int, height: int) -> 
 def paint(
     area: NDArray[np.bool_], start: tuple[float, float], end: tuple[float, float], radius: float
 ) -> None:
-    """Add to an area, (H, W), the pixels that a round brush covers on its way.
-
-    Parameters
-    ----------
-    area : (H, W) bool
-        Changed in place.
-    start, end : (float, float)
-        Column and row of the brush's middle, pixels.
-    radius : float
-        Pixels.
-    """
+    """Add to an area, (H, W) bool, in place, what a round brush covers on its way, pixels."""
     (left, right), (top, bottom) = (
         (max(math.floor(min(ends) - radius), 0), min(math.ceil(max(ends) + radius) + 1, size))
         for ends, size in zip(zip(start, end, strict=True), area.shape[::-1], strict=True)
@@ -323,14 +242,7 @@ def paint(
 
 
 def grown(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A selection, (N,), and the neighbours of its splats.
-
-    Parameters
-    ----------
-    neighbours : (N, K) int32
-        See `neighbours_of`; two splats are neighbours if one is among those of the other.
-    selected : (N,) bool
-    """
+    """A selection, (N,), and its neighbours, in either direction of `neighbours`, (N, K)."""
     more: NDArray[np.bool_] = selected | selected[neighbours].any(axis=1)
     more[neighbours[selected].ravel()] = True
     return more
@@ -342,10 +254,7 @@ def shrunk(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArra
 
 
 def neighbours_of(means: NDArray[Any], *, progress: Progress = silent) -> NDArray[np.int32]:
-    """The `NEIGHBOURS` nearest of each splat, (N, K), of centres (N, 3).
-
-    Splats that are not finite have neighbours of no meaning.
-    """
+    """`NEIGHBOURS` nearest of each splat, (N, K), of centres (N, 3); meaningless if not finite."""
     places = np.asarray(means, np.float64)
     finite = np.isfinite(places).all(axis=1)
     if not finite.any():

@@ -1,9 +1,7 @@
-"""What views see of splats, drawn on the processor, also among other things; before and after a
-change as files: a truth beside the estimate.
+"""What views see of splats, drawn on the processor, also among meshes; before and after as files.
 
-Every pixel is computed as a ray is (`visibility.cast`): footprints by EWA splatting, blended front
-to back, colours of the direction of view. Pictures agree with those of the reference renderer of
-the benchmarks to 75 dB and more. Files are called ``NAME-CAMERA-before.png`` and so on.
+Pixels are computed as rays are (`visibility.cast`): EWA footprints blended front to back, colours
+by direction of view. They agree with the benchmarks' reference renderer to 75 dB and more.
 """
 
 from __future__ import annotations
@@ -33,23 +31,19 @@ from .visibility.rays import LOG_OPAQUE, in_front
 from .visibility.scene import Scene
 from .whole_file import new_folder, refuse_existing, whole_file
 
-LONGEST = 960
-"""Pixels along the longer side of a picture, at most: views of more are drawn smaller."""
+LONGEST = 960  # pixels along the longer side of a picture, at most
 
-CAMERAS = 3
-"""How many views are drawn at most, spread evenly over all."""
+CAMERAS = 3  # how many views are drawn at most, spread evenly over all
 
-AMPLIFIED = 8
-"""Factor by which the difference of two pictures is shown larger."""
+AMPLIFIED = 8  # factor by which differences are shown larger
 
 KINDS = ("before", "after", "difference")
-"""The three pictures of a view; each is the end of a file name."""
+"""The three pictures of a view; each ends a file name: ``NAME-CAMERA-before.png``."""
 
 _IMAGE = re.compile(r"\.(png|jpe?g|webp|tiff?|exr|bmp)$", re.IGNORECASE)
 """The suffix of a photo, after which imported cameras are named."""
 
-_LABEL = 80
-"""Bytes of a camera's name that its files have: its end. Systems take names of 255 bytes."""
+_LABEL = 80  # bytes at the end of a camera's name used in file names; systems take 255 in all
 
 _PIXELS = 1 << 15  # drawn at a time, about, which limits temporary memory
 _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
@@ -57,47 +51,29 @@ _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """Pictures of other things with a depth a pixel, such as meshes that splats stand among.
+    """Pictures with a depth a pixel, such as meshes among splats: K layers behind each other.
 
-    In each pixel K layers lie one behind another. A splat is in front of a layer where its centre
-    is nearer, else behind it.
-
-    Attributes
-    ----------
-    colors : (K, 3, H, W) floating
-        Display-referred, 0..1, times alpha.
-    alphas : (K, H, W) floating
-        How much each hides of what is behind it, 0..1.
-    depths : (K, H, W) floating
-        Along the view's axis, world units; ascending in each pixel.
-    background : (3, H, W) floating, optional
-        What is seen through all of them of what is infinitely far away, display-referred.
+    A splat is in front of a layer where its centre is nearer.
     """
 
-    colors: NDArray[Any]
-    alphas: NDArray[Any]
-    depths: NDArray[Any]
-    background: NDArray[Any] | None = None
+    colors: NDArray[Any]  # (K, 3, H, W), display-referred, 0..1, premultiplied; top row first
+    alphas: NDArray[Any]  # (K, H, W), 0..1
+    depths: NDArray[Any]  # (K, H, W), along the view's axis, world units; ascending in K
+    background: NDArray[Any] | None = None  # (3, H, W), infinitely far away, display-referred
 
     def left(self) -> NDArray[np.float64]:
-        """How much is seen of what is behind the first 0 to K of them, (K + 1, H, W)."""
+        """Share seen of what is behind the first 0 to K layers, (K + 1, H, W)."""
         left = np.ones((len(self.alphas) + 1, *self.alphas.shape[1:]))
         np.cumprod(1.0 - self.alphas, axis=0, out=left[1:])
         return left
 
     def over_nothing(self) -> NDArray[np.float64]:
-        """Their colours, blended, without the background, (3, H, W)."""
+        """Their colours blended without the background, (3, H, W)."""
         return np.asarray(np.einsum("kchw,khw->chw", self.colors, self.left()[:-1]))
 
 
 def in_order(layers: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]) -> Layers:
-    """Layers, each in an order of its own, in the order of their depths in each pixel.
-
-    Parameters
-    ----------
-    layers : sequence of ((3, H, W), (H, W), (H, W)) floating
-        Colours, alphas and depths, as in `Layers`. Of equal depths the first is in front.
-    """
+    """Layers (colours, alphas, depths) sorted by depth in each pixel; ties keep their order."""
     colors, alphas, depths = (np.stack(arrays) for arrays in zip(*layers, strict=True))
     if len(layers) > 1:
         order = np.argsort(depths, axis=0, kind="stable")
@@ -115,31 +91,10 @@ def draw(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.float64]:
-    """What a view sees of splats, and of layers among them.
+    """What a view sees of splats and of layers among them, (4, H, W) float64 in 0..1.
 
-    Parameters
-    ----------
-    splats : Splats
-        In the frame of the view.
-    view : View
-    layers : Layers, optional
-        In the size of the view.
-    scene : Scene, optional
-        The frame to compute in; by default that of the splats and the view.
-    progress : callable, optional
-        ``progress(fraction, what)``; returning ``False`` cancels.
-    threads : int, optional
-
-    Returns
-    -------
-    (4, H, W) float64
-        Display-referred red, green and blue, times alpha, and alpha, 0..1; the top row first. What
-        shows of the background of the layers adds to the colours and not to alpha.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
+    Red, green and blue are display-referred and premultiplied; the layers' background adds to them
+    and not to alpha. `scene` is the frame to compute in, by default that of splats and view.
     """
     gaussians, scene, _ = projection.prepare(
         splats, ViewSet((view,)), scene, progress=part(progress, 0.0, 0.1), threads=threads
@@ -149,14 +104,7 @@ def draw(
 
 
 def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
-    """The splats with the colours that they show to a place, the same in all directions.
-
-    Parameters
-    ----------
-    splats : Splats
-    center : (3,) float64
-        In their frame.
-    """
+    """Splats with the colours they show to a place, (3,), the same in all directions."""
     if not splats.sh_degree:
         return splats
     with np.errstate(all="ignore"):  # of splats that cannot be drawn
@@ -177,7 +125,7 @@ def drawn(
     progress: Progress,
     threads: int | None,
 ) -> NDArray[np.float64]:
-    """What `draw` returns, of splats that are prepared: see `projection.prepare`."""
+    """`draw` for splats prepared by `projection.prepare`."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         colors = colors_from(splats, gaussians.index[footprints.index], view)
@@ -197,7 +145,7 @@ def drawn(
 
 
 class _Cut:
-    """Layers between the splats of a strip of R rows, in P pixels."""
+    """Layers between the splats of a strip of R rows, P pixels."""
 
     def __init__(self, layers, depths, rows):
         def flat(planes):
@@ -221,7 +169,7 @@ class _Cut:
         return self._left[before, pixel]
 
     def insert(self, image, log_left):
-        """Add them to the picture of the splats, (4, P), whose transmittance is (P,)."""
+        """Add them to the splats' picture, (4, P), and transmittance, (P,)."""
         passed = np.exp(log_left)
         for layer, log_front in enumerate(self._log_front):
             image[:3] += self._left[layer] * np.exp(log_front) * self._colors[layer]
@@ -235,10 +183,9 @@ class _Cut:
 
 
 def _strip(footprints, colors, columns, rows, cut):
-    """Pixels in C columns and R rows, ascending, as of `draw`, (4, R * C).
+    """`draw` in C columns and R rows, ascending, (4, R * C), with colours (3, n) float64.
 
-    Footprints come front to back, some at a time; pixels through which nothing more is seen are
-    left out of those that follow. Their colours are (3, n) float64.
+    Footprints come front to back, some at a time; opaque pixels are left out of those that follow.
     """
     pixels = len(columns) * len(rows)
     log_left, image = np.zeros(pixels), np.zeros((4, pixels))  # logarithm of the transmittance
@@ -263,10 +210,9 @@ def _strip(footprints, colors, columns, rows, cut):
 
 
 def _weights(pixel, alpha, log_left):
-    """Share of its pixel that each hit makes up, (h,); darkens what lies behind.
+    """Share of its pixel that each hit makes up, (h,); updates `log_left`, (P,), to behind them.
 
-    Hits come pixel by pixel, ascending, and front to back in each. `log_left`, (P,), is the
-    logarithm of the transmittance of each pixel in front of these hits; afterwards behind them.
+    Hits come pixel by pixel, ascending, and front to back in each.
     """
     if not len(pixel):
         return np.empty(0)
@@ -282,22 +228,12 @@ def _weights(pixel, alpha, log_left):
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What a view sees of splats before and after a change.
+    """What a view sees before and after a change."""
 
-    Attributes
-    ----------
-    view : View
-        In the size of the pictures.
-    before, after : (H, W, 3) uint8
-        Display-referred, as splats are trained; the top row first.
-    psnr : float
-        Of the pictures before they were rounded to 8 bits, dB, at most `quality.PSNR_CAP`.
-    """
-
-    view: View
-    before: NDArray[np.uint8]
+    view: View  # in the size of the pictures
+    before: NDArray[np.uint8]  # (H, W, 3), display-referred, top row first
     after: NDArray[np.uint8]
-    psnr: float
+    psnr: float  # dB, before rounding to 8 bits, at most `PSNR_CAP`
 
     @property
     def difference(self) -> NDArray[np.uint8]:
@@ -314,28 +250,7 @@ def compare(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> list[Comparison]:
-    """Draw two states of a scene in each view.
-
-    Parameters
-    ----------
-    before, after : Splats
-        In the frame of the views.
-    views : ViewSet
-        One longer than `LONGEST` is drawn in that size.
-    progress : callable, optional
-        ``progress(fraction, what)``; returning ``False`` cancels.
-    threads : int, optional
-
-    Returns
-    -------
-    list of Comparison
-        In the order of the views.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
-    """
+    """Draw two states of a scene in each view; views longer than `LONGEST` are drawn smaller."""
     pictures: list[list[NDArray[np.float64]]] = []
     for splats, start in ((before, 0.0), (after, 0.5)):
         gaussians, scene, _ = projection.prepare(
@@ -360,8 +275,6 @@ def compare(
 def fitted(view: View) -> View:
     """View of the same field of view, at most `LONGEST` pixels along its longer side.
 
-    Examples
-    --------
     >>> from refine_addon.core.views import View
     >>> view = View(np.eye(3), np.zeros(3), 1000.0, 1000.0, 960.0, 540.0, 1920, 1080)
     >>> small = fitted(view)
@@ -379,16 +292,13 @@ def fitted(view: View) -> View:
 
 
 def _fitted(view, scene):
-    """A view in the size of its picture, with the near plane that scoring gives it.
-
-    Otherwise a scene of fewer splats, whose size is another, would begin elsewhere.
-    """
+    """View in picture size, with the near plane of scoring: fewer splats would move it."""
     near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
     return replace(fitted(view), near=near if near < far else view.near)
 
 
 def _rounded(picture):
-    """A picture of 0..1, (3, H, W), in 8 bits, (H, W, 3)."""
+    """A picture (3, H, W) of 0..1 as (H, W, 3) uint8."""
     return np.ascontiguousarray(np.rint(picture * 255.0).astype(np.uint8).transpose(1, 2, 0))
 
 
@@ -398,17 +308,7 @@ def _psnr(after, before, view):
 
 @dataclass(frozen=True)
 class PictureFiles:
-    """Where the pictures of one prune go.
-
-    Attributes
-    ----------
-    folder : Path
-        Made if it is not there.
-    name : str
-        Of the splats: the first part of the files' names.
-    overwrite : bool
-        Whether files may be replaced.
-    """
+    """Where the pictures of one prune go; `name`, that of the splats, begins the files' names."""
 
     folder: Path
     name: str
@@ -416,13 +316,7 @@ class PictureFiles:
 
     @contextlib.contextmanager
     def opened(self, views: ViewSet) -> Iterator[None]:
-        """Make the folder, and refuse what could not be written, before the work.
-
-        Raises
-        ------
-        RefineError
-            See `refine_addon.core.whole_file.new_folder` and `refuse_existing`.
-        """
+        """Make the folder, and refuse what could not be written, before the work."""
         with new_folder(self.folder):
             for paths in self._paths(views.spread(CAMERAS)):
                 for path in paths.values():
@@ -438,28 +332,7 @@ class PictureFiles:
         progress: Progress = silent,
         threads: int | None = None,
     ) -> dict[str, Any]:
-        """Draw `CAMERAS` of the views and write their pictures.
-
-        Parameters
-        ----------
-        before, after, progress, threads
-            See `compare`.
-        views : ViewSet
-            Those that decided.
-
-        Returns
-        -------
-        dict
-            What the report says: the mean PSNR that was measured, and of each view its camera, its
-            size, its PSNR and its files.
-
-        Raises
-        ------
-        RefineError
-            If a file cannot be written; by then the prune is done.
-        Cancelled
-            If `progress` answers ``False``.
-        """
+        """Draw and write `CAMERAS` of the views; returns PSNRs and files for the report."""
         views = views.spread(CAMERAS)
         comparisons = compare(before, after, views, progress=progress, threads=threads)
         facts = []
@@ -477,7 +350,6 @@ class PictureFiles:
         return {"psnr": round(mean, 2), "amplified": AMPLIFIED, "views": facts}
 
     def _paths(self, views: ViewSet) -> list[dict[str, Path]]:
-        """Files of each view, by `KINDS`."""
         return [
             {kind: self.folder / f"{_plain(self.name)}-{label}-{kind}.png" for kind in KINDS}
             for label in _labels([view.name for view in views])
@@ -515,5 +387,5 @@ def _labels(names: list[str]) -> list[str]:
 
 
 def _plain(name: str) -> str:
-    """A name with only what every system takes within the name of a file."""
+    """Name with only what every system takes in a file name."""
     return re.sub(r"[^\w.() -]", "_", name)

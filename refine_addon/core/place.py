@@ -1,8 +1,7 @@
-"""What is refused in a file: at a place in it, or since the file is of another kind.
+"""What is refused in a file: a value at a place in it, or a file of another kind, with advice.
 
-A `Place` is a position in a file, such as "cameras.json: camera 3". Each check of a JSON value
-there is one method of it, and each error names the file, the place, what was got and what was
-expected. Files of known kinds where another kind is expected are refused with advice what to do.
+Each check of a JSON value is one method of `Place`; each error names file, place, what was got and
+what was expected.
 """
 
 from __future__ import annotations
@@ -18,38 +17,26 @@ from typing import Any, NoReturn, Self, TypeGuard
 from .errors import RefineError
 from .whole_file import Url
 
-LARGEST_NUMBER = 1e18
-"""Largest number that is taken, such as a coordinate: its square still fits float32."""
+LARGEST_NUMBER = 1e18  # largest number taken, such as a coordinate: its square fits float32
 
-LARGEST_COUNT = 1 << 53
-"""Largest whole number that is taken: up to it, floating-point numbers hold every one."""
+LARGEST_COUNT = 1 << 53  # largest whole number that is taken: floats hold every one up to it
 
-NEGLIGIBLE = 1e-30
-"""Smaller numbers are read as 0, so that products of two numbers do not underflow."""
+NEGLIGIBLE = 1e-30  # smaller numbers are read as 0, so products of two do not underflow
 
 _SHOWN = 40  # most characters of a value in a message
 
-GZIP = b"\x1f\x8b"
-"""The first bytes of a gzip file."""
+GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
 
-SPZ = b"NGSP"
-"""The first bytes of what an SPZ file holds."""
+SPZ = b"NGSP"  # the first bytes of what an SPZ file holds
 
 _ZIP = b"PK\x03\x04"
 
 
 @dataclass(frozen=True)
 class Place:
-    """A file and a place in it.
+    """A file and a place in it, such as "camera 3"; "" for the whole file.
 
     Every check returns the value that it is given, or raises `RefineError` with the place.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    where : str
-        The place, "" for the whole file.
     """
 
     path: Path
@@ -69,7 +56,7 @@ class Place:
         self.fail(f"expected {what}, got {described(value)}")
 
     def number(self, value: object) -> float:
-        """Return `value` if it is a number of at most `LARGEST_NUMBER`."""
+        """A number of at most `LARGEST_NUMBER`."""
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             self.expected("a number", value)
         if not abs(value) <= LARGEST_NUMBER:  # also refuses NaN, and integers too large for float
@@ -77,7 +64,7 @@ class Place:
         return float(value) if abs(value) >= NEGLIGIBLE else 0.0
 
     def numbers(self, value: object, count: int) -> list[float]:
-        """Return `value` if it is a list of `count` numbers."""
+        """A list of `count` numbers."""
         if not isinstance(value, list) or len(value) != count:
             self.expected(f"a list of {count} numbers", value)
         try:
@@ -87,25 +74,25 @@ class Place:
             return [self.at(f"[{index}]").number(item) for index, item in enumerate(value)]
 
     def whole(self, value: object, least: int = 0, most: int = LARGEST_COUNT) -> int:
-        """Return `value` if it is a whole number of `least` to `most`."""
+        """A whole number from `least` to `most`."""
         if not is_whole(value) or not least <= value <= most:
             self.expected(f"a whole number from {least} to {most}", value)
         return value
 
     def text(self, value: object) -> str:
-        """Return `value` if it is a string."""
+        """A string."""
         if not isinstance(value, str):
             self.expected("a string", value)
         return value
 
     def items(self, value: object) -> list[Any]:
-        """Return `value` if it is a list."""
+        """A list."""
         if not isinstance(value, list):
             self.expected("a list", value)
         return value
 
     def members(self, value: object, required: Sequence[str] = ()) -> dict[str, Any]:
-        """Return `value` if it is a JSON object with these keys."""
+        """A JSON object with these keys."""
         if not isinstance(value, dict):
             self.expected("an object", value)
         missing = [key for key in required if key not in value]
@@ -141,20 +128,7 @@ def described(value: object) -> str:
 
 
 def refuse_pointer(path: Path | Url, head: bytes) -> None:
-    """Refuse a Git LFS pointer, which Git leaves in place of a large file.
-
-    Parameters
-    ----------
-    path : Path or Url
-        For the message.
-    head : bytes
-        The first bytes of the file.
-
-    Raises
-    ------
-    RefineError
-        If it is one; with advice.
-    """
+    """Raise `RefineError` if a file's first bytes are a Git LFS pointer, left for a large file."""
     if head.startswith(b"version https://git-lfs.github.com/spec/"):
         raise RefineError(
             f"{path}: a Git LFS pointer, not the file itself: 'git lfs pull' fetches that"
@@ -162,13 +136,7 @@ def refuse_pointer(path: Path | Url, head: bytes) -> None:
 
 
 def foreign_kind(path: Path | Url, head: bytes) -> str:
-    """What a file in another format is and what to do with it; "" if it is not known.
-
-    Parameters
-    ----------
-    path, head
-        See `refuse_pointer`; a few hundred bytes.
-    """
+    """What a file in another format is and what to do with it, by a few hundred bytes; or ""."""
     suffix, read = path.suffix.lower(), "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
     if suffix in (".splat", ".ksplat"):  # only the name tells: they have no signature
         return f"a {suffix} file: {read}"
@@ -185,7 +153,7 @@ def foreign_kind(path: Path | Url, head: bytes) -> str:
 
 
 def is_spz(head: bytes) -> bool:
-    """Whether a file with these first bytes is an SPZ file, as it is or within gzip."""
+    """Whether these are the first bytes of an SPZ file, as it is or within gzip."""
     if head.startswith(SPZ):
         return True
     try:
@@ -196,7 +164,7 @@ def is_spz(head: bytes) -> bool:
 
 
 def is_sog(path: Path | Url, head: bytes) -> bool:
-    """Whether a file is a SOG file: a ZIP archive by that name or with meta.json and images."""
+    """Whether a file is a SOG: a ZIP archive by that name or with meta.json and images."""
     if not head.startswith(_ZIP) or path.suffix.lower() == ".sog":
         return head.startswith(_ZIP)
     try:

@@ -1,8 +1,7 @@
-"""From splats, views and a budget to the splats that stay, and what they become.
+"""From splats, views and a budget to the kept splats and their new values.
 
-Panel, command and Python code all call `prune`, so all of them keep the same splats. Splats are
-scored, and the budget selects by score. Where kept splats may change, splats are merged until as
-many are left as were selected, and these are refitted, if asked.
+Panel, command and Python code all call `prune`. Splats are scored, and the budget selects by score.
+Where kept splats may change, splats are merged until as many are left, then refitted if asked.
 """
 
 from __future__ import annotations
@@ -38,23 +37,21 @@ from .visibility.cast import validation_rays
 from .visibility.measuring import Measured
 from .volumes import Forced, must_go
 
-TRIES = 3
-"""How often splats are merged at most to reach a PSNR."""
+TRIES = 3  # how often splats are merged at most to reach a PSNR
 
-CLOSE = 0.7
-"""How close to a PSNR the estimate for a result must be, dB, or splats are merged again."""
+CLOSE = 0.7  # how close to a PSNR a result's estimate must be, dB, or splats are merged again
 
 FIRST = 0.1
-"""Share of the splats that is deleted before any are merged: those with the lowest scores, whose
-deletion changes the pictures less than any merge."""
+"""Share of the splats deleted before any are merged: the lowest scores, whose deletion changes the
+pictures less than any merge."""
 
 PARTS = 2
-"""While splats are merged, they are measured again in one of so many parts of the views, which take
-turns; what the other views see is carried over."""
+"""Parts of the views, measured again in turn while splats are merged; the others' values are
+carried over."""
 
 REFITTING = "refitting"
-"""What a progress callback is told while splats are refitted: from here on a cancelled prune still
-has something to offer; see `Result.stopped`."""
+"""Told to progress callbacks during refitting: a cancelled prune now has a result
+(`Result.stopped`)."""
 
 
 def score(
@@ -73,34 +70,20 @@ def score(
 
     Parameters
     ----------
-    splats : Splats or SplatFile
-        In the frame of the views.
-    views : ViewSet
-    method : Method
-        `ClosedForm` scores by its formula, all others by occlusion.
-    protected : (N,) bool, optional
-        Splats that are not removed: no score depends on them, the estimate of the pictures' quality
-        does.
-    removed : (N,) bool, optional
-        Splats that are to go in any case: the others are scored as if they had gone, and they
-        score 0.
-    quality : bool
-        Whether scores by the closed form get an estimate of the pictures' quality, which takes
-        longer than scoring; scores by occlusion always have one.
-    settled : int, optional
-        How many splats must be in their final order, those `removed` left aside: scoring by
-        occlusion takes less time where these are few. By default all.
-    progress : callable, optional
-        ``progress(fraction, what)``; returning ``False`` cancels.
-    threads : int, optional
+    splats : Splats or SplatFile, in the frame of the views
+    method : Method; `ClosedForm` scores by its formula, all others by occlusion
+    protected : (N,) bool, optional; only the estimated PSNR depends on it, no score does
+    removed : (N,) bool, optional; the others are scored as if these were gone, these score 0
+    quality : bool, whether the closed form estimates the PSNR, which takes longer than scoring
+    settled : int, optional; how many splats need their final order, without `removed`; fewer is
+    faster
+    progress : callable, optional; ``progress(fraction, what)``, returning ``False`` cancels
+    threads : int, optional; by default the cores of this process, at most 8
 
     Raises
     ------
-    RefineError
-        If there are no splats, if none of them can be drawn, if no view sees any, or the views are
-        no `ViewSet`.
+    RefineError : no splats, none that can be drawn or that a view sees, or `views` is no `ViewSet`
     Cancelled
-        If `progress` answers ``False``.
     """
     refuse_other(views)
     splats = splats.splats() if isinstance(splats, SplatFile) else splats
@@ -141,16 +124,7 @@ def with_quality(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Scores with the curve of the estimated PSNR, as far as their validation rays tell it.
-
-    Parameters
-    ----------
-    scores : Scores
-    protected : (N,) bool, optional
-        Splats that are not removed.
-    progress : callable, optional
-    threads : int, optional
-    """
+    """Scores with the curve of the estimated PSNR, if they have validation rays."""
     if scores.ray_sample is None:
         return scores
     curve = quality_curve(
@@ -163,7 +137,7 @@ def with_quality(
 def _with_views(
     scores: Scores, splats: Splats, views: ViewSet, used: ViewSet, threads: int | None
 ) -> Scores:
-    """Scores with what there is to say of all views given, not only of those used."""
+    """Scores with alignment and notes on all views given, not only on those used."""
     notes = (*scores.notes, views.note) if views.note else scores.notes
     # Beside the closed form, measuring would take as long as scoring.
     measured = None if scores.ray_sample is None else used
@@ -188,46 +162,29 @@ def prune(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Decide which splats stay and what they become. Nothing is changed or written.
+    """Decide which splats are kept and their new values. Nothing is changed or written.
 
     Parameters
     ----------
-    splats : Splats or SplatFile
-        In the frame of the views.
-    views : ViewSet
-        Both may be None where `scores` decide and nothing is merged.
-    budget : Budget
-        How much to remove. Where kept splats may change it says how many stay; which ones, and
-        their new values, come from merging.
-    method : Method
-    protected : (N,) bool, optional
-        Splats that are neither removed nor changed.
+    splats, views, progress, threads
+        See `score`; both may be None where `scores` decide and nothing is merged.
+    budget : Budget; where kept splats may change, only their number comes from it
+    protected : (N,) bool, optional; neither removed nor changed
     removed : (N,) bool, optional
-        Splats that go before all others, and count as removed; those that are protected stay. The
-        rest is scored without them, and is what the pictures of a PSNR are compared with; they are
-        merged into none.
-    scores : Scores, optional
-        Known scores. Merging measures by itself, and takes only what a threshold keeps from them.
-    sizes : (float, int), optional
-        Bytes of a splat in the output and of everything else there, for a budget in MB. By default
-        those of the file, if `splats` is one.
-    origin : Origin, optional
-        What the splats were before an earlier prune merged them; the pictures are compared to it.
-    reusable : bool
-        Whether the scores are to serve other budgets too. Else scoring ends where this budget does.
-    partial : bool
-        Whether a prune that is cancelled while it refits returns what that had reached; see
-        `Result.stopped`.
-    clock : Clock, optional
-        Gets the times of the steps.
-    progress : callable, optional
-        ``progress(fraction, what)``; returning ``False`` cancels.
-    threads : int, optional
+        Removed first, and counted, unless protected. The others are scored without them, compared
+        with pictures without them, and not merged with them.
+    scores : Scores, optional; merging measures anew and takes only what a threshold keeps
+    sizes : (float, int), optional; bytes of a splat and of the rest of the output, for a budget in
+    MB
+    origin : Origin, optional; the splats before an earlier merging prune, for comparing pictures
+    reusable : bool, whether scores are to serve other budgets; else scoring ends where this one
+    does
+    partial : bool, whether a cancelled refit returns what it reached (`Result.stopped`)
+    clock : Clock, optional; gets the times of the steps
 
     Raises
     ------
-    RefineError, Cancelled
-        See `score` and `selection.select`; also if no splat would be left.
+    RefineError, Cancelled : see `score` and `select`; also if no splat would be left
     """
     file = splats if isinstance(splats, SplatFile) else None
     if file is not None:
@@ -254,7 +211,7 @@ def prune(
 
 
 class _Try(NamedTuple):
-    """How many kept splats reached which PSNR, dB."""
+    """Number of kept splats and the PSNR reached, dB."""
 
     kept: int
     psnr: float
@@ -266,37 +223,23 @@ class _Try(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What merging, and refitting if asked, made of splats.
+    """What merging, and refitting if asked, made of splats."""
 
-    Attributes
-    ----------
-    merged : Merged
-        Before refitting: by merging, or by deletion where that is better to begin with.
-    done : {"delete", "merge", "refit"}
-    psnr : dict of str to (float or None)
-        The estimates by what was done, dB; None if too little is seen.
-    refitted : Refitted or None
-    seconds : float
-        How long refitting took.
-    stopped : Cancelled or KeyboardInterrupt or None
-        What ended refitting before it was done.
-    """
-
-    merged: Merged
+    merged: Merged  # before refitting; by deletion where that is better to begin with
     done: Way
-    psnr: dict[Way, float | None]
+    psnr: dict[Way, float | None]  # estimates, dB; None if too little is seen
     refitted: Refitted | None = None
-    seconds: float = 0.0
-    stopped: Cancelled | KeyboardInterrupt | None = None
+    seconds: float = 0.0  # of refitting
+    stopped: Cancelled | KeyboardInterrupt | None = None  # what ended refitting early
 
     @property
     def reached(self) -> float | None:
-        """The estimate of what was made in the end, dB."""
+        """Estimated PSNR of the final splats, dB."""
         return self.psnr[self.done]
 
     @property
     def final(self) -> Merged:
-        """The kept splats as they became in the end."""
+        """The kept splats with their final values."""
         if self.refitted is None:
             return self.merged
         changed = self.merged.changed | self.refitted.changed
@@ -305,7 +248,7 @@ class Made:
 
 @dataclass(frozen=True, eq=False)
 class _Prune:
-    """One prune; see `prune` for its values."""
+    """One prune; fields as the arguments of `prune`."""
 
     splats: Any  # Splats, or None where scores are known
     views: Any  # ViewSet, or None
@@ -321,13 +264,12 @@ class _Prune:
 
     @property
     def used(self) -> ViewSet:
-        """The views that decide."""
         if self.views is None or self.splats is None:
             raise RefineError("expected splats and views: scoring and merging need both")
         return self.views.spread(self.method.views)
 
     def without(self, gone: NDArray[np.bool_]) -> _Prune:
-        """The prune of what is left when some splats, (N,), have gone."""
+        """Prune of the rest once some splats, (N,) bool, are gone."""
         rest = ~gone
         return replace(
             self,
@@ -338,7 +280,7 @@ class _Prune:
         )
 
     def delete(self, progress: Progress, tried: Made | None = None) -> Result:
-        """Decide by scores alone; `tried` is what merging had made, if it was tried."""
+        """Decide by scores alone; `tried` is what merging made, if it was tried."""
         scores = self._scores(part(progress, 0.0, 0.94))
         report(progress, 0.94, "selecting")
         keep, psnr = self._select(scores)
@@ -420,7 +362,7 @@ class _Prune:
         )
 
     def _deleted(self, result: Result, tried: Made | None) -> Result:
-        """The result of deleting where merging was asked for."""
+        """Result of deletion where merging was asked for."""
         facts = result.report
         facts["method"]["asked"] = self.method.name
         facts["settings"] = self.method.facts()
@@ -430,7 +372,6 @@ class _Prune:
         return result
 
     def _scores(self, progress: Progress) -> Scores:
-        """The scores that decide: those given, or new ones."""
         scores = self.scores
         if scores is None:
             scores = score(
@@ -467,7 +408,7 @@ class _Prune:
         return keep, None
 
     def _deletion_is_as_good(self, keep, plain: float | None, made: Made) -> bool:
-        """Whether deletion, which keeps (N,) and reaches `plain` dB, is about as good."""
+        """Whether deletion, keeping (N,) at `plain` dB, is about as good."""
         if plain is None or made.reached is None:
             return True
         if self.budget.psnr is None:
@@ -476,20 +417,19 @@ class _Prune:
         return missed or np.count_nonzero(keep) <= len(made.merged.splats)
 
     def _merging_seconds(self, left: int) -> float:
-        """Expected seconds of merging down to so many splats, and of the estimate then."""
+        """Expected seconds of merging to so many splats, estimate included."""
         count, views = len(self.splats), len(self.used)
         counts = stage_counts(max(math.ceil((1.0 - FIRST) * count), left), left)
         return sum(stage_seconds(count, counts, views)) + seconds("compare", left, views)
 
     def _refitting_seconds(self, left: int) -> float:
-        """Expected seconds of refitting so many splats, if asked."""
         if not isinstance(self.method, Refit):
             return 0.0
         rounds = expected_rounds(left, self.method.rounds)
         return rounds * seconds("refit", len(self.splats) + left, len(self.used))
 
     def _to_count(self, keep, scores: Scores, known: Measured, progress: Progress) -> Made:
-        """Merge until as many splats are left as deletion keeps, (N,); refit them if asked."""
+        """Merge until as many are left as deletion keeps, (N,); refit if asked."""
         origin, used, left = self.origin, self.used, int(np.count_nonzero(keep))
         truth = scores.ray_sample if origin is None else origin.ray_sample
         comparing_seconds = seconds("compare", left, len(used))
@@ -526,8 +466,8 @@ class _Prune:
     def _to_psnr(self, goal: float, scores: Scores, known: Measured, progress: Progress) -> Made:
         """Merge to as few splats as keep a PSNR, dB.
 
-        What a number of kept splats reaches is read from the curve of the scores, put right by what
-        the last try reached; between a try that keeps the PSNR and one that does not, from these.
+        Their number comes from the scores' curve, corrected by what the last try reached; between a
+        try that keeps the PSNR and one that does not, from these two.
         """
         total, curve = len(self.splats), quality_of(scores)
         way: Way = "refit" if isinstance(self.method, Refit) else "merge"
@@ -557,10 +497,7 @@ class _Prune:
         return best
 
     def _refitted(self, made: Made, progress: Progress) -> Made:
-        """Refit what was made to what the views see of the unpruned splats.
-
-        Where `progress` cancels, and where a signal does, the rounds so far are returned.
-        """
+        """Refit to the views' pictures of the unpruned splats; if cancelled, the rounds so far."""
         assert isinstance(self.method, Refit)
         merged, start = made.merged, time.perf_counter()
         if merged.keep.all() and self.origin is None:
@@ -589,7 +526,7 @@ class _Prune:
         )  # fmt: skip
 
     def _between(self, scores: Scores, made: Made) -> float | None:
-        """The estimate in views between those that decided, dB; None where nothing tells it."""
+        """Estimate in views in between, dB; None where nothing tells it."""
         rays = scores.between if self.origin is None else self.origin.between
         if rays is None or made.stopped is not None:
             return None
@@ -603,9 +540,9 @@ def _as_deleted(splats: Splats, keep: NDArray[np.bool_], threads: int | None) ->
 
 
 def _share_between(tried: Sequence[_Try], goal: float, total: int) -> float | None:
-    """Share of `total` that has to go by the tries next to a PSNR; None without both.
+    """Share of `total` to remove by the tries next to a PSNR; None without both.
 
-    The PSNR is taken as linear in the logarithm of the odds of that share, as by `Quality.at`.
+    The PSNR is linear in the log odds of that share, as in `Quality.at`.
     """
     above = min((one for one in tried if one.psnr >= goal), default=None)
     below = max((one for one in tried if one.psnr < goal), default=None)
@@ -627,28 +564,10 @@ def merge_down(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Merged:
-    """Reduce splats to `count` that the others are merged into.
+    """Merge splats until `count` are left, by all `views`.
 
-    Parameters
-    ----------
-    splats, progress, threads
-        See `score`.
-    views : ViewSet
-        All of them are used.
-    count : int
-        How many stay.
-    known : tuple of Scores and Measured, optional
-        The results of `occlusion.score_once` for these splats and views, if known.
-    began : int, optional
-        How many splats there were before others were merged into these. What is deleted first, and
-        how cheap merging is, go by the share of them that has gone.
-    protected : (N,) bool, optional
-        Splats that are neither removed nor changed.
-
-    Raises
-    ------
-    RefineError, Cancelled
-        See `score`.
+    `known` are the results of `occlusion.score_once` for them. `began` is their number before
+    earlier merging: what is deleted first, and the merge penalty, go by the share gone since.
     """
     total = len(splats)
     if known is None:

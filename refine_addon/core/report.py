@@ -22,26 +22,17 @@ NOT_PREDICTED = (
 )
 """Why there is no estimate: notes of the report."""
 
-MANY_UNSEEN = 0.05
-"""Share of the splats from which on it is said how many of those that lie in no view go."""
+MANY_UNSEEN = 0.05  # share of unseen splats from which on the report says how many of them go
 
 LITTLE_SEEN = 0.19
-"""Share of the splats that lie in one view or none from which on it is said that other views may
-lose more than is told. On five scenes 8 views have 0.197 to 0.341 and 16 neighbours more, 12 and
-more that are spread out at most 0.180."""
+"""Share of splats in at most one view from which on other views may lose more than predicted. On
+five scenes 8 views or 16 neighbours have 0.197 and more, 12 spread out at most 0.180."""
 
-PRICED = (0.3, 0.5, 0.7, 0.9)
-"""Shares removed of which a scoring says what they would cost."""
+PRICED = (0.3, 0.5, 0.7, 0.9)  # shares removed whose cost a scoring predicts
 
 
 class Clock:
-    """Times of the steps of a run.
-
-    Attributes
-    ----------
-    timings : dict of str to float
-        Seconds of each step, by name.
-    """
+    """Times of the steps of a run, seconds by name."""
 
     def __init__(self) -> None:
         self.timings: dict[str, float] = {}
@@ -87,17 +78,7 @@ def scoring_notes(scores: Scores) -> list[str]:
 def seen_by(
     seen: NDArray[np.int32], undrawable: int, given: int, used: int
 ) -> dict[str, dict[str, int]]:
-    """Counts of splats and views that every report has.
-
-    Parameters
-    ----------
-    seen : (N,) int32
-        In how many of the views used each splat's centre lies.
-    undrawable : int
-        How many splats cannot be drawn.
-    given, used : int
-        How many views there were, and how many of them were used.
-    """
+    """Counts of splats and views for every report; `seen`, (N,), counts views of each splat."""
     unseen = int(np.count_nonzero(seen == 0))
     return {
         "splats": {"before": len(seen), "undrawable": undrawable, "unseen": unseen},
@@ -106,12 +87,12 @@ def seen_by(
 
 
 def scored(scores: Scores) -> dict[str, dict[str, int]]:
-    """The same of a scoring."""
+    """`seen_by` of a scoring."""
     return seen_by(scores.seen, scores.undrawable, scores.views_given, scores.views_used)
 
 
 def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
-    """How many splats stay and go."""
+    """How many splats are kept and removed."""
     kept = int(np.count_nonzero(keep))
     return {"kept": kept, "removed": len(keep) - kept}
 
@@ -133,24 +114,10 @@ def of_prune(
 ) -> dict[str, Any]:
     """The report of a prune.
 
-    Parameters
-    ----------
-    scores : Scores
-        Those that decided.
-    keep : (N,) bool
-        Which splats stay.
-    budget, method, sizes, clock
-        Those of the prune; the report shares the clock's times, and gets later laps too.
-    psnr, between : float or None
-        The estimate in the views that decided, and in views between these, dB.
-    measured : mapping of {"delete", "merge", "refit"} to (float or None)
-        The estimates that were measured, dB.
-    timed : bool
-        Whether the clock tells how long scoring took, so that other methods' times are predicted.
-    made : prune.Made, optional
-        What merging made; without it splats were deleted.
-    tried : prune.Made, optional
-        What merging had made where splats were deleted instead.
+    `psnr` and `between` are estimates in the views that decided and in views in between, dB;
+    `measured` those on rays; `timed` whether the clock timed scoring, to predict other methods'
+    times; `made` (`prune.Made`) what merging made, `tried` what it made where deletion won. The
+    report shares the clock's times, later laps too.
     """
     count, curve = len(keep), scores.quality
     facts: dict[str, Any] = {**scored(scores)}
@@ -227,13 +194,7 @@ def of_prune(
 
 
 def deleted_note(plain: float | None, tried: float | None) -> str:
-    """Why splats are deleted where merging was asked for.
-
-    Parameters
-    ----------
-    plain, tried : float or None
-        The estimates of deletion and of merging, dB; None where it was not tried.
-    """
+    """Why splats are deleted where merging was asked for, by both estimates, dB."""
     why = "the views see too little to tell what merging would gain"
     if tried is not None:
         more = "no more" if plain is not None and tried <= plain else "hardly more"
@@ -244,18 +205,10 @@ def deleted_note(plain: float | None, tried: float | None) -> str:
 
 
 def little_seen(seen: NDArray[np.int32]) -> str:
-    """What few views cannot know of others, for the user; "" where they are enough.
+    """What few views cannot know of others, by `seen`, (N,); "" where they are enough.
 
-    The share of what exactly one of some views holds is about that which the next one adds to all
-    of them (Good 1953, "The population frequencies of species").
+    The share that exactly one view holds is about what the next one adds (Good 1953).
 
-    Parameters
-    ----------
-    seen : (N,) int32
-        In how many of the views that decided each splat lies.
-
-    Examples
-    --------
     >>> little_seen(np.array([0, 1, 2, 3]))
     '50% of the splats lie in one view or none: views from elsewhere may lose more than is told'
     >>> little_seen(np.array([2, 2, 2, 3]))
@@ -271,14 +224,7 @@ def little_seen(seen: NDArray[np.int32]) -> str:
 
 
 def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
-    """What pruning by scores of occlusion would cost, by the share removed and by what is done.
-
-    Parameters
-    ----------
-    scores : Scores
-    took : float
-        How long scoring took, seconds.
-    """
+    """Predicted cost of pruning by occlusion, by share and method; scoring took `took` seconds."""
     curve = scores.quality
     if curve is None or scores.method == "closed-form":
         return []
@@ -296,16 +242,10 @@ def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
 
 
 def predicted(scores: Scores, share: float, measured: Mapping[Way, float | None]) -> dict[str, Any]:
-    """How close the pictures stay by what is done: ``psnr`` in dB, and why it is not predicted.
+    """How close the pictures stay by method: ``psnr``, dB, or why it is not predicted.
 
-    Parameters
-    ----------
-    scores : Scores
-        Their curve and their rays tell what was not measured.
-    share : float
-        Of the splats that goes.
-    measured : mapping of {"delete", "merge", "refit"} to (float or None)
-        The estimates that were measured on rays, dB.
+    `share` of the splats goes; `measured` are estimates on rays, dB, the curve of the scores tells
+    the others.
     """
     rays, many = scores.ray_sample, len(scores.values) >= FEWEST
     hits = rays.hits_of_ray() if rays is not None and many else None

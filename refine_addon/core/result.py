@@ -1,4 +1,4 @@
-"""The result of a prune: which splats stay, what they became, and how it is written."""
+"""The result of a prune: kept splats, their new values, and how it is written."""
 
 from __future__ import annotations
 
@@ -26,22 +26,12 @@ from .visibility.cast import RaySample
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """What splats were before an earlier prune merged and refitted them.
-
-    Attributes
-    ----------
-    splats : Splats
-        As they were.
-    ray_sample, between : RaySample or None
-        What the views, and views between these, saw of them: the estimated PSNR is against that.
-    psnr : float or None
-        The estimated PSNR that is left, dB.
-    """
+    """Splats as they were before an earlier prune merged and refitted them."""
 
     splats: Splats
-    ray_sample: RaySample | None
-    between: RaySample | None
-    psnr: float | None
+    ray_sample: RaySample | None  # what the views saw of them: estimates are against that
+    between: RaySample | None  # likewise of views in between
+    psnr: float | None  # estimate that is left, dB
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,22 +40,14 @@ class Result:
 
     Attributes
     ----------
-    keep : (N,) bool
-        Which splats stay: K of them.
-    report : dict
-        Counts, settings, what decided, times and versions, ready for JSON.
-    scores : Scores or None
-        Those that decided; of those that stay they may tell less, see `Scores.settled`.
-    merged : Merged or None
-        The kept splats as they became; None if all are what they were.
-    stopped : Cancelled or KeyboardInterrupt or None
-        What ended refitting before it was done: the result is what it had reached by then.
-    source : SplatFile or Splats or None
-        What was decided on.
-    columns : dict of str to (N,)
-        Properties that are written otherwise than they are stored.
-    matrix : (4, 4) float64 or None
-        From the frame of the file to that of the views, where these differ.
+    keep : (N,) bool, which splats are kept
+    report : dict, ready for JSON; see docs/report.md
+    scores : Scores that decided; of kept splats they may tell less (`Scores.settled`)
+    merged : Merged, kept splats with their new values; None if all are as they were
+    stopped : what ended refitting early: the result is what it had reached
+    source : what was decided on
+    columns : dict of str to (N,), properties written otherwise than they are stored
+    matrix : (4, 4) float64, from the frame of the file to that of the views, if these differ
     """
 
     keep: NDArray[np.bool_]
@@ -85,19 +67,19 @@ class Result:
 
     @property
     def splats(self) -> Splats:
-        """The kept splats as they became, in the frame of the views."""
+        """The kept splats with their new values, in the frame of the views."""
         if self.merged is not None:
             return self.merged.splats
         return self.all_splats().take(self.keep)
 
     def all_splats(self) -> Splats:
-        """All splats as they were; raises `RefineError` if only their scores were known."""
+        """All splats as they were; `RefineError` if only their scores were known."""
         if self.source is None:
             raise RefineError("only scores were known: there are no splats to return")
         return self.source.splats() if isinstance(self.source, SplatFile) else self.source
 
     def for_all(self, rest: NDArray[np.bool_]) -> Result:
-        """The result for what was left of N splats, (N,) bool, as one for them all."""
+        """This result for the splats in `rest`, (N,) bool, as one for all N."""
         keep = among_all(self.keep, rest)
         total, kept = len(keep), int(np.count_nonzero(keep))
         self.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}
@@ -111,15 +93,9 @@ class Result:
     def write(
         self, path: Path | str, *, overwrite: bool = False, threads: int | None = None
     ) -> None:
-        """Write the kept splats in the format that the suffix of `path` names.
+        """Write the kept splats in the format that the suffix of `path` names, whole or not at all.
 
-        Rows that did not change are equal to those of the source file, to the bit where the format
-        holds them so.
-
-        Raises
-        ------
-        RefineError
-            If the file cannot be written, or exists and may not be replaced; nothing is left then.
+        Unchanged rows equal those of the source file, to the bit where the format can.
         """
         file = self.source
         if not isinstance(file, SplatFile):
@@ -128,18 +104,9 @@ class Result:
         write_splats(path, file, self.keep, columns=columns, overwrite=overwrite, threads=threads)
 
     def changed(self, stored: Any) -> Mapping[str, NDArray[Any]]:
-        """Stored columns with what kept splats became; none if nothing changed.
+        """Columns, (N,) by name, with new values in stored types, rounded once; none if unchanged.
 
-        Parameters
-        ----------
-        stored : mapping of str to (N,), or structured array
-            All properties of the N splats, such as `SplatFile.rows`; not changed.
-
-        Returns
-        -------
-        mapping of str to (N,)
-            The properties that make a splat, each in its stored type, rounded once. Rows of all
-            other splats are equal to the stored ones to the bit.
+        `stored` has all properties, such as `SplatFile.rows`; other rows equal it to the bit.
         """
         merged = self.merged
         if merged is None:
@@ -152,7 +119,7 @@ class Result:
 
 
 def file_of(splats: Splats, path: Path = Path("splats.ply"), stored_bytes: int = 0) -> SplatFile:
-    """A file in memory that holds splats which came from none, or from several."""
+    """A file in memory of splats that came from none, or from several."""
     file, copied = new_file(
         path, FileOrigin("arranged", stored_bytes), len(splats), splats.sh_degree, splats.model
     )

@@ -23,36 +23,18 @@ class Scores:
 
     Attributes
     ----------
-    values : (N,) float32
-        Finite, >= 0; 0 only for undrawable splats and those that were not scored. Each method has
-        its own scale.
-    seen : (N,) int32
-        In how many of the views used the splat's centre lies.
-    views_used : int
-        How many views were used.
-    undrawable : int
-        How many splats cannot be drawn.
-    facts : dict of str to Any
-        Numbers of the method that explain the scores, for the report.
-    notes : tuple of str
-        What the user should know about how the scores were computed.
-    method : str
-        Name of the method asked for, as in `Settings.method`; "" where it is not known.
-    views_given : int
-        How many views were given; those used were chosen from them.
-    ray_sample : RaySample, optional
-        Validation rays, which tell the PSNR of any choice of the splats that were scored.
-    between : RaySample, optional
-        Rays of views between those that scored.
-    quality : Quality, optional
-        The PSNR over the share removed in the order of the scores.
-    alignment : Alignment, optional
-        How the views stand to the splats.
-    settled : int, optional
-        How many splats, from those with the lowest scores on, are in their final order; None for
-        all. Scores that were computed for one budget end where that does.
-    scored : (N,) bool, optional
-        Which splats were scored; None for all. The others had to go (`for_all`).
+    values : (N,) float32, finite, >= 0, on the method's scale; 0 if undrawable or not scored
+    seen : (N,) int32, in how many of the views used the splat's centre lies
+    undrawable : int, how many splats cannot be drawn
+    facts : dict, numbers of the method for the report
+    notes : tuple of str, what the user should know
+    views_given : int, of which those used were chosen
+    ray_sample : RaySample, validation rays: the PSNR of any choice of the splats scored
+    between : RaySample, of views in between
+    quality : Quality, the PSNR over the share removed in the order of the scores
+    alignment : Alignment, how the views stand to the splats
+    settled : int, how many of the lowest scores are in final order; None for all
+    scored : (N,) bool, which splats were scored; None for all, see `for_all`
     """
 
     values: NDArray[np.float32]
@@ -71,30 +53,14 @@ class Scores:
     scored: NDArray[np.bool_] | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
-        """Return these scores as scores of all N splats, of which some had gone before.
-
-        Parameters
-        ----------
-        rest : (N,) bool
-            Which were scored. The others get the score 0.
-        """
+        """These scores for all N splats, of which those in `rest`, (N,), have one; others get 0."""
         values, seen = among_all(self.values, rest), among_all(self.seen, rest)
         settled = None if self.settled is None else self.settled + len(rest) - len(self.values)
         scored = rest if self.scored is None else among_all(self.scored, rest)
         return replace(self, values=values, seen=seen, settled=settled, scored=scored)
 
     def of(self, rest: NDArray[np.bool_]) -> Scores:
-        """Return the scores of some splats: the inverse of `for_all`.
-
-        Parameters
-        ----------
-        rest : (N,) bool
-
-        Raises
-        ------
-        RefineError
-            If some of them were not scored.
-        """
+        """Scores of the splats in `rest`, (N,) bool; `RefineError` if some were not scored."""
         self.refuse_unscored(rest)
         count = int(np.count_nonzero(rest))
         # Of a scene with other splats they tell nothing.
@@ -109,10 +75,7 @@ class Scores:
         )  # fmt: skip
 
     def refuse_unscored(self, rest: NDArray[np.bool_] | None = None) -> None:
-        """Raise `RefineError` if some of the splats in question, (N,) bool, have no score.
-
-        By default all are.
-        """
+        """Raise `RefineError` if splats in `rest`, (N,) bool, by default all, have no score."""
         if self.scored is None:
             return
         unscored = ~self.scored if rest is None else rest & ~self.scored
@@ -124,25 +87,11 @@ class Scores:
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-    """Return, for each place in the order of removal, the share of `count` splats then removed.
+    """Share of `count` splats removed at each place, (N,) from 1, in the order of removal, float32.
 
-    Above 2^24 splats float32 has fewer numbers near 1 than there are places. A share that would
-    equal the next one is lowered to the nearest smaller number, so that no two places tie. The
-    highest shares are then a little too low; the lowest stay exact.
+    Above 2^24 splats float32 has too few numbers near 1: the highest shares are then lowered to the
+    nearest smaller ones, so that no two places tie; the lowest stay exact.
 
-    Parameters
-    ----------
-    places : (N,) int64
-        From 1, removed first, to `count`, removed last.
-    count : int
-
-    Returns
-    -------
-    (N,) float32
-        In (0, 1]; larger for a later place.
-
-    Examples
-    --------
     >>> shares_gone(np.array([1, 2, 4]), 4).tolist()
     [0.25, 0.5, 1.0]
     """

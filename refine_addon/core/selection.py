@@ -21,19 +21,12 @@ class Budget:
 
     Attributes
     ----------
-    ratio : float, optional
-        Share to remove, in [0, 1): exactly ``floor(ratio * N)`` splats go.
-    keep : int, optional
-        How many splats stay, at least 1; if there are fewer splats, all stay.
-    max_mb : float, optional
-        Largest size of the file afterwards, in megabytes of 1e6 bytes.
-    threshold : float, optional
-        Splats with a lower score are removed.
-    min_seen : float, optional
-        Splats that lie in fewer than this percentage of the views are removed.
-    psnr : float, optional
-        As many splats are removed as the pictures of the views allow: their estimated PSNR against
-        those of the unpruned splats stays at least this, dB; see `quality`.
+    ratio : float in [0, 1), share to remove: exactly ``floor(ratio * N)`` splats
+    keep : int, how many splats are kept, at least 1; all if there are fewer
+    max_mb : float, largest size of the file, megabytes of 1e6 bytes
+    threshold : float, splats with a lower score are removed
+    min_seen : float, splats in fewer than this percentage of the views are removed
+    psnr : float, least estimated PSNR of the views' pictures against the unpruned splats', dB
 
     Examples
     --------
@@ -49,7 +42,6 @@ class Budget:
     psnr: float | None = None
 
     def __post_init__(self) -> None:
-        """Check that exactly one value is given, and that it is in range."""
         given = [name for name, value in vars(self).items() if value is not None]
         if len(given) != 1:
             raise RefineError(f"expected one of {', '.join(vars(self))}, got {given or 'none'}")
@@ -74,16 +66,12 @@ class Budget:
 
     @property
     def needs_scores(self) -> bool:
-        """Whether the number of splats that are removed depends on the scores of a method."""
+        """Whether the number of removed splats depends on the scores of a method."""
         return self.threshold is not None or self.min_seen is not None
 
     def after(self, gone: int, count: int) -> Budget:
-        """Return the budget for what is left of `count` splats when `gone` went before.
+        """Budget for the rest of `count` splats once `gone` are removed; these count.
 
-        Those count as removed; where the budget removes no more than these, nothing else goes.
-
-        Examples
-        --------
         >>> Budget(ratio=0.5).after(20, 100), Budget(ratio=0.5).after(70, 100).removals(30)
         (Budget(ratio=None, keep=50, max_mb=None, threshold=None, min_seen=None, psnr=None), 0)
         """
@@ -92,21 +80,10 @@ class Budget:
         return Budget(keep=count - max(self.removals(count) or 0, gone))
 
     def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
-        """Return how many of `count` splats are removed, or None if that depends on the scores.
+        """How many of `count` splats to remove; None if that depends on the scores.
 
-        Parameters
-        ----------
-        count : int
-            Number of splats.
-        row_bytes : float
-            Size of a splat in the file; for `max_mb`.
-        fixed_bytes : int
-            Size of everything else in the file.
-
-        Raises
-        ------
-        RefineError
-            If not even one splat fits in `max_mb`.
+        For `max_mb`, `row_bytes` is the size of a splat in the file, `fixed_bytes` that of the
+        rest; `RefineError` if not even one splat fits.
         """
         if self.ratio is not None:
             # The decimal as written; the nearest binary number would give floor(.29 * 100) = 28.
@@ -133,29 +110,18 @@ def select(
     row_bytes: float = 0.0,
     fixed_bytes: int = 0,
 ) -> NDArray[np.bool_]:
-    """Return which splats stay.
-
-    The splats with the lowest scores are removed; of equal scores, the first in the file. Protected
-    splats always stay, and others are removed instead, as far as there are any.
+    """Which splats are kept, (N,) bool: the lowest scores go, of equal ones the first in the file.
 
     Parameters
     ----------
-    scores : Scores
-    budget : Budget
-    protected : (N,) bool, optional
-        Splats that are not removed.
-    row_bytes, fixed_bytes
-        See `Budget.removals`.
-
-    Returns
-    -------
-    (N,) bool
+    protected : (N,) bool, optional; always kept, others go instead as far as there are any
+    row_bytes, fixed_bytes : see `Budget.removals`
 
     Raises
     ------
     RefineError
-        If the budget is a PSNR and the scores have no estimate of it, if it removes more than the
-        scores were computed for (`Scores.settled`), or if no splat would be left.
+        If a PSNR is the budget and the scores have no estimate, if more would go than was scored
+        for (`Scores.settled`), or none would be kept.
     """
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`
@@ -174,40 +140,31 @@ def select(
 
 
 def single(threshold: float) -> np.float32:
-    """Return a threshold in the precision of scores; beyond its range all of them are below."""
+    """A threshold in the precision of scores; beyond its range all of them are below."""
     with np.errstate(over="ignore"):
         return np.float32(threshold)
 
 
 def _removals(scores: Scores, budget: Budget, row_bytes: float, fixed_bytes: int) -> int | None:
-    """Return how many splats a budget removes, of those with the lowest scores.
-
-    None where each splat's score or number of views tells whether it goes.
-    """
+    """How many of the lowest scores a budget removes; None where each splat decides for itself."""
     if budget.psnr is not None:
         return math.floor(quality_of(scores).share(budget.psnr) * len(scores.values))
     return budget.removals(len(scores.values), row_bytes, fixed_bytes)
 
 
 def least_seen(percentage: float, views: int) -> int:
-    """Return in how many of the views a splat must lie to stay.
-
-    In exact fractions: a splat that lies in 16 of 64 views lies in 25 % of them, and stays.
-    """
+    """In how many views a kept splat must lie, in exact fractions: 16 of 64 views are 25 %."""
     return math.ceil(Fraction(repr(float(percentage))) * views / 100)
 
 
 def refuse_none_left(budget: Budget, before: int, after: int) -> None:
-    """Raise `RefineError` if none of the splats would stay."""
+    """Raise `RefineError` if no splat would be kept."""
     if not after:
         raise RefineError(f"{budget.kind} would remove all {before} splats; nothing was removed")
 
 
 def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -> None:
-    """Raise `RefineError` if scores were computed for a budget that removes fewer splats.
-
-    Some of the scores are settled; `gone`, (N,), is what this budget removes.
-    """
+    """Raise `RefineError` if `gone`, (N,), goes beyond the settled scores."""
     settled = scores.settled or 0
     # A PSNR that all of the curve reaches may be reached beyond its end, too.
     beyond = budget.psnr is not None and budget.psnr <= quality_of(scores).psnr[-1]
@@ -219,13 +176,7 @@ def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -
 
 
 def quality_of(scores: Scores) -> Quality:
-    """Return the curve of the estimated PSNR.
-
-    Raises
-    ------
-    RefineError
-        If the scores have none.
-    """
+    """The curve of the estimated PSNR; `RefineError` if the scores have none."""
     if scores.quality is None:
         raise RefineError(
             "these scores have no estimate of the pictures' quality: score again with a PSNR as "
@@ -248,19 +199,10 @@ def _remove_lowest(
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return each splat's place in the order of removal, 0 (removed first) to 1 (removed last).
+    """Each splat's place in the order of removal, (N,) float64, 0 (first) to 1 (last); 1 of one.
 
-    It is for display, and for selecting in Blender. Attributes there are float32, so neighbours
-    share a rank above 2^24 splats. Core does not decide by it; `select` uses scores and rows.
-
-    Parameters
-    ----------
-    values : (N,) float32
-
-    Returns
-    -------
-    (N,) float64
-        A single splat has rank 1.
+    For display and selection in Blender, where float32 makes neighbours above 2^24 splats share a
+    rank; `select` uses scores and rows.
     """
     count = len(values)
     if count == 1:

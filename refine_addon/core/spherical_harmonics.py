@@ -12,32 +12,15 @@ from .execute import chunks
 
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 
-_DIRECTIONS = 4096
-"""Directions over which stretched harmonics are fitted; degree 4 has 25 coefficients."""
+_DIRECTIONS = 4096  # over which stretched harmonics are fitted; degree 4 has 25 coefficients
 
 
 def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
-    """Values of all harmonics along directions.
+    """Values of all harmonics along unit vectors from view to splat, (..., (degree + 1)^2) float64.
 
-    Parameters
-    ----------
-    directions : (..., 3) floating
-        Unit vectors from the view to the splat, in the frame of the coefficients.
-    degree : int
-        0 to 4.
+    The constant first, then band by band, m = -l .. l, with the Condon-Shortley phase as in 3DGS:
+    constants are sqrt((2l + 1) / 4 pi (l - m)! / (l + m)!) times those of the polynomials.
 
-    Returns
-    -------
-    (..., (degree + 1)^2) float64
-        In the order of the coefficients: constant first, then band by band, m = -l .. l.
-
-    Notes
-    -----
-    Real harmonics with the Condon-Shortley phase, as in the reference implementation of 3DGS: the
-    constants below are sqrt((2l + 1) / 4 pi (l - m)! / (l + m)!) times those of the polynomials.
-
-    Examples
-    --------
     >>> basis(np.array([0.0, 0.0, 1.0]), 1).round(4).tolist()
     [0.2821, -0.0, 0.4886, -0.0]
     """
@@ -94,16 +77,7 @@ def _values(directions, degree):
 def colors(
     directions: NDArray[Any], sh_dc: NDArray[Any], sh_rest: NDArray[Any]
 ) -> NDArray[np.float64]:
-    """Colour of each splat as viewed along a direction, (N, 3), not clipped.
-
-    Parameters
-    ----------
-    directions : (N, 3) floating
-        See `basis`.
-    sh_dc : (N, 3) floating
-    sh_rest : (N, K, 3) floating
-        Coefficients above the constant, K = (degree + 1)^2 - 1.
-    """
+    """Colour of each splat along a direction as in `basis`, (N, 3), not clipped."""
     values = basis(directions, math.isqrt(sh_rest.shape[1] + 1) - 1)  # (N, K + 1)
     color = 0.5 + values[:, :1] * np.asarray(sh_dc, np.float64)
     if sh_rest.shape[1]:
@@ -113,13 +87,9 @@ def colors(
 
 
 def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What `colors` does, (3, N), in float32 throughout: a tenth of the time.
+    """`colors`, (3, N), in float32 throughout: a tenth of the time.
 
-    Parameters
-    ----------
-    directions : (3, N) floating
-    harmonics : (N, 3, K) float32
-        Coefficients of each channel, the constant first.
+    Directions are (3, N), harmonics (N, 3, K), the constant first.
     """
     degree = math.isqrt(harmonics.shape[2]) - 1
     values = np.stack(_values(np.asarray(directions, np.float32), degree), axis=1)  # (N, K)
@@ -129,18 +99,9 @@ def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> N
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients whose colour along ``rotation @ d`` is the old colour along d.
+    """Coefficients, (N, K, 3), whose colour along ``rotation @ d`` is the old colour along d.
 
-    Parameters
-    ----------
-    sh_rest : (N, K, 3) floating
-        Coefficients above the constant, K = (degree + 1)^2 - 1.
-    rotation : (3, 3) float64
-        Orthonormal; it may be a reflection.
-
-    Returns
-    -------
-    (N, K, 3) float64
+    `rotation` is orthonormal and may be a reflection.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     rotated = np.empty_like(sh_rest, np.float64)
@@ -168,21 +129,8 @@ def stretched(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coefficients whose colour along ``linear @ d`` is nearly the old colour along d.
 
-    A matrix that scales directions differently bends the sphere of directions, which harmonics of
-    no degree can follow exactly: these are the nearest of the same degree, by least squares over
-    the directions after it. For rotations use `rotate`, which is exact.
-
-    Parameters
-    ----------
-    sh_dc : (N, 3) floating
-    sh_rest : (N, K, 3) floating
-    linear : (3, 3) float64
-        Any that can be inverted.
-
-    Returns
-    -------
-    sh_dc : (N, 3) float64
-    sh_rest : (N, K, 3) float64
+    Uneven scales bend the sphere of directions, which no degree follows exactly: the nearest of the
+    same degree, by least squares over directions. `rotate` is exact.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     here = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))

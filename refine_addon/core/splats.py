@@ -1,11 +1,8 @@
 """3D Gaussian splats as 3DGS files store them, and the only place where they are activated.
 
-The constants that renderers share are those of the reference implementation (Kerbl et al. 2023, "3D
-Gaussian Splatting for Real-Time Radiance Field Rendering", `diff-gaussian-rasterization`), which
-other renderers follow; except for the near plane, which is a length in scene units there.
-
-Splats are trained to be drawn in one of three ways, their *model*, and look wrong in another. The
-words are those of splat-transform and SOG; how a PLY says it: `formats.ply`.
+Constants are those of the reference implementation (Kerbl et al. 2023,
+`diff-gaussian-rasterization`), except for the near plane. Splats are trained for one way of
+drawing, their *model*, named as by splat-transform and SOG; `formats.ply` tells how a PLY says it.
 """
 
 from __future__ import annotations
@@ -22,71 +19,52 @@ from .errors import RefineError
 from .execute import chunks, run_all
 
 Model = Literal["default", "antialiased", "2dgs"]
-"""How splats are drawn.
+"""How splats are drawn. ``default``: the footprint is widened by `LOW_PASS`, its opacity stays
+(Kerbl et al. 2023). ``antialiased``: opacity falls by ``sqrt(det C / det(C + LOW_PASS I))``, C the
+covariance in the image (Yu et al. 2024, "Mip-Splatting"). ``2dgs``: a flat disc without third
+scale, hit where the ray meets its plane (Huang et al. 2024)."""
 
-- ``default``: the footprint is widened by `LOW_PASS`, and its opacity stays (Kerbl et al. 2023).
-- ``antialiased``: it is widened likewise, and its opacity falls so that the integral of alpha
-  stays: times ``sqrt(det C / det(C + LOW_PASS I))``, C the covariance in the image (Yu et al.
-  2024, "Mip-Splatting"; gsplat's ``rasterize_mode="antialiased"``).
-- ``2dgs``: a splat is a flat disc without a third scale, hit where the ray meets its plane (Huang
-  et al. 2024, "2D Gaussian Splatting for Geometrically Accurate Radiance Fields").
-"""
+MODELS: tuple[Model, ...] = get_args(Model)  # the first is meant where a file does not say
 
-MODELS: tuple[Model, ...] = get_args(Model)
-"""All models. The first is meant where a file does not say."""
-
-LOW_PASS = 0.3
-"""Variance added to a footprint along both axes so that it is not thinner than a pixel, px^2."""
+LOW_PASS = 0.3  # variance added to a footprint along both axes so that it covers a pixel, px^2
 
 DISC_LOW_PASS = 0.5
-"""Variance of the Gaussian that a disc is at least drawn as, px^2: the larger of the two alphas
-counts (Huang et al. 2024, Eq. 11, with sigma = sqrt(2) / 2)."""
+"""Variance of the Gaussian that a disc is at least drawn as, px^2: the larger alpha counts (Huang
+et al. 2024, Eq. 11, sigma = sqrt(2) / 2)."""
 
-ALPHA_MAX = 0.99
-"""Largest alpha of one splat at a pixel, 0..1: no splat hides everything behind it."""
+ALPHA_MAX = 0.99  # largest alpha of one splat at a pixel: none hides everything behind it
 
-ALPHA_CUT = 1.0 / 255.0
-"""Least alpha that is drawn, 0..1; a splat's footprint ends where its alpha falls below it."""
+ALPHA_CUT = 1.0 / 255.0  # least alpha that is drawn; a splat's footprint ends there
 
 NEAR_RELATIVE = 0.01
-"""Near plane over the size of the scene, for views that have none of their own. Renderers use .2 or
-.01 in the scene's unit; a multiple of the scene's size is independent of the unit."""
+"""Near plane over the size of the scene, for views without one. Renderers use 0.2 or 0.01 in the
+scene's unit; this does not depend on the unit."""
 
-SH_C0 = 0.28209479177387814
-"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
+SH_C0 = 0.28209479177387814  # Value of the constant spherical harmonic, 1 / (2 sqrt(pi))
 
 _CHECKED = 1 << 15  # rows of which it is checked together whether they can be drawn
-_COPIED = 2048
-"""Rows of a file copied at a time: 0.5 MB at degree 3, in the L2 cache for all columns."""
+_COPIED = 2048  # rows of a file copied at a time: 0.5 MB at degree 3, in the L2 cache
 
 ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
-"""Attributes of `Splats` that have a row for each splat."""
+"""Attributes of `Splats` with a row for each splat."""
 
 
 @dataclass(frozen=True, eq=False)
 class Splats:
     """N splats with the values a 3DGS file stores: log scales, logit opacities, raw harmonics.
 
-    The arrays may be read-only strided views of a memory-mapped file in any byte order, so callers
-    convert them one chunk at a time. They are never changed.
+    The arrays are never changed. They may be read-only strided views of a memory-mapped file in any
+    byte order: convert them one chunk at a time.
 
     Attributes
     ----------
-    means : (N, 3) floating
-        Centres, in the frame and unit of the file, or of the world after a transform.
-    log_scales : (N, 3) floating
-        Natural logarithm of the standard deviation along each axis of the splat.
-    quaternions : (N, 4) floating
-        Rotation from the splat's axes to the frame, w x y z, not necessarily normalised.
+    means : (N, 3) floating, centres in the frame and unit of the file or, transformed, of the world
+    log_scales : (N, 3) floating, logarithm of the standard deviation along each axis of the splat
+    quaternions : (N, 4) floating, w x y z from the splat's axes to the frame, of any length
     opacity_logits : (N,) floating
-        Opacity before the logistic function.
-    sh_dc : (N, 3) floating
-        Constant spherical-harmonics coefficient of red, green, blue.
-    sh_rest : (N, K, 3) floating
-        The other coefficients, K = (degree + 1)^2 - 1 of each channel.
-    model : {"default", "antialiased", "2dgs"}
-        How they are drawn, see `Model`. Of "2dgs" the third scale is 0 (`LOG_ZERO`),
-        whatever a file holds: see `with_model`.
+    sh_dc : (N, 3) floating, constant harmonic of red, green and blue
+    sh_rest : (N, K, 3) floating, the other harmonics, K = (degree + 1)^2 - 1
+    model : Model; for "2dgs" the third scale is `LOG_ZERO`, whatever a file holds (`with_model`)
     """
 
     means: NDArray[Any]
@@ -98,27 +76,24 @@ class Splats:
     model: Model = "default"
 
     def __len__(self) -> int:
-        """Return the number of splats."""
         return len(self.means)
 
     @property
     def sh_degree(self) -> int:
-        """Highest spherical-harmonics band present, 0 to 4."""
+        """Highest band of spherical harmonics, 0 to 4."""
         return math.isqrt(self.sh_rest.shape[1] + 1) - 1
 
     def up_to_degree(self, degree: int) -> Splats:
-        """Return the splats without harmonics above a degree."""
+        """Splats without harmonics above a degree."""
         return replace(self, sh_rest=self.sh_rest[:, : above_constant(degree)])
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
-        """Return the splats at `index` (a mask, integers or a slice), in that order."""
+        """Splats at `index` (a mask, integers or a slice), in that order."""
         return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def by_columns(self) -> Splats:
-        """Return copies of which each column is contiguous, and `sh_rest` as it is.
-
-        Rows of a file have the values of a splat side by side; numbers of many splats are computed
-        several times as fast where they stand side by side.
+        """Copies with contiguous columns, several times as fast to compute with; `sh_rest` as it
+        is.
         """
         rows = {name: getattr(self, name) for name in ARRAYS if name != "sh_rest"}
         columns: dict[str, Any] = {
@@ -131,13 +106,7 @@ class Splats:
 
 
 def with_model(splats: Splats, model: Model) -> Splats:
-    """Return the splats as drawn in another way; discs have no third scale.
-
-    Parameters
-    ----------
-    splats : Splats
-    model : {"default", "antialiased", "2dgs"}
-    """
+    """Splats as drawn in another way; discs have no third scale."""
     if model != "2dgs":
         return replace(splats, model=model)
     flat = np.array(splats.log_scales)
@@ -146,14 +115,8 @@ def with_model(splats: Splats, model: Model) -> Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Return all splats of several sets, one at least, in that order.
-
-    The result has the highest degree among them; coefficients that a part lacks are 0.
-
-    Raises
-    ------
-    RefineError
-        If they are drawn in different ways.
+    """Splats of one or more sets, in order, with the highest degree among them; missing harmonics
+    are 0.
     """
     if len(parts) == 1:
         return parts[0]
@@ -169,7 +132,7 @@ def joined(parts: Sequence[Splats]) -> Splats:
 
 
 def refuse_mixed(models: Sequence[Model]) -> None:
-    """Raise `RefineError` if splats that are to become one scene are drawn in different ways."""
+    """Raise `RefineError` if splats that become one scene are drawn in different ways."""
     if len(set(models)) > 1:
         listed = ", ".join(dict.fromkeys(models))
         raise RefineError(
@@ -178,21 +141,13 @@ def refuse_mixed(models: Sequence[Model]) -> None:
 
 
 def above_constant(degree: int) -> int:
-    """Return how many harmonics above the constant one a channel has."""
+    """Number of harmonics of a channel above the constant one."""
     return (degree + 1) ** 2 - 1
 
 
 def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
-    """Opacity in 0..1, the logistic function of the stored value, without overflow.
-
-    Parameters
-    ----------
-    logits : (...) floating
-        Any value, infinities included; NaN stays NaN.
-
-    Returns
-    -------
-    (...) float64
+    """Opacities (...) float64 in 0..1 of any logits, infinities included, without overflow; NaN
+    stays.
     """
     logits = np.asarray(logits, np.float64)
     # exp(-700) is 1e-304; the limit avoids underflow.
@@ -201,34 +156,21 @@ def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
 
 
 OPACITY_MARGIN = 1e-6
-"""Opacities read from formats that round them are kept this far from 0 and 1, whose logits are
-infinite. The step of 8 bits is 4,000 times as large."""
+"""Distance from 0 and 1, whose logits are infinite, of opacities read from formats that round; the
+step of 8 bits is 4,000 times as large."""
 
-SINGLE_MARGIN = 2.0**-26
-"""Opacities read from float32 are kept this far from 1: float32 has no number between, and rounds
-what is this close to 1."""
+SINGLE_MARGIN = 2.0**-26  # distance from 1 of opacities read from float32; none is nearer
 
 LOG_ZERO = -104.0
-"""Log scale and logit of what is 0 in float32: ``exp(-104)`` rounds to 0 there, ``exp(-103)`` does
-not."""
+"""Log scale and logit of what is 0 in float32: ``exp(-104)`` rounds to 0, ``exp(-103)`` does not.
+"""
 
 
 def opacity_logits(
     opacities: NDArray[Any], margin: float = OPACITY_MARGIN, least: float | None = None
 ) -> NDArray[np.float64]:
-    """Logits of opacities: the inverse of `opacity`.
-
-    Parameters
-    ----------
-    opacities : (...) floating
-        Those outside of ``least..1 - margin`` count as the nearer end; NaN stays NaN.
-    margin : float
-    least : float, optional
-        By default `margin`.
-
-    Returns
-    -------
-    (...) float64
+    """Inverse of `opacity`, (...) float64; opacities are clipped to ``least..1 - margin``, NaN
+    stays.
     """
     low = margin if least is None else least
     inside = np.clip(np.asarray(opacities, np.float64), low, 1.0 - margin)
@@ -236,22 +178,8 @@ def opacity_logits(
 
 
 def single_logits(opacities: NDArray[Any]) -> NDArray[np.float64]:
-    """Logits of opacities that are held in float32, such as Blender's.
+    """Logits (...) float64 of float32 opacities; `opacity` of them, in float32, gives these back.
 
-    `opacity` of them, rounded to float32, is what they came from: 0 has the logit `LOG_ZERO`, and
-    1 the largest that is told from it, 18.02 (see `SINGLE_MARGIN`).
-
-    Parameters
-    ----------
-    opacities : (...) float32
-        Those outside of 0..1 count as the nearer end; NaN stays NaN.
-
-    Returns
-    -------
-    (...) float64
-
-    Examples
-    --------
     >>> single_logits([0.0, 0.5, 1.0]).round(2).tolist()
     [-104.0, 0.0, 18.02]
     """
@@ -259,25 +187,15 @@ def single_logits(opacities: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def scales(log_scales: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the standard deviations of log scales, in float64; beyond its range 0 or infinite."""
+    """Standard deviations in float64 of log scales; beyond its range 0 or infinite."""
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(np.exp(np.asarray(log_scales, np.float64)))
 
 
 def single_log_scales(scales: NDArray[Any]) -> NDArray[np.float64]:
-    """Log scales of standard deviations that are held in float32: the inverse of `scales`.
+    """Log scales (...) float64 of float32 scales; signs do not count, as the covariance has
+    squares.
 
-    Parameters
-    ----------
-    scales : (...) float32
-        The sign does not count, as the covariance has squares; 0 has the log scale `LOG_ZERO`.
-
-    Returns
-    -------
-    (...) float64
-
-    Examples
-    --------
     >>> single_log_scales([0.0, 1.0, -1.0]).tolist()
     [-104.0, 0.0, 0.0]
     """
@@ -286,30 +204,13 @@ def single_log_scales(scales: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def base_color(sh_dc: NDArray[Any]) -> NDArray[np.float64]:
-    """View-independent colour in 0..1, ``clip(SH_C0 * f_dc + 0.5, 0, 1)``.
-
-    Parameters
-    ----------
-    sh_dc : (..., 3) floating
-
-    Returns
-    -------
-    (..., 3) float64
-    """
+    """Colour from all directions, (..., 3) float64 in 0..1, ``clip(SH_C0 * f_dc + 0.5, 0, 1)``."""
     return np.clip(SH_C0 * np.asarray(sh_dc, np.float64) + 0.5, 0.0, 1.0)
 
 
 def unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float64]:
-    """Quaternions of length 1.
-
-    Parameters
-    ----------
-    quaternions : (..., 4) floating
-        w x y z of any length; a zero or non-finite quaternion counts as the identity.
-
-    Returns
-    -------
-    (..., 4) float64
+    """Quaternions of length 1, (..., 4) float64 w x y z; zero and non-finite ones become the
+    identity.
     """
     q = np.asarray(quaternions, np.float64)
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
@@ -321,17 +222,10 @@ def unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def single_unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float32]:
-    """Quaternions of length 1 in float32, as Blender holds them.
+    """Quaternions of length 1, (N, 4) float32 w x y z, as Blender holds them; zero becomes the
+    identity.
 
-    Parameters
-    ----------
-    quaternions : (N, 4) floating
-        w x y z. Those of length 1 within the rounding of float32 stay as they are, to the bit, and
-        so do those that are not finite, which no renderer can draw; zero becomes the identity.
-
-    Returns
-    -------
-    (N, 4) float32
+    Those of length 1 within float32's rounding, and non-finite ones, stay to the bit.
     """
     with np.errstate(over="ignore", under="ignore"):  # doubles that are no floats
         q = np.array(quaternions, np.float32)
@@ -345,18 +239,7 @@ def single_unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
-    """Rotation matrices of stored quaternions.
-
-    Parameters
-    ----------
-    quaternions : (..., 4) floating
-        See `unit_quaternions`.
-
-    Returns
-    -------
-    (..., 3, 3) float64
-        Columns are the splat's axes in the frame of the means.
-    """
+    """Rotations (..., 3, 3) float64 of stored quaternions; columns are the splat's axes."""
     w, x, y, z = np.moveaxis(unit_quaternions(quaternions), -1, 0)
     with np.errstate(under="ignore"):  # products of components near 0
         rows = [
@@ -368,21 +251,11 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
-    """Return which splats a renderer can draw.
+    """Which splats a renderer can draw, (N,) bool.
 
-    A splat cannot be drawn if one of its values is NaN or infinite. Two exceptions: an infinite
-    opacity logit means opacity 0 or 1, and a log scale of minus infinity means scale 0. It cannot
-    be drawn either if a renderer that computes in float32 gets opacity 0, size 0 along every axis,
-    or a mean or scale that overflows.
-
-    Parameters
-    ----------
-    splats : Splats
-    threads : int, optional
-
-    Returns
-    -------
-    (N,) bool
+    Not those with a NaN or infinite value (but an infinite logit means opacity 0 or 1, and a log
+    scale of minus infinity scale 0), nor those with opacity 0, size 0 along all axes or an overflow
+    in float32.
     """
     good = np.empty(len(splats), np.bool_)
 
@@ -406,13 +279,7 @@ def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
 
 
 def refuse_undrawable(good: int, total: int) -> None:
-    """Raise `RefineError` if no splat can be drawn.
-
-    Parameters
-    ----------
-    good, total : int
-        How many splats can be drawn, and how many there are.
-    """
+    """Raise `RefineError` if none of `total` splats can be drawn."""
     if not good:
         raise RefineError(
             f"none of the {total} splats can be drawn: each is transparent or not finite"
@@ -428,7 +295,7 @@ _LOG_SMALLEST = float(np.log(np.float64(np.finfo(np.float32).smallest_subnormal)
 
 
 def among_all(values: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return values of the splats in `rest`, (N,) bool, as values of all N: 0 for the others."""
+    """Values of the splats in `rest`, (N,) bool, as values of all N: 0 for the others."""
     of_all = np.zeros(len(rest), values.dtype)
     of_all[rest] = values
     return of_all

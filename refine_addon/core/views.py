@@ -12,45 +12,33 @@ from numpy.typing import NDArray
 
 from .errors import RefineError
 
-ORTHONORMAL = 1e-3
-"""How far from orthonormal a rotation may be: four decimals in a text file are enough."""
+ORTHONORMAL = 1e-3  # how far from orthonormal a rotation may be: four decimals in a file are enough
 
-WIDEST = math.radians(90.0)
-"""Views that are turned farther than that from each other have nothing between them."""
+WIDEST = math.radians(90.0)  # views turned farther from each other have nothing in between
 
-MOST_BETWEEN = 1000
-"""So many may be added at most: each is compared with all others, so more would take minutes."""
+MOST_BETWEEN = 1000  # views added at most: each is compared with all others, which takes minutes
 
-FAR = 1000.0
-"""Extents of the splats from which a view without perspective is looked at instead."""
+FAR = 1000.0  # extents of the splats from which a view without perspective is looked at instead
 
-_CANDIDATES = 64
-"""So many of the nearest views of each are looked at for neighbours."""
+_CANDIDATES = 64  # nearest views of each that are tried as neighbours
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """One pinhole camera: x right, y down, z forward; pixels, origin at the image's upper left.
 
-    A point ``p`` of the world lies at ``rotation @ (p - center)`` in the camera, and at
-    ``(fx x / z + cx, fy y / z + cy)`` in the image; the centre of pixel k is at k + 0.5.
+    A point ``p`` of the world lies at ``rotation @ (p - center)`` in the camera, and at ``(fx x / z
+    + cx, fy y / z + cy)`` in the image; the centre of pixel k is at k + 0.5.
 
     Attributes
     ----------
-    rotation : (3, 3) float64
-        World to camera, orthonormal; determinant -1 where the camera is mirrored.
-    center : (3,) float64
-        Centre of projection, world units.
-    fx, fy, cx, cy : float
-        Focal lengths and principal point, pixels.
-    width, height : int
-        Image size, pixels.
-    near, far : float
-        Clip distances along z, world units; 0 and infinity if the source has none.
-    weight : float
-        How much this view counts among the others, >= 0.
-    name : str
-        Image or camera name, for messages.
+    rotation : (3, 3) float64, world to camera, orthonormal; determinant -1 if mirrored
+    center : (3,) float64, centre of projection, world units
+    fx, fy, cx, cy : float, focal lengths and principal point, pixels
+    width, height : int, pixels
+    near, far : float, clip distances along z, world units; 0 and infinity if not known
+    weight : float >= 0, how much the view counts among the others
+    name : str, of image or camera, for messages
     """
 
     rotation: NDArray[np.float64]
@@ -67,7 +55,6 @@ class View:
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Check all values."""
         try:
             rotation = np.array(self.rotation, np.float64)
             center = np.array(self.center, np.float64)
@@ -81,14 +68,7 @@ class View:
     def turned(
         self, rotation: NDArray[np.float64], shift: NDArray[np.float64] | float = 0.0
     ) -> View:
-        """View moved with the world: p goes to ``rotation @ p + shift``.
-
-        Parameters
-        ----------
-        rotation : (3, 3) float64
-            Orthonormal.
-        shift : (3,) float64, optional
-        """
+        """View moved with the world: p goes to ``rotation @ p + shift``."""
         center = rotation @ self.center + shift
         return replace(self, rotation=self.rotation @ rotation.T, center=center)
 
@@ -132,13 +112,10 @@ class ViewSet:
 
     Attributes
     ----------
-    views : tuple of View
-        At least one has a positive weight.
-    note : str
-        What is not modelled of the source of the views, such as lens distortion; or "".
-    turn : int or None
-        By how many quarters about x (`affine.QUARTER`) the views are to be turned to stand to the
-        splats as in the files that both came from; None where that is not known.
+    views : tuple of View, at least one of positive weight
+    note : str, what is not modelled of their source, such as lens distortion
+    turn : int or None, quarters about x (`affine.QUARTER`) from the views to the splats of their
+    files
     """
 
     views: tuple[View, ...]
@@ -146,7 +123,6 @@ class ViewSet:
     turn: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a set without any view that counts."""
         object.__setattr__(self, "views", tuple(self.views))
         if not self.views:
             raise RefineError("no cameras: scoring needs at least one view")
@@ -154,15 +130,12 @@ class ViewSet:
             raise RefineError(f"all {len(self.views)} views have weight 0: at least one must count")
 
     def __len__(self) -> int:
-        """Number of views."""
         return len(self.views)
 
     def __iter__(self) -> Iterator[View]:
-        """Iterate over the views in order."""
         return iter(self.views)
 
     def __getitem__(self, index: int) -> View:
-        """One view."""
         return self.views[index]
 
     def take(self, indices: Sequence[int] | NDArray[Any]) -> ViewSet:
@@ -170,14 +143,8 @@ class ViewSet:
         return replace(self, views=tuple(self.views[int(index)] for index in indices))
 
     def select(self, names: Sequence[str]) -> ViewSet:
-        """Views of these names, in the order of `names`.
-
-        If several views have one name, the last of them is returned.
-
-        Raises
-        ------
-        RefineError
-            If no view has one of the names.
+        """Views by name, in the order of `names`; of equal names the last. `RefineError` without
+        one.
         """
         by_name = {view.name: view for view in self.views}
         missing = [name for name in names if name not in by_name]
@@ -204,14 +171,8 @@ class ViewSet:
             return np.asarray(weights / weights.sum())
 
     def middle(self) -> tuple[NDArray[np.float64], float]:
-        """Middle of the views and how far they are from it; outliers hardly count.
-
-        Returns
-        -------
-        middle : (3,) float64
-            Weighted geometric median of the centres (Weiszfeld's iteration).
-        variance : float
-            Weighted median of the centres' squared distances to it.
+        """Weighted geometric median of the centres (Weiszfeld's iteration), (3,), and weighted
+        median of their squared distances to it; outliers hardly count.
         """
         centers, weights = self.centers, self.weights
         with np.errstate(under="ignore"):
@@ -230,17 +191,10 @@ class ViewSet:
         return middle, _median(squared, weights)
 
     def spread(self, count: int) -> ViewSet:
-        """At most `count` views that cover the set evenly, in the order of the set.
+        """At most `count` views that cover the set evenly, in its order; 0 keeps all.
 
-        Farthest-point sampling over position and viewing direction (`places`), starting from the
-        view that is farthest from the middle of the set. The choice depends neither on the frame
-        and the unit of the set nor, as far as names differ, on its order; a stray view takes up
-        only one place.
-
-        Parameters
-        ----------
-        count : int
-            How many to keep; 0 keeps all.
+        Farthest-point sampling by `places`, from the view farthest from the middle. Frame, unit
+        and, as far as names differ, order do not matter; a stray view takes one place.
         """
         # Ties, of which regular rigs have many, go to the first name.
         usable = np.array([index for index in self.by_name() if self.views[index].weight > 0])
@@ -257,27 +211,18 @@ class ViewSet:
         return self.take(np.sort(usable[chosen]))
 
     def places(self) -> NDArray[np.float64]:
-        """Where each view stands and looks, (V, 6), for distances between views.
-
-        Positions are from the middle of the set and divided by the root of `middle`'s variance;
-        then come the viewing directions.
-        """
+        """Positions from the middle over the root of its variance, then directions, (V, 6)."""
         middle, variance = self.middle()
         offset = (self.centers - middle) / (np.sqrt(variance) or 1.0)
         return np.hstack([offset, self.rotations[:, 2]])
 
     def by_name(self) -> list[int]:
-        """Indices of the views sorted by name; views of one name keep their order.
-
-        An order that neither a motion of the scene nor another order of the set changes.
-        """
+        """Indices by name, ties in order; no motion or reordering of distinct names changes it."""
         return sorted(range(len(self)), key=lambda index: self.views[index].name)
 
     def by_distance(self) -> list[tuple[View, float]]:
-        """Views of positive weight and their weights, in an order given by the scene.
-
-        They are sorted by distance from their middle, then from the view farthest from it, equal
-        ones by name. So their order depends neither on the frame nor on that of the set.
+        """Views of positive weight and their weights, by distance from their middle, then from the
+        farthest view, then by name: independent of frame and order.
         """
         centers = self.centers - self.middle()[0]
         order = np.array(self.by_name())
@@ -292,13 +237,13 @@ class ViewSet:
 
 
 def _median(values, weights):
-    """Weighted median of values, (V,); the smaller one if two are in the middle."""
+    """Weighted median of values, (V,); the smaller of two."""
     order = np.argsort(values, kind="stable")
     return float(values[order[np.searchsorted(np.cumsum(weights[order]), 0.5 - 1e-9)]])
 
 
 def refuse_other(views: object) -> None:
-    """Raise `RefineError` if what is given as views is no `ViewSet`."""
+    """Raise `RefineError` if `views` is no `ViewSet`."""
     if not isinstance(views, ViewSet):
         raise RefineError(
             f"views is a {type(views).__name__}, expected a ViewSet: ViewSet((view, ...))"
@@ -306,22 +251,11 @@ def refuse_other(views: object) -> None:
 
 
 def views_between(views: ViewSet, most: int) -> list[View]:
-    """At most `most` views, each halfway between two neighbours, evenly from all there are.
+    """At most `most` views halfway between neighbours, evenly from all.
 
-    Two views are neighbours if no third is nearer to the place halfway between them than they are
-    (the Gabriel graph, Gabriel and Sokal 1969), by `ViewSet.places`. A view between them has the
-    mean of their positions and rotations, and the lens of one of them.
-
-    Parameters
-    ----------
-    views : ViewSet
-    most : int
-
-    Returns
-    -------
-    list of View
-        Empty where all views stand in one place or there is but one. Neither the frame of the views
-        nor, as far as names differ, their order changes it.
+    Neighbours have no third view nearer to their middle than they are (Gabriel graph, Gabriel and
+    Sokal 1969), by `ViewSet.places`. Position and rotation are means, the lens is that of one.
+    Neither the frame nor, as far as names differ, the order matters.
     """
     ordered = [view for view, _ in views.by_distance()]
     if most < 1 or len(ordered) < 2:
@@ -338,18 +272,9 @@ def views_between(views: ViewSet, most: int) -> list[View]:
 
 
 def with_views_between(views: ViewSet, count: int) -> ViewSet:
-    """Views with about `count` more between them: all at first, then again between these.
+    """Views with about `count` more in between, 0 to `MOST_BETWEEN`; then again between these.
 
-    Parameters
-    ----------
-    views : ViewSet
-    count : int
-        How many to add, 0 to `MOST_BETWEEN`; fewer where there are none left.
-
-    Raises
-    ------
-    RefineError
-        If `count` is out of range.
+    Fewer are added where there are none left.
     """
     if not 0 <= count <= MOST_BETWEEN:
         raise RefineError(f"views in between are {count:,}, expected 0 to {MOST_BETWEEN:,}")
@@ -377,15 +302,15 @@ def _neighbours(place):
 
 
 def _distances(place, here):
-    """Squares of how far places are from one, (V,), rounded: equal ones stay equal."""
+    """Squared distances of places from one, (V,), rounded: equal ones stay equal."""
     return np.round(np.sum((place - here) ** 2, axis=1), 9)
 
 
 def _halfway(one, other):
-    """View halfway between two; None where they look too far apart, or one is mirrored.
+    """View halfway between two; None if they look too far apart or one is mirrored.
 
-    The rotation is the one nearest to the mean of both. The singular values of this mean are 1 and
-    the cosine of half the angle between them, so they also tell how far apart they look.
+    Its rotation is nearest to the mean of both, whose singular values are 1 and the cosine of half
+    the angle between them.
     """
     one, other = sorted((one, other), key=lambda view: view.name)
     left, size, right = np.linalg.svd((one.rotation + other.rotation) / 2.0)
@@ -406,20 +331,10 @@ def pinhole(
     size: tuple[int, int],
     means: NDArray[Any],
 ) -> View:
-    """View of a camera that is given by OpenGL's matrices.
+    """View of a camera by OpenGL's matrices, (4, 4); `matrix` is world to camera, y up, z back.
 
-    A camera without perspective is looked at from `FAR` extents of the splats away, where rays are
-    parallel but for a thousandth.
-
-    Parameters
-    ----------
-    matrix : (4, 4) float64
-        World to camera: x right, y up, z back; rigid.
-    projection_matrix : (4, 4) float64
-    size : (int, int)
-        Pixels across and up.
-    means : (N, 3) floating
-        Centres of the splats, in the world.
+    Without perspective the view stands `FAR` extents of the splats, (N, 3) `means`, away, where
+    rays are parallel but for a thousandth.
     """
     flip = np.diag([1.0, -1.0, -1.0])
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)  # float32
@@ -441,18 +356,11 @@ def view_through(
     size: tuple[int, int],
     parallel: tuple[float, float] = (0.0, 1.0),
 ) -> View:
-    """View of a camera with one of OpenGL's projection matrices.
+    """View of a camera with one of OpenGL's projection matrices, (4, 4).
 
-    Parameters
-    ----------
-    projection_matrix : (4, 4) float64
-    pose : ((3, 3) float64, (3,) float64)
-        Rotation and centre of the view.
-    size : (int, int)
-        Pixels across and up.
-    parallel : (float, float)
-        Of a camera without perspective: the depth at which pixels have their exact size, along its
-        axis, and how far from there the view stands instead.
+    `pose` is rotation, (3, 3), and centre, (3,), of the view; `size` pixels across and up;
+    `parallel`, without perspective, the depth where pixels have their exact size and the distance
+    from there.
     """
     p, (width, height), (rotation, center) = projection_matrix, size, pose
     fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0

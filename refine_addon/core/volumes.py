@@ -1,10 +1,8 @@
-"""Volumes that say which splats must stay and which must go, by where their centres lie.
+"""Volumes that protect or remove the splats whose centres they hold.
 
-Of a closed mesh, a ray upward from a point counts the triangles that it crosses: those that turn
-their outer side up count 1, the others -1. The sum is the winding number of the mesh about the
-point, 0 outside. Where neighbours do not turn the same way, the number of crossings decides, odd
-inside. Points are halved into groups. A group whose box no triangle touches lies inside or outside
-as a whole, so that one ray tells of all its points.
+For a closed mesh, a ray upward from a point sums the triangles it crosses, 1 or -1 by their side:
+the winding number, 0 outside. Where neighbours turn differently, an odd number is inside. Points
+are halved into groups; one ray decides for a group whose box no triangle touches.
 """
 
 from __future__ import annotations
@@ -30,19 +28,17 @@ class Volume(Protocol):
     """A part of space."""
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Points, (N, 3) floating, that lie inside, (N,) bool; none that is not finite."""
+        """Which points, (N, 3), lie inside, (N,) bool; none that is not finite."""
         ...
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box along the axes. It holds its lower faces and not its upper ones, so boxes side by side
-    share no point.
+    """A box along the axes, without its upper faces, so boxes side by side share no point.
 
     Attributes
     ----------
-    low, high : tuple of 3 float
-        Two corners; infinite where it has no end.
+    low, high : three float, two corners; may be infinite
 
     Examples
     --------
@@ -54,7 +50,6 @@ class Box:
     high: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        """Check the corners."""
         for axis, low, high in zip("xyz", self.low, self.high, strict=True):
             if not low < high:
                 raise RefineError(
@@ -62,26 +57,19 @@ class Box:
                 )
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Points, (N, 3), that lie inside, (N,) bool."""
+        """See `Volume.inside`."""
         between = ((points >= self.low) & (points < self.high)).all(axis=1)
         return np.asarray(between & np.isfinite(points).all(axis=1))
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere with its surface.
-
-    Attributes
-    ----------
-    center : tuple of 3 float
-    radius : float
-    """
+    """A sphere with its surface."""
 
     center: tuple[float, float, float]
     radius: float
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if not np.isfinite([*self.center, self.radius]).all():
             raise RefineError(
                 f"sphere at {self.center} has radius {self.radius}, expected finite numbers"
@@ -90,7 +78,7 @@ class Sphere:
             raise RefineError(f"sphere has radius {self.radius:g}, expected more than 0")
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Points, (N, 3), that lie inside, (N,) bool."""
+        """See `Volume.inside`."""
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             away: NDArray[np.float64] = points - np.asarray(self.center, np.float64)
             squared = np.square(np.float64(self.radius))
@@ -100,18 +88,14 @@ class Sphere:
 class Solid:
     """The inside of a closed mesh.
 
-    A point on its surface belongs to the side towards which x, y and z grow, but for rounding, so
-    that solids that share a face share no point. Parts that overlap are joined; where one turns its
-    faces the other way, their overlap is outside, like the hollow of a hollow sphere.
+    Of its surface it holds the side towards which x, y and z grow, but for rounding: solids side by
+    side share no point. Overlapping parts are joined, unless one turns its faces the other way.
 
     Attributes
     ----------
-    vertices : (V, 3) float64
-        Equal ones are made one.
-    triangles : (T, 3) int64
-        Three vertices each; those without area are left out where two of these are one.
-    turned : bool
-        Whether all triangles turn the same way as their neighbours.
+    vertices : (V, 3) float64, equal ones joined
+    triangles : (T, 3) int64, without those of two equal vertices
+    turned : bool, whether all triangles turn the same way as their neighbours
 
     Examples
     --------
@@ -122,7 +106,6 @@ class Solid:
     """
 
     def __init__(self, vertices: NDArray[Any], triangles: NDArray[Any]) -> None:
-        """Join equal vertices, and check the mesh."""
         vertices = np.asarray(vertices, np.float64).reshape(-1, 3) + 0.0  # -0 equals 0
         triangles = np.asarray(triangles, np.int64).reshape(-1, 3)
         if not len(triangles):
@@ -150,7 +133,7 @@ class Solid:
         self.turned = not np.bincount(edge, np.where(start < end, 1.0, -1.0)).any()
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Points, (N, 3) floating, that lie inside, (N,) bool; none that is not finite."""
+        """See `Volume.inside`."""
         inside = np.zeros(len(points), np.bool_)
         corners = self.vertices.T[:, self.triangles]
         low, high = corners.min(axis=2), corners.max(axis=2)  # (3, T) each
@@ -180,12 +163,10 @@ class Solid:
         return inside
 
     def _turns(self, points, triangles, low, high):
-        """Sum over the crossings of a ray upward from each point, (3, n): (n,).
+        """Signed crossings of a ray upward from each point, (3, n); unsigned if not `turned`.
 
-        A crossing counts 1 or -1 by the way that the triangle turns, or 1 if not all are `turned`.
-        An edge is crossed on the same side of a ray for both of its triangles, since its vertices
-        are taken in the same order for both, and rays through a vertex count the edges that begin
-        there: so no ray slips between two triangles or hits both.
+        Both triangles of an edge take its vertices in one order, and rays through a vertex count
+        the edges that begin there: no ray slips between two triangles or hits both.
         """
         (left, bottom), (right, top) = low[:2, triangles], high[:2, triangles]
         x, y = points[:2, :, None]
@@ -222,39 +203,24 @@ class Solid:
 
 @dataclass(frozen=True, eq=False)
 class MovedVolume:
-    """A volume that a matrix has moved.
-
-    Attributes
-    ----------
-    volume : Volume
-    matrix : (4, 4) float64
-        From its frame to that of the points.
-    """
+    """A volume moved by a matrix, (4, 4), from its frame to that of the points."""
 
     volume: Volume
     matrix: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        """Check the matrix."""
         if is_flat(self.matrix):
             scales = scales_of(self.matrix).round(9).tolist()
             raise RefineError(f"is flat (scales {scales}), expected a volume")
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Points, (N, 3), that lie inside, (N,) bool."""
+        """See `Volume.inside`."""
         return self.volume.inside(moved(points, np.linalg.inv(self.matrix)))
 
 
 def parse(text: str) -> Volume | None:
     """The volume that a text gives in numbers, None where it is a name.
 
-    Raises
-    ------
-    RefineError
-        If the numbers are no volume.
-
-    Examples
-    --------
     >>> parse("sphere:0,0,1.5,2")
     Sphere(center=(0.0, 0.0, 1.5), radius=2.0)
     >>> parse("box:0,0,0,1,1,inf").high
@@ -280,18 +246,14 @@ _FORMS = {"box": "x0,y0,z0,x1,y1,z1", "sphere": "x,y,z,radius"}
 
 @dataclass(frozen=True, eq=False)
 class Zone:
-    """A volume with what becomes of the splats in it.
+    """A volume and what becomes of the splats in it.
 
     Attributes
     ----------
-    role : {"protect", "remove", "keep"}
-        They stay; they go; or all others go, those in no volume of this kind.
-    name : str
-        Of the volume, for messages and the report.
-    volume : Volume
-        In the frame of the views.
-    idle : bool
-        Whether it may hold no splat, as a volume may from which they were removed.
+    role : "protect", "remove", or "keep", which removes those in no volume of this role
+    name : str, of the volume, for messages and the report
+    volume : Volume, in the frame of the views
+    idle : bool, whether it may hold no splat, as a volume may from which they were removed
     """
 
     role: Role
@@ -302,21 +264,11 @@ class Zone:
 
 @dataclass(frozen=True, eq=False)
 class Forced:
-    """What volumes decide of N splats.
+    """What volumes decide of N splats."""
 
-    Attributes
-    ----------
-    protected : (N,) bool or None
-        Those that stay as they are, for this or another reason.
-    removed : (N,) bool or None
-        Those that go whatever they are worth; none that is protected.
-    facts : list of dict
-        For the report: ``role``, ``name`` and number of ``splats`` of each volume.
-    """
-
-    protected: NDArray[np.bool_] | None = None
-    removed: NDArray[np.bool_] | None = None
-    facts: tuple[dict[str, Any], ...] = ()
+    protected: NDArray[np.bool_] | None = None  # (N,), also for other reasons
+    removed: NDArray[np.bool_] | None = None  # (N,), none that is protected
+    facts: tuple[dict[str, Any], ...] = ()  # ``role``, ``name``, ``splats`` of each volume
 
     def counts(self) -> dict[str, int]:
         """How many splats are ``protected`` and how many were ``removed_by_user``."""
@@ -324,7 +276,7 @@ class Forced:
         return {n: 0 if m is None else int(np.count_nonzero(m)) for n, m in masks.items()}
 
     def of(self, rows: NDArray[np.bool_]) -> Forced:
-        """The same for the splats in `rows`, (N,) bool, alone."""
+        """The same for the splats in `rows`, (N,) bool."""
         masks = (self.protected, self.removed)
         protected, removed = (None if mask is None else mask[rows] for mask in masks)
         return Forced(protected, removed, self.facts)
@@ -336,24 +288,10 @@ def forced(
     protected: NDArray[np.bool_] | None = None,
     removed: NDArray[np.bool_] | None = None,
 ) -> Forced:
-    """What must stay and what must go by volumes.
+    """Which splats volumes protect and remove, by their centres, (N, 3), in the volumes' frame.
 
-    Parameters
-    ----------
-    zones : sequence of Zone
-    means : (N, 3) floating
-        Centres of the splats, in the frame of the volumes.
-    protected, removed : (N,) bool, optional
-        Splats that stay, and that go, for another reason.
-
-    Returns
-    -------
-    Forced
-
-    Raises
-    ------
-    RefineError
-        If a volume holds no splat and is not `Zone.idle`, or all splats would go.
+    `protected` and `removed`, (N,) bool, are added. `RefineError` if a volume holds no splat and is
+    not `Zone.idle`, or all splats would be removed.
     """
     inside = [(zone, zone.volume.inside(means)) for zone in zones]
     for zone, mask in inside:
@@ -383,13 +321,7 @@ def _any(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
 def must_go(
     removed: NDArray[np.bool_] | None, protected: NDArray[np.bool_] | None = None
 ) -> NDArray[np.bool_] | None:
-    """Which splats are removed and not protected, (N,) bool; None if none are.
-
-    Raises
-    ------
-    RefineError
-        If all are.
-    """
+    """Which splats are removed and not protected, (N,) bool, None if none; `RefineError` if all."""
     gone = removed if protected is None or removed is None else removed & ~protected
     if gone is None or not gone.any():
         return None
@@ -399,7 +331,6 @@ def must_go(
 
 
 def _extent(means: NDArray[Any]) -> str:
-    """In words, from where to where splats lie."""
     finite = means[np.isfinite(means).all(axis=1)]
     if not len(finite):
         return "there is none with a finite centre"

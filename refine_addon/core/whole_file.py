@@ -17,39 +17,34 @@ from typing import BinaryIO
 from .errors import RefineError, reason_of
 from .execute import REPLACES_MAPPED, checkpoint
 
-ABANDONED = 86_400.0
-"""Seconds after which a temporary file is removed: a killed run left it."""
+ABANDONED = 86_400.0  # seconds after which a temporary file is deleted: a killed run left it
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.:-]+://")
 """A scheme has two letters at least: one would be a drive of Windows."""
 
 
 class Url(str):
-    """The address of a file or folder, such as ``s3://bucket/a.ply``.
-
-    It has what a `Path` tells without looking at the disk.
-    """
+    """Address of a file or folder, such as ``s3://bucket/a.ply``, with `Path`'s names."""
 
     __slots__ = ()
 
     @property
     def name(self) -> str:
-        """What stands behind the last slash; of ``https:`` without a query."""
+        """Part after the last slash; of ``https:`` without a query."""
         whole = self.partition("?")[0] if self.startswith("http") else self
         return whole.rpartition("/")[2]
 
     @property
     def suffix(self) -> str:
-        """The ending of the name, with its dot; "" if it has none."""
+        """Ending of the name, with its dot; "" if it has none."""
         return PurePosixPath(self.name).suffix
 
     def __truediv__(self, name: str) -> Url:
-        """Return the address of a file in this folder."""
         return Url(f"{self}{'' if self.endswith('/') else '/'}{name}")
 
 
 def is_url(text: Path | str) -> bool:
-    """Return whether this is a URL and no path."""
+    """Whether this is a URL and no path."""
     return isinstance(text, str) and _URL.match(text) is not None
 
 
@@ -63,13 +58,7 @@ def refuse_url(text: Path | str) -> None:
 
 
 def expanded(path: Path | str) -> Path:
-    """Path with ``~`` replaced by the home folder.
-
-    Raises
-    ------
-    RefineError
-        If there is no such user, or it is a URL.
-    """
+    """Path with ``~`` replaced by the home folder; `RefineError` without one, or for a URL."""
     refuse_url(path)
     try:
         return Path(path).expanduser()
@@ -78,14 +67,7 @@ def expanded(path: Path | str) -> Path:
 
 
 def mode_of(path: Path) -> int:
-    """Type and permissions of `path`, as ``st_mode``; 0 if it does not exist.
-
-    Raises
-    ------
-    OSError, ValueError
-        If the system cannot tell: a name too long, a folder that may not be entered. (In some
-        versions of Python, pathlib says then that the file does not exist.)
-    """
+    """``st_mode`` of `path`, 0 if missing; OSError or ValueError if unknown, unlike pathlib."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -93,10 +75,7 @@ def mode_of(path: Path) -> int:
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Raise `RefineError` if writing `path` would replace a file, or could not work at all.
-
-    Call it before long work starts, so that a mistyped output is noticed at once.
-    """
+    """Raise `RefineError` early if writing `path` would replace a file, or could not work."""
     with _explained(
         path, (OSError, ValueError)
     ):  # a name too long, a folder that may not be entered
@@ -138,13 +117,7 @@ def refuse_mapped(path: Path, source: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[None]:
-    """Make a folder and those above it; remove those that were not there and are empty at the end.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be made; nothing is left then.
-    """
+    """Make a folder and its parents; new ones that are empty at the end are deleted."""
     made: list[Path] = []
     try:
         try:
@@ -163,27 +136,10 @@ def new_folder(path: Path) -> Iterator[None]:
 def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`, which is renamed to `path` when the block ends.
 
-    If the block is interrupted (by an error, a kill, a full disk), `path` stays as it was. If it is
-    a symbolic link, the file that it points to is replaced. Nobody else may read the temporary file
-    until it is whole. A file that is replaced hands on its permissions.
-
-    Parameters
-    ----------
-    path : Path
-        The file to make.
-    overwrite : bool
-        Whether a file of that name may be replaced.
-
-    Yields
-    ------
-    binary file, open for writing
-
-    Raises
-    ------
-    RefineError
-        If the file exists and may not be replaced, or the system cannot write it.
-    Cancelled
-        See `execute.checkpoint`; the file stays as it was.
+    If the block is interrupted (error, kill, full disk), `path` stays as it was. Of a symbolic
+    link, the target is replaced. Until it is whole nobody else may read the file; one that is
+    replaced hands on its permissions. `RefineError` if it may not be replaced or the system
+    refuses.
     """
     refuse_existing(path, overwrite=overwrite)
     target = Path(os.path.realpath(path))
@@ -213,13 +169,7 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
 
 
 def publish(finished: Path, path: Path, *, overwrite: bool) -> None:
-    """Rename a finished file on the same disk to `path`, as `whole_file` does with its own.
-
-    Raises
-    ------
-    RefineError
-        See `whole_file`.
-    """
+    """Rename a finished file on the same disk to `path`, as `whole_file` does."""
     refuse_existing(path, overwrite=overwrite)
     with _explained(path):
         target = Path(os.path.realpath(path))
@@ -230,7 +180,7 @@ def publish(finished: Path, path: Path, *, overwrite: bool) -> None:
 
 
 def _rename(made: Path, target: Path, overwrite: bool) -> None:
-    """Rename a file; without `overwrite`, raise `FileExistsError` if the target exists by now."""
+    """Rename a file; without `overwrite`, `FileExistsError` if the target exists by now."""
     if overwrite:
         made.replace(target)
         return
