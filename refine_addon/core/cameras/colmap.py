@@ -1,10 +1,8 @@
 """COLMAP sparse models, text and binary: ``cameras`` and ``images`` of a folder.
 
-The formats are described in COLMAP's "Output Format" page, the camera models in its
-``src/colmap/sensor/models``. Poses are world to camera, quaternions Hamilton (w, x, y, z), axes
-x right, y down, z forward. The upper left corner of the image is at (0, 0), the centre of its first
-pixel at (0.5, 0.5). `View` has the same conventions, so only the camera's centre is computed. Newer
-models also have files ``rigs`` and ``frames``; ``images`` still holds every pose.
+See COLMAP's "Output Format" and ``src/colmap/sensor/models``. Poses are world to camera,
+quaternions w x y z, axes x right, y down, z forward, pixel centres at 0.5: as in `View`. Newer
+models add ``rigs`` and ``frames``; ``images`` still holds every pose.
 """
 
 from __future__ import annotations
@@ -24,43 +22,28 @@ from ..splats import rotation_matrices
 from ..views import ViewSet
 from .place import CameraPlace, is_file, opened
 
-SUFFIXES = (".bin", ".txt")
-"""Binary files are preferred, as in COLMAP itself."""
+SUFFIXES = (".bin", ".txt")  # binary files are preferred, as in COLMAP itself
 
-MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
-"""Names, without suffix, of the files that a model may consist of."""
+MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")  # without suffix
 
-POINT_BYTES = 24
-"""Size of an observation in ``images.bin``: x, y (doubles) and the point's id (64 bit)."""
+POINT_BYTES = 24  # an observation in ``images.bin``: x, y (doubles), point id (64 bit)
 
 POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
 IMAGE_FIELDS = ("IMAGE_ID", *POSE, "CAMERA_ID", "NAME")
 
 SHORT_LINE = 400
-"""Only lines of points below this many bytes are checked: if the line of points is missing, the
-short line of the next image is in its place."""
+"""Only shorter lines of points are checked, bytes: one may be the next image's, if points are
+missing."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A camera model. Its parameters are the focal lengths, cx, cy, then those of distortion.
+    """A camera model. Its parameters are the focal lengths, cx, cy, then those of distortion."""
 
-    Attributes
-    ----------
-    name : str
-        As in ``cameras.txt``.
-    focals : int
-        Number of focal lengths: 2, 1 if fx = fy, or 0 for a panorama.
-    count : int
-        Number of parameters.
-    fisheye : bool
-        Whether the distance from the centre grows with the angle, not with its tangent.
-    """
-
-    name: str
-    focals: int
-    count: int
-    fisheye: bool = False
+    name: str  # as in ``cameras.txt``
+    focals: int  # number: 2, 1 if fx = fy, 0 for a panorama
+    count: int  # of parameters
+    fisheye: bool = False  # the distance from the centre grows with the angle, not its tangent
 
 
 MODELS = {
@@ -82,8 +65,7 @@ MODELS = {
     15: Model("FISHEYE", 2, 4, fisheye=True),
     16: Model("EUCM", 2, 6),
     17: Model("EQUIRECTANGULAR", 0, 2),
-}
-"""COLMAP's camera models by their number in ``cameras.bin``."""
+}  # by number in ``cameras.bin``
 
 MODELS_BY_NAME = {model.name: model for model in MODELS.values()}
 
@@ -94,15 +76,7 @@ def counted(count: int, thing: str) -> str:
 
 
 def lens_note(counts: Mapping[Model, int], thing: str) -> str:
-    """Note about lenses that are not pinholes, or "" if there are none.
-
-    Parameters
-    ----------
-    counts : mapping of Model to int
-        How many things have each model.
-    thing : str
-        What is counted, in the singular: "camera" or "frame".
-    """
+    """Note about lenses that are no pinholes, by model, or ""; `thing` is "camera" or "frame"."""
     ways = (
         "distortion of {} ignored (model {})",
         "{} (fisheye, {}) taken as pinhole: wrong away from the centre",
@@ -115,11 +89,6 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
     """Folder of a model and the suffix to read, or ``None``.
 
     Looks in the folder itself, then ``sparse/0``, ``sparse`` and ``colmap/sparse/0``.
-
-    Parameters
-    ----------
-    folder : Path
-        A model's folder or a project's.
     """
     for place in (".", "sparse/0", "sparse", "colmap/sparse/0"):
         for suffix in SUFFIXES:
@@ -129,22 +98,9 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
 
 
 def read_colmap(folder: Path, suffix: str) -> ViewSet:
-    """Views of a COLMAP model, sorted by image name.
+    """Views of a COLMAP model, sorted by image name like in the 3DGS loader.
 
-    COLMAP writes images in the order of registration or of a hash, which may differ between text
-    and binary. The 3DGS loader sorts them by name, too.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder of ``cameras`` and ``images``.
-    suffix : str
-        ``".bin"`` or ``".txt"``.
-
-    Raises
-    ------
-    RefineError
-        If a file is missing, truncated or wrong; with the byte or the line.
+    COLMAP's own order may differ between text and binary. Errors name the byte or the line.
     """
     cameras, images = (CameraPlace(folder / f"{stem}{suffix}") for stem in MODEL_FILES[:2])
     binary = suffix == ".bin"
@@ -197,12 +153,11 @@ class _Binary:
     offset: int = 0
 
     def take(self, layout: str, what: str) -> tuple[Any, ...]:
-        """Return the next values, of a `struct` layout."""
         start = self.skip(struct.calcsize(f"<{layout}"), what)
         return struct.unpack_from(f"<{layout}", self.data, start)
 
     def skip(self, count: int, what: str) -> int:
-        """Skip `count` bytes; return where they start."""
+        """Skip bytes; the offset at which they start."""
         start = self.offset
         if count > len(self.data) - start:
             self.truncated(f"{what}: expected {count} more bytes")
@@ -210,7 +165,7 @@ class _Binary:
         return start
 
     def name(self, what: str) -> str:
-        """Return the next text, which ends with a zero byte."""
+        """Next text, up to a zero byte."""
         end = self.data.find(b"\0", self.offset)
         if end < 0:
             self.truncated(f"{what}: expected a zero byte after the name")
@@ -223,7 +178,7 @@ class _Binary:
 
 
 def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, str, CameraPlace]]:
-    """Yield the file at each of its rows, of at least so many bytes; its name; and its place."""
+    """Yield file, name and place of each row, of at least `least` bytes."""
     # Memory-mapped, since images.bin is mostly observations, which are skipped.
     with opened(file) as (stream, _):
         data = _Binary(file, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
@@ -262,7 +217,7 @@ def _binary_images(file: CameraPlace) -> Iterator[Any]:
 
 
 def _lines(file: CameraPlace) -> Iterator[tuple[CameraPlace, bytes]]:
-    """Yield the lines of a text file, each with its place, without comments."""
+    """Yield place and text of each line that is no comment."""
     with opened(file) as (stream, _):
         for number, text in enumerate(stream, 1):
             line = text.strip()

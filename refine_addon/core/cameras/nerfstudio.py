@@ -1,15 +1,9 @@
 """``transforms.json`` of nerfstudio, instant-ngp and the NeRF synthetic scenes.
 
-``transform_matrix`` is camera to world in OpenGL axes (x right, y up, z back). Poses are used as
-stored. nerfstudio's ``applied_transform`` and ``applied_scale`` describe what was done to them
-before; instant-ngp's ``scale``, ``offset`` and ``aabb*`` what it does internally. So the views are
-in the world of a splat file that a trainer without a transform of its own makes of this file.
-
-nerfstudio's own training rotates, centres and scales the poses, and ``ns-export`` writes splats in
-that frame. The run records the change in ``dataparser_transforms.json``; if that file lies beside
-the ``transforms.json``, it is applied here.
-
-Principal points are measured from the image's upper left corner, and pixel centres are at k + 0.5.
+``transform_matrix`` is camera to world in OpenGL axes (x right, y up, z back), used as stored:
+``applied_*``, ``scale``, ``offset`` and ``aabb*`` do not count. nerfstudio trains and exports in
+another frame; a ``dataparser_transforms.json`` beside the file is applied. Principal points are
+measured from the upper left corner, pixel centres are at k + 0.5.
 """
 
 from __future__ import annotations
@@ -29,46 +23,31 @@ from .place import CameraPlace, is_file, is_folder, read_json
 
 DATAPARSER_FILE = "dataparser_transforms.json"
 
-OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])
-"""Factors on a camera's axes: y up becomes y down, z back becomes z forward."""
+OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # factors on axes: y up to down, z back to forward
 
-LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6
-"""Range of uniform scales that are removed from a ``transform_matrix``."""
+LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6  # scales removed from a ``transform_matrix``
 
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
-PANORAMA_KEYS = ("equirectangular", "latlong")
-"""Keys that mark a panorama for instant-ngp."""
+PANORAMA_KEYS = ("equirectangular", "latlong")  # of instant-ngp
 
 LENSES = {**MODELS_BY_NAME, "FISHEYE624": Model("FISHEYE624", 1, 15, fisheye=True)}
-"""Models by their names: also that of Project Aria's lenses, for which COLMAP has no number."""
+"""Models by name; that of Project Aria's lenses has no number in COLMAP."""
 
 PANORAMAS = {
     *("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R"),
     *("VR180_L", "VR180_R", "ORTHOPHOTO"),
-}
-"""Models of nerfstudio and COLMAP that a pinhole cannot approximate."""
+}  # models that a pinhole cannot approximate
 
-IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
-"""Suffixes tried when the size is read from the image; names of NeRF synthetic scenes have none."""
+IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # tried for sizes; NeRF synthetic names lack one
 
 LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""What nerfstudio assumes for older COLMAP projects, which have no ``applied_transform``."""
+"""nerfstudio's assumption for older COLMAP projects, which have no ``applied_transform``."""
 
 
 def read_transforms(path: Path, data: object) -> ViewSet:
     """Views of a ``transforms.json``, in the order of its frames.
 
-    Parameters
-    ----------
-    path : Path
-        The file. If ``w`` and ``h`` are missing, images are looked for beside it.
-    data : object
-        Its content.
-
-    Raises
-    ------
-    RefineError
-        If a key is missing or wrong, with the frame and the key.
+    Images are looked for beside `path` if ``w`` or ``h`` is missing. Errors name frame and key.
     """
     place = CameraPlace(path)
     shared = place.members(data, ("frames",))
@@ -106,8 +85,7 @@ def _view(place, values, name, world, remarks):
 def _pose(place, value, remarks):
     """The camera's axes (x right, y down, z forward) as columns, and its centre.
 
-    A uniform scale only moves points along rays through the centre, which does not change the
-    picture, so it is removed.
+    A uniform scale is removed: it moves points along rays, which changes no picture.
     """
     matrix = place.matrix(value, (3, 4), 4)
     if len(matrix) > 3 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
@@ -155,7 +133,7 @@ def _focal(place, sources, axis, side):
 
 
 def _lens(place: CameraPlace, values: Mapping[str, Any]) -> list[Model]:
-    """The camera model in a list, which is empty for a pinhole; panoramas are refused."""
+    """The camera model in a list, empty for a pinhole; panoramas are refused."""
     at = place.at("'camera_model'")
     distorted = any(values.get(key) for key in DISTORTIONS)
     fisheye = "ftheta_p0" in values or (distorted and values.get("is_fisheye"))
@@ -172,10 +150,7 @@ def _lens(place: CameraPlace, values: Mapping[str, Any]) -> list[Model]:
 
 
 def _splat_world(place: CameraPlace, shared: Mapping[str, Any]) -> tuple[Any, list[str]]:
-    """Rotation, offset and scale from the file's world to the splats', and notes about it.
-
-    A point p goes to ``scale * (rotation @ p + offset)``.
-    """
+    """Rotation, offset, scale to the splats' world, ``scale * (rotation @ p + offset)``; notes."""
     beside = CameraPlace(place.path.parent / DATAPARSER_FILE)
     if not is_file(beside.path):
         hint = f"splats of ns-export need {DATAPARSER_FILE} beside it"

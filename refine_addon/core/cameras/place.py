@@ -1,4 +1,4 @@
-"""Checks of what camera files hold, and how they are read: for every format of cameras alike."""
+"""Reading and checks that all camera formats share."""
 
 from __future__ import annotations
 
@@ -16,14 +16,11 @@ from ..place import LARGEST_NUMBER, Place, foreign_kind, refuse_pointer
 from ..views import View, is_orthonormal
 from ..whole_file import mode_of
 
-SMALLEST_LENGTH = 1e-6
-"""Smallest focal length (pixels) or scale."""
+SMALLEST_LENGTH = 1e-6  # focal length, px, or scale
 
-LARGEST_SIDE = 1_000_000
-"""Largest width or height of an image, pixels."""
+LARGEST_SIDE = 1_000_000  # of an image, px
 
-SNIFFED_BYTES = 4096
-"""How many bytes are read to find out whether a file can be JSON."""
+SNIFFED_BYTES = 4096  # read to find out whether a file can be JSON
 
 
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -34,32 +31,32 @@ class CameraPlace(Place):
     """A place in a file of cameras."""
 
     def positive(self, value: object, what: str) -> float:
-        """Return `value` if it is a number of 1e-6 to 1e18; `what` names it in messages."""
+        """The value, if it is a number of 1e-6 to 1e18; `what` names it in messages."""
         number = self.number(value)
         if number < SMALLEST_LENGTH:
             self.expected(f"a positive {what}", value)
         return number
 
     def focal(self, value: object) -> float:
-        """Return `value` if it can be a focal length in pixels."""
+        """The value, if it can be a focal length in pixels."""
         return self.positive(value, "focal length in pixels")
 
     def side(self, value: object) -> int:
-        """Return `value` if it is a whole number of pixels; it may be written as 800.0."""
+        """The value, if it is a whole number of pixels; it may be written as 800.0."""
         number = self.number(value)
         if not (number.is_integer() and 1 <= number <= LARGEST_SIDE):
             self.expected(f"a whole number of pixels from 1 to {LARGEST_SIDE}", value)
         return int(number)
 
     def principal(self, values: Mapping[str, object], size: Sequence[int]) -> list[float]:
-        """Return ``cx`` and ``cy`` of some values, pixels; the middle of the image without them."""
+        """``cx`` and ``cy`` in pixels; the middle of the image without them."""
         return [
             self.at(repr(key)).number(values.get(key, side / 2))
             for key, side in zip(("cx", "cy"), size, strict=True)
         ]
 
     def matrix(self, value: object, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
-        """Return `value` if it is a list of rows of numbers; `rows` are the allowed counts."""
+        """The value, if it is a list of rows of numbers; `rows` are the allowed counts."""
         if not isinstance(value, list) or len(value) not in rows:
             sizes = " or ".join(f"{count} x {columns}" for count in rows)
             self.expected(f"a {sizes} matrix", value)
@@ -67,7 +64,7 @@ class CameraPlace(Place):
         return np.array(table, np.float64)
 
     def rotation(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return `matrix` (3, 3) if it is orthonormal up to the rounding of a text file."""
+        """The matrix (3, 3), if it is orthonormal up to the rounding of a text file."""
         if not is_orthonormal(matrix):
             self.fail(f"expected an orthonormal rotation, got {np.round(matrix, 6).tolist()}")
         return matrix
@@ -75,14 +72,9 @@ class CameraPlace(Place):
     def view(self, name: str, pose: Pose, lens: Lens) -> View:
         """View of a camera; errors name this place.
 
-        Parameters
-        ----------
-        name : str
-            As in the file. Halves of surrogate pairs become "?", since they cannot be printed.
-        pose : ((3, 3) float64, (3,) float64)
-            Rotation, world to camera (x right, y down, z forward), and centre, world units.
-        lens : sequence of three pairs
-            fx and fy, cx and cy, width and height; pixels.
+        `pose` is the rotation (3, 3), world to camera (x right, y down, z forward), and the centre,
+        world units; `lens` is (fx, fy), (cx, cy), (width, height) in pixels. Surrogates in `name`
+        become "?".
         """
         (rotation, center), ((fx, fy), (cx, cy), (width, height)) = pose, lens
         if np.abs(center).max() > LARGEST_NUMBER:
@@ -95,13 +87,7 @@ class CameraPlace(Place):
 
 
 def kind_of(path: Path) -> int:
-    """Type of `path`, see `stat.S_IFMT`; 0 if it does not exist.
-
-    Raises
-    ------
-    RefineError
-        If the system cannot tell: a name too long, a folder that may not be entered.
-    """
+    """Type of `path` (`stat.S_IFMT`), 0 if it does not exist; `RefineError` if unknown."""
     try:
         return stat.S_IFMT(mode_of(path))
     except (OSError, ValueError) as error:
@@ -120,13 +106,7 @@ def is_folder(path: Path) -> bool:
 
 @contextmanager
 def opened(place: Place) -> Iterator[tuple[BinaryIO, bytes]]:
-    """Open a file to read it; yield it at its start, and its first bytes.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be read, is empty, or is a Git LFS pointer.
-    """
+    """Yield a file at its start, and its first bytes; refuses empty files and LFS pointers."""
     try:
         with place.path.open("rb") as stream:
             head = stream.read(SNIFFED_BYTES)
@@ -140,18 +120,7 @@ def opened(place: Place) -> Iterator[tuple[BinaryIO, bytes]]:
 
 
 def read_json(path: Path) -> object:
-    """Content of a JSON file.
-
-    Parameters
-    ----------
-    path : Path
-        UTF-8; a byte order mark is skipped.
-
-    Raises
-    ------
-    RefineError
-        If the file cannot be read, is empty or is not JSON; with line and column.
-    """
+    """Content of a UTF-8 JSON file, byte order mark or not; errors name line and column."""
     place = Place(path)
     with opened(place) as (stream, head):
         if head[:1] not in b"{[\xef \t\r\n":  # so that a large splat file is not read

@@ -1,7 +1,6 @@
 """Cameras from files: Inria ``cameras.json``, ``transforms.json`` and COLMAP models.
 
-The same rule holds for every format: values are read as stored and checked, and errors name the
-place in the file. Nothing that would move a camera is guessed.
+Values are read as stored and checked; nothing that would move a camera is guessed.
 """
 
 from __future__ import annotations
@@ -17,36 +16,32 @@ from .colmap import MODEL_FILES, SUFFIXES, find_colmap, read_colmap
 from .nerfstudio import read_transforms
 from .place import CameraPlace, is_file, is_folder, kind_of, read_json
 
-INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
-"""Keys that every camera of a ``cameras.json`` must have."""
+INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")  # required
 
 JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
-"""Files that are looked for in a folder, in this order; a COLMAP model comes last."""
+"""Looked for in a folder, in this order; a COLMAP model comes last."""
 
 
 def read_cameras(path: Path | str) -> ViewSet:
-    """Read the cameras of a scene.
+    """Read the cameras of a scene, in the order of the file; COLMAP's sorted by name.
 
     Parameters
     ----------
     path : path-like
-        A ``cameras.json`` as the reference 3DGS implementation writes it, a ``transforms.json`` of
-        nerfstudio or instant-ngp, any file of a COLMAP model (text or binary), or a folder. In a
-        folder, ``cameras.json`` is preferred to ``transforms.json``, ``transforms_train.json`` and
-        a COLMAP model (in the folder itself, ``sparse/0``, ``sparse`` or ``colmap/sparse/0``); the
-        note names those that were not read. ``~`` is the home folder.
+        A ``cameras.json`` of the reference 3DGS implementation, a ``transforms.json`` of nerfstudio
+        or instant-ngp, any file of a COLMAP model, or a folder. A folder is searched for
+        ``cameras.json``, ``transforms.json``, ``transforms_train.json`` and a COLMAP model (here,
+        in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``). ``~`` is the home folder.
 
     Returns
     -------
     ViewSet
-        In the order of the file; COLMAP's sorted by name. `ViewSet.note` tells what is not
-        modelled, such as lens distortion.
+        Its note names distortion, which is ignored, and other cameras in the folder.
 
     Raises
     ------
     RefineError
-        If the file does not exist or is wrong; the message names the file, the place, what was
-        found and what was expected.
+        If the file is missing or wrong; with the place in the file.
     """
     path = expanded(path)
     if is_folder(path):
@@ -60,17 +55,7 @@ def read_cameras(path: Path | str) -> ViewSet:
 
 
 def cameras_in(folder: Path) -> list[Path]:
-    """What of a folder holds cameras: JSON files, then the folder of a COLMAP model.
-
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    list of Path
-        Judged by names alone; the first is what `read_cameras` reads of the folder.
-    """
+    """JSON files and COLMAP folder of a folder, by name; `read_cameras` reads the first."""
     files = [folder / name for name in JSON_NAMES if is_file(folder / name)]
     colmap = find_colmap(folder)
     return [*files, colmap[0]] if colmap else files
@@ -112,9 +97,8 @@ def _read_json_cameras(path: Path) -> ViewSet:
 def _inria_view(file: CameraPlace, index: int, item: object) -> View:
     """View of a camera as the reference 3DGS implementation writes it.
 
-    ``rotation`` is camera to world; its columns are the camera's x (right), y (down) and z
-    (forward). ``position`` is the camera's centre. Some forks add the principal point as ``cx`` and
-    ``cy`` (pixels); without them it is the centre of the image.
+    Columns of ``rotation`` (camera to world) are x right, y down, z forward; ``position`` is the
+    centre. Some forks add ``cx`` and ``cy``, pixels.
     """
     place = file.at(f"camera {index}")
     camera = place.members(item)

@@ -1,31 +1,9 @@
 """How the colours of rays change with the parameters of the splats that they hit.
 
-For a hit with transmittance T in front of it, alpha a, colour c and the colour B that arrives from
-behind it, the colour C of its ray changes by::
-
-    dC / dc = T a,    dC / da = T (c - B)
-
-The colour changes with the constant of the harmonics and with their first degree, by the values
-that these have in the direction of view. Those of higher degrees stay.
-
-Alpha is ``o exp(-d' A d / 2)`` at the distance d, in pixels, from the footprint's centre, with
-``A = (J W S W' J' + .3 I)^-1`` (`visibility.projection`). With ``g = W' J' A d``, and h_j its
-component along the splat's axis j, whose scale is s_j and the longest of which is s::
-
-    da / d logit(o)      = a (1 - o)
-    da / d mean_j        = a s h_j                      the mean along axis j, in units of s
-    da / d log s_j       = a (s_j h_j)^2
-    da / d turn_1        = a (s_2^2 - s_3^2) h_2 h_3    a small turn about axis 1; others in turn
-
-That J changes with the mean, the colour with the direction of view, and what antialiasing keeps of
-the opacity with the scales, is left out. Of discs, d is scaled to their plane first. Parameters are
-those of the splat's own axes, so results turn and grow with the scene.
-
-With ``e = A d``, ``g = W' J' e``. In the scene's frame all changes of a splat's mean are one vector
-m, and those of its scales and turns one symmetric matrix S: the logarithm of alpha changes by
-``g' m + g' S g``. In a view that is a polynomial of degree 2 in the two numbers of e, whose five
-coefficients are ``J W m`` and ``J W S W' J'``. So a hit keeps e and how its ray changes with alpha,
-and a splat of a view keeps J W.
+docs/method.md, section 12, derives it. Per hit, ``dC / dc = T a`` and ``dC / da = T (c - B)``; the
+geometry, a vector m and a symmetric matrix S in the scene's frame, changes ``log a`` by
+``g' m + g' S g``, ``g = W' J' e``, ``e = A d``. Changes of J, of the view direction with the mean
+and of the antialiasing factor with the scales are left out.
 """
 
 from __future__ import annotations
@@ -51,43 +29,29 @@ Singles = NDArray[np.float32]
 COLOR, DEGREE_1, OPACITY, MEAN, SCALE, TURN = (
     slice(0, 3), slice(3, 12), slice(12, 13), slice(13, 16), slice(16, 19), slice(19, 22)
 )  # fmt: skip
-"""Rows of the 22 parameters of a splat: the constant of the harmonics, their first degree (three
-coefficients of three channels each), the logit of the opacity, the mean, the logarithms of the
-scales and a turn, the last three by its own axes."""
+"""Rows of a splat's 22 parameters: constant and first degree (3 coefficients of 3 channels each) of
+the harmonics, opacity logit; by its own axes mean, log scales and turn."""
 
 COUNT = 22
 
-PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Rows and columns of the six numbers of a symmetric matrix."""
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
 
 LEAST_WEIGHT = ALPHA_CUT
-"""Hits that make up less of their pixel are left out: a quarter less to do than with 1e-3, and the
-same results to .01 dB."""
+"""Hits of less weight T a are left out: a quarter less work than 1e-3, equal results to 0.01 dB."""
 
-HUBER = 1.0
-"""Errors count in proportion beyond so many times the root mean square of their view: `_trust`."""
+HUBER = 1.0  # root mean squares of a view from which errors count in proportion, see `_trust`
 
 _LEAST_ERROR = 1e-10  # squared; keeps a division finite
 
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """M Gaussians with what derivatives need of them.
-
-    Attributes
-    ----------
-    gaussians : Gaussians
-    scene : Scene
-    axes : (3, 3, M) float32
-        Of each of the splat's axes, its components in the scene's frame.
-    scales : (3, M) float32
-        Standard deviations along these, scene sizes.
-    """
+    """M Gaussians with what derivatives need of them."""
 
     gaussians: Gaussians
     scene: Scene
-    axes: Singles
-    scales: Singles
+    axes: Singles  # (3, 3, M): components in the scene's frame of each of the splat's axes
+    scales: Singles  # (3, M): standard deviations along these, scene sizes
 
     @classmethod
     def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene) -> Shapes:
@@ -100,7 +64,6 @@ class Shapes:
         return cls(gaussians, scene, axes, scales.astype(np.float32))
 
     def __len__(self) -> int:
-        """How many Gaussians there are."""
         return len(self.gaussians)
 
     def take(self, hit: NDArray[np.integer[Any]]) -> Shapes:
@@ -109,14 +72,7 @@ class Shapes:
         return Shapes(self.gaussians.take(hit), self.scene, axes, scales)
 
     def in_scene(self, change: Singles) -> Singles:
-        """Changed parameters, (22, M), as changes in the frame of the scene.
-
-        Returns
-        -------
-        (22, M) float32
-            Of the colour, of the first degree of the harmonics as it is, of the logarithm of the
-            opacity, m, and the six numbers of S (`PAIRS`).
-        """
+        """Changed parameters, (22, M), as colour, degree 1, log opacity, m, S (`PAIRS`)."""
         result = np.zeros((COUNT, len(self)), np.float32)
         result[COLOR] = np.float32(SH_C0) * change[COLOR]
         result[DEGREE_1] = change[DEGREE_1]
@@ -130,7 +86,7 @@ class Shapes:
         return result
 
     def by_parameter(self, sums: Singles) -> Singles:
-        """The transpose of `in_scene`: of such sums, see `LinearView.backward`, (22, M)."""
+        """The transpose of `in_scene`, (22, M), applied to sums as of `LinearView.backward`."""
         result = np.zeros((COUNT, len(self)), np.float32)
         result[COLOR] = np.float32(SH_C0) * sums[COLOR]
         result[DEGREE_1] = sums[DEGREE_1]
@@ -144,10 +100,7 @@ class Shapes:
         return result
 
     def _quadratic(self) -> Iterator[tuple[int, Any, Any, Any]]:
-        """Yield for scales and turns the number of the parameter, and half of its factor, (M,).
-
-        And the two axes, (3, M) each, of which S is the symmetric product.
-        """
+        """Yield row, half factor (M,) and two axes (3, M) of S for each scale and turn."""
         squared, half = np.square(self.scales), np.float32(0.5)
         for axis in range(3):
             after, last = (axis + 1) % 3, (axis + 2) % 3
@@ -158,58 +111,22 @@ class Shapes:
 
 @dataclass(frozen=True, eq=False)
 class LinearView:
-    """The colours of the P rays of one view as a linear function of what its u splats change.
+    """The colours of P rays of one view, linear in the changes of the u splats that they hit."""
 
-    Attributes
-    ----------
-    hit : (u,) int64
-        The Gaussians that are hit, ascending.
-    errors : (3, P) float32
-        The colours that the rays should see, less those that they see now.
-    hitting : (p,) int64
-        The rays that have hits.
-    counts : (p,) int64
-        How many hits each of these has.
-    owner : (h,) uint16 or int32
-        Of each hit, ray by ray: the splat as a place in `hit`.
-    weight : (h,) uint16
-        T a, see `_halves`.
-    by_log_alpha : (3, h) uint16
-        How the colour changes with the logarithm of alpha, ``T a (c - B)``; 0 where alpha is
-        clipped, and does not change.
-    steepness : (2, h) or (3, h) uint16
-        ``A d`` across and down, 1/px. Of discs also whether the disc is hit, 1, or its low-pass, 0,
-        which no scale and no turn changes.
-    unclipped : (3, u) bool
-        Where the colour changes with the harmonics.
-    jacobian : (2, 3, u) float32
-        Rows of J W: pixels for a step of one scene size.
-    basis : (3, u) float32
-        Values of the harmonics of the first degree in the direction of view.
-    """
-
-    hit: NDArray[np.int64]
-    errors: Singles
-    hitting: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    owner: NDArray[Any]
-    weight: NDArray[np.uint16]
-    by_log_alpha: NDArray[np.uint16]
-    steepness: NDArray[np.uint16]
-    unclipped: NDArray[np.bool_]
-    jacobian: Singles
-    basis: Singles
+    hit: NDArray[np.int64]  # (u,): Gaussians that are hit, ascending
+    errors: Singles  # (3, P): colours that the rays should see less those seen now
+    hitting: NDArray[np.int64]  # (p,): rays with hits
+    counts: NDArray[np.int64]  # (p,): hits of each
+    owner: NDArray[Any]  # (h,), ray by ray: the splat's place in `hit`; uint16 or int32
+    weight: NDArray[np.uint16]  # (h,): T a, see `_halves`
+    by_log_alpha: NDArray[np.uint16]  # (3, h): T a (c - B); 0 where alpha is clipped
+    steepness: NDArray[np.uint16]  # (2, h): A d, 1/px; of discs (3, h), 0 where the low-pass is hit
+    unclipped: NDArray[np.bool_]  # (3, u): where the colour changes with the harmonics
+    jacobian: Singles  # (2, 3, u): rows of J W, pixels a scene size
+    basis: Singles  # (3, u): harmonics of the first degree in the view direction
 
     def forward(self, change: Singles, hits: tuple[Any, ...] | None = None) -> Singles:
-        """By how much the colours change, (3, P), to first order.
-
-        Parameters
-        ----------
-        change : (22, M) float32
-            Of all Gaussians, in the frame of the scene: see `Shapes.in_scene`.
-        hits : tuple, optional
-            See `hits`.
-        """
+        """First-order change of the colours, (3, P), by changes (22, M) of `Shapes.in_scene`."""
         owner, weight, by_log_alpha, (across, down, *on_plane) = hits or self.hits()
         mine = [row.take(self.hit) for row in change]
         log_alpha = mine[OPACITY.start].take(owner)
@@ -241,19 +158,7 @@ class LinearView:
         return result
 
     def backward(self, errors: Singles, hits: tuple[Any, ...] | None = None) -> Singles:
-        """The transpose of `forward` times some errors of the colours.
-
-        Parameters
-        ----------
-        errors : (3, P) float32
-        hits : tuple, optional
-            See `hits`.
-
-        Returns
-        -------
-        (22, u) float32
-            Off the diagonal of S, half of it.
-        """
+        """The transpose of `forward`, (22, u), applied to errors of the colours, (3, P)."""
         owner, weight, by_log_alpha, (across, down, *on_plane) = hits or self.hits()
         result = np.zeros((COUNT, len(self.hit)), np.float32)
         value = np.zeros(len(owner), np.float32)
@@ -306,15 +211,7 @@ class LinearView:
         ]  # fmt: skip
 
     def diagonal(self, shapes: Shapes) -> Singles:
-        """Squared length of each column, that is of each parameter, (22, u).
-
-        Of the three harmonics of a degree the mean, which does not turn with the axes of the world.
-
-        Parameters
-        ----------
-        shapes : Shapes
-            Of the Gaussians that are hit.
-        """
+        """Squared length of each column, (22, u); of a degree the mean, rotation-free."""
         owner, weight, by_log_alpha, (x, y, *on_plane) = self.hits()
         result = np.zeros((COUNT, len(self.hit)), np.float32)
         result[COLOR] = np.float32(SH_C0**2) * self._sum(np.square(weight), owner, np.float64)
@@ -351,17 +248,17 @@ class LinearView:
         return result
 
     def _sum(self, values, owner, kind=np.float32):
-        """Sums of values of hits over the hits of each splat, (u,)."""
+        """Sums over the hits of each splat, (u,)."""
         return np.bincount(owner, values, len(self.hit)).astype(kind, copy=False)
 
 
 def _of_channel(channel: int) -> slice:
-    """Rows of the parameters that are harmonics of the first degree of a channel."""
+    """Rows of the first-degree harmonics of a channel."""
     return slice(DEGREE_1.start + channel, DEGREE_1.stop, 3)
 
 
 def _basis(shapes: Shapes, view: View) -> Singles:
-    """Values of the harmonics of the first degree in the direction of view, (3, u)."""
+    """First-degree harmonics in the view direction, (3, u)."""
     scene = shapes.scene
     from_view = shapes.gaussians.means.astype(np.float64)
     from_view -= scene.positions(view.center[None])[0][:, None]
@@ -391,21 +288,10 @@ def linear_view(
     shapes: Shapes,
     view: View,
 ) -> tuple[LinearView, Shapes]:
-    """How the colours of the rays of a view change with the splats that they hit, and their shapes.
+    """A view's rays as a linear function of the splats that they hit, and the shapes of these.
 
-    Parameters
-    ----------
-    visible : (Rays, (h,) float32)
-        At most 2^16 rays.
-    footprints : Footprints
-        In the view.
-    truth : (3, P) float32
-        The colours that the rays should see.
-    colors : (3, u) float32
-        Of the splats that are hit.
-    shapes : Shapes
-        Of the first Gaussians; what else is hit does not change.
-    view : View
+    `truth` (3, P) are the colours to be seen, `colors` (3, u) those of the splats hit. At most 2^16
+    rays. Gaussians beyond `shapes`, the first ones, do not change.
     """
     rays, transmittance = visible
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit
@@ -444,11 +330,7 @@ def linear_view(
 
 
 def _trust(errors: Singles) -> Singles:
-    """How much the rays of a view count, of their errors, (3, P): roots of weights, (P,).
-
-    Errors of more than `HUBER` times their root mean square count in proportion, not squared
-    (Huber's loss, by one step of reweighted least squares).
-    """
+    """Roots of the weights of rays, (P,), from errors (3, P): Huber's loss, reweighted once."""
     squared = np.mean(np.square(errors), axis=0)
     mean = max(float(squared.mean(dtype=np.float64)), _LEAST_ERROR)
     most = np.float32(HUBER * np.sqrt(mean))
@@ -456,20 +338,18 @@ def _trust(errors: Singles) -> Singles:
 
 
 def _halves(values: Singles) -> NDArray[np.uint16]:
-    """The upper halves of the bits of some numbers, rounded: they keep them to 1 / 256."""
+    """Upper halves of the bits, rounded: good to 1 / 256."""
     return ((values.view(np.uint32) + np.uint32(1 << 15)) >> np.uint32(16)).astype(np.uint16)
 
 
 def _floats(halves: NDArray[np.uint16]) -> Singles:
-    """The numbers of `_halves`."""
     return (halves.astype(np.uint32) << np.uint32(16)).view(np.float32)
 
 
 def _steepness_on_discs(discs: Singles, step: list[Singles]) -> Singles:
     """`_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
 
-    With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian.
-    Where its low-pass is what is drawn, only the mean matters; see `LinearView.steepness`.
+    With d scaled to the disc's plane, ``d / (1 + g d)``, C of the disc is that of a Gaussian.
     """
     across, down = step
     depth = 1.0 + discs[4] * across + discs[5] * down

@@ -1,28 +1,9 @@
 """Refitting: kept splats learn the colours that the unpruned splats have on rays.
 
-Deleting and merging leave kept splats with the numbers that they had, or that one merge at a time
-gave them. On rays it is known what the unpruned splats look like, and how the colours change with
-every parameter of the kept splats (`linear`). So in rounds, each on rays through other pixels, the
-squared difference of colours is made small by damped least squares (Levenberg, Marquardt)::
-
-    minimise over x   |J x - r|^2  +  sum over parameters p of  (k (D_p + m_p) + K_p) x_p^2
-
-r is the difference on all rays, in which large ones count less (`linear.HUBER`), D the diagonal of
-J'J, m_p the median of D over all splats that are hit, for each kind of parameter, and K the sum of
-D over the rounds before. So what few rays tell of a splat moves it little, and rounds together
-learn from the rays of all of them, not from the last alone: each has a share in what a parameter
-becomes. The sum is made small by a few steps of conjugate gradients, preconditioned by the
-diagonal. What these and the damping leave of J'r, half of it is added to that of the next round.
-
-k is `DAMPING` over how many rays there are for each kept splat: the more rays, the less damping.
-
-Validation rays, which nothing is learned from, compare kept splats before and after a round. One
-that loses is undone, and the next is damped more. Rounds end where little is gained, or after many
-rays.
-
-Splats in files, too many for memory, are divided into boxes of about equally many. Each box is
-refitted by itself; splats of other regions are drawn as they are, in front and behind, and do not
-change.
+Rounds, each on other rays, minimize ``|J x - r|^2 + sum_p (k (D_p + m_p) + K_p) x_p^2`` (Levenberg,
+Marquardt; docs/method.md, section 12): r differences of colours, D the diagonal of J'J, m its
+medians, K the sum of D over earlier rounds. Validation rays, which nothing is learned from, undo a
+round that loses. Splats in files go by boxes, amid other boxes that do not change.
 """
 
 from __future__ import annotations
@@ -46,38 +27,32 @@ from ..visibility.projection import Footprints, Gaussians
 from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, Singles
 from .round_rays import LARGEST, RoundRays, Target, Window, limits, steps_of
 
-STEPS = 8
-"""Steps of conjugate gradients in a round."""
+STEPS = 8  # of conjugate gradients in a round
 
 DAMPING, LEAST_DAMPING = 4.0, 0.1
-"""Damping counts as so many rays for each kept splat: k is this over how many there are, but at
-least so much, as colours change with parameters in straight lines near by alone."""
+"""k is `DAMPING` over the rays for each kept splat, but at least the other: colours are linear in
+the parameters only near by."""
 
-CARRIED = 0.5
-"""How much of what a round leaves of J'r counts in the next one."""
+CARRIED = 0.5  # share of the J'r that a round leaves that counts in the next
 
-MORE_DAMPING = 8.0
-"""Factor of k after a round that lost; see the top of this file."""
+MORE_DAMPING = 8.0  # factor of k after a round that lost
 
 MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
-"""By default there are so many rounds, and fewer where these have had so many rays for each
-kept splat and so many in all: of large scenes each round takes as long as merging."""
+"""Default rounds, fewer after this many rays for each kept splat and in all: for large scenes a
+round takes as long as merging."""
 
-MOST_ROUNDS = 100
-"""No more may be asked for: after some ten none gains."""
+MOST_ROUNDS = 100  # limit of the option; after some ten none gains
 
-LEAST_GAIN = 0.05
-"""Rounds end where the PSNR of the validation rays rises by less, dB."""
+LEAST_GAIN = 0.05  # dB on validation rays; rounds end below
 
 ONE_PLACE = "nothing was refitted: what fits views in one place looks worse from others"
-"""What is said where no view can move (`round_rays.steps_of`). Validation rays begin where those of
-the rounds do, and cannot tell: one view gains 9 dB by them, and in others -0.6 to 0.5 dB."""
+"""If no view can move (`round_rays.steps_of`), validation rays start where those of the rounds do
+and cannot tell: one view gains 9 dB by them, others -0.6 to 0.5 dB."""
 
 MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3}
-"""How far a parameter moves in a round: as `linear` has them, means by the longest scale."""
+"""Largest move of a parameter in a round, as in `linear`; of means in longest scales."""
 
-LEAST_MOVE = 0.02
-"""A mean that would move by less in a round stays, in longest scales; see `_worthwhile`."""
+LEAST_MOVE = 0.02  # shorter moves of means are left out, longest scales; `_worthwhile`
 
 SHARE = 0.5
 """Kept splats of a region, in `mapped.REGION`: one takes twice the memory of one that merges."""
@@ -91,31 +66,17 @@ _NOTHING = 1e-30  # rays that tell less of a parameter tell nothing; 1 over it i
 
 @dataclass(frozen=True, eq=False)
 class Refitted:
-    """What some rounds have made of N kept splats.
+    """N kept splats after some rounds."""
 
-    Attributes
-    ----------
-    splats : Splats
-        As they are now.
-    changed : (N,) bool
-        Which of them may not be what they were; all others are equal to the bit.
-    rounds : int
-        How many rounds made them so.
-    psnr_before, psnr : float
-        Of the splats as given, and as they are now, dB, on rays that nothing was learned from.
-    why_not : str
-        Why there was no round that made them better, for the user.
-    """
-
-    splats: Splats
-    changed: NDArray[np.bool_]
+    splats: Splats  # as they are now
+    changed: NDArray[np.bool_]  # (N,); all others keep their bits
     rounds: int
-    psnr_before: float
-    psnr: float
+    psnr_before: float  # dB on validation rays, of the splats as given
+    psnr: float  # now
     why_not: str = "refitting gains nothing on rays that nothing was fitted to"
 
     def facts(self, seconds: float) -> dict[str, float]:
-        """The same for a report, with how long it took."""
+        """The numbers for a report."""
         return {
             "rounds": self.rounds,
             "changed": int(np.count_nonzero(self.changed)),
@@ -125,7 +86,7 @@ class Refitted:
         }
 
     def note(self, seconds: float) -> str:
-        """The same as a sentence, for the user."""
+        """The numbers as a sentence, for the user."""
         told = (
             "{changed:,} kept splats were refitted in {rounds} rounds: {psnr_before:.1f} -> "
             "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s"
@@ -134,26 +95,19 @@ class Refitted:
 
 
 def check_rounds(rounds: int | None) -> None:
-    """Raise `RefineError` if so many rounds cannot be asked for; None leaves it open."""
+    """Raise `RefineError` if `rounds` is out of range."""
     if rounds is not None and not 1 <= rounds <= MOST_ROUNDS:
         raise RefineError(f"rounds is {rounds}, expected 1 to {MOST_ROUNDS}")
 
 
 def expected_rounds(count: int, rounds: int | None = None) -> int:
-    """How many rounds it takes to refit so many splats if all of them gain.
-
-    Parameters
-    ----------
-    count : int
-    rounds : int, optional
-        So many, if given.
-    """
+    """Rounds that refitting `count` splats takes if all of them gain."""
     enough = max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
     return rounds or min(math.ceil(enough / limits(count)[0]), MAX_ROUNDS)
 
 
 def refit(*arguments: Any, **options: Any) -> Refitted:
-    """What `refit_rounds` yields last."""
+    """The last result of `refit_rounds`."""
     *_, last = refit_rounds(*arguments, **options)
     return last
 
@@ -168,41 +122,11 @@ def refit_rounds(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Iterator[Refitted]:
-    """Yield kept splats as they are, and after each round that gains.
+    """Yield kept splats as they are, and after each round that gains on validation rays.
 
-    Parameters
-    ----------
-    splats : Splats
-        N kept splats, in the frame and unit of the views.
-    original : Splats
-        The unpruned splats, in the same frame.
-    views : ViewSet
-        All of them are used.
-    rounds : int, optional
-        At most so many, up to `MOST_ROUNDS`; by default see `MAX_ROUNDS`. They end before where
-        little is gained.
-    protected : (N,) bool, optional
-        Kept splats that do not change.
-    progress : callable, optional
-        See `refine_addon.core.execute.Progress`.
-    threads : int, optional
-
-    Yields
-    ------
-    Refitted
-        Never below what it began with, on rays that nothing was learned from.
-
-    Raises
-    ------
-    RefineError
-        If `rounds` is out of range.
-    Cancelled
-        If `progress` answers ``False``.
-
-    Notes
-    -----
-    Memory: about 900 bytes a kept splat. 14 bytes for each hit of a round, see `round_rays.limits`,
-    lie in a temporary file.
+    `original` are the unpruned splats, in the frame and unit of the views like `splats`;
+    `protected` ones do not change. Memory: about 900 bytes a kept splat; a temporary file takes 14
+    bytes for each hit of a round, see `round_rays.limits`.
     """
     check_rounds(rounds)
     if in_regions(original, len(original)) and in_regions(original, 2 * len(splats)):
@@ -222,7 +146,7 @@ def refit_on(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Iterator[Refitted]:
-    """Yield what `refit_rounds` does, of some rays."""
+    """`refit_rounds` on given rays."""
     count = len(splats)
     moving = np.ones(COUNT, np.bool_)
     moving[DEGREE_1] = splats.sh_rest.shape[1] > 0
@@ -269,9 +193,9 @@ def refit_on(
 
 
 def _solve(linear, movable, damping, before, *, progress, threads):
-    """By how much to change the parameters of N splats, (22, N), and what rays told.
+    """Change of N splats' parameters, (22, N), and `before` with this round added.
 
-    Like what they told `before` that is K, (22, N), and what is left of J'r, (22, N).
+    `before` holds K, the sum of D over rounds, and what they leave of J'r, (22, N) each.
     """
     index = linear.shapes.gaussians.index
     moving = movable[:, index]
@@ -306,10 +230,7 @@ def _solve(linear, movable, damping, before, *, progress, threads):
 
 
 def _conjugate_gradients(product, residual, inverse, steps):
-    """About the solution x of ``product(x) = residual``, by a few steps from 0.
-
-    And what it leaves of the residual.
-    """
+    """Solution x of ``product(x) = residual`` after a few steps from 0, and its residual."""
     solution = np.zeros_like(residual)
     direction = inverse * residual
     before = _dot(residual, direction)
@@ -335,14 +256,10 @@ def _dot(one: Singles, other: Singles) -> float:
 
 
 def _worthwhile(change: Singles) -> Singles:
-    """A change in which means move only where that is worth it, (22, N).
+    """A change, (22, N), with moves of means shortened: ``m max(1 - (LEAST_MOVE / |m|)^2, 0)``.
 
-    Splats are drawn in the order of their means, and each move puts some behind others that were
-    behind them, which no derivative tells of. The squared error that costs grows in proportion to
-    the move, what a move gains with its square. So those shorter than `LEAST_MOVE` are left out,
-    and others are shortened by less the longer they are (Breiman's garrote)::
-
-        m <- m max(1 - (LEAST_MOVE / |m|)^2, 0)
+    A move changes the depth order, which no derivative knows: that costs a squared error in
+    proportion to the move, where the gain grows with its square. This is Breiman's garrote.
     """
     means = change[MEAN]
     squared = np.maximum(np.square(means).sum(axis=0), np.float32(_NOTHING))
@@ -433,7 +350,7 @@ def _by_regions(kept, original, views, rounds, progress, threads):
 
 
 def _refit_region(folder, views, rounds, original, kept, threads, number):
-    """Refit the splats of a region amid all others: which changed, in how many rounds, and they."""
+    """Refit the splats of a region amid all others: changed, rounds, splats."""
     rows = noted(folder, f"rows-{number}")[1]
     others = np.ones(len(kept.splats), np.bool_)
     others[rows] = False
@@ -463,7 +380,7 @@ class _Amid(Target):
         return projection.project(both, self.scene, window.view, window.part)
 
     def colors(self, hit: NDArray[np.int64], view: View) -> Singles:
-        """Colours in which a view sees some of the Gaussians, ascending, (3, u)."""
+        """Colours that a view sees of Gaussians, ascending, (3, u)."""
         count = len(self.gaussians)
         mine = int(np.searchsorted(hit, count))
         parts = [super().colors(hit[:mine], view), self.every.colors(hit[mine:] - count, view)]
@@ -472,13 +389,12 @@ class _Amid(Target):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Both(Gaussians):
-    """The Gaussians of a region and, behind them, all but these, as far as `project` asks."""
+    """The Gaussians of a region, then all others, as far as `project` asks."""
 
     every: Gaussians
     others: NDArray[np.bool_]
 
     def parts(self, *seen: Any) -> Iterator[tuple[int, Gaussians]]:
-        """See `Gaussians.parts`."""
         yield 0, self
         for first, chunk in self.every.parts(*seen):
             there = self.others[first : first + len(chunk)]
@@ -487,10 +403,9 @@ class _Both(Gaussians):
 
 
 def _windows(splats, total, scene, views):
-    """Windows of the views, with their weights, that show a region.
+    """Windows of the views that show a region, weighted by how much of it they show.
 
-    Rays are as dense in them as if all of the `total` kept splats were refitted together. A view
-    counts by how much of the region it shows.
+    Their rays are as dense as if all of the `total` kept splats were refitted together.
     """
     sample = splats.take(slice(None, None, max(len(splats) // _SAMPLE, 1)))
     only = [view for view, _ in views]

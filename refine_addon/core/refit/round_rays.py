@@ -1,10 +1,7 @@
 """The rays of all rounds of refitting: what unpruned and kept splats look like on them.
 
-Each round learns from rays through other pixels, of views that stand a little beside the given ones
-(`SHIFT`): what the given ones alone tell does not hold between them. So do validation rays, which
-no round learns from: they tell what a round has gained.
-
-Views are cast in processes of their own, as they are measured (`execute`).
+Each round takes other pixels, of views moved beside the given ones (`SHIFT`), since fits to the
+given views alone do not hold in between; so do validation rays. Views are cast in processes.
 """
 
 from __future__ import annotations
@@ -35,31 +32,26 @@ from ..visibility.scene import Scene
 from .linear import COUNT, LEAST_WEIGHT, LinearView, Shapes, Singles, linear_view
 
 RAYS_OF_SPLAT = 7.0
-"""Rays of a round for each kept splat: with fewer, they are learned by heart, and two rounds of
-half as many bring less than one."""
+"""Rays of a round for each kept splat: fewer are learned by heart, and two rounds of half as many
+gain less than one."""
 
-MIN_RAYS = 1 << 17
-"""Rays of a round where that would be fewer."""
+MIN_RAYS = 1 << 17  # of a round, if that is more
 
 HITS_OF_SPLAT, MIN_HITS = 112, 3 << 21
-"""About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`), for each
-kept splat, and where that would be fewer. Each takes 14 bytes of a file (`Stored`)."""
+"""Most hits of a round on the unpruned splats (about; above `linear.LEAST_WEIGHT`), for each kept
+splat, or in all if that is more. Each takes 14 bytes of a file (`Stored`)."""
 
 MANY_HITS, FEWER_HITS = 1 << 24, 64
-"""Rounds of more hits have no more than so many for each kept splat, to bound that file."""
+"""Rounds of more hits have at most this many for each kept splat, to bound that file."""
 
 SHIFT, MAX_SHIFT = 0.7, 0.1
-"""About how far a view is moved in a round: so many times as far as the view next to it is, at most
-so many scene sizes."""
+"""Move of a view in a round, about: in distances to the next view; at most in scene sizes."""
 
-HELD = 1 << 23
-"""So many bytes stay in memory; small scenes need no file."""
+HELD = 1 << 23  # bytes that stay in memory; small scenes need no file
 
-LARGEST = np.float32(1e36)
-"""Coefficients of harmonics count as no larger: 25 of them add up to a float32."""
+LARGEST = np.float32(1e36)  # of harmonics' coefficients: 25 of them add up to a float32
 
-FARTHEST = 1e18
-"""Steps from a camera count as no longer, world units: their squares fit into a float32."""
+FARTHEST = 1e18  # step from a camera, world units; its square fits into a float32
 
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
 _CHUNK = 1 << 14
@@ -69,33 +61,18 @@ _NOTHING = 1e-30  # hits of a ray; keeps a division finite
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Where rays go through a view, in each round.
-
-    Attributes
-    ----------
-    view : View
-    number : int
-        Of the view, see `cast.pixels`.
-    weight : float
-        How much it counts for the PSNR.
-    rays, hits : float
-        About how many rays there are, and how many hits on the unpruned splats may show.
-    left, top, width, height : int
-        The part of the image that they go through, pixels; by default all of it.
-    step : float
-        About how far the view is moved in a round, world units.
-    """
+    """Where rays go through a view, in each round."""
 
     view: View
-    number: int
-    weight: float
-    rays: float
-    hits: float
-    left: int = 0
+    number: int  # of the view, see `cast.pixels`
+    weight: float  # in the PSNR
+    rays: float  # about
+    hits: float  # about, on the unpruned splats
+    left: int = 0  # px; by default all of the image
     top: int = 0
     width: int = 0
     height: int = 0
-    step: float = 0.0
+    step: float = 0.0  # about how far the view moves in a round, world units
 
     @cached_property
     def part(self) -> View:
@@ -116,17 +93,9 @@ class Window:
         return replace(self, view=replace(self.view, center=center))
 
     def pixels(self, hits: float, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Columns and rows that the rays of a round go through.
+        """Columns and rows of the rays of a round (0 for validation), for `hits` a ray.
 
-        Rounds follow the rays that an estimate uses in the R2 sequence (`cast.pixels`), so that the
-        rays of one are not next to those of another.
-
-        Parameters
-        ----------
-        hits : float
-            About how many hits on the unpruned splats a ray shows.
-        number : int
-            0 for validation rays, 1 for the first round.
+        Rounds follow an estimate's rays in the R2 sequence (`cast.pixels`), so pixels differ.
         """
         count = min(self.rays, self.hits / max(hits, 1.0), cast.MAX_RAYS_OF_VIEW)
         columns, rows = cast.pixels(self.part, self.number + 1 + number, count)
@@ -137,26 +106,14 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Splats that rays are cast into. It is pickled, so that any process can.
-
-    Attributes
-    ----------
-    splats : Splats
-        Not copied but where they are pickled.
-    gaussians : Gaussians
-        Made of them.
-    scene : Scene
-    """
+    """Splats that rays are cast into; pickled for other processes, copied only then."""
 
     splats: Splats
     gaussians: Gaussians
     scene: Scene
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled: the rows that are wanted, one after the other, or the names of files.
-
-        Processes map what is contiguous, and would have copies of their own of what is not.
-        """
+        """Contiguous rows, which processes map instead of copying, or names of files."""
         if folder_of(self.splats) is not None:
             return vars(self)
         arrays: dict[str, Any] = {
@@ -172,12 +129,12 @@ class Target:
         return projection.project(self.gaussians, self.scene, window.view, window.part)
 
     def colors(self, hit: NDArray[np.int64], view: View) -> Singles:
-        """Colours in which a view sees some of the Gaussians, (3, u)."""
+        """Colours that a view sees of Gaussians, (3, u)."""
         return colors_of(self.splats, self.gaussians.index[hit], view)
 
 
 def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> Singles:
-    """Colours in which a view sees some splats, (3, u), as far as they can be drawn."""
+    """Colours that a view sees of splats, (3, u), as far as they can be drawn."""
     result = np.empty((3, len(rows)), np.float32)
     for piece in chunks(len(rows), _CHUNK):
         chosen = rows[piece]
@@ -194,37 +151,16 @@ def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> Singles:
 
 
 class Truth(NamedTuple):
-    """Rays of one view, and the colours that the unpruned splats have on them.
+    """Rays of one view, and the unpruned splats' colours on them."""
 
-    Attributes
-    ----------
-    columns, rows : (C,), (R,) int64
-        See `Rays`.
-    colors : (3, P) float32
-    shown : float
-        How many hits a ray has that count for `Window.hits`, for each that the sizes of footprints
-        predict.
-    """
-
-    columns: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    colors: Singles
-    shown: float
+    columns: NDArray[np.int64]  # (C,), see `Rays`
+    rows: NDArray[np.int64]  # (R,)
+    colors: Singles  # (3, P)
+    shown: float  # hits that count for `Window.hits`, over those that footprint sizes predict
 
 
 class RoundRays:
-    """The rays of all rounds, of which it is known what the unpruned splats look like on them.
-
-    Parameters
-    ----------
-    windows : sequence of Window
-        Of the views that rays are cast from; also an attribute.
-    original : Target
-        The unpruned splats; also an attribute.
-    threads : int, optional
-    made : callable
-        Makes a `Target` of what it holds.
-    """
+    """The rays of all rounds, with the colours of the unpruned splats on them."""
 
     def __init__(
         self,
@@ -242,18 +178,7 @@ class RoundRays:
     def of(
         cls, original: Splats, views: ViewSet, count: int, progress: Progress, threads: int | None
     ) -> RoundRays:
-        """Rays of all views into splats in memory.
-
-        Parameters
-        ----------
-        original : Splats
-            The unpruned splats, in the frame of the views.
-        views : ViewSet
-        count : int
-            For how many kept splats there are to be rays, see `limits`.
-        progress : callable
-        threads : int, optional
-        """
+        """Rays of all views into `original`, in memory, for `count` kept splats; see `limits`."""
         gaussians, scene, _ = projection.prepare(
             original, views, progress=progress, threads=threads
         )
@@ -268,16 +193,7 @@ class RoundRays:
         return cls(windows, Target(original, gaussians, scene), threads)
 
     def linear(self, splats: Splats, number: int, progress: Progress) -> LinearRays:
-        """How the colours of rays change with the kept splats as they are now.
-
-        Parameters
-        ----------
-        splats : Splats
-            `psnr` has been asked for before, of these or others.
-        number : int
-            Of the round, from 1.
-        progress : callable
-        """
+        """The rays of a round, from 1, linearized at the kept splats; call `psnr` before."""
         target = self.target(splats, part(progress, 0.0, 0.05))
         shapes = Shapes.of(splats, target.gaussians, target.scene)
         windows = [window.moved(number) for window in self.windows]
@@ -311,7 +227,7 @@ class RoundRays:
         return self._made(splats, prepared[0], scene)
 
     def _each(self, work, windows, splats, told):
-        """Iterator of what is found on the rays of each of some windows."""
+        """Iterator of the results of `work` on the rays of each window."""
         numbers = range(len(windows))
         cost = seconds("refit", len(self.original.splats) + len(splats), len(windows))
         return run(work, numbers, cost=cost, progress=told, what="refitting", threads=self._threads)
@@ -338,19 +254,9 @@ def steps_of(views: Sequence[View], scene: Scene) -> list[float]:
 def cast_truth(
     target: Target, windows: Sequence[Window], number: int, shown: float | None, place: int
 ) -> Truth:
-    """The rays of a view in a round, cast into the unpruned splats; any process can.
+    """The rays of the view at a `place` in a round (0: validation), cast into the unpruned splats.
 
-    Parameters
-    ----------
-    target : Target
-        The unpruned splats.
-    windows : sequence of Window
-    number : int
-        Of the round; 0 for the validation rays.
-    shown : float or None
-        Of the validation rays, see `Truth`; None before these are cast.
-    place : int
-        Of the view among the windows.
+    `shown` is that of the validation rays, see `Truth`; None before these are cast.
     """
     window = windows[place]
     with np.errstate(under="ignore"):
@@ -394,25 +300,11 @@ def _linearized(truth_of, windows, target, shapes, place):
 class LinearRays:
     """The colours of the rays of all views, as a linear function of what M Gaussians change.
 
-    Parameters
-    ----------
-    shapes : Shapes
-        Of these; also an attribute.
-    seen : iterable of (LinearView, (22, u) float32, (22, u) float32)
-        Each view, with what it adds to the residual and to the diagonal.
-
-    Attributes
-    ----------
-    views : Stored
-        A `LinearView` of each view.
-    residual, diagonal : (22, M) float32
-        J'r and the diagonal of J'J, see `refit`.
-    count : int
-        How many rays there are.
+    `seen` yields each view with its part of the residual J'r and of the diagonal of J'J, (22, u).
     """
 
     def __init__(self, shapes: Shapes, seen: Iterable[tuple[LinearView, Singles, Singles]]) -> None:
-        self.shapes, self.views, self.count = shapes, Stored(), 0
+        self.shapes, self.views, self.count = shapes, Stored(), 0  # count of rays
         residual, self.diagonal = np.zeros((2, COUNT, len(shapes)), np.float32)
         for view, of_residual, of_diagonal in seen:  # each as soon as it is there
             self.views.append(view)
@@ -422,7 +314,7 @@ class LinearRays:
         self.residual = shapes.by_parameter(residual)
 
     def normal(self, change: Singles, progress: Progress, threads: int | None) -> Singles:
-        """J'J times some change of the parameters, (22, M)."""
+        """J'J times a change of the parameters, (22, M)."""
         in_scene = self.shapes.in_scene(change)
         total = np.zeros_like(in_scene)
 
@@ -444,10 +336,9 @@ def _add(total, hit, values):
 
 
 class Stored:
-    """A list of objects, most of them in a file, which goes with this list.
+    """A list of objects, most of them in a temporary file.
 
-    The first of them, up to `HELD` bytes, stay in memory, and so does what the file has no room
-    for. One of the file is read whenever it is asked for.
+    The first `HELD` bytes, and what the file has no room for, stay in memory.
     """
 
     def __init__(self) -> None:
@@ -456,7 +347,6 @@ class Stored:
         self._file: Any = None
 
     def __len__(self) -> int:
-        """How many there are."""
         return len(self._places)
 
     def append(self, item: Any) -> None:
@@ -476,7 +366,7 @@ class Stored:
         self._places.append(place)
 
     def __getitem__(self, number: int) -> Any:
-        """One of them, equal to the bit. Any thread can ask."""
+        """One of them, equal to the bit, for any thread."""
         place = self._places[number]
         if isinstance(place, tuple):
             start, end = place

@@ -1,7 +1,7 @@
 """Many files as one scene, larger than memory: one ranking and one budget over all of them.
 
-`prune` is the way through. `source` copies the files' columns into files of the job (`job`), where
-they are one array each (`core.mapped`): so everything else is the code that prunes a single file.
-Only what would need all splats in memory at once is done region by region (`core.mapped`).
-`cluster` has work done by Dask, `writing` writes all tiles or none, `storage` opens URLs.
+`prune` is the entry. `source` copies the files' columns into one array each, on the disk
+(`core.mapped`), so the rest is the code for a single file; what would need all splats in memory
+goes region by region. `cluster` runs work on Dask, `writing` writes all tiles or none, `storage`
+opens URLs.
 """

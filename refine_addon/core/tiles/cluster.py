@@ -1,7 +1,7 @@
 """Work done on the workers of a Dask cluster, on this machine or on others.
 
-Arrays in files travel as names, so workers must see the folder of the job under the same path. Dask
-does the work of a lost worker again elsewhere.
+Arrays in files travel as names, so workers must see the job's folder under the same path. Dask
+repeats the work of a lost worker elsewhere.
 """
 
 from __future__ import annotations
@@ -28,13 +28,11 @@ from ..mapped import Interrupted
 from .source import Tile, bytes_of
 from .writing import waiting_in
 
-_AHEAD = 3
-"""Groups of items a thread of a worker that are handed out ahead: so many wait here at most."""
+_AHEAD = 3  # groups of items for each thread that are handed out ahead and may wait here
 
 _TOGETHER = 16  # most items in a group: each group takes scheduler and coordinator about 15 ms
 
-_TURNS = 4
-"""Groups a thread at least, where there are as many items, so that all end at about one time."""
+_TURNS = 4  # groups a thread at least, so that all end at about one time
 
 _INTERVAL = 0.2  # seconds between two looks whether to go on
 
@@ -44,13 +42,12 @@ _MEMORY = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
     "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
 }
-"""Dask lets glibc hand back memory at once, in bytes; arrays of a chunk would be page-faulted anew
-for each chunk, which takes longer than the work."""
+"""Dask makes glibc give memory back at once; page faults in each chunk's arrays would then take
+longer than the work. Bytes."""
 
 _CONNECT = 10  # seconds to find a scheduler, and a worker
 
-_TRIES = 3
-"""How often workers are asked whether they see the files of a job, if all of them get lost."""
+_TRIES = 3  # times that workers are checked if all of them get lost
 
 
 @contextlib.contextmanager
@@ -60,18 +57,8 @@ def cluster(workers: int | str) -> Iterator[Cluster]:
     Parameters
     ----------
     workers : int or str
-        How many to start here, of one thread each; or the address of a scheduler, such as
+        Number of processes to start, of one thread each; or a scheduler's address, such as
         ``tcp://10.0.0.1:8786``.
-
-    Yields
-    ------
-    Cluster
-        For ``prune_tiles(..., workers=...)``.
-
-    Raises
-    ------
-    RefineError
-        If Dask is not installed, or the scheduler not to be found.
     """
     try:
         import dask
@@ -103,10 +90,9 @@ def cluster(workers: int | str) -> Iterator[Cluster]:
 
 
 def _uninterrupted(make: Callable[[], Any]) -> Any:
-    """What `make` returns, called on a thread, where no Ctrl-C arrives.
+    """Run `make` on a thread, out of reach of Ctrl-C, which is raised afterwards.
 
-    A cluster that is interrupted while it starts cannot close what it has started. So it starts,
-    is closed, and only then is the interrupt raised.
+    A cluster that is interrupted while it starts cannot close what it has started.
     """
     with ThreadPoolExecutor(1, initializer=_block_ctrl_c) as pool:
         future = pool.submit(make)
@@ -119,35 +105,23 @@ def _uninterrupted(make: Callable[[], Any]) -> Any:
 
 
 def _block_ctrl_c() -> None:
-    """Keep Ctrl-C from this thread, and so from all processes that it starts.
-
-    A terminal sends it to all processes; workers would print where they were.
-    """
+    """Keep a terminal's Ctrl-C from this thread and the processes that it starts."""
     if hasattr(signal, "pthread_sigmask"):  # not on Windows
         resource_tracker.ensure_running()  # starting it, Python unblocks these signals
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 class Cluster:
-    """The workers of a Dask cluster; see `execute.on`.
-
-    Parameters
-    ----------
-    client : distributed.Client
-    """
+    """The workers of a Dask cluster; see `execute.on`."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
 
     def check(self, job: Path, tiles: Sequence[Tile]) -> None:
-        """Ask every worker whether it sees the files of a job.
+        """Ask every worker whether it sees the files of a job and has this version.
 
-        Raises
-        ------
-        RefineError
-            If there is no worker, or one does not see a file or has another version; by its name.
-        Interrupted
-            If all workers were lost.
+        `RefineError` names a worker that does not, or says that there is none; `Interrupted` if all
+        workers were lost.
         """
         for _ in range(_TRIES):
             try:
@@ -174,12 +148,9 @@ class Cluster:
     def run(
         self, packed: bytes, items: Sequence[Any], progress: Progress, what: str
     ) -> Iterator[Any]:
-        """Do pickled work with each item; yield the results in order.
+        """Yield the results of pickled work with each item, in order.
 
-        Raises
-        ------
-        Interrupted
-            If workers were lost again and again.
+        `Interrupted` if workers were lost again and again.
         """
         from distributed import CancelledError, KilledWorker
         from distributed.comm import CommClosedError
@@ -204,7 +175,7 @@ class Cluster:
             self._client.cancel([*waiting])
 
     def _wait(self, future: Any, look: Callable[[], None]) -> None:
-        """Wait for a future, and look meanwhile whether to go on."""
+        """Wait for a future; meanwhile `look` may cancel."""
         ended, seen = threading.Event(), time.monotonic()
         future.add_done_callback(lambda _: ended.set())
         look()
@@ -218,7 +189,6 @@ class Cluster:
 
 
 def _run(packed: bytes, items: Sequence[Any]) -> list[Any]:
-    """Do work with some items, in a worker."""
     return alone(_unpacked(packed), items)
 
 
@@ -226,7 +196,7 @@ _unpacked = functools.lru_cache(maxsize=2)(pickle.loads)
 
 
 async def _answer(version: str, job: Path, tiles: Sequence[Tile]) -> str:
-    """What is wrong with this worker, in a sentence; "" if nothing is."""
+    """Sentence that says what is wrong with this worker, or ""."""
     if version != VERSION:
         return f"it has refine {VERSION}, this is {version}"
     # Not on the worker's own thread: requests for many tiles would make it look dead.
@@ -234,7 +204,7 @@ async def _answer(version: str, job: Path, tiles: Sequence[Tile]) -> str:
 
 
 def _missing(job: Path, tiles: Sequence[Tile]) -> str:
-    """What this process cannot see of a job's files, in a sentence; "" if all is there."""
+    """Sentence that names the job's files that this process cannot see, or ""."""
     if not waiting_in(job).exists():
         return f"{job} is not there"
     for tile in tiles:

@@ -53,48 +53,39 @@ def prune_tiles(
 ) -> dict[str, Any]:
     """Prune files of splats as one scene, by one budget over all of them; none is held in memory.
 
-    The same splats stay as if all files were one, in the order in which they are given: of equal
-    scores, those of the first file go first. All files are written, or none. The columns of all
-    splats and what is made of them lie in a folder beside the outputs until the job is done. If the
-    process is interrupted or killed, the same call later goes on behind the last finished stage.
+    The kept splats are those of one file with all rows in the given order. All files are written,
+    or none. The job's folder lies beside the outputs until the end; the same call goes on after an
+    interruption, behind the last finished stage.
 
     Parameters
     ----------
     sources : sequence of path-like
-        Plain binary PLY files in one frame and unit, or URLs of such, which fsspec opens.
+        Plain binary PLY files in one frame and unit, or URLs that fsspec opens.
     folder : path-like or None
-        Where each goes under its own name; made if it is not there. None writes nothing. If it is a
-        URL, the folder of the job is in the current directory, files are copied to the URL under
-        other names, and renamed at the end.
-    views, budget, method
-        See `prune`. Kept splats become what those of one file would.
-    model, overwrite, dry_run
-        See `prune_file`.
-    progress : callable, optional
-        ``progress(fraction, what)``; returning ``False`` cancels.
-    threads : int, optional
+        Where each goes under its own name; None writes nothing. For a URL the job's folder is in
+        the current directory.
+    views, budget, method, model, overwrite, dry_run, progress, threads
+        See `prune` and `prune_file`.
     workers : Cluster, optional
-        Who does what is worth processes; by default this machine. See `cluster`.
+        Runs the large steps; by default this machine. See `cluster`.
 
     Returns
     -------
     dict
-        The report, with ``tiles``: of each its name, counts and bytes.
+        The report, with ``tiles``: name, counts and bytes of each.
 
     Raises
     ------
     RefineError, Cancelled
-        See `prune` and `source.tiles_at`; also if two files have one name. Then nothing is written,
-        and nothing kept.
+        As in `prune`, or if two files have one name; nothing is written or kept.
     Interrupted
-        If a disk is full, a storage or all workers fail, or a file appears in the place of an
-        output. What is done is kept for the same call.
+        If a disk, a storage or all workers fail, or a file takes an output's place; the same
+        call goes on.
 
     Notes
     -----
     Memory: about 150 bytes a splat, and the hits of scoring rays, see `occlusion.score`. A worker
-    needs for each view at work about 160 bytes for each splat that it shows. On the disk: what the
-    tiles take, and 60 bytes a splat besides.
+    needs for each view about 160 bytes for each splat shown. Disk: the tiles, 60 bytes a splat.
     """
     clock, tiles = Clock(), tiles_at(sources, model)
     output = None if folder is None or dry_run else located(folder)
@@ -157,7 +148,7 @@ def _check(workers: Cluster, job: Path, tiles: Sequence[Tile]) -> None:
 
 
 def _decided(job, tiles, views, budget, method, clock, reading, deciding, threads):
-    """What stays; of each tile how many stay and how many are unseen; the report."""
+    """Kept splats; kept and unseen counts of each tile; the report."""
     splats = once(job, "splats", lambda: copied(tiles, job / "splats", reading, threads))
     clock.lap("read_s")
     row_bytes = max(tile.dtype.itemsize for tile in tiles)
@@ -175,7 +166,7 @@ def _decided(job, tiles, views, budget, method, clock, reading, deciding, thread
 
 
 def _stored(job: Path, result: Result) -> Kept:
-    """What stays, in files of the job."""
+    """Kept splats, in files of the job."""
     rows, became = np.empty(0, np.int64), None
     if result.merged is not None:
         changed = np.flatnonzero(result.merged.changed)
@@ -187,13 +178,7 @@ def _stored(job: Path, result: Result) -> Kept:
 
 @contextlib.contextmanager
 def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
-    """Make the folder of a job, and keep others from it; it stays if the job can go on.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be made, or another process works on the job.
-    """
+    """Make and lock the folder of a job; it stays if the job can go on."""
     try:
         waiting_in(job).mkdir(parents=True, exist_ok=True)
         lock = (job / "lock").open("wb")
@@ -237,7 +222,7 @@ def _lock(job: Path, lock: Any) -> None:
 
 
 def _remove(job: Path) -> None:
-    """Remove a folder and all that is in it; Ctrl-C meanwhile comes too late."""
+    """Remove a folder with its content; Ctrl-C meanwhile comes too late."""
     try:
         shutil.rmtree(job, ignore_errors=True)
     except KeyboardInterrupt:
@@ -245,7 +230,7 @@ def _remove(job: Path) -> None:
 
 
 def _digest(tiles: Sequence[Tile], views: ViewSet, budget: Budget, method: Method) -> str:
-    """Name of a job: that of the same job again, and of no other."""
+    """Name of a job: equal for the same job, and for no other."""
     digest = hashlib.blake2b(digest_size=8)
     for fact in (VERSION, [*tiles], budget, method):
         digest.update(repr(fact).encode("utf-8", "surrogateescape"))

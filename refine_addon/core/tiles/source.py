@@ -1,4 +1,4 @@
-"""Tiles: what is known of them, and their rows as splats."""
+"""Tiles: their state when the job began, and their rows as splats."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from ..splats import Model, Splats, joined, with_model
 from ..whole_file import Url
 from . import storage
 
-ROWS = 1 << 16
-"""Rows of a tile that are read together, 15 MB at degree 3."""
+ROWS = 1 << 16  # of a tile, read together: 15 MB at degree 3
 
 _HEADER = 1 << 16  # bytes that are read of a tile for its header, which hardly ever has more
 _PIECE = 1 << 24  # bytes beside the rows that are copied at a time
@@ -39,12 +38,12 @@ class Tile(NamedTuple):
 
     @property
     def place(self) -> Path | Url:
-        """Where it is."""
+        """Path or URL."""
         return storage.located(self.path)
 
     @property
     def name(self) -> str:
-        """The name of the file."""
+        """File name."""
         return self.place.name
 
     @property
@@ -59,19 +58,10 @@ class Tile(NamedTuple):
 
 
 def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
-    """Look at the files of a scene.
+    """Look at the files of a scene; `model` overrides those that they state.
 
-    Parameters
-    ----------
-    paths : sequence of path-like
-    model : {"default", "antialiased", "2dgs"}, optional
-        How their splats are drawn, where they do not say or are wrong.
-
-    Raises
-    ------
-    RefineError
-        See `tile_at`; also if a file is given twice, since its splats would count twice, if they
-        are of different models, or none has a splat.
+    `RefineError` also if a file is given twice (its splats would count twice), if models differ, or
+    if no file has a splat.
     """
     tiles: list[Tile] = []
     given: dict[Hashable, Tile] = {}
@@ -93,20 +83,7 @@ def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Ti
 
 
 def tile_at(path: Path | str, model: Model | None = None) -> Tile:
-    """Look at a file of splats; only its header is read.
-
-    Parameters
-    ----------
-    path : path-like
-        Or a URL.
-    model
-        See `tiles_at`.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be read, is no plain binary PLY, is truncated or holds no splats.
-    """
+    """Look at a plain binary PLY; only its header is read."""
     place = storage.located(path)
     size, changed = storage.state(place)
     if place.name in ("", ".", ".."):
@@ -132,24 +109,20 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
 
 
 def rows_of(tile: Tile, start: int, stop: int) -> NDArray[Any]:
-    """Rows of a tile, read rather than mapped: what is mapped stays in memory.
+    """Rows of a tile, read rather than mapped: mapped pages stay in memory.
 
-    Raises
-    ------
-    RefineError
-        If the tile cannot be read, or is another file than it was.
+    `RefineError` if the tile cannot be read or has changed.
     """
     return _read(tile, tile.dtype, stop - start, tile.begin + start * tile.dtype.itemsize)
 
 
 def bytes_of(tile: Tile, start: int, stop: int) -> Iterator[NDArray[np.uint8]]:
-    """Bytes of a tile, some at a time; see `rows_of` for errors."""
+    """Bytes of a tile, some at a time; errors as in `rows_of`."""
     for begin in range(start, stop, _PIECE):
         yield _read(tile, np.dtype(np.uint8), min(_PIECE, stop - begin), begin)
 
 
 def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
-    """Array from a tile; see `storage.array`."""
     sent = storage.array(tile.place, dtype, count, begin)
     if storage.state(tile.place) != (tile.size, tile.changed):
         raise RefineError(f"{tile.path}: was changed while it was worked on; nothing was written")
@@ -162,15 +135,9 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
 
 
 def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
-    """All splats of some tiles, one of which has one, in files of a new folder.
+    """All splats of some tiles, in files of a new folder, with the widest type and degree of all.
 
-    They have the types and the degree that hold the numbers of all tiles: coefficients that a tile
-    lacks are 0.
-
-    Raises
-    ------
-    RefineError, Cancelled
-        See `rows_of` and `mapped.on_disk`.
+    Coefficients that a tile lacks are 0. At least one tile has a splat.
     """
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
     kinds = [splats_from_columns(np.empty(0, each)) for each in dtypes] if len(dtypes) > 1 else []

@@ -1,6 +1,6 @@
-"""Where tiles lie: on disks that this machine sees, or behind URLs, which fsspec opens.
+"""Files of tiles: on disks of this machine, or behind URLs, which fsspec opens.
 
-All functions raise `RefineError` where a file cannot be looked for, read or written; behind a URL
+All functions raise `RefineError` if a file cannot be looked for, read or written; behind a URL
 `Interrupted`, since that may pass.
 """
 
@@ -22,15 +22,14 @@ from ..mapped import Interrupted
 from ..whole_file import Url, expanded, is_url
 
 _FLEETING = ("url", "access")
-"""Parts of the names of facts about a file that change though it does not: where a server sends
-whoever asks for it, and when it was read."""
+"""In names of facts that change though the file does not: redirect targets, times of access."""
 
 _LOCAL = "file://"
 _NO_SUCH = "there is no such file"
 
 
 def located(path: Path | str) -> Path | Url:
-    """URL, or path with ``~`` replaced; raises `RefineError` if there is no such user."""
+    """URL, or path with ``~`` replaced."""
     return Url(path) if is_url(path) else expanded(path)
 
 
@@ -46,7 +45,7 @@ def identity(path: Path | Url) -> str:
 
 
 def file_key(path: Path | Url) -> Hashable:
-    """What all names of a file that exists have in common, hard links included."""
+    """Key that all names of an existing file share, hard links included."""
     name = identity(path)
     if not name.startswith(_LOCAL):
         return name
@@ -56,7 +55,7 @@ def file_key(path: Path | Url) -> Hashable:
 
 
 def state(path: Path | Url) -> tuple[int, int | str]:
-    """Bytes of a file, and what changes with its content: a time in ns, or facts."""
+    """Bytes of a file, and a time in ns or facts that change with its content."""
     if not isinstance(path, Url):
         with _explained(path, "cannot be read"):
             status = path.stat()
@@ -81,7 +80,7 @@ def state(path: Path | Url) -> tuple[int, int | str]:
 def beginning(path: Path | Url, size: int, whole: int) -> bytes:
     """First `size` bytes of a file of `whole` bytes, or all.
 
-    A URL that can only be read from its beginning is refused: `array` would be sent all of it.
+    Refuses a URL without random access: `array` would download all of it.
     """
     if not isinstance(path, Url):
         with _explained(path, "cannot be read"), path.open("rb") as stream:
@@ -111,10 +110,10 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
 
 @contextlib.contextmanager
 def new_folder(folder: Path | Url) -> Iterator[None]:
-    """Make a folder, if it is not there; remove it if it is empty at the end.
+    """Make a folder if it is missing; remove it if it is empty at the end.
 
-    Behind a URL an empty file is written there, moved and removed, so that a storage that does not
-    let us is known before long work starts.
+    Behind a URL an empty file is written, moved and removed, to find missing rights before long
+    work.
     """
     if not isinstance(folder, Url):
         with whole_file.new_folder(folder):
@@ -131,7 +130,7 @@ def new_folder(folder: Path | Url) -> Iterator[None]:
 
 
 def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
-    """Do what `whole_file.refuse_existing` does, for URLs too."""
+    """`whole_file.refuse_existing`, for URLs too."""
     if not isinstance(path, Url):
         whole_file.refuse_existing(path, overwrite=overwrite)
         return
@@ -152,10 +151,7 @@ def upload(made: Path, url: Url) -> None:
 
 
 def publish(made: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
-    """Rename a finished file in the same storage, as `whole_file.publish` does.
-
-    A file of that name that may not be replaced is refused.
-    """
+    """`whole_file.publish` within one storage; refuses to replace unless `overwrite`."""
     if isinstance(made, Path) and isinstance(path, Path):
         whole_file.publish(made, path, overwrite=overwrite)
         return
@@ -181,7 +177,7 @@ def discard(url: Url) -> None:
 
 @contextlib.contextmanager
 def _opened(url: Url, problem: str) -> Iterator[tuple[Any, str]]:
-    """Yield the file system of a URL, as it is now, and the path there; see `_explained`."""
+    """Yield the current file system of a URL, and the path there; see `_explained`."""
     with _explained(url, problem):
         system, inner = _split(url)
         system.invalidate_cache()
@@ -202,7 +198,7 @@ def _split(url: Url) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def _explained(path: Path | Url, problem: str) -> Iterator[None]:
-    """Raise `RefineError` for whatever the storage raises; for a URL `Interrupted`: it may pass."""
+    """Raise `RefineError` for any error of the storage; for a URL `Interrupted`: it may pass."""
     try:
         yield
     except (RefineError, MemoryError):

@@ -29,26 +29,17 @@ RENAMED = "renamed"
 
 
 def waiting_in(job: Path) -> Path:
-    """Where finished tiles of a job wait until all of them are finished."""
+    """Folder in which finished tiles of a job wait for the others."""
     return job / "tiles"
 
 
 @dataclass(frozen=True)
 class Kept:
-    """What stays of N splats, in files of the job.
+    """Kept splats of N, in files of the job."""
 
-    Attributes
-    ----------
-    keep : (N,) bool
-    changed : (M,) int64
-        Rows of the splats that stay and are not what they were, ascending.
-    became : Splats or None
-        What these are now.
-    """
-
-    keep: Mapped
-    changed: Mapped
-    became: Splats | None
+    keep: Mapped  # (N,)
+    changed: Mapped  # rows of the kept splats with new values, ascending
+    became: Splats | None  # these values
 
     def columns(self, rows: NDArray[Any], begin: int) -> Mapping[str, NDArray[Any]]:
         """Columns of rows of a tile with their changes; `begin` splats are before them."""
@@ -61,28 +52,16 @@ class Kept:
 
 
 def header_of(tile: Tile, kept: int) -> bytes:
-    """Header of a tile of which so many splats stay."""
+    """Header of a tile of which `kept` splats stay."""
     header = with_count(b"".join(map(bytes, bytes_of(tile, 0, tile.header))), kept)
     return with_model(header, tile.model) if THIRD_SCALE in (tile.dtype.names or ()) else header
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """Where the tiles of a job go.
+    """Places of a job's tiles in an existing `folder`, each under its own name.
 
-    Parameters
-    ----------
-    job : Path
-    tiles : sequence of Tile
-    folder : Path or Url
-        In which each gets a file of its own name; it is there.
-    overwrite : bool
-        Whether files may be replaced.
-
-    Raises
-    ------
-    RefineError
-        If two tiles have one name, or a file could not be made, or may not be replaced.
+    `RefineError` if two tiles have one name, or a file could not be made or may not be replaced.
     """
 
     job: Path
@@ -106,7 +85,7 @@ class Outputs:
 
     @property
     def targets(self) -> list[Path | Url]:
-        """The names that tiles get in the end."""
+        """Final names of the tiles."""
         return [self.folder / tile.name for tile in self.tiles]
 
     @property
@@ -126,7 +105,7 @@ class Outputs:
         }
 
     def write(self, kept: Kept, progress: Progress, threads: int | None) -> list[int]:
-        """Bytes of each tile, which is written where it waits, unless it is in its place."""
+        """Write each tile where it waits, unless it is in place; bytes of each."""
         sizes = self.in_place()
         numbers = [number for number in range(len(self.tiles)) if number not in sizes]
         work = partial(_write_tile, self.job, self.tiles, kept, self.waiting)
@@ -136,13 +115,9 @@ class Outputs:
         return [sizes[number] for number in range(len(self.tiles))]
 
     def publish(self) -> None:
-        """Rename all tiles that are not in their places yet.
+        """Rename all tiles not yet in place; none if another file is in the way from the start.
 
-        Raises
-        ------
-        Interrupted
-            If one cannot be renamed, or another file is in its place; if that is so from the
-            beginning, none is renamed.
+        `Interrupted` if one cannot be renamed.
         """
         there, before = self.in_place(), noted(self.job, RENAMED)[1]
         try:
@@ -159,13 +134,13 @@ class Outputs:
             raise Interrupted(str(error)) from error
 
     def discard(self) -> None:
-        """Remove what waits behind URLs."""
+        """Remove waiting files behind URLs."""
         for place in self.waiting:
             if isinstance(place, Url):
                 storage.discard(place)
 
     def _refuse_existing(self, there: Mapping[int, int]) -> None:
-        """Raise `RefineError` if a tile that is not in its place could not get there."""
+        """Raise `RefineError` if a tile could not get to its place."""
         for number, target in enumerate(self.targets):
             if number in there:
                 continue
@@ -178,10 +153,7 @@ class Outputs:
                     )
 
     def _is_renamed(self, number: int, size: int, changed: int) -> bool:
-        """Whether a tile is in its place, given its bytes and the time of its last change.
-
-        Storages behind URLs give a file another time when they rename it.
-        """
+        """Whether a tile is in place; URLs' storages give renamed files another time."""
         target, waiting = self.targets[number], self.waiting[number]
         if isinstance(target, Path):
             return target.is_file() and _state(target) == (size, changed)
@@ -189,7 +161,7 @@ class Outputs:
 
 
 def _write_tile(job, tiles, kept, places, number):
-    """Write what stays of a tile, unless an earlier run has, and copy it to a URL: its bytes."""
+    """Write a tile's kept rows, unless an earlier run has, and upload it: its bytes."""
     waiting = waiting_in(job) / tiles[number].name
     if not waiting.exists():
         unfinished = waiting_in(job) / f"{number:06d}-{secrets.token_hex(8)}.tmp"
