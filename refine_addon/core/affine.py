@@ -118,10 +118,7 @@ def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
 
 
 def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
-    """Raise `RefineError` unless a matrix is affine, not flat, and scales within float32.
-
-    With `with_sh` it must be uniform, too: harmonics cannot follow others.
-    """
+    """Raise `RefineError` unless a matrix is affine, not flat, in range and, `with_sh`, uniform."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise RefineError(f"expected a finite (4, 4) matrix, got {matrix.tolist()}")
     scales = scales_of(matrix)
@@ -265,9 +262,8 @@ def _fits(matrix, before, after, *, slack=1.0):
 def _fitted(before, after):
     """Affine least-squares map between points, (4, 4); a translation where that explains them.
 
-    Points in a plane do not tell the direction across it: mapped across their plane by the mean
-    scale, not mirrored. None for points on a line, or in a plane only now (Blender's *Mirror*
-    merges).
+    A plane's points are mapped across it by the mean scale, not mirrored. None for points on a
+    line, or in a plane only now (Blender's *Mirror* merges).
     """
     shift = np.eye(4)
     shift[:3, 3] = (after - before).mean(axis=0)

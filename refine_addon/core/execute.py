@@ -1,10 +1,9 @@
 """The one way to run work, in this thread, on threads or in processes, and its progress.
 
-NumPy releases Python's lock in its loops; many short loops keep passing it on (two threads 1.2
-times as fast as one, two processes 2). Processes run this Python and package under its name here
-(an extension's is Blender's), nothing of the calling program (`ProcessPoolExecutor` imports its
-main module), and end after `IDLE` seconds. Progress is divided into `stages`, as long as `seconds`
-expects.
+NumPy's loops release Python's lock; many short loops keep passing it on (two threads are 1.2 times
+as fast as one, two processes nearly twice). Processes import this package under its name here
+(Blender's, for an extension), nothing of the caller as `ProcessPoolExecutor` would, and end after
+`IDLE` seconds. Progress has `stages`, as long as `seconds` expects.
 """
 
 from __future__ import annotations
@@ -59,8 +58,7 @@ REPLACES_MAPPED = os.name != "nt"
 IDLE = 8.0  # seconds without work after which a process ends, to free its memory; others start fast
 
 WORTH, WORTH_READY = 2.0, 0.2
-"""Seconds of work on one core that are worth processes: yet to be started, a third of a second
-each, or there."""
+"""Seconds of work on one core worth starting processes, a third of a second each, or using them."""
 
 _HEAPS = -8  # M_ARENA_MAX of glibc's malloc.h
 _HELD = 30_000_000  # bytes; above 32 MB, freeing a block does not raise glibc's threshold
@@ -192,7 +190,7 @@ def checked_by(check: Callable[[], None]) -> AbstractContextManager[None]:
 
 
 def on(cluster: Any) -> AbstractContextManager[None]:
-    """Have `run` in this thread, within the block, send long work to a `Cluster` if not None.
+    """Have `run` in this thread, within the block, send long work to a `Cluster`; None does not.
 
     Work that holds large arrays is not sent.
     """
@@ -219,21 +217,14 @@ def return_freed() -> None:
 
 
 def share_heap() -> None:
-    """Let all threads allocate from one heap, in a process of our own; only glibc has several.
-
-    A thread's own heap keeps what it freed: 70 MB of 300 while 160,000 splats are merged.
-    """
+    """Let all threads share one heap: glibc's separate ones keep 70 MB of 300 after freeing."""
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).mallopt(_HEAPS, 1)
 
 
 def chunks(total: int, size: int) -> list[slice]:
-    """Divide ``range(total)`` into consecutive slices, all but the last of one length.
-
-    >>> chunks(5, 2)
-    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
-    """
+    """Divide ``range(total)`` into consecutive slices, all but the last of one length."""
     return [slice(start, min(start + size, total)) for start in range(0, total, size)]
 
 
@@ -260,9 +251,8 @@ def run(
         Called in this thread between items and, on threads or if work calls `checkpoint`, ten times
         a second. When it cancels, running items end at their next `checkpoint`, processes at once.
     threads : int, optional; 1 does everything in this thread, by default `default_threads`
-    cost : float
-        About how many seconds it takes on one core, if it may run in processes. Work, items and
-        results are pickled then, and what work changes is lost.
+    cost : float, expected seconds on one core if it may run in processes
+        Work, items and results are pickled then, and what work changes is lost.
     """
     # Freeing one 30 MB block raises glibc's mmap threshold, so that buffers are reused instead of
     # page-faulted. No effect on other systems.

@@ -100,11 +100,7 @@ class Levels:
         return self.shares or self.psnr
 
     def notes(self, remarks: Mapping[float, str]) -> list[str]:
-        """Which levels were not made, and `remarks` (`Level.remark` by `asked`), in sentences.
-
-        >>> Levels(psnr=(99.0, 40.0)).notes({40.0: ""})
-        ['no level for 99 dB: it would be a copy of the input']
-        """
+        """Which levels were not made, and `remarks` (`Level.remark` by `asked`), in sentences."""
         notes, number, unit = [], 0, "" if self.shares else " dB"
         for asked in self.asked:
             if asked not in remarks:

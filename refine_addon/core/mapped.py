@@ -1,9 +1,8 @@
 """Arrays, splats and regions in files, and what a job has done.
 
-Indexing maps the file, copies and unmaps, as mapped pages count as memory of the process; pickled,
-an array is its file's name, type and shape. A job's folder holds these files and the results of its
-stages (`once`), so it continues after a kill. Splats too many to merge or refit at once are divided
-into regions, each worked on by any process.
+Indexing maps the file, copies and unmaps, as mapped pages count as memory; pickled, an array is its
+file's name, type and shape. A job's folder holds the files and its stages' results (`once`), to
+continue after a kill. Splats too many at once are divided into regions, for any process.
 """
 
 from __future__ import annotations
@@ -204,8 +203,7 @@ def divided(
 ) -> list[NDArray[np.int64]]:
     """Rows, ascending, of boxes of about equally many splats, at most `share` of a `REGION` each.
 
-    Planes are at right angles to, or `askew` of, where `means`, (n, 3), vary; non-finite ones count
-    as the origin.
+    Planes are across where `means`, (n, 3), vary, or `askew`; non-finite ones count as the origin.
     """
     with np.errstate(over="ignore"):  # doubles that are no floats
         place = np.asarray(means, np.float32)
@@ -235,10 +233,7 @@ def look(_fraction: float, _what: str) -> None:
 def in_one(
     folder: Path, regions: Sequence[Splats], boxes: Sequence[NDArray[np.int64]]
 ) -> tuple[Splats, NDArray[np.int64]]:
-    """Splats of all regions, ascending by rows (`boxes`), and the order, (N,), that sorts them.
-
-    The folder of the regions is deleted.
-    """
+    """Splats of all regions (whose folder is deleted) by rows (`boxes`), and their order, (N,)."""
     every, order = on_disk(folder / "every", regions), np.argsort(np.concatenate(boxes))
     result = on_disk(folder.with_name(f"{folder.name}-done"), pieces(every, order))
     shutil.rmtree(folder, ignore_errors=True)

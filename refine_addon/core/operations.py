@@ -60,8 +60,7 @@ def read_scene(
 ) -> Scene:
     """Read a file of any format, whose frame is that of the views.
 
-    `model` tells how splats are drawn where the file is silent or wrong; `form` is the output's
-    format, by default plain PLY.
+    `model` is used where the file is silent or wrong; `form` is the output's, by default plain PLY.
     """
     file = read_splats(path, model)
     splats = file.splats()
@@ -174,11 +173,7 @@ def run(
 
 
 def _reread(path: Path, matrix: NDArray[np.float64] | None) -> Splats | None:
-    """Splats of a lossy file in the frame of the views; None where that cannot be told.
-
-    It cannot of an unreadable file, which has its predecessor's permissions, nor where `matrix` is
-    not uniform.
-    """
+    """Splats of a lossy file in the views' frame; None if unreadable or `matrix` is not uniform."""
     matrix = np.eye(4) if matrix is None else matrix
     try:
         path.open("rb").close()
@@ -242,8 +237,7 @@ def prune_file(
 
     Parameters
     ----------
-    source, output : path-like, of any format; the suffix of the output names it, None writes
-    nothing
+    source, output : path-like, of any format, by suffix; without output nothing is written
     views, budget, method, progress, threads : see `prune`
     zones : sequence of Zone, which splats to protect and remove
     cleaning : Cleaning, optional; what to clean away first, the budget then counts the rest
@@ -382,12 +376,7 @@ class Move:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """The move as (4, 4).
-
-        >>> quarter = Move((1.0, 0.0, 0.0), (0.0, 0.0, 90.0), 2.0)
-        >>> (quarter.matrix @ [1.0, 0.0, 0.0, 1.0]).round(6).tolist()
-        [1.0, 2.0, 0.0, 1.0]
-        """
+        """The move as (4, 4)."""
         turned = np.eye(3)
         for axis, degrees in enumerate(self.rotate):
             one, other = (axis + 1) % 3, (axis + 2) % 3
@@ -422,15 +411,13 @@ def convert_files(
     sources : sequence of path-like, one at least; the first comes first
     moves : sequence of Move, one for each file, or none
     degree : int, optional; harmonics above it are left out
-    morton : bool, whether splats are sorted along a Z-shaped (Morton) curve, so that near ones
-    follow
+    morton : bool, whether splats are sorted along a Z-shaped (Morton) curve: near ones follow
     level : int, of a streamed SOG; 0 is the finest
     model : Model, optional; see `prune_file`
 
     Raises
     ------
-    RefineError : see `read_splats`; also if models differ, or files without levels are asked for
-    one
+    RefineError : see `read_splats`; also if models differ, or files have no such level
 
     Examples
     --------

@@ -93,9 +93,9 @@ class Sight:
         return self._of(np.abs(colors - color).max(axis=1) <= tolerance, hidden)
 
     def piece(self, chosen: NDArray[np.bool_], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Those of the chosen splats, (N,), that hang together at a place, (3,).
+        """Chosen splats, (N,), that touch each other, in the largest piece near a place, (3,).
 
-        Neighbours that touch do. Of the pieces of the `NEIGHBOURS` nearest to it, the largest.
+        Pieces are those of the `NEIGHBOURS` nearest to it; only neighbours can touch.
         """
         gaussians = self.prepared.gaussians
         picked = gaussians.take(np.flatnonzero(chosen[gaussians.index]))
@@ -164,10 +164,9 @@ def look(prepared: Prepared, view: View) -> Sight:
 def surfaces(
     footprints: Footprints, depths: NDArray[np.float32], view: View, step: int
 ) -> NDArray[np.float32]:
-    """Depth of the hit behind which a ray has `LIGHT_LEFT`, infinite without one.
+    """Depth of the hit behind which a ray has `LIGHT_LEFT`, infinite without one, float32.
 
-    One ray through each cell of `step` pixels: (rows, columns) float32. `footprints` are front to
-    back, `depths` theirs, (n,).
+    One ray a cell of `step` pixels. `footprints` are front to back, `depths` theirs, (n,).
     """
     columns, rows = (
         np.minimum(np.arange(0, size, step) + step // 2, size - 1)
@@ -190,12 +189,7 @@ def surfaces(
 
 
 def combined(before: NDArray[np.bool_], taken: NDArray[np.bool_], mode: Mode) -> NDArray[np.bool_]:
-    """A selection, (N,), once some splats were taken, (N,).
-
-    >>> before, taken = np.array([True, True, False]), np.array([True, False, True])
-    >>> combined(before, taken, "SUBTRACT").tolist()
-    [False, True, False]
-    """
+    """A selection, (N,), once some splats were taken, (N,)."""
     if mode == "ADD":
         return before | taken
     if mode == "SUBTRACT":

@@ -51,10 +51,7 @@ _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """Pictures with a depth a pixel, such as meshes among splats: K layers behind each other.
-
-    A splat is in front of a layer where its centre is nearer.
-    """
+    """Pictures with a depth a pixel, such as meshes; splats with nearer centres are in front."""
 
     colors: NDArray[Any]  # (K, 3, H, W), display-referred, 0..1, premultiplied; top row first
     alphas: NDArray[Any]  # (K, H, W), 0..1
@@ -273,14 +270,7 @@ def compare(
 
 
 def fitted(view: View) -> View:
-    """View of the same field of view, at most `LONGEST` pixels along its longer side.
-
-    >>> from refine_addon.core.views import View
-    >>> view = View(np.eye(3), np.zeros(3), 1000.0, 1000.0, 960.0, 540.0, 1920, 1080)
-    >>> small = fitted(view)
-    >>> small.width, small.height, small.fx, small.cy
-    (960, 540, 500.0, 270.0)
-    """
+    """View of the same field of view, at most `LONGEST` pixels along its longer side."""
     scale = LONGEST / max(view.width, view.height)
     if scale >= 1.0:
         return view

@@ -1,8 +1,4 @@
-"""What is refused in a file: a value at a place in it, or a file of another kind, with advice.
-
-Each check of a JSON value is one method of `Place`; each error names file, place, what was got and
-what was expected.
-"""
+"""What is refused in a file: a value at a place in it, or a file of another kind, with advice."""
 
 from __future__ import annotations
 
@@ -36,7 +32,8 @@ _ZIP = b"PK\x03\x04"
 class Place:
     """A file and a place in it, such as "camera 3"; "" for the whole file.
 
-    Every check returns the value that it is given, or raises `RefineError` with the place.
+    Each check of a JSON value is one method, which returns the value or raises `RefineError` with
+    file, place, what was got and what was expected.
     """
 
     path: Path

@@ -42,16 +42,13 @@ TRIES = 3  # how often splats are merged at most to reach a PSNR
 CLOSE = 0.7  # how close to a PSNR a result's estimate must be, dB, or splats are merged again
 
 FIRST = 0.1
-"""Share of the splats deleted before any are merged: the lowest scores, whose deletion changes the
-pictures less than any merge."""
+"""Share of splats deleted before any merge: the lowest scores, which cost less than merges."""
 
 PARTS = 2
-"""Parts of the views, measured again in turn while splats are merged; the others' values are
-carried over."""
+"""Parts of the views, measured in turn while splats are merged; the others' values stay."""
 
 REFITTING = "refitting"
-"""Told to progress callbacks during refitting: a cancelled prune now has a result
-(`Result.stopped`)."""
+"""Told during refitting: from then on a cancelled prune has a result (`Result.stopped`)."""
 
 
 def score(
@@ -75,8 +72,7 @@ def score(
     protected : (N,) bool, optional; only the estimated PSNR depends on it, no score does
     removed : (N,) bool, optional; the others are scored as if these were gone, these score 0
     quality : bool, whether the closed form estimates the PSNR, which takes longer than scoring
-    settled : int, optional; how many splats need their final order, without `removed`; fewer is
-    faster
+    settled : int, optional; how many, besides `removed`, need their final order: fewer is faster
     progress : callable, optional; ``progress(fraction, what)``, returning ``False`` cancels
     threads : int, optional; by default the cores of this process, at most 8
 
@@ -166,19 +162,16 @@ def prune(
 
     Parameters
     ----------
-    splats, views, progress, threads
-        See `score`; both may be None where `scores` decide and nothing is merged.
+    splats, views, progress, threads : see `score`; None where `scores` decide and none is merged
     budget : Budget; where kept splats may change, only their number comes from it
     protected : (N,) bool, optional; neither removed nor changed
     removed : (N,) bool, optional
         Removed first, and counted, unless protected. The others are scored without them, compared
         with pictures without them, and not merged with them.
     scores : Scores, optional; merging measures anew and takes only what a threshold keeps
-    sizes : (float, int), optional; bytes of a splat and of the rest of the output, for a budget in
-    MB
+    sizes : (float, int), optional; bytes of a splat and of the rest of the output, for `max_mb`
     origin : Origin, optional; the splats before an earlier merging prune, for comparing pictures
-    reusable : bool, whether scores are to serve other budgets; else scoring ends where this one
-    does
+    reusable : bool, whether scores are to serve other budgets; else scoring ends at this one
     partial : bool, whether a cancelled refit returns what it reached (`Result.stopped`)
     clock : Clock, optional; gets the times of the steps
 
@@ -540,10 +533,7 @@ def _as_deleted(splats: Splats, keep: NDArray[np.bool_], threads: int | None) ->
 
 
 def _share_between(tried: Sequence[_Try], goal: float, total: int) -> float | None:
-    """Share of `total` to remove by the tries next to a PSNR; None without both.
-
-    The PSNR is linear in the log odds of that share, as in `Quality.at`.
-    """
+    """Share of `total` to remove by the tries next to a PSNR, linear in its log odds, or None."""
     above = min((one for one in tried if one.psnr >= goal), default=None)
     below = max((one for one in tried if one.psnr < goal), default=None)
     if above is None or below is None:

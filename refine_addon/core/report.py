@@ -112,12 +112,11 @@ def of_prune(
     made: Any = None,
     tried: Any = None,
 ) -> dict[str, Any]:
-    """The report of a prune.
+    """The report of a prune; it shares the clock's times, later laps too.
 
-    `psnr` and `between` are estimates in the views that decided and in views in between, dB;
-    `measured` those on rays; `timed` whether the clock timed scoring, to predict other methods'
-    times; `made` (`prune.Made`) what merging made, `tried` what it made where deletion won. The
-    report shares the clock's times, later laps too.
+    `psnr` and `between` are estimates in the views that decided and in views in between, `measured`
+    those on rays, dB; `timed`: the clock timed scoring, to predict other methods' times; `made` and
+    `tried` (`prune.Made`) are what merging made, where it won and where deletion did.
     """
     count, curve = len(keep), scores.quality
     facts: dict[str, Any] = {**scored(scores)}
@@ -211,8 +210,6 @@ def little_seen(seen: NDArray[np.int32]) -> str:
 
     >>> little_seen(np.array([0, 1, 2, 3]))
     '50% of the splats lie in one view or none: views from elsewhere may lose more than is told'
-    >>> little_seen(np.array([2, 2, 2, 3]))
-    ''
     """
     share = np.count_nonzero(seen < 2) / max(len(seen), 1)
     if share < LITTLE_SEEN:
@@ -242,10 +239,9 @@ def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
 
 
 def predicted(scores: Scores, share: float, measured: Mapping[Way, float | None]) -> dict[str, Any]:
-    """How close the pictures stay by method: ``psnr``, dB, or why it is not predicted.
+    """Estimated PSNR at a share removed, by method, dB, or why there is none.
 
-    `share` of the splats goes; `measured` are estimates on rays, dB, the curve of the scores tells
-    the others.
+    `measured` are estimates on rays; the scores' curve gives the others.
     """
     rays, many = scores.ray_sample, len(scores.values) >= FEWEST
     hits = rays.hits_of_ray() if rays is not None and many else None

@@ -91,9 +91,6 @@ def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:
 
     Above 2^24 splats float32 has too few numbers near 1: the highest shares are then lowered to the
     nearest smaller ones, so that no two places tie; the lowest stay exact.
-
-    >>> shares_gone(np.array([1, 2, 4]), 4).tolist()
-    [0.25, 0.5, 1.0]
     """
     shares = (places / count).astype(np.float32)
     if count <= _DISTINCT:

@@ -199,10 +199,9 @@ def _remove_lowest(
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Each splat's place in the order of removal, (N,) float64, 0 (first) to 1 (last); 1 of one.
+    """Each splat's place in the order of removal, (N,) float64, 0 (first) to 1 (last, or only).
 
-    For display and selection in Blender, where float32 makes neighbours above 2^24 splats share a
-    rank; `select` uses scores and rows.
+    For display in Blender, whose float32 ties above 2^24 splats; `select` uses scores and rows.
     """
     count = len(values)
     if count == 1:

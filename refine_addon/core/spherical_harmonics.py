@@ -20,9 +20,6 @@ def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
 
     The constant first, then band by band, m = -l .. l, with the Condon-Shortley phase as in 3DGS:
     constants are sqrt((2l + 1) / 4 pi (l - m)! / (l + m)!) times those of the polynomials.
-
-    >>> basis(np.array([0.0, 0.0, 1.0]), 1).round(4).tolist()
-    [0.2821, -0.0, 0.4886, -0.0]
     """
     return np.stack(_values(np.moveaxis(np.asarray(directions, np.float64), -1, 0), degree), -1)
 
@@ -87,10 +84,7 @@ def colors(
 
 
 def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`colors`, (3, N), in float32 throughout: a tenth of the time.
-
-    Directions are (3, N), harmonics (N, 3, K), the constant first.
-    """
+    """`colors`, (3, N), of (3, N) and (N, 3, K), in float32 throughout: a tenth of the time."""
     degree = math.isqrt(harmonics.shape[2]) - 1
     values = np.stack(_values(np.asarray(directions, np.float32), degree), axis=1)  # (N, K)
     result = np.einsum("nk,nck->cn", values, harmonics)
@@ -99,7 +93,7 @@ def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> N
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients, (N, K, 3), whose colour along ``rotation @ d`` is the old colour along d.
+    """Coefficients, (N, K, 3), whose colour along ``rotation @ d`` is the old one along d.
 
     `rotation` is orthonormal and may be a reflection.
     """
@@ -129,8 +123,7 @@ def stretched(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coefficients whose colour along ``linear @ d`` is nearly the old colour along d.
 
-    Uneven scales bend the sphere of directions, which no degree follows exactly: the nearest of the
-    same degree, by least squares over directions. `rotate` is exact.
+    Uneven scales bend the sphere of directions; least squares over directions. `rotate` is exact.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     here = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))

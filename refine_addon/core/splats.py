@@ -1,8 +1,7 @@
 """3D Gaussian splats as 3DGS files store them, and the only place where they are activated.
 
-Constants are those of the reference implementation (Kerbl et al. 2023,
-`diff-gaussian-rasterization`), except for the near plane. Splats are trained for one way of
-drawing, their *model*, named as by splat-transform and SOG; `formats.ply` tells how a PLY says it.
+Constants are those of `diff-gaussian-rasterization` (Kerbl et al. 2023), except for the near plane.
+Splats are trained for one way of drawing, their *model*, named as by splat-transform and SOG.
 """
 
 from __future__ import annotations
@@ -92,9 +91,7 @@ class Splats:
         return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def by_columns(self) -> Splats:
-        """Copies with contiguous columns, several times as fast to compute with; `sh_rest` as it
-        is.
-        """
+        """Copies with contiguous columns, faster to compute with; `sh_rest` as it is."""
         rows = {name: getattr(self, name) for name in ARRAYS if name != "sh_rest"}
         columns: dict[str, Any] = {
             name: np.empty(values.shape, values.dtype, order="F") for name, values in rows.items()
@@ -115,9 +112,7 @@ def with_model(splats: Splats, model: Model) -> Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Splats of one or more sets, in order, with the highest degree among them; missing harmonics
-    are 0.
-    """
+    """Splats of sets, in order, to the highest degree among them; missing harmonics are 0."""
     if len(parts) == 1:
         return parts[0]
     refuse_mixed([part.model for part in parts])
@@ -146,9 +141,7 @@ def above_constant(degree: int) -> int:
 
 
 def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
-    """Opacities (...) float64 in 0..1 of any logits, infinities included, without overflow; NaN
-    stays.
-    """
+    """Opacities (...) float64 in 0..1 of any logits, without overflow; NaN stays."""
     logits = np.asarray(logits, np.float64)
     # exp(-700) is 1e-304; the limit avoids underflow.
     decay = np.exp(-np.minimum(np.abs(logits), 700.0))
@@ -162,27 +155,20 @@ step of 8 bits is 4,000 times as large."""
 SINGLE_MARGIN = 2.0**-26  # distance from 1 of opacities read from float32; none is nearer
 
 LOG_ZERO = -104.0
-"""Log scale and logit of what is 0 in float32: ``exp(-104)`` rounds to 0, ``exp(-103)`` does not.
-"""
+"""Log scale and logit of 0 in float32: ``exp(-104)`` rounds to 0, ``exp(-103)`` does not."""
 
 
 def opacity_logits(
     opacities: NDArray[Any], margin: float = OPACITY_MARGIN, least: float | None = None
 ) -> NDArray[np.float64]:
-    """Inverse of `opacity`, (...) float64; opacities are clipped to ``least..1 - margin``, NaN
-    stays.
-    """
+    """Inverse of `opacity`, (...) float64; clips to ``least..1 - margin``, NaN stays."""
     low = margin if least is None else least
     inside = np.clip(np.asarray(opacities, np.float64), low, 1.0 - margin)
     return np.asarray(np.log(inside) - np.log1p(-inside))
 
 
 def single_logits(opacities: NDArray[Any]) -> NDArray[np.float64]:
-    """Logits (...) float64 of float32 opacities; `opacity` of them, in float32, gives these back.
-
-    >>> single_logits([0.0, 0.5, 1.0]).round(2).tolist()
-    [-104.0, 0.0, 18.02]
-    """
+    """Logits (...) float64 of float32 opacities; `opacity` of them, in float32, inverts it."""
     return opacity_logits(opacities, SINGLE_MARGIN, math.exp(LOG_ZERO))
 
 
@@ -193,12 +179,7 @@ def scales(log_scales: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def single_log_scales(scales: NDArray[Any]) -> NDArray[np.float64]:
-    """Log scales (...) float64 of float32 scales; signs do not count, as the covariance has
-    squares.
-
-    >>> single_log_scales([0.0, 1.0, -1.0]).tolist()
-    [-104.0, 0.0, 0.0]
-    """
+    """Log scales (...) float64 of float32 scales, without signs: the covariance has squares."""
     sizes = np.abs(np.asarray(scales, np.float64))
     return np.asarray(np.log(np.maximum(sizes, math.exp(LOG_ZERO))))
 
@@ -209,9 +190,7 @@ def base_color(sh_dc: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float64]:
-    """Quaternions of length 1, (..., 4) float64 w x y z; zero and non-finite ones become the
-    identity.
-    """
+    """Quaternions w x y z of length 1, (..., 4) float64; the identity for 0 and non-finite ones."""
     q = np.asarray(quaternions, np.float64)
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
     usable = np.isfinite(largest) & (largest > 0.0)
@@ -222,8 +201,7 @@ def unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def single_unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float32]:
-    """Quaternions of length 1, (N, 4) float32 w x y z, as Blender holds them; zero becomes the
-    identity.
+    """Quaternions w x y z of length 1, (N, 4) float32, as Blender's; zero becomes the identity.
 
     Those of length 1 within float32's rounding, and non-finite ones, stay to the bit.
     """
@@ -253,9 +231,8 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
     """Which splats a renderer can draw, (N,) bool.
 
-    Not those with a NaN or infinite value (but an infinite logit means opacity 0 or 1, and a log
-    scale of minus infinity scale 0), nor those with opacity 0, size 0 along all axes or an overflow
-    in float32.
+    Not those with NaN or infinities (but logits, and minus infinity as log scale, may be infinite),
+    nor those with opacity 0, size 0 along all axes or an overflow in float32.
     """
     good = np.empty(len(splats), np.bool_)
 

@@ -114,8 +114,7 @@ class ViewSet:
     ----------
     views : tuple of View, at least one of positive weight
     note : str, what is not modelled of their source, such as lens distortion
-    turn : int or None, quarters about x (`affine.QUARTER`) from the views to the splats of their
-    files
+    turn : int or None, quarters about x (`affine.QUARTER`) from the views to their files' splats
     """
 
     views: tuple[View, ...]
@@ -143,9 +142,7 @@ class ViewSet:
         return replace(self, views=tuple(self.views[int(index)] for index in indices))
 
     def select(self, names: Sequence[str]) -> ViewSet:
-        """Views by name, in the order of `names`; of equal names the last. `RefineError` without
-        one.
-        """
+        """Views by name, in the order of `names`; of equal names the last. Or `RefineError`."""
         by_name = {view.name: view for view in self.views}
         missing = [name for name in names if name not in by_name]
         if missing:
@@ -221,8 +218,8 @@ class ViewSet:
         return sorted(range(len(self)), key=lambda index: self.views[index].name)
 
     def by_distance(self) -> list[tuple[View, float]]:
-        """Views of positive weight and their weights, by distance from their middle, then from the
-        farthest view, then by name: independent of frame and order.
+        """Views of positive weight and their weights, whatever frame and order the set has: by
+        distance from the middle, ties by distance from the farthest view, then by name.
         """
         centers = self.centers - self.middle()[0]
         order = np.array(self.by_name())
@@ -251,11 +248,11 @@ def refuse_other(views: object) -> None:
 
 
 def views_between(views: ViewSet, most: int) -> list[View]:
-    """At most `most` views halfway between neighbours, evenly from all.
+    """At most `most` views halfway between neighbours, evenly from all, by `ViewSet.places`.
 
     Neighbours have no third view nearer to their middle than they are (Gabriel graph, Gabriel and
-    Sokal 1969), by `ViewSet.places`. Position and rotation are means, the lens is that of one.
-    Neither the frame nor, as far as names differ, the order matters.
+    Sokal 1969). Positions and rotations are means, the lens is that of one. Neither the frame nor,
+    as far as names differ, the order matters.
     """
     ordered = [view for view, _ in views.by_distance()]
     if most < 1 or len(ordered) < 2:
@@ -272,10 +269,7 @@ def views_between(views: ViewSet, most: int) -> list[View]:
 
 
 def with_views_between(views: ViewSet, count: int) -> ViewSet:
-    """Views with about `count` more in between, 0 to `MOST_BETWEEN`; then again between these.
-
-    Fewer are added where there are none left.
-    """
+    """Views with about `count` (0 to `MOST_BETWEEN`) more in between, if there are as many."""
     if not 0 <= count <= MOST_BETWEEN:
         raise RefineError(f"views in between are {count:,}, expected 0 to {MOST_BETWEEN:,}")
     while count > 0:
@@ -307,12 +301,9 @@ def _distances(place, here):
 
 
 def _halfway(one, other):
-    """View halfway between two; None if they look too far apart or one is mirrored.
-
-    Its rotation is nearest to the mean of both, whose singular values are 1 and the cosine of half
-    the angle between them.
-    """
+    """View halfway between two; None if they look too far apart or one is mirrored."""
     one, other = sorted((one, other), key=lambda view: view.name)
+    # Singular values of the mean are 1 and the cosine of half the angle between both.
     left, size, right = np.linalg.svd((one.rotation + other.rotation) / 2.0)
     if size[-1] < math.cos(WIDEST / 2.0):
         return None
@@ -333,8 +324,7 @@ def pinhole(
 ) -> View:
     """View of a camera by OpenGL's matrices, (4, 4); `matrix` is world to camera, y up, z back.
 
-    Without perspective the view stands `FAR` extents of the splats, (N, 3) `means`, away, where
-    rays are parallel but for a thousandth.
+    Without perspective it stands `FAR` extents of the splats away: rays are nearly parallel.
     """
     flip = np.diag([1.0, -1.0, -1.0])
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)  # float32
@@ -356,11 +346,9 @@ def view_through(
     size: tuple[int, int],
     parallel: tuple[float, float] = (0.0, 1.0),
 ) -> View:
-    """View of a camera with one of OpenGL's projection matrices, (4, 4).
+    """View of a camera with one of OpenGL's projection matrices, (4, 4), at a rotation and centre.
 
-    `pose` is rotation, (3, 3), and centre, (3,), of the view; `size` pixels across and up;
-    `parallel`, without perspective, the depth where pixels have their exact size and the distance
-    from there.
+    `parallel`: without perspective, the depth of exact pixel size and how far from there it stands.
     """
     p, (width, height), (rotation, center) = projection_matrix, size, pose
     fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0

@@ -89,20 +89,14 @@ class Solid:
     """The inside of a closed mesh.
 
     Of its surface it holds the side towards which x, y and z grow, but for rounding: solids side by
-    side share no point. Overlapping parts are joined, unless one turns its faces the other way.
+    side share no point. Overlapping parts are joined; where one turns its faces the other way,
+    their overlap is outside, as in a hollow sphere.
 
     Attributes
     ----------
     vertices : (V, 3) float64, equal ones joined
     triangles : (T, 3) int64, without those of two equal vertices
     turned : bool, whether all triangles turn the same way as their neighbours
-
-    Examples
-    --------
-    >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    >>> solid = Solid(corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
-    >>> solid.inside(np.array([[0.2, 0.2, 0.2], [0.5, 0.5, 0.5]])).tolist()
-    [True, False]
     """
 
     def __init__(self, vertices: NDArray[Any], triangles: NDArray[Any]) -> None:
@@ -221,10 +215,8 @@ class MovedVolume:
 def parse(text: str) -> Volume | None:
     """The volume that a text gives in numbers, None where it is a name.
 
-    >>> parse("sphere:0,0,1.5,2")
-    Sphere(center=(0.0, 0.0, 1.5), radius=2.0)
-    >>> parse("box:0,0,0,1,1,inf").high
-    (1.0, 1.0, inf)
+    >>> parse("sphere:0,0,1.5,2"), parse("box:0,0,0,1,1,inf").high
+    (Sphere(center=(0.0, 0.0, 1.5), radius=2.0), (1.0, 1.0, inf))
     """
     kind, colon, rest = text.partition(":")
     if not colon or kind not in _FORMS:

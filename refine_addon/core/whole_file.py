@@ -67,7 +67,7 @@ def expanded(path: Path | str) -> Path:
 
 
 def mode_of(path: Path) -> int:
-    """``st_mode`` of `path`, 0 if missing; OSError or ValueError if unknown, unlike pathlib."""
+    """``st_mode`` of `path`, 0 if missing; raises if the system cannot tell (pathlib: missing)."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -137,9 +137,8 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`, which is renamed to `path` when the block ends.
 
     If the block is interrupted (error, kill, full disk), `path` stays as it was. Of a symbolic
-    link, the target is replaced. Until it is whole nobody else may read the file; one that is
-    replaced hands on its permissions. `RefineError` if it may not be replaced or the system
-    refuses.
+    link, the target is replaced. Nobody else may read it until it is whole; a replaced file hands
+    on its permissions. `RefineError` if it may not be replaced or the system refuses.
     """
     refuse_existing(path, overwrite=overwrite)
     target = Path(os.path.realpath(path))
