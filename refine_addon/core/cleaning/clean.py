@@ -1,20 +1,8 @@
 """Which splats float: they stand where the cameras see that nothing is.
 
-1. Suspects are found: splats that have little support by others (`support.own_support`), small
-   clusters that touch nothing else, giants and needles (`search.Search`).
-2. All suspects are taken away, and it is measured what the views see at the place of each: how much
-   of the light that reaches it stops near it, and how much goes on to a surface behind. So floaters
-   are no support for each other, and a surface supports all that belongs to it. A splat that has
-   lost its support by that is suspect, too, and both steps are done again.
-
-Only the second step decides (`judge`). A suspect floats if little light stops near it, views see
-past it, and the evidence is enough: by how much it changes a pixel, and how many views see past it.
-What touches splats that stay needs more evidence. A splat with nothing behind it, such as one of a
-sky, stays.
-
-Solid suspects that touch each other are also judged as one clump: they hold each other, and rays
-hit each in few views, but together they are evidence enough. The views are split into groups by
-turns, and each group has to agree.
+Suspects have little support (`support.own_support`), or are small clusters, giants or needles. With
+all of them absent, views measure how much light stops at the place of each and how much goes on to
+a surface behind; what loses its support joins them. Only this evidence decides (`judge`).
 """
 
 from __future__ import annotations
@@ -44,13 +32,13 @@ REASONS = {
     "haze": "haze near cameras",
     "outside": "outside all views",
 }
-"""Why a splat may go, and how that is said after a number."""
+"""Why a splat is removed, as said after a number."""
 
 DEFAULT_REASONS = ("front", "isolated", "giant", "needle")
-"""All but what no picture shows, and what no view can judge."""
+"""All but what no picture shows and what no view can judge."""
 
 NEAR = 0.3
-"""Haze is at most so far from a camera, scene sizes."""
+"""Haze is at most this far from a camera, scene sizes."""
 
 SUPPORT = 0.5
 """A suspect floats only if less than this share of the light stops near it."""
@@ -59,73 +47,64 @@ ISOLATED_SUPPORT = 0.05
 """The same of what only belongs to a small cluster."""
 
 AGREE = 0.1
-"""At least this share of the views that see it must see past it, but for giants and needles."""
+"""Least share of the views that see a suspect that see past it; not for giants and needles."""
 
 FEW = 2.0
-"""What fewer views see past stays: no view could be left out, and the others still tell."""
+"""Least views that see past it: with fewer, none could be left out."""
 
 POWER = 1.5
-"""The evidence is by how much a splat changes a pixel, times this power of one more than the views
-that see past it."""
+"""Evidence is the change of a pixel times (views that see past + 1) to this power."""
 
 NEEDED = 4 / 255
-"""So much evidence is needed against a splat that touches nothing."""
+"""Evidence needed against a splat that touches nothing."""
 
 HELD = 8.0
-"""For a single splat it is multiplied by this to the power of the square root of how many
-neighbours touch it and stay."""
+"""Factor of `NEEDED` for a single splat, to the power of the root of kept neighbours in touch."""
 
 GIANT_NEEDED, NEEDLE_NEEDED = 8.0, 1 / 3
-"""It is multiplied by these, too, for giants and needles."""
+"""Factors of `NEEDED` for giants and needles."""
 
 AT_SURFACE = 150.0
-"""For giants by this to the power of their support, too: a sky is made of giants that lie near each
-other, and a veil hangs before what lies behind."""
+"""Factor to the power of a giant's support: giants of a sky support each other, a veil has none."""
 
 FAINT = 0.15
 """Haze is of lower opacity."""
 
 HAZE_HELD = 1.35
-"""For what is so faint, but for giants, by this to the power of how many faint neighbours touch it,
-whether they stay or go: a cloud of faint splats was trained as one, and pictures need it as one."""
+"""Factor to the power of the faint neighbours, kept or not, of a faint splat that is no giant: a
+cloud was trained as one, and pictures need it as one."""
 
 VISIBLE, GLARING, WIDE = 4 / 255, 40 / 255, 0.05
-"""A change of a pixel is opacity times contrast to what lies behind, at most the second of these.
-Where the standard deviation of a giant reaches across more than the third share of a picture's
-longer side it counts by so much more. What stays, but would go if it changed a pixel by the first
-and touched no haze, is nearly transparent."""
+"""A pixel's change is opacity times contrast, at most the second, more for giants wider than the
+third; what would float with the first for its change, outside haze, is nearly transparent."""
 
 CLUMP_NEEDED = 125.0
-"""`NEEDED` is multiplied by this for a clump that is judged as one, whatever it touches."""
+"""Factor of `NEEDED` for a clump that is judged as one, whatever it touches."""
 
 AGREED = 0.7
-"""A group agrees that a clump floats if, of its views that see the splats' places, this share sees
-past them, weighted by opacity."""
+"""Opacity-weighted share of a group's views that must see past a clump."""
 
 FEWEST = 10
-"""Clumps of at least so many splats are judged as one; what does not go so may go by itself."""
+"""Least splats of a clump; smaller ones are judged singly."""
 
 CLUMP_SUPPORT = 0.1
-"""A clump goes only if less than this share of the light stops near its splats."""
+"""A clump floats only if less than this share of the light stops near its splats."""
 
 
 @dataclass(frozen=True)
 class Cleaning:
     """What to clean away.
 
-    Attributes
+    Parameters
     ----------
-    reasons : tuple of str
-        Among `REASONS`.
-    views : int
-        Use at most this many views, spread evenly; 0 uses all.
+    reasons : tuple of str, among `REASONS`
+    views : int, at most this many, spread evenly; 0 uses all
     """
 
     reasons: tuple[str, ...] = DEFAULT_REASONS
     views: int = 64
 
     def __post_init__(self) -> None:
-        """Check the values."""
         object.__setattr__(self, "reasons", tuple(self.reasons))
         unknown = [reason for reason in self.reasons if reason not in REASONS]
         if unknown or not self.reasons:
@@ -142,21 +121,12 @@ class Cleaned:
     Attributes
     ----------
     keep : (N,) bool
-        Which splats stay.
-    by_reason : dict of str to (N,) bool
-        For each of `REASONS`, switched on or not, the splats that it is true of; a splat has one
-        reason. Protected splats have none.
-    past : (N,) int32
-        How many views see past each splat.
-    seen : (N,) int32
-        In how many of the views used each splat's centre lies; 0 of those that had to go.
-    sure : (N,) float32
-        Of those that have a reason, the share of further views that is expected to see past each,
-        (p + 1) / (n + 2) where p of n do (Laplace's rule of succession).
-    undrawable : int
-        How many splats cannot be drawn. They stay.
+    by_reason : dict of str to (N,) bool, for all `REASONS`; at most one a splat, none if protected
+    past : (N,) int32, views that see past each splat
+    seen : (N,) int32, views that hold its centre; 0 of those removed by the user
+    sure : (N,) float32, (p + 1) / (n + 2) where p of n views see past it (Laplace)
+    undrawable : int, splats that cannot be drawn, which stay
     views_given, views_used : int
-        How many views there were, and how many of them were used.
     settings : Cleaning
     """
 
@@ -171,7 +141,7 @@ class Cleaned:
     settings: Cleaning
 
     def counts(self) -> dict[str, int]:
-        """Number of splats that go for each reason that is switched on."""
+        """Splats to remove for each reason that is switched on."""
         return {name: int(np.count_nonzero(self.by_reason[name])) for name in self.settings.reasons}
 
     def surety(self) -> dict[str, float | None]:
@@ -184,16 +154,13 @@ class Cleaned:
         }
 
     def facts(self) -> dict[str, Any]:
-        """What a report says of it."""
+        """Plain JSON values for reports."""
         surety = self.surety()
         sure = {name: surety[name] for name in self.settings.reasons}
         return {**self.counts(), "sure": sure, "words": self.in_words()}
 
     def in_words(self) -> str:
-        """What goes, why, and how sure that is, such as "2,114 in front of surfaces (96 %)".
-
-        The percentage is the mean of `sure`.
-        """
+        """What is removed, why and how surely, such as "2,114 in front of surfaces (96 %)"."""
         counts, surety = self.counts(), self.surety()
         words = [
             f"{counts[name]:,} {text}"
@@ -204,7 +171,7 @@ class Cleaned:
         return ", ".join(words) or "nothing to clean away"
 
     def notes(self) -> list[str]:
-        """What else the user should know, in sentences."""
+        """Notes for the user, in sentences."""
         note = f"{self.undrawable} splats cannot be drawn: no view shows them, and they stay"
         return [note] if self.undrawable else []
 
@@ -223,25 +190,17 @@ def clean(
 
     Parameters
     ----------
-    splats : Splats
-        In the frame and unit of the views.
+    splats : Splats, in the frame and unit of the views
     views : ViewSet
     settings : Cleaning
-    protected : (N,) bool, optional
-        Splats that stay, whatever they are. They are evidence all the same.
-    removed : (N,) bool, optional
-        Splats that go, unless they are protected, and are no evidence: as if they had gone before.
-    progress : callable, optional
-        See `refine_addon.core.execute.Progress`.
-    threads : int, optional
+    protected : (N,) bool, splats that stay, and are evidence
+    removed : (N,) bool, splats that go unless protected, and are no evidence
+    progress, threads : see `prune`
 
     Raises
     ------
     RefineError
-        If there are splats and none of them can be drawn, if no view sees any, or if nothing would
-        be left.
-    Cancelled
-        If `progress` answers ``False``.
+        If no splat can be drawn, no view sees any, or nothing would be left.
     """
     gone = must_go(removed, protected)
     rest = np.ones(len(splats), np.bool_) if gone is None else ~gone
@@ -290,7 +249,7 @@ def clean(
 
 
 def _near_any(gaussians, scene, views, chosen):
-    """Gaussians among those chosen, (M,) bool, that are near a camera, (M,) bool."""
+    """Gaussians among those chosen that are near a camera, (M,) bool."""
     rows = np.flatnonzero(chosen)
     near = np.zeros(len(rows), np.bool_)
     for view in views:
@@ -300,7 +259,7 @@ def _near_any(gaussians, scene, views, chosen):
 
 
 def _outside(gaussians, scene, shown, unused):
-    """Gaussians that reach into the picture of no view, used or not, (M,)."""
+    """Gaussians that reach into the picture of no view, used or not, (M,) bool."""
     rows = np.flatnonzero(~shown)
     for view in unused:
         if len(rows):
@@ -311,13 +270,10 @@ def _outside(gaussians, scene, shown, unused):
 def judge(
     gaussians: Gaussians, found: Found, threads: int | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
-    """Suspects that float and show, those that float but do not show, and how sure that is.
+    """Suspects that float and show, those that float only, and `Cleaned.sure`, (M,) each.
 
-    Returns
-    -------
-    shows, faint : (M,) bool
-    sure : (M,) float64
-        The share of further views that is expected to see past each.
+    A suspect floats if little light stops near it, views see past it, and the evidence suffices,
+    more of it if kept splats touch it. With nothing behind, as in a sky, it stays.
     """
     evidence, giant, large = found.evidence, found.giant, found.large
     seen, past = evidence.views, evidence.past
@@ -354,18 +310,9 @@ def judge(
 
 
 def _clumps(gaussians, found, change, rows, near, touch):
-    """Gaussians that go as the clump of solid suspects that they are in, (M,) bool.
+    """Solid suspects that touch and float as one clump, (M,): single ones are hit in few views.
 
-    Parameters
-    ----------
-    gaussians : Gaussians
-    found : Found
-    change : (M,) float64
-        By how much each changes a pixel.
-    rows : (s,) int64
-        The suspects.
-    near, touch : (s, k)
-        Near splats, and which of them each touches.
+    Each group of views has to agree; `near` and `touch`, (s, k), are of the suspects `rows`.
     """
     chosen = np.flatnonzero(~found.large[rows] & (gaussians.alphas[rows] >= SOLID[-1]))
     members, near, touch = rows[chosen], near[chosen], touch[chosen]

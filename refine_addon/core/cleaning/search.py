@@ -1,11 +1,8 @@
 """Which splats are suspect, and what the views see at their places: found round by round.
 
-A round asks the rays of all views, some aimed at suspects, with the suspects so far absent. It
-measures two things: what the views see at the places of the suspects, which is evidence, and how
-much the others support each other without them. A splat whose support falls below `DOUBTED` is a
-suspect of the next round: a veil that reaches through a scene stops light near everything in it,
-and the splats of a cluster stop light near each other. Clusters are of splats that touch, each
-searched among its near neighbours.
+Each round casts rays, some aimed at suspects, with those so far absent, for evidence and for the
+support of the others: below `DOUBTED` they join. A veil through a scene stops light near everything
+in it, and the splats of a cluster support each other.
 """
 
 from __future__ import annotations
@@ -25,75 +22,53 @@ from ..visibility.projection import Gaussians
 from .support import Evidence, Hits, evidence_of, hits_of_view, own_support, share
 
 DOUBTED = 0.4
-"""A splat is suspect, and may turn out to be in front of surfaces, if others support less than this
-share of its light."""
+"""A splat is suspect if others support less than this share of its light."""
 
 HUGE, GIANT = 0.15, 0.25
-"""A giant is longer than this many scene sizes, and its standard deviation reaches across this
-share of a picture's longer side."""
+"""A giant is longer than this in scene sizes, and its sigma than this share of a picture."""
 
 SLENDER, LONG = 10.0, 0.05
-"""A needle is this many times as long as wide, and its standard deviation reaches across this share
-of a picture's longer side."""
+"""A needle is this many times as long as wide, its sigma longer than this share of a picture."""
 
 ROUNDS = ((0.3, 0.8), (0.8, 0.9), (0.9, 1.0))
-"""Suspects are absent in at most so many rounds, which begin and end at these shares of the work:
-the first casts the rays."""
+"""Begin and end of each round as shares of the work; the first casts the rays."""
 
 FEW_NEW = 0.02
-"""Rounds end where this share of the suspects, or less, joins them."""
+"""Rounds end when at most this share of the suspects joins."""
 
 VIEW_PARTS = 4
-"""The views are also in so many groups, each of which tells what it sees; see `judge`."""
+"""Groups of views that each give evidence; see `clean.judge`."""
 
 SMALL = 100
 """A cluster of fewer splats is suspect."""
 
 SOLID = (0.1, 0.3)
-"""Splats of lower opacity do not hold clusters together: by each of these, since faint ones between
-a dense cluster and a bush make one of the two."""
+"""Opacities below which splats do not link clusters, each tried: faint ones link many."""
 
 NEIGHBOURS = 8
-"""How many near neighbours of a splat are tested for whether they touch it."""
+"""Near neighbours of a splat that are tested for touch."""
 
 REACH = 2.0
 """Two splats touch within this many standard deviations of both, along the step between them."""
 
 APART = 0.01
-"""They touch as well if they are this close: a share of the scene's size plus the distance to its
-middle."""
+"""They also touch this close: a share of the scene's size plus the distance to its middle."""
 
 _DECIDED = 0.8  # others whose light is supported by this share in the first round are not doubted
 
 
 class Found(NamedTuple):
-    """Suspects among M Gaussians, and what the views see with these absent.
+    """Suspects among M Gaussians, why, and what the views see with these absent."""
 
-    Attributes
-    ----------
-    doubted, giant, needle, small : (M,) bool
-        Which Gaussians are suspect, and why.
-    shown : (M,) bool
-        Which have a footprint in any view.
-    views : (M,) float64
-        In how many views the centre lies.
-    width : (M,) float64
-        The largest of `Hits.width`.
-    evidence : Evidence
-        Of the last round.
-    by_part : (2, VIEW_PARTS, M) float32
-        `Evidence.views` and `Evidence.past` of each group of views.
-    """
-
-    doubted: NDArray[np.bool_]
+    doubted: NDArray[np.bool_]  # (M,), as are giant to width
     giant: NDArray[np.bool_]
     needle: NDArray[np.bool_]
     small: NDArray[np.bool_]
-    shown: NDArray[np.bool_]
-    views: NDArray[np.float64]
-    width: NDArray[np.float64]
-    evidence: Evidence
-    by_part: NDArray[np.float32]
+    shown: NDArray[np.bool_]  # have a footprint in any view
+    views: NDArray[np.float64]  # number that holds the centre
+    width: NDArray[np.float64]  # largest of `Hits.width`
+    evidence: Evidence  # of the last round
+    by_part: NDArray[np.float32]  # (2, VIEW_PARTS, M), `Evidence.views` and `past` of each group
 
     @property
     def large(self) -> NDArray[np.bool_]:
@@ -116,19 +91,7 @@ class Search:
         self.hits: list[Hits | None] = [None] * len(views)
 
     def find(self, slender: NDArray[np.bool_], progress: Progress) -> Found:
-        """Let the views look until few suspects join.
-
-        Parameters
-        ----------
-        slender : (M,) bool
-            Which Gaussians are `SLENDER`.
-        progress : callable
-
-        Raises
-        ------
-        RefineError
-            If no view sees any.
-        """
+        """Look in rounds until few suspects join; `slender`, (M,) bool, is from `is_slender`."""
         light, supported, views, width = self._first_look(part(progress, 0.0, ROUNDS[0][0]))
         support = share(supported, light)
         giant = self.huge & (width >= GIANT)
@@ -187,8 +150,7 @@ class Search:
     def _look(self, absent, wanted, behind, progress):
         """Light and supported light of those wanted, and evidence, (7, M), of each group.
 
-        The first time rays are cast for all rounds: aimed at those that are absent, through all
-        `behind` which more may show, (M,) bool.
+        The first call casts the rays of all rounds, aimed at absent ones, and through all `behind`.
         """
 
         def of_group(numbers: range) -> NDArray[np.float64]:
@@ -223,11 +185,7 @@ def is_slender(log_scales: NDArray[np.float32]) -> NDArray[np.bool_]:
 def small_clusters(
     gaussians: Gaussians, solid: NDArray[np.bool_], progress: Progress, threads: int | None
 ) -> NDArray[np.bool_]:
-    """Gaussians of a small cluster, (M,) bool, of those that are solid, (M,) bool.
-
-    Two are in one cluster if they touch, or if a chain of others that touch leads from one to the
-    other.
-    """
+    """Solid Gaussians, (M,) bool, in a small cluster: chains of those that touch."""
     small = np.zeros(len(solid), np.bool_)
     for number, least in enumerate(SOLID):
         rows = np.flatnonzero(solid & (gaussians.alphas >= least))
@@ -242,14 +200,7 @@ def small_clusters(
 def touching(
     gaussians: Gaussians, rows: NDArray[np.int64], progress: Progress, threads: int | None
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Near neighbours of some splats, and which of them each touches, (r, k) each.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-    rows : (r,) int64
-        Which splats.
-    """
+    """Near neighbours of r splats, and which of them each touches, (r, k) each."""
     points = gaussians.means.T.astype(np.float64)  # (M, 3)
     near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)[rows].astype(np.int64)
     one, other = np.repeat(rows, near.shape[1]), near.ravel()
@@ -267,20 +218,7 @@ def touching(
 
 
 def connected(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Lowest number in the connected part of a graph that each node is in, (count,).
-
-    Parameters
-    ----------
-    count : int
-        How many nodes there are.
-    one, other : (E,) int64
-        The ends of the edges.
-
-    Examples
-    --------
-    >>> connected(5, np.array([3, 1]), np.array([1, 4])).tolist()
-    [0, 1, 2, 1, 1]
-    """
+    """Lowest number in the connected part of each node of a graph, (count,)."""
     labels = np.arange(count)
     while True:
         low = np.minimum(labels[one], labels[other])

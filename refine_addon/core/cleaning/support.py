@@ -1,15 +1,10 @@
-"""How much of what the rays see stops near a splat, and how much goes on to what lies behind.
-
-A ray hits splats front to back, and each takes a share of the light that reaches it. Of the light
-that reaches a place, a share stops near that place, and the rest goes on. At a surface nearly all
-of it stops; at a floater most goes on::
+"""How much of the light on rays stops near a splat, and how much goes on to what lies behind.
 
     support = light that stops near the place / light that stops there or behind
 
-A splat is hit where its density is highest along the ray, not at the depth of its centre, so that a
-large wall that is seen obliquely is a surface along all of it. Two hits are near each other if
-their nearness (1 / depth, in scene sizes) differs by less than `WINDOW` of it, or by `PARALLAX`:
-beyond, cameras a scene size apart see one move against the other.
+A surface stops nearly all, a floater little. Hits are where a splat's density peaks on the ray, so
+an oblique wall is a surface. Two are near if their nearness (1 / depth, scene sizes) differs by
+less than `WINDOW` of it, or `PARALLAX`.
 """
 
 from __future__ import annotations
@@ -31,26 +26,25 @@ RAYS = 2500
 """Rays of a view."""
 
 MAX_HITS = 1 << 20
-"""About how many hits the rays of a view may have; there are fewer rays in dense scenes."""
+"""About the most hits of a view's rays; dense scenes get fewer rays."""
 
 WINDOW = 0.1
 """Hits on a ray are near each other if their nearness differs by less than this share of it."""
 
 PARALLAX = 0.05
-"""They are as well if it differs by less than this, per scene size."""
+"""Or by less than this, per scene size: cameras that far apart see more as a shift."""
 
 TARGET = 0.2
-"""Rays are aimed at suspects whose standard deviations, multiplied, are less than this share of the
-area that a ray stands for."""
+"""Rays are aimed at suspects whose product of sigmas is less than this share of a ray's area."""
 
 REACHED = 1e-3
-"""Hits that less of the light reaches tell nothing."""
+"""Hits that less light reaches are no evidence."""
 
 NOTHING = 0.02
-"""Where less of the light stops behind a place, there is nothing behind it."""
+"""With less light stopped behind a place, nothing is behind it."""
 
 SEEN = 0.1
-"""A view sees what lies at and behind a splat if this share of the light stops there."""
+"""A view sees what is at and behind a splat if this share of the light stops there."""
 
 PAST = 0.15
 """A view sees past a splat if a lower share of the light stops near it."""
@@ -62,36 +56,18 @@ _TINY = 1e-30  # replaces 0 as a divisor
 
 
 class Light(NamedTuple):
-    """What becomes of the light on the rays of one view: the h hits that it reaches, near to far.
+    """The light on the rays of one view: the h hits that it reaches, near to far."""
 
-    Attributes
-    ----------
-    hit : (u,) int64
-        The Gaussians that any ray hits.
-    owner : (h,) int32
-        Which of them each hit is on.
-    alpha, transmittance, weight : (h,) float64
-        Alpha there, the share of the light that reaches it, and the share that it takes: their
-        product, or 0 where the Gaussian counts as absent.
-    key : (h,) float64
-        See `Hits`.
-    window : (h,) float64
-        Hits on the same ray are near if their keys differ by at most this.
-    """
-
-    hit: NDArray[np.int64]
-    owner: NDArray[np.int32]
-    alpha: NDArray[np.float64]
-    transmittance: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    key: NDArray[np.float64]
-    window: NDArray[np.float64]
+    hit: NDArray[np.int64]  # (u,), Gaussians hit
+    owner: NDArray[np.int32]  # (h,), place in `hit`
+    alpha: NDArray[np.float64]  # (h,)
+    transmittance: NDArray[np.float64]  # (h,), in front
+    weight: NDArray[np.float64]  # (h,), their product, 0 for absent ones
+    key: NDArray[np.float64]  # (h,), see `Hits`
+    window: NDArray[np.float64]  # (h,), largest difference of keys of near hits
 
     def around(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
-        """First, last and end for each of some hits, (r,) each, as places among all.
-
-        Hits from first up to last are near it on its ray, those from last up to end behind it.
-        """
+        """First, last and end for some hits, (r,) each: near up to last, then behind up to end."""
         key, window, ray = self.key[rows], self.window[rows], np.floor(self.key[rows])
         end = ray + (1.0 + _FRACTION) / 2.0
         first = np.searchsorted(self.key, np.maximum(key - window, ray))
@@ -104,32 +80,17 @@ class Light(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What the rays of one view hit that may show once suspects are absent: h hits, near to far.
+    """The h hits of one view that may show once suspects are absent, near to far."""
 
-    Attributes
-    ----------
-    hit : (u,) int64
-        The Gaussians that any ray hits.
-    width : (u,) float32
-        The longer standard deviation of their footprints, as a share of the image's longer side.
-    owner : (h,) int32
-        Which of them each hit is on.
-    alpha : (h,) float32
-    key : (h,) float64
-        The ray's number plus the place on it, 0 to 1; ascending.
-    scale : float
-        How much of a key is one unit of nearness, 1 / scene size.
-    """
-
-    hit: NDArray[np.int64]
-    width: NDArray[np.float32]
-    owner: NDArray[np.int32]
-    alpha: NDArray[np.float32]
-    key: NDArray[np.float64]
-    scale: float
+    hit: NDArray[np.int64]  # (u,), Gaussians hit
+    width: NDArray[np.float32]  # (u,), longer sigma over the image's longer side
+    owner: NDArray[np.int32]  # (h,), place in `hit`
+    alpha: NDArray[np.float32]  # (h,)
+    key: NDArray[np.float64]  # (h,), ascending: ray number plus place on it, 0 to 1
+    scale: float  # keys per unit of nearness, 1 / scene size
 
     def without(self, absent: NDArray[np.bool_]) -> Light:
-        """The light if some Gaussians, (M,) bool, take none."""
+        """The light if absent Gaussians, (M,) bool, take none."""
         ray = np.floor(self.key)
         present = (~absent[self.hit]).take(self.owner).astype(np.float64)
         alpha = self.alpha.astype(np.float64)
@@ -143,23 +104,13 @@ class Hits(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What views see of M Gaussians with all suspects absent; 0 but for the suspects.
+    """What views see of M Gaussians, (M,) each, with all suspects absent; 0 but for these."""
 
-    Attributes
-    ----------
-    near, behind : (M,) float64
-        Light that stops near their places, and behind them, times their alpha.
-    contrast : (M,) float64
-        The latter times the difference of colour between suspect and what lies behind.
-    views, past : (M,) float64
-        How many views see what lies at and behind it, and how many of them see past it.
-    """
-
-    near: NDArray[np.float64]
-    behind: NDArray[np.float64]
-    contrast: NDArray[np.float64]
-    views: NDArray[np.float64]
-    past: NDArray[np.float64]
+    near: NDArray[np.float64]  # light that stops near, times alpha
+    behind: NDArray[np.float64]  # light that stops behind, times alpha
+    contrast: NDArray[np.float64]  # the latter times the difference of colour to what is behind
+    views: NDArray[np.float64]  # number that sees what is at and behind it
+    past: NDArray[np.float64]  # number of these that sees past it
 
 
 def hits_of_view(
@@ -170,19 +121,10 @@ def hits_of_view(
     absent: NDArray[np.bool_],
     targets: NDArray[np.bool_] | None = None,
 ) -> Hits | None:
-    """What the rays of one view hit; None if nothing.
+    """Hits of one view, given with the number that sets its pixels; None if nothing is hit.
 
-    Parameters
-    ----------
-    gaussians, footprints
-        The latter are those of the former in the view.
-    scene
-    numbered : View, int
-        The view, and its number: each has its rays in other pixels.
-    absent : (M,) bool
-        Gaussians that may take no light, though they are hit.
-    targets : (M,) bool, optional
-        Rays are aimed at these if they are small.
+    absent : (M,) bool, Gaussians that may take no light, though they are hit
+    targets : (M,) bool, which rays are aimed at if small
     """
     view, number = numbered
     count = min(RAYS, MAX_HITS / max(depth_complexity(footprints, view), 1.0))
@@ -211,10 +153,7 @@ def hits_of_view(
 
 
 def _centers(footprints, targets, number, area):
-    """Centres of those targets that rays spread evenly would miss, (2, t), pixels.
-
-    They are smaller than an area, px^2, and in another order in each view.
-    """
+    """Centres, (2, t) px, of targets below `area`, px^2, which rays may miss, shuffled by view."""
     small = footprints.sigmas[0] * footprints.sigmas[1] < area
     rows = np.flatnonzero(small & targets[footprints.index])
     turn = (footprints.index[rows] * _TURNS[0] + number * _TURNS[1]) % 1.0
@@ -222,14 +161,10 @@ def _centers(footprints, targets, number, area):
 
 
 def _depths(gaussians, footprints, scene, view, rays, reached):
-    """Depths at which rays hit splats, scene sizes, (h,): where the splats are densest on them.
+    """Depths, scene sizes, (h,), where splats are densest on the rays that reach them.
 
-    Given the place in the image, the mean depth of a Gaussian is that of its centre plus
-    ``c' C^-1 d``, with C its covariance in the image, c that of image and depth, and d the step
-    from its centre. That is the sum of ``(c.a / s^2) (d.a / s^2)`` over the footprint's axes a, of
-    length s.
-
-    `gaussians` and `footprints` are the u that are hit; `reached`, (h,), says which hits count.
+    The centre's plus ``c' C^-1 d``, the sum of ``(c.a / s^2) (d.a / s^2)`` over axes a of length s:
+    C is the covariance in the image, c that with depth, d the step from the centre.
     """
     in_camera = projection.in_camera(gaussians, scene, view)
     (x, y, z), covariances = (values.astype(np.float64) for values in in_camera)
@@ -254,10 +189,9 @@ def _depths(gaussians, footprints, scene, view, rays, reached):
 
 
 def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Light that each of `Light.hit` takes, and that times its support by others, (2, u).
+    """Light of each wanted `Light.hit`, and that times its support by others, (2, u).
 
-    Others support it as they would if it were gone: then ``1 / (1 - alpha)`` times as much light
-    reaches what lies behind it. Both are 0 of those that are not wanted, (M,) bool.
+    With it gone, what lies behind gets ``1 / (1 - alpha)`` times the light.
     """
     rows = np.flatnonzero(wanted[light.hit].take(light.owner) & (light.weight > 0.0))
     before = _running(light.weight)
@@ -275,10 +209,7 @@ def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
 def evidence_of(
     light: Light, suspects: NDArray[np.bool_], colors: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """`Evidence` that one view gives of `Light.hit`, (5, u).
-
-    The suspects, (M,) bool, are absent; colours are (M, 3).
-    """
+    """`Evidence` of one view for `Light.hit`, (5, u), with suspects, (M,) bool, absent."""
     rows = np.flatnonzero(suspects[light.hit].take(light.owner))
     before = _running(light.weight)
     first, last, end = light.around(rows)
@@ -299,7 +230,7 @@ def evidence_of(
 
 
 def share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share that a part is of a whole, (M,) each; 1 where there is nothing."""
+    """Share of a part in the whole, (M,) each; 1 where there is nothing."""
     return np.divide(part, whole, out=np.ones_like(whole), where=whole > 0.0)
 
 

@@ -1,17 +1,10 @@
-"""Whether cameras and splats can belong together, by how fine the pictures of a sample are.
-
-Training made splats small where cameras looked at them, and left them large, or out, elsewhere. So
-pictures from where the capture was made are finer than from where it was not::
+"""Whether cameras and splats belong together: pictures are finest where the capture was made.
 
     fineness = mean over pixels of the sum of  T_i alpha_i / (1 + (s_i / (FINE side))^2)
 
-s is the geometric mean of a footprint's two standard deviations and side that of the image's sides,
-in pixels. Where nothing is, and where a splat fills the picture, it is 0. No threshold on it would
-hold for all scenes. But if the pictures become much finer once all cameras are turned a quarter
-about x, cameras and splats came from files of which only one was turned upright.
-
-From far away every picture is fine. So a distant view is found by where its splats lie: all of them
-in a small part of its picture.
+s and side, px, are geometric means of a footprint's standard deviations and of the image's sides.
+No threshold holds for all scenes, but much finer pictures after a quarter turn about x mean that
+only one of the files was turned upright. From far away all is fine: see `SMALL`.
 """
 
 from __future__ import annotations
@@ -31,65 +24,50 @@ from ..visibility import frustum, projection
 from ..visibility.cast import cast, pixels
 
 SAMPLE = 4096
-"""About so many splats are a sample of all; each is enlarged to the area of those it stands for."""
+"""About this many splats stand for all, each enlarged to the area of those it stands for."""
 
 POINTS = 512
-"""Distant views are found by where about so many splats lie in the pictures."""
+"""About this many splats show which views are distant."""
 
 VIEWS = 12
-"""So many views at most are turned."""
+"""Most views that are turned."""
 
 RAYS = 1024
-"""How many rays all of them together have."""
+"""Rays of all of them together."""
 
 FINE = 0.015
 """Standard deviation at which a splat is half as fine as a point, as a share of the image."""
 
 BETTER = 1.5
-"""By which factor turned cameras must see finer pictures."""
+"""Factor by which turned cameras must see finer pictures."""
 
 LEAST = 0.04
-"""Pictures that are less fine than that show too little to tell anything."""
+"""Pictures less fine show too little to decide by."""
 
 ONE_WAY = 0.95
-"""Length of the mean of the viewing directions from which on the views look one way: then turning
-them shows another part of the scene, and its fineness tells nothing."""
+"""Views whose mean direction is this long look one way: turned, they see another part."""
 
 WHOLE = 0.8
-"""Share of the splats that are in the picture, on average, from which on the turn is not measured:
-the views see all of the scene from outside, and would after a turn."""
+"""Mean share of splats in the picture if views see the whole from outside, turned or not."""
 
 FEW = 8
 """A view with fewer splats of the sample is never called distant."""
 
 SMALL = 0.02
-"""A view is distant if its splats, but for a tenth of them to each side, fill less than this share
-of its picture's width and of its height."""
+"""A view is distant if its splats, but a tenth to each side, fill less of its width and height."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How the views stand to the splats.
+    """How the views stand to the splats."""
 
-    Attributes
-    ----------
-    turn : {0, 1, -1}
-        By how many quarters about x, `affine.QUARTER` or its inverse, the views are to be turned.
-    known : bool
-        Whether that is known from how views and splats were imported; else it was measured.
-    fineness : tuple of float
-        Of the pictures as the views are, turned by a quarter, and back; empty if not measured.
-    far : tuple of str
-        Names of the views that see the splats from far away.
-    """
-
-    turn: int = 0
-    known: bool = False
-    fineness: tuple[float, ...] = ()
-    far: tuple[str, ...] = ()
+    turn: int = 0  # quarters about x (`affine.QUARTER`) to turn the views by: 0, 1 or -1
+    known: bool = False  # by the import; else it was measured
+    fineness: tuple[float, ...] = ()  # as they are, turned by a quarter, and back; or ()
+    far: tuple[str, ...] = ()  # names of the views that see the splats from far away
 
     def notes(self) -> list[str]:
-        """What the user should know, in sentences."""
+        """Notes for the user, in sentences."""
         return [note for note in (self.turned(), self.distant()) if note]
 
     def turned(self) -> str:
@@ -123,7 +101,7 @@ class Alignment:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Alignment:
-        """The alignment that `facts` describe; of malformed ones, that nothing is known."""
+        """The alignment from `facts`; an empty one if they are malformed."""
         try:
             stored = dict(facts or {})
             turn, known = int(stored.get("turn", 0)), bool(stored.get("known", False))
@@ -143,24 +121,7 @@ def alignment(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Alignment:
-    """How views stand to splats.
-
-    Parameters
-    ----------
-    splats : Splats
-        In the frame of the views.
-    views : ViewSet
-        All that were given; if they know their turn, it is not measured.
-    used : ViewSet, optional
-        Those that are turned to measure; without them nothing is measured.
-    progress : callable, optional
-    threads : int, optional
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
-    """
+    """How given views stand to splats; `used` are turned to measure, unless the views know it."""
     with np.errstate(invalid="ignore"):  # signalling NaN
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
     far, in_pictures, count = [], 0, 0
@@ -189,10 +150,7 @@ def _spread_rows(splats, count):
 
 
 def _in_picture(means, view):
-    """Where those of some points, (n, 3), that lie in a view are in its picture, (2, m).
-
-    In depths, from the middle of the lens.
-    """
+    """Places, (2, m), in depths from the lens's middle, of points, (n, 3), in a view's picture."""
     with np.errstate(over="ignore", invalid="ignore"):
         local = view.rotation @ (means - view.center).T  # (3, n)
         planes = frustum.clip_planes(view, float(np.finfo(np.float64).tiny))

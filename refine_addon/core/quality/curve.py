@@ -1,7 +1,6 @@
-"""How close the pictures of the views stay to those of the unpruned splats, as a curve.
+"""PSNR of the views against the unpruned splats, as a curve over the share removed.
 
-The measure is PSNR in dB of pictures clipped to 0..1, as a screen shows them: of each view by
-itself, at most 100, and of these the mean. `estimate.psnr` estimates it.
+In dB of pictures clipped to 0..1: the mean over views of at most 100 each. `psnr` estimates it.
 """
 
 from __future__ import annotations
@@ -21,59 +20,53 @@ Way = Literal["delete", "merge", "refit"]
 WAYS: tuple[Way, ...] = ("delete", "merge", "refit")
 
 PSNR_CAP = 100.0
-"""PSNR of equal pictures, dB, and the highest that an estimate may be."""
+"""PSNR of equal pictures, dB, and the highest estimate."""
 
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-"""Shares of the splats removed at which the estimate is made; between them it is interpolated."""
+"""Shares removed at which the PSNR is estimated; between them it is interpolated."""
 
 MERGED_SHARES = (0.3, 0.5, 0.7, 0.9)
 """Shares removed at which kept splats stand in for removed ones; see `merged_from`."""
 
 GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
-"""What merging gains over deleting at those shares, dB: a constant, and a part of what
-standing in gains on rays."""
+"""Gain of merging over deletion there, dB: a constant, and a part of the gain of standing in."""
 
 FULL_GAIN = 40_000
-"""Scenes of at least so many splats gain that much."""
+"""Scenes of at least this many splats gain that much."""
 
 FEWER = 0.2, 0.4, 0.8, 1.3
-"""By how much less fewer splats gain at those shares, dB for each halving: they have fewer
-neighbours of their kind to merge with."""
+"""Loss of gain there, dB for each halving: fewer neighbours of a kind to merge with."""
 
 FEWEST = 20_000
-"""Of fewer splats it is not foretold: scenes differ by up to 7 dB."""
+"""Fewer splats have no prediction: scenes differ by up to 7 dB."""
 
 PLAIN = 0.1
 """Share removed up to which merging is plain deletion."""
 
 REFIT_GAIN, REFIT_HITS, FEWER_RAYS = (2.9, 3.2, 3.8, 4.7), 78.0, 1.3
-"""What refitting gains over merging in the views that decide, dB: at `MERGED_SHARES`, where a
-ray hits `REFIT_HITS` splats, and so much less for each doubling of that. Rounds learn from a number
-of hits, so that of a scene in which rays hit more they see fewer rays."""
+"""Gain of refitting over merging, dB: at `MERGED_SHARES`, if a ray has `REFIT_HITS` hits, and the
+loss for each doubling: rounds use a number of hits, so dense scenes get fewer rays."""
 
 UNSEEN = 60.0
-"""PSNR in dB above which pictures are the same to the eye: rounding to 8 bits alone makes 59."""
+"""PSNR in dB above which pictures look the same: rounding to 8 bits alone makes 59."""
 
 AS_GOOD = 0.5
-"""By so much more, dB, merging has to reach than plain deletion, or deletion is as good: nobody
-sees a difference so small, and rows that stay to the bit can be compared with the original's."""
+"""Merging must gain more dB, or deletion is as good: nobody sees less, and rows stay to the bit."""
 
 PARTED = 3.0
-"""By so much less, dB, views in between are said to lose more than those that decided."""
+"""Views in between lose more than those that decided if they are lower by this, dB."""
 
 NOTICED = 50.0
-"""What decided counts as no more than that, dB: between views at 70 and at 55 nobody sees more."""
+"""Deciding views count as at most this, dB: nobody sees more between 70 and 55."""
 
 ROUNDS = 2.5
-"""Scoring by occlusion takes so many times as long as measuring all splats once."""
+"""Time of scoring by occlusion over that of measuring all splats once."""
 
 TIMED = (0.1, 0.3, 0.5, 0.55, 0.7, 0.9)
-"""Shares removed for which the next two hold; between them they are interpolated."""
+"""Shares removed of the next two, which are interpolated."""
 
 MERGING = (0.1, 0.5, 0.65, 1.4, 1.8, 2.4)
-"""How many times as long as measuring once merging takes after that: more stages, more time.
-
-These and the next are processor times of `room_small`, of one thread."""
+"""Time of merging over that of measuring once: one thread's processor time of `room_small`."""
 
 REFITTING = (20.0, 17.0, 8.5, 10.5, 7.5, 5.0)
 """The same of refitting."""
@@ -83,87 +76,41 @@ _LEAST_SHARE = 1e-6  # the place of "nothing removed" on the curve's axis, where
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """A curve from the share of the splats that is removed to the estimated PSNR.
+    """Estimated PSNR, dB, never rising, at L shares of the splats removed.
 
-    Attributes
-    ----------
-    shares : (L,) float64
-        Ascending, between 0 and 1.
-    psnr : (L,) float64
-        With these shares deleted, lowest scores first; dB, never rising.
-    merged : (L,) float64
-        About what merging reaches with as many kept splats; dB, never rising.
-    foretold : bool
-        Whether `merged` is accurate enough to be shown.
-    views : dict of str to (L,) float64
-        As `psnr`, of single views by their names; those that no ray tells of are missing.
-    hits : float
-        How many splats a ray hits on average.
-    between : (L,) float64 or None
-        As `psnr`, in views between these; None where nothing tells it.
-
-    Examples
-    --------
     >>> curve = Quality(np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0]), np.zeros(3))
     >>> curve.at(0.5), curve.share(40.0)
     (40.0, 0.5)
     """
 
-    shares: NDArray[np.float64]
-    psnr: NDArray[np.float64]
-    merged: NDArray[np.float64]
-    foretold: bool = True
-    views: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    hits: float = REFIT_HITS
-    between: NDArray[np.float64] | None = None
+    shares: NDArray[np.float64]  # (L,), ascending
+    psnr: NDArray[np.float64]  # (L,), with the lowest scores deleted
+    merged: NDArray[np.float64]  # (L,), about what merging reaches
+    foretold: bool = True  # whether `merged` is accurate enough to be shown
+    views: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # by name, if rays hit
+    hits: float = REFIT_HITS  # mean number of splats that a ray hits
+    between: NDArray[np.float64] | None = None  # (L,), `psnr` of views in between
 
     def at(self, share: float, way: Way = "delete") -> float:
-        """PSNR with a share of the splats removed, dB; if kept splats may change, about.
-
-        Between the shares of the curve the PSNR is taken as linear in the logarithm of the odds
-        ``share / (1 - share)``, which it nearly is; beyond the last it stays.
-        """
+        """PSNR with a share removed, dB; between shares linear in log-odds, which it nearly is."""
         return self._at(self._curve(way), share)
 
     def of_views(self, share: float, way: Way = "delete") -> dict[str, float]:
-        """PSNR of single views with a share of the splats removed, dB.
-
-        Merging and refitting are taken to gain as much in each view as in all together.
-
-        Examples
-        --------
-        >>> curve = Quality(np.array([0.2, 0.5]), *np.array([[50.0, 40.0], [53.0, 46.0]]))
-        >>> curve.views["a"] = np.array([48.0, 36.0])
-        >>> curve.of_views(0.5), curve.of_views(0.5, "merge")
-        ({'a': 36.0}, {'a': 42.0})
-        """
+        """The same of single views: methods gain as much in each as in all together."""
         gain = self.at(share, way) - self.at(share)
         return {
             name: min(self._at(psnr, share) + gain, PSNR_CAP) for name, psnr in self.views.items()
         }
 
     def at_between(self, share: float, way: Way = "delete") -> float | None:
-        """PSNR in views between these with a share of the splats removed, dB.
-
-        Merging and refitting are taken to gain as much there. None where nothing tells it.
-
-        Examples
-        --------
-        >>> between = np.array([48.0, 36.0])
-        >>> curve = Quality(np.array([0.2, 0.5]), between + 2.0, between + 9.0, between=between)
-        >>> curve.at_between(0.5), curve.at_between(0.5, "merge")
-        (36.0, 43.0)
-        """
+        """The same of views in between; None if unknown."""
         if self.between is None:
             return None
         deleted = self._at(self.between, share)
         return min(deleted + self.at(share, way) - self.at(share), PSNR_CAP)
 
     def share(self, psnr: float, way: Way = "delete") -> float:
-        """Largest share that can go while the PSNR is at least `psnr`, dB; or 0.
-
-        It is at most the last share of the curve.
-        """
+        """Largest share that leaves at least `psnr` dB, at most the last of the curve; or 0."""
         odds, values = self._odds(), [PSNR_CAP, *self._curve(way)]
         if psnr > PSNR_CAP:
             return 0.0
@@ -175,7 +122,6 @@ class Quality:
         return float(1.0 / (1.0 + np.exp(-place)))
 
     def _curve(self, way):
-        """PSNR at the shares, dB, never rising."""
         if way == "delete":
             return self.psnr
         gain = refit_gain(self.shares, self.hits) if way == "refit" else 0.0
@@ -185,11 +131,10 @@ class Quality:
         return [_log_odds(share) for share in (0.0, *self.shares.tolist())]
 
     def _at(self, psnr, share):
-        """PSNR of a curve at a share; at its beginning nothing is removed."""
         return float(np.interp(_log_odds(share), self._odds(), [PSNR_CAP, *psnr]))
 
     def as_good(self, share: float) -> bool:
-        """Whether plain deletion of a share is about as good as merging, as foretold."""
+        """Whether deleting a share is predicted to be about as good as merging."""
         plain = self.at(share)
         return deletion_will_do(plain) or plain > self.at(share, "merge") - AS_GOOD
 
@@ -220,17 +165,8 @@ class Quality:
 
 
 def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.float64]:
-    """About what refitting gains over merging, dB, at least 0.
+    """Predicted gain of refitting over merging, dB >= 0, by share removed and mean hits of a ray.
 
-    Parameters
-    ----------
-    share : (L,) float64 or float
-        Of the splats that goes.
-    hits : float
-        How many splats a ray hits on average.
-
-    Examples
-    --------
     >>> [round(float(refit_gain(0.5, hits)), 2) for hits in (39.0, 78.0, 156.0)]
     [4.5, 3.2, 1.9]
     """
@@ -245,23 +181,9 @@ def expected(
     measured: Mapping[Way, float | None],
     hits: float | None = None,
 ) -> dict[Way, float | None]:
-    """About which PSNR is reached by what kept splats become, dB; None where nothing tells it.
+    """Predicted PSNR of each method, dB, None if unknown; what was measured stays.
 
-    Parameters
-    ----------
-    curve : Quality or None
-    share : float
-        Of the splats that goes.
-    measured : mapping of str to (float or None)
-        The estimates that were measured, dB: these are returned.
-    hits : float or None
-        How many splats a ray hits on average, to foretell what refitting gains over merging that
-        was measured; None where that is not foretold.
-
-    Examples
-    --------
-    >>> expected(None, 0.5, {"merge": 46.0}, 78.0)
-    {'delete': None, 'merge': 46.0, 'refit': 49.2}
+    With a ray's mean `hits`, refitting is predicted from merging that was measured.
     """
     told: dict[Way, float | None] = {}
     for way in WAYS:
@@ -277,33 +199,14 @@ def expected(
 
 
 def deletion_will_do(psnr: float | None) -> bool:
-    """Whether nobody would see what merging gains over plain deletion.
-
-    Parameters
-    ----------
-    psnr : float or None
-        The estimate with splats deleted, dB; None where the views see too little, so that nothing
-        tells of a gain.
-    """
+    """Whether nobody sees a gain over deletion at `psnr` dB, None if views see too little."""
     return psnr is None or psnr > UNSEEN
 
 
 def needed(gone: int | None, count: int) -> int | None:
-    """How many of `count` splats the curve must be known for where `gone` are removed.
+    """Splats, of `count`, that the curve must cover for `gone` removed; None if all.
 
-    That is up to the next of `MERGED_SHARES`, so that what it says up to there is what the whole
-    curve says. None if the whole is needed.
-
-    Parameters
-    ----------
-    gone : int or None
-        None where that is not known before.
-    count : int
-
-    Examples
-    --------
-    >>> needed(40, 100), needed(50, 100), needed(95, 100)
-    (50, 50, None)
+    Up to the next of `MERGED_SHARES`, so that it equals the whole curve up to there.
     """
     places = (math.floor(share * count) for share in MERGED_SHARES)
     return None if gone is None else next((place for place in places if place >= gone), None)
@@ -312,21 +215,10 @@ def needed(gone: int | None, count: int) -> int | None:
 def merged_from(
     psnr: NDArray[np.float64], gains: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
-    """About what merging reaches at the first L of `SHARES`, without merging; dB.
+    """Predicted PSNR of merging at the first L of `SHARES`, dB, from that of deletion, (L,).
 
-    Rays tell what the pictures would be if removed splats stayed as opaque as they are, in the
-    colour of the nearest kept hit (`Rays.colors_by_nearest_kept`). That is neither an upper nor a
-    lower bound of what merging reaches, but goes up and down with it from scene to scene.
-
-    Parameters
-    ----------
-    psnr : (L,) float64
-        With the splats deleted, at those shares.
-    gains : (G,) float64
-        By how much it is higher with kept splats standing in, at the first G of `MERGED_SHARES`,
-        which go as far.
-    count : int
-        How many splats there are.
+    Kept splats that stand in (`Rays.colors_by_nearest_kept`) give `gains`: no bound, but they vary
+    from scene to scene as those of merging do.
     """
     constant, part, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
     halvings = max(math.log2(FULL_GAIN / max(count, 1)), 0.0)
@@ -337,18 +229,8 @@ def merged_from(
 
 
 def left_to_lose(goal: float, psnr: float | None) -> float:
-    """PSNR that a second change may have by itself so that both together reach `goal`, dB.
+    """PSNR that a second change may have so that both reach `goal`, dB: squared errors add up.
 
-    The squared errors of changes that have nothing to do with each other add up.
-
-    Parameters
-    ----------
-    goal : float
-    psnr : float or None
-        Of the first change; None if there was none.
-
-    Examples
-    --------
     >>> round(left_to_lose(40.0, 43.0103), 2), left_to_lose(40.0, 39.0)
     (43.01, inf)
     """
@@ -359,19 +241,8 @@ def left_to_lose(goal: float, psnr: float | None) -> float:
 
 
 def out_of_reach(goal: float, gone: int, count: int, psnr: float | None) -> str:
-    """Sentence where a PSNR as budget cannot be had, or "".
+    """Sentence if a PSNR, dB, cannot be had as budget with `gone` of `count` removed, or "".
 
-    Parameters
-    ----------
-    goal : float
-        The PSNR, dB.
-    gone, count : int
-        How many splats go, of how many.
-    psnr : float or None
-        The estimate with these removed, dB.
-
-    Examples
-    --------
     >>> out_of_reach(99.0, 0, 100, 100.0)
     'by the estimate nothing can go at 99 dB'
     >>> out_of_reach(10.0, 95, 100, 16.2)
@@ -386,25 +257,17 @@ def out_of_reach(goal: float, gone: int, count: int, psnr: float | None) -> str:
 
 
 def in_words(psnr: float) -> str:
-    """An estimate as a user needs it.
-
-    >>> in_words(38.4), in_words(72.0)
-    ('about 38 dB', 'more than 60 dB')
-    """
+    """An estimate as a user needs it, "about 38 dB" or "more than 60 dB"."""
     return f"more than {UNSEEN:.0f} dB" if psnr > UNSEEN else f"about {psnr:.0f} dB"
 
 
 def parted(psnr: float | None, between: float | None) -> bool:
-    """Whether views in between lose more than those that decided, so that it can be seen.
-
-    >>> parted(50.0, 36.0), parted(50.0, 48.0), parted(80.0, 48.0), parted(50.0, None)
-    (True, False, False, False)
-    """
+    """Whether views in between visibly lose more than those that decided, see `PARTED`."""
     return psnr is not None and between is not None and min(psnr, NOTICED) - between > PARTED
 
 
 def in_views(psnr: float, between: float | None) -> str:
-    """An estimate in the views that decided and in those between them, as a user needs it.
+    """An estimate for the views that decided and for those in between, in words.
 
     >>> in_views(50.2, 36.1), in_views(50.2, None)
     ('about 50 dB in these views, about 36 between them', 'about 50 dB in these views')
@@ -420,19 +283,8 @@ def in_views(psnr: float, between: float | None) -> str:
 
 
 def expected_seconds(scored: float, share: float, *, once: bool) -> dict[Way, float]:
-    """About how long pruning takes, by what is done, seconds; without files.
+    """Predicted seconds of each method after `scored` seconds of scoring, `once` or in rounds.
 
-    Parameters
-    ----------
-    scored : float
-        How long scoring took, seconds.
-    share : float
-        Of the splats that goes.
-    once : bool
-        Whether all splats were measured once; else they were scored in rounds.
-
-    Examples
-    --------
     >>> expected_seconds(1.0, 0.5, once=True)
     {'delete': 2.5, 'merge': 1.65, 'refit': 10.15}
     """

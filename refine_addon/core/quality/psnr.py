@@ -1,8 +1,6 @@
-"""The PSNR that views will have, from a sample of their pixels instead of whole pictures.
+"""PSNR of views from a sample of their pixels, which a `RaySample` knows with all splats or some.
 
-The rays of a `RaySample` tell the colours of their pixels exactly, with all splats and with some of
-them removed. The mean squared difference over these pixels is an unbiased sample of that over the
-picture, and nothing is assumed about which splats go together or what lies behind them.
+The mean squared difference over these pixels is unbiased for that over the picture.
 """
 
 from __future__ import annotations
@@ -22,20 +20,14 @@ from ..visibility.cast import RaySample, cast, colors_from
 from .curve import FEWEST, MERGED_SHARES, PSNR_CAP, SHARES, Quality, merged_from
 
 MIN_RAYS_WITH_HITS = 256
-"""So many rays must hit a splat at least, or nothing is estimated."""
+"""Fewer rays that hit a splat give no estimate."""
 
 
 def psnr_of(colors: NDArray[Any], truth: NDArray[Any], view: View) -> float:
-    """PSNR of a view, dB, given the colours of its rays with other and with all splats.
+    """PSNR of a view, dB, from the colours of its rays with other and with all splats, (3, P).
 
-    The logarithm of a mean over few rays is too low on average: by half the square of the mean's
-    relative error, to second order. This is corrected. The variance is that between neighbouring
-    rays, so that differences between parts of the picture do not count as chance.
-
-    Parameters
-    ----------
-    colors, truth : (3, P) floating
-    view : View
+    The logarithm of a mean is too low by half its squared relative error, which is corrected; the
+    variance is that between neighbouring rays, so that parts of the picture may differ.
     """
     errors = np.mean((colors - truth) ** 2, axis=0, dtype=np.float64)
     mean, count = float(np.mean(errors)), len(errors)
@@ -50,15 +42,7 @@ def psnr_of(colors: NDArray[Any], truth: NDArray[Any], view: View) -> float:
 def psnr_kept(
     sample: RaySample, keep: NDArray[np.bool_], *, threads: int | None = None
 ) -> float | None:
-    """Mean PSNR of all views with only some splats kept, dB; None if too little is seen.
-
-    Parameters
-    ----------
-    sample : RaySample
-        Of all N splats.
-    keep : (N,) bool
-    threads : int, optional
-    """
+    """Mean PSNR of all views with only splats `keep`, (N,) bool, dB; None if too little is seen."""
     if not _enough(sample):
         return None
     views = sample.seeing()
@@ -78,26 +62,10 @@ def quality_curve(
 ) -> Quality | None:
     """Estimated PSNR at each of `curve.SHARES`; None if too little is seen.
 
-    Parameters
-    ----------
-    sample : RaySample
-        Of all N splats.
-    values : (N,) float32
-        The lowest are removed first; of equal ones the first in the file.
-    protected : (N,) bool, optional
-        Splats that are removed after all others.
-    settled : int, optional
-        How many splats are in their final order, see `Scores`: the curve ends there, and is None
-        if that is before the first of its shares.
-    between : RaySample, optional
-        Of views between those of `sample`.
-    progress : callable, optional
-    threads : int, optional
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
+    values : (N,) float32, the lowest are removed first; of equal ones the first in the file
+    protected : (N,) bool, removed after all others
+    settled : splats in final order, see `Scores`: the curve ends there
+    between : RaySample of views in between those of `sample`
     """
     last = len(values) if settled is None else settled
     if settled is not None and protected is not None:
@@ -119,7 +87,6 @@ def quality_curve(
         return _of_views(rays_of, compare, rays_of.seeing(), progress, threads)
 
     def gaining(number, rays):
-        """By how much the PSNR is higher if kept splats stand in."""
         view, colors = sample.views[number][0], sample.colors(number, rays)
         truth, gains, place_of_hit = rays.colors(colors), [], place[sample.splat_rows[rays.hit]]
         for count in merged:
@@ -156,24 +123,7 @@ def psnr_against(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> float | None:
-    """Estimated PSNR with other splats instead, dB; None if too little is seen.
-
-    Parameters
-    ----------
-    sample : RaySample
-        Of the splats that are the truth.
-    splats : Splats
-        In the frame of the views.
-    views : ViewSet
-        Those of the sample.
-    progress : callable, optional
-    threads : int, optional
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
-    """
+    """Estimated PSNR of other splats, dB, against the sample's; None if too little is seen."""
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
@@ -198,11 +148,7 @@ def _enough(sample):
 
 
 def _removing(sample, place, counts):
-    """A function that gives the PSNR of one view after each of L removals, dB.
-
-    `place`, (M,), is that of each of the Gaussians in an order of removal: those whose place is
-    below one of the ascending `counts` are removed.
-    """
+    """PSNR function of a view, dB, removing places, (M,), below each of L ascending `counts`."""
 
     def compare(number, rays):
         view, colors = sample.views[number][0], sample.colors(number, rays)
@@ -229,6 +175,5 @@ def _of_views(sample, compare, numbers, progress, threads):
 
 
 def _mean(sample, values, numbers):
-    """Mean of values of some views, (v, L), weighted as the views are, (L,)."""
     weights = np.array([sample.views[number][1] for number in numbers])
     return weights @ values / weights.sum()

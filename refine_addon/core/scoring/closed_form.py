@@ -1,20 +1,10 @@
 """REFINE's closed form: the error of removing each splat as if nothing were hidden (T = 1).
 
-    D_i   = sum over k of  lambda^k  H_i G_i^k / mean_j(H_j G_j^k)          REFINE, Eq. 20
-    H_i   = alpha_i  mean over views of  inside_iv / (d_iv^2 + eta)         Eq. 13-16
-    G_gem = product of the two largest scales, G_col = luma^2, G_opa = alpha^2
+    D_i = sum over k of  lambda^k  H_i G_i^k / mean_j(H_j G_j^k)        REFINE, Eq. 20
+    H_i = alpha_i  mean over views of  inside_iv / (d_iv^2 + eta)       Eq. 13-16
 
-``d`` is the depth along the view's axis (the paper) or the distance to its centre (the authors'
-code). Each term is divided by its mean, as in the authors' code, which makes the terms comparable.
-
-Two factors are our addition. ``inside`` is the share of the splat that counts as inside the view's
-frustum. And the more is removed, the more a splat counts relative to those around it:
-
-    D'_i  = D_i / m_i^(w_i / 2),    w_i = D_i / (D_i + .05)
-
-with D in units of its mean, and m_i its mean over the splats in the same cell of a coarse grid.
-
-Splats are read once, in chunks, and may lie in files: 49 bytes of each are kept.
+G is the product of the two largest scales, luma^2 and alpha^2. Our additions: `inside`, the share
+that counts as in the frustum, and `_compare`. Splats are read once, in chunks: 49 bytes each stay.
 """
 
 from __future__ import annotations
@@ -41,32 +31,29 @@ CALIBRATION = (10.73, 56.06, 100.67)
 """Means of the three statistics over the calibration scenes of REFINE's authors."""
 
 RATIO_LIMIT = 1e6
-"""Axis ratios above this count as this, so that one flat disk does not make the mean infinite."""
+"""Largest axis ratio, so that one flat disc does not make the mean infinite."""
 
 ETA_RELATIVE = 0.005
-"""Eta over the squared size of the scene: the paper's .05 at a viewing distance of 3 m."""
+"""Eta over the squared size of the scene: the paper's 0.05 at a viewing distance of 3 m."""
 
 UNSEEN = 1e-6
-"""A splat that no view sees has H = this / (squared distance to the views + eta): such splats are
-ordered by distance, and nearly always below all that are seen."""
+"""H of a splat in no view, times (squared distance + eta): nearly always below all others."""
 
 REACH = 2.0
 """Standard deviations along its longest axis that a splat reaches into an image from outside."""
 
 LOCAL_HALF = 0.05
-"""Score, in units of the mean, at which w is 1/2; see the top of this file."""
+"""Score, in units of the mean, at which w of `_compare` is 1/2."""
 
 CELLS = 64
 """Cells of the neighbourhoods along each axis."""
 
 ROWS = 1 << 18
-"""Splats whose order and whose sums over cells are computed together; the last bits of scores
-depend on it."""
+"""Splats ordered and summed over cells together; the last bits of scores depend on it."""
 
 _CHUNK = 4096
 _RUN = 1000
-"""Splats processed together: so few that their projections into 64 views stay in the L2 cache, and
-not a multiple of the page size, at which loads and stores alias."""
+"""Splats at a time: 64 views of them fit the L2 cache; multiples of a page's size would alias."""
 
 _VIEW_BLOCK = 64
 _SMALLEST_AREA = -300.0  # natural logarithm
@@ -107,36 +94,11 @@ def score(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Score splats by the closed form.
+    """Score splats, in files or not, by the closed form; threads do not change a bit.
 
-    Parameters
-    ----------
-    splats : Splats
-        N splats in the frame and unit of the views; they may lie in files.
-    views : ViewSet
-        All of them are used.
-    depth : {"z", "distance"}
-        Depth along the view's axis, or distance to its centre.
-    frustum : bool
-        Whether only views that a splat lies in, or reaches into, count for it.
-    local : bool
-        Whether a splat counts relative to those around it.
-    progress : callable, optional
-        See `refine_addon.core.execute.Progress`.
-    threads : int, optional
-        The scores are the same bits for any number.
-
-    Returns
-    -------
-    Scores
-        ``facts`` holds lambda and the statistics that it is computed from.
-
-    Raises
-    ------
-    RefineError
-        If there are no splats, if none of them can be drawn, or if no view sees any.
-    Cancelled
-        If `progress` answers ``False``.
+    depth : along the view's axis (the paper) or to its centre (the authors' code)
+    frustum : whether only views that a splat lies in, or reaches into, count for it
+    local : whether a splat counts relative to those around it, see `_compare`
     """
     total = len(splats)
     if not total:
@@ -208,22 +170,10 @@ def score(
 
 
 def lambdas(anisotropy: float, luma_variance: float, translucency: float) -> list[float]:
-    """Lambda of geometry, colour and opacity: each in [0, 1], their sum 1 (REFINE, Eq. 17-20).
+    """Lambda of geometry, colour and opacity, of sum 1 (REFINE, Eq. 17-20; authors' constants).
 
-    ``ln(F_gem) / 10.73``, ``100 F_col / 56.06`` and ``100 F_opa / 100.67``, divided by their sum,
-    with the constants of the authors' code. If all three are 0, all lambdas are equal.
+    From the mean axis ratio, the variance of luma in 0..1, and the mean of 4 alpha (1 - alpha).
 
-    Parameters
-    ----------
-    anisotropy : float
-        F_gem, mean of longest over shortest axis, 1 or more.
-    luma_variance : float
-        F_col, variance of the luma, which lies in 0..1.
-    translucency : float
-        F_opa times 4, mean of 4 alpha (1 - alpha), in 0..1.
-
-    Examples
-    --------
     >>> [round(value, 3) for value in lambdas(10.73, 0.05, 0.5)]
     [0.274, 0.111, 0.615]
     """
@@ -331,11 +281,7 @@ def _sum_views(columns, counted, progress, threads):
 
 
 def _near_order(means):
-    """Order of finite positions, (n, 3), in which consecutive ones lie near each other.
-
-    It follows a Hilbert curve through a grid of 32 x 32 x 32 cells. Those of a cell, and those
-    beyond the same face of the grid, keep their order.
-    """
+    """Order of positions, (n, 3), along a Hilbert curve through 32^3 cells, stable in a cell."""
     sample = means[:: max(len(means) // _SAMPLE, 1)].astype(np.float64)
     cell = np.zeros(len(means), np.uint16)
     with np.errstate(under="ignore"):
@@ -352,11 +298,7 @@ def _near_order(means):
 
 @cache
 def _places():
-    """Place of each cell along the curve; cells count z first, then y, then x.
-
-    J. Skilling, Programming the Hilbert curve, AIP Conf. Proc. 707, 2004: the loops are those of
-    ``AxestoTranspose`` there, for all cells at once.
-    """
+    """Place of each cell along the curve (Skilling, AIP Conf. Proc. 707, 2004)."""
     cells = np.arange(1 << 3 * _BITS)
     axes = np.stack([cells >> 2 * _BITS, cells >> _BITS, cells]) & ((1 << _BITS) - 1)  # (3, cells)
     for bit in range(_BITS - 1, 0, -1):
@@ -390,11 +332,7 @@ class _Views:
         self.frustums = Frustums(views, origin, near)
 
     def sums(self, points, reach):
-        """H without alpha, and the number of views that each lies in, of n splats, (n,) each.
-
-        `points` is (4, n) around the origin, `reach` (n,). Splats of a run lie near each other, so
-        most views see none of them, and many see all.
-        """
+        """H without alpha, and number of views that hold each, of n points, (4, n)."""
         starts = np.arange(0, len(reach), _RUN)
         low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
         visibility, seen = np.empty(len(reach)), np.empty(len(reach), np.int32)
@@ -466,7 +404,11 @@ def _cells(place):
 
 
 def _compare(values, cells, good, threads):
-    """Divide each score by a power of the mean score around it."""
+    """Divide each score by a power of the mean score in its cell of a coarse grid.
+
+    ``D'_i = D_i / m_i^(w_i / 2)``, ``w_i = D_i / (D_i + 0.05)``, all in units of the mean: the more
+    is removed, the more a splat counts relative to those around it.
+    """
     end = int(cells.max()) + 1
     powers, count = np.zeros(end), np.zeros(end, np.int64)
     for rows in chunks(len(values), ROWS):
@@ -488,7 +430,7 @@ def _compare(values, cells, good, threads):
 
 
 def _store(into, values, good, piece):
-    """Set the scores of some splats, where underflow is ignored; undrawable ones score 0."""
+    """Set the scores of some splats; only undrawable ones score 0, despite underflow."""
     stored = values.astype(np.float32)
     # A drawable splat must not tie with undrawable ones by underflow.
     np.maximum(stored, np.finfo(np.float32).tiny, out=stored, where=good[piece])

@@ -1,17 +1,8 @@
 """The floor of occlusion scores: what a splat may be worth to views that were not given.
 
-A splat that no given view shows may be visible from elsewhere. So every splat gets a floor, the
-closed form, which ignores occlusion, times a weight. If views cover the scene densely, a small
-weight is best, since splats that no view shows are truly hidden. With few views, more is unknown
-and a larger weight is best.
-
-The weight is chosen by cross-validation: an eighth of the views is left out, the others score with
-every weight in `FLOOR_WEIGHTS`, and the weight is taken whose order removes the least error as the
-left-out views measured it. There is one weight for each share removed (`SHARES`), since the same
-floor is negligible beside the last scores but exceeds the first ones.
-
-Left-out views resemble the others: if all views stand in one corner of a room, they agree that the
-rest of it is worth nothing. So from half removed on the weight is at least `LEAST_FLOOR_WEIGHTS`.
+It is the closed form, which ignores occlusion, times a weight for each of `SHARES`, chosen by
+cross-validation: an eighth of the views is left out, the others score with each of `FLOOR_WEIGHTS`,
+and the one wins whose order removes least error of those left out.
 """
 
 from __future__ import annotations
@@ -26,45 +17,32 @@ from ..visibility.projection import Gaussians
 from ..visibility.scene import MIX, fingerprint
 
 FLOOR_WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
-"""Weights that are tried. At weight 1, a splat of average prior that lies in no view gets a floor
-as high as the mean score."""
+"""Weights tried. At 1, a splat in no view, of average prior, gets the mean score as its floor."""
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""Shares removed, each with its own weight: the one that loses least if this share is removed."""
+"""Shares removed, each with the weight that loses least there."""
 
 LEAST_FLOOR_WEIGHTS = (0.0, 0.0, 0.03, 0.03, 0.03)
-"""Smallest weight for each of `SHARES`: it costs tenths of a dB on views like those given, and
-gains up to 20 dB on other views."""
+"""Least weight for each of `SHARES`: costs tenths of a dB on views like those given, and gains up
+to 20 dB on others, as left-out views resemble those given."""
 
 SAMPLE = 1 << 16
-"""How many splats are enough to choose the floor's weights."""
+"""Splats that are enough to choose the floor's weights."""
 
 TIED = 0.002
-"""Weights whose losses differ by about this much count as equally good; the mean of their
-logarithms is taken, so that a change in the last digits does not switch to another weight."""
+"""Weights with losses this close are equally good: their log-mean is taken, which is stable."""
 
 DOUBTS = (0.03, 0.03, 0.0, 0.0, 0.0)
-"""What a weight ten times as large must gain to be preferred, as a share of the error removed, for
-each of `SHARES`: the first losses are uncertain by as much, and a floor that is not needed costs
-quality."""
+"""Share of the error removed, by `SHARES`, that a tenfold weight must gain: losses are noisy."""
 
 _NO_WEIGHT = 10.0**-5.5  # stands for 0 in a mean of logarithms
 
 
 def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> NDArray[np.float64]:
-    """Worth of each splat to views that were not given, (n,).
+    """Worth of each splat to views not given, from its prior and the views that hold it, (n,) each.
 
-    A splat's centre lies in `seen` views. If none of them shows the splat, the next view shows it
-    with a probability of about ``1 / (1 + seen)``, by the rule of succession.
-
-    Parameters
-    ----------
-    prior : (n,) float64
-        Worth of each splat if nothing were hidden.
-    seen : (n,) int32
-        In how many views the centre lies.
-    power : float
-        Exponent of the prior: 1 + p, as the score is ``error contribution^p``.
+    If none shows it, the next does with probability ``1 / (1 + seen)``, by the rule of succession.
+    Scores are ``error contribution^p``, so `power` is 1 + p.
     """
     return np.asarray(_unit(prior**power) / (1.0 + seen))
 
@@ -75,18 +53,10 @@ def _with_floor(scores, floors, weight):
 
 
 def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
-    """Best weight of the floor for each of `SHARES`.
+    """Best weight of the floor for each of `SHARES`; all 1 if every view is ignored.
 
-    Parameters
-    ----------
-    folds : iterable of scores, floors, errors
-        Scores, (n,), and floors, (n,), by all views but some; and the error of each splat in each
-        view left out, (views, n). Views without any error are ignored.
-
-    Returns
-    -------
-    list of float
-        All 1 if every view is ignored.
+    folds : (scores, floors, errors), (n,), (n,), and (views, n) of the views left out; those
+        without any error are ignored
     """
     losses = []
     for scores, floors, errors in folds:
@@ -107,15 +77,9 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
 
 
 def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
-    """Rows of `count` splats, or of all if there are fewer, ascending.
+    """Ascending rows of at most `count` splats, by a hash of opacity and colour.
 
-    They are chosen by a hash of opacity and colour, so the choice is the same every time, whatever
-    the order of the splats and the frame of the scene.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-    count : int
+    So the choice depends neither on the order of the splats nor on the frame of the scene.
     """
     total = len(gaussians)
     if total <= count:
@@ -136,14 +100,8 @@ def order(
 ) -> NDArray[np.int64]:
     """All n rows in the order of removal, exact up to the last of `stops`.
 
-    Parameters
-    ----------
-    scores, floors, ties : (n,) array
-        Of equal scores, the splat with the lower value in `ties` goes first.
-    floor_weights : sequence of float
-        Used one after the other.
-    stops : array of int
-        For each weight, how many splats have gone when the next weight takes over; ascending.
+    ties : (n,), of equal scores the lower value goes first
+    stops : for each weight, in turn, the number removed when the next takes over, ascending
     """
     left, going = np.arange(len(scores)), [np.arange(0)]
     for weight, count in zip(floor_weights, np.diff(stops, prepend=0), strict=True):
@@ -165,11 +123,7 @@ def _unit(values):
 
 
 def _losses(scores, errors):
-    """Logarithm of the share of each view's error that is removed, (v, shares).
-
-    The lowest scores, (n,), are removed first, equal ones together; the errors of each splat in
-    each of v views are (v, n).
-    """
+    """Logarithm of the share of each view's error removed, (v, shares), equal scores together."""
     places = [max(int(share * len(scores)) - 1, 0) for share in SHARES]
     last = np.partition(scores, places)[places]  # (shares,), the highest score that is removed
     removed = errors @ (scores[:, None] <= last).astype(np.float64)  # (v, shares)

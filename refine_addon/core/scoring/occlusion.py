@@ -1,28 +1,10 @@
-"""Scores that take into account what hides what, computed without a renderer.
+"""Scores with occlusion: ``error_i contribution_i^(1/4)`` (`measuring`), plus a floor (`coverage`).
 
-    score_i = error_i  contribution_i^(1/4)
+A splat's worth rises as those around it go, so they go in rounds, the rest scored again, down to a
+tenth: one order, so larger budgets contain smaller ones. Views are measured once, then corrected by
+the n_i rays that hit splat i, cast once::
 
-`measuring` defines the error and the contribution. The error is exact for one splat that is removed
-while all others stay. The contribution also counts what the splat hides, which matters once its
-neighbours are removed too.
-
-A floor is added to every score, for views that were not given: the closed form, with a weight that
-rises with the share removed (`coverage`).
-
-Splats hide each other, so what one is worth rises as those around it go, and they are removed in
-rounds: a part of the splats goes, the rest is scored again, until a tenth is left. The result is
-one order of removal, so a larger budget also removes all that a smaller one does. Scoring for one
-budget ends with the round that removes the last of its splats.
-
-The views are measured once. Later, rays that were cast once (`RaySample`) tell what the rest is
-worth: the hits of a ray are known, front to back, and so is what it would show without any one of
-them. Few rays hit a small splat, so what they tell is weighed against what the views measured of
-all splats::
-
-    error_i = (n_i  error on the rays now  +  KNOWN  error measured, grown) / (n_i + KNOWN)
-
-n_i is how many rays hit the splat while all were there. A measured sum grows as the rays tell, see
-`_grown`.
+    error_i = (n_i  error on the rays now  +  KNOWN  error measured, `_grown`) / (n_i + KNOWN)
 """
 
 from __future__ import annotations
@@ -51,13 +33,13 @@ EXPONENT = 0.25
 """Exponent of the contribution."""
 
 BETWEEN = 12
-"""So many views at most tell what lies between those that score."""
+"""Most views in between that are looked at."""
 
 BETWEEN_RAYS = 0.375
-"""How many rays they have together, as a part of `VALIDATION_RAYS`."""
+"""Their rays, as a part of `VALIDATION_RAYS`."""
 
 KNOWN = 10.0
-"""What was measured counts as much as so many rays."""
+"""What was measured counts as much as this many rays."""
 
 _LOADING = 0.3  # share of the time of getting ready that getting colours takes, to show progress
 _SAMPLING = Sampling()
@@ -73,44 +55,13 @@ def score(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Score splats by how much the views would change without them, occlusion included.
+    """Score splats, in files or not, by the change of all views without them, with occlusion.
 
-    Parameters
-    ----------
-    splats : Splats
-        N splats in the frame and unit of the views; they may lie in files.
-    views : ViewSet
-        All of them are used.
-    rounds : int
-        How often scores are computed: once, or again after each part of the removal.
-    sampling : Sampling
-    settled : int, optional
-        How many splats to put in their final order, the first to be removed first; the others get
-        scores of the last round that this takes. By default all.
-    progress : callable, optional
-        See `refine_addon.core.execute.Progress`.
-    threads : int, optional
+    Values are the share removed once a splat is, in (0, 1]. Memory: 300 bytes a splat, 100 more for
+    each further thread, and 100 a point (`points.MAX_POINTS`) of a view and thread.
 
-    Returns
-    -------
-    Scores
-        ``values`` is the share of the splats that have been removed once this one is, in (0, 1].
-
-    Raises
-    ------
-    RefineError
-        If there are no splats, if none of them can be drawn, if no view sees any, or if `rounds` is
-        less than 1.
-    Cancelled
-        If `progress` answers ``False``.
-
-    Notes
-    -----
-    Memory: about 300 bytes a splat, plus a third of that for each thread beyond the first; and 100
-    bytes for each point of a view, per thread. A view has at most about 4 million points
-    (`points.MAX_POINTS`); only a view that shows more than 3 million splats has more.
-    Each hit of the scoring rays takes 16 bytes, of which there are at most about
-    `cast.MAX_SCORING_HITS`.
+    rounds : how often scores are computed: once, or again after each part of the removal, >= 1
+    settled : splats to put in their final order, the first removed first; by default all
     """
     if rounds < 1:
         raise RefineError(f"rounds is {rounds}, expected 1 or more")
@@ -126,24 +77,7 @@ def score_once(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Scores, Measured]:
-    """Score splats in one round; also return what was measured of all N.
-
-    Parameters
-    ----------
-    splats, views, sampling, progress, threads
-        See `score`.
-    few_views : bool
-        Whether rays of few views are enough, see `RaySample`.
-
-    Returns
-    -------
-    Scores, Measured
-
-    Raises
-    ------
-    RefineError, Cancelled
-        See `score`.
-    """
+    """Scores of one round, and what was measured of all N; `few_views` as for `RaySample`."""
     with np.errstate(under="ignore"):  # numbers that underflow to 0 are negligible in all sums
         return _score(splats, views, 1, None, sampling, few_views, progress, threads)
 
@@ -158,27 +92,9 @@ def measure_part(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Measured, float]:
-    """Measure what one part of the views sees of each splat, hidden by all others.
+    """What one part of the views sees of all N splats, and its share of the weights of all views.
 
-    Parameters
-    ----------
-    splats, views, sampling, progress, threads
-        See `score`.
-    turn, parts : int
-        The views are divided into so many parts, or into fewer if there are fewer views; each part
-        is spread over all of them. Turn 0 measures the first, and so on, and then the first again.
-
-    Returns
-    -------
-    Measured
-        Of all N splats; 0 for splats that no view shows or that cannot be drawn.
-    share : float
-        Of the weights of all views, those of this part.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
+    Turn 0 is the first of at most `parts` parts, each spread over all views, and so on in a circle.
     """
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.05), threads=threads
@@ -197,10 +113,7 @@ def measure_part(
 
 
 def _score(splats, views, rounds, settled, sampling, few_views, progress, threads):
-    """Scores, and what was measured of all N; see `score` and `score_once`.
-
-    Of splats in files they are a stage of the job.
-    """
+    """Scores, and what was measured of all N; a stage of the job if splats lie in files."""
     job, stage = folder_of(splats), f"scores-{rounds}-{settled}-{few_views}"
     done, found = (False, None) if job is None else noted(job, stage)
     if done:
@@ -265,11 +178,7 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
 
 
 def _folds(whole, of_groups, errors, prior, progress):
-    """What `coverage.floor_weights` takes, with each group of views left out once.
-
-    Of a sample: `whole` has the sums over all views, `of_groups` those over each group, `errors`
-    are by views.
-    """
+    """Folds of `coverage.floor_weights` for a sample: each group of views left out once."""
     for without, of_views in zip(of_groups, errors, strict=True) if len(errors) > 1 else ():
         report(progress, 0.0, "scoring")
         others = Measured(
@@ -283,11 +192,7 @@ def _folds(whole, of_groups, errors, prior, progress):
 
 
 def _order(index, prior, measured, rays, weights, kept, progress):
-    """Rows of the Gaussians in the order of removal, (M,); they are the last of all N.
-
-    Arguments: rows and prior of all N, what was measured, scoring rays if there are rounds, weights
-    of the floor, and how many are left after each round.
-    """
+    """Rows of the Gaussians in the order of removal, (M,); `kept` are left after each round."""
     count, left, removed = len(prior), np.arange(len(index)), []
     for stay, of_round in zip(kept, progress, strict=True):
         now = measured if rays is None else rays.remove_and_measure(left, of_round)
@@ -329,7 +234,7 @@ class _RemovalRounds:
         self._first = self._sums(every, part(progress, _LOADING, 1.0))
 
     def remove_and_measure(self, left, progress):
-        """Remove all Gaussians but some, (n,) rows, ascending; what each of these is worth now."""
+        """Remove all but ascending rows, (n,); sums of these now."""
         all_left = len(left) == len(self._rays_hitting)
         now = self._first if all_left else self._sums(left, progress)
         measured = self._measured.error[left], self._measured.contribution[left]
@@ -366,16 +271,11 @@ class _RemovalRounds:
 
 
 def _grown(measured, before, now, known):
-    """Measured sums times what they have grown by since, (n,).
-
-    The growth of a splat is what the rays tell of it, and the mean growth of the scene as if that
-    were so many rays more::
+    """Measured sums, (n,), times their growth from `before` any removal to `now`, by the rays::
 
         growth = (now + scene growth  prior) / (before + prior),    prior = known  measured
 
-    `measured` is from before any splat had gone, `before` and `now` are what the rays told then and
-    what they tell now. `known` is the weight of the scene's growth, over the measured sum: large
-    for a splat that few rays hit. All are (n,).
+    The scene's mean growth weighs most for splats that few rays hit.
     """
     total = float(before.sum())
     scene_growth = float(now.sum()) / total if total > 0.0 else 1.0
@@ -386,19 +286,12 @@ def _grown(measured, before, now, known):
 
 
 def _kept_after_rounds(count, rounds, settled):
-    """How many of `count` splats are left after each round: `LEAST` before the last, then 0.
-
-    The last is the first round that removes `settled` splats or more together with those before.
-    """
+    """Splats left after each round, at last 0, up to the round that settles `settled`."""
     rest = 0 if settled is None else max(count - settled, 0)
     stays = (round(count * LEAST ** (number / (rounds - 1))) for number in range(1, rounds))
     return [*itertools.takewhile(lambda stay: stay > rest, stays), 0]
 
 
 def _combined(measured):
-    """``error contribution^p``, (M,).
-
-    The error is exact for one splat. The more of its neighbours go too, the more it matters how
-    much of the picture the splat covers, whatever lies behind it.
-    """
+    """``error contribution^p``, (M,): the error is exact for one splat, and neighbours go too."""
     return measured.error * measured.contribution**EXPONENT

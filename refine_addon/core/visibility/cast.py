@@ -169,10 +169,7 @@ def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[
 
 
 def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Ascending columns and rows, (C,) and (R,), of about `count` pixels, evenly spread.
-
-    Different numbers give different pixels.
-    """
+    """Ascending columns and rows of about `count` even pixels, which differ for each `number`."""
     count = max(count, MIN_RAYS_OF_VIEW)
     columns = max(round(math.sqrt(count * view.width / view.height)), 1)
     columns = min(columns, view.width, max(int(count), 1))
@@ -225,10 +222,7 @@ def cast(
     rows: NDArray[np.int64],
     aims: NDArray[np.int64] | None = None,
 ) -> Rays:
-    """Rays with all their hits on footprints, front to back, of an alpha of `ALPHA_CUT` or more.
-
-    For columns, rows and aims see `Rays`; discs are hit where the ray meets their plane.
-    """
+    """Rays with all their hits on footprints, front to back, of an alpha of `ALPHA_CUT` or more."""
     found = hits(footprints, columns, rows, _PAIRS, aims=aims)
     return _front_to_back(footprints, columns, rows, aims, found)
 
@@ -251,7 +245,6 @@ def cast_visible(
 
 
 def _front_to_back(footprints, columns, rows, aims, found):
-    """Rays of the hits that `hits` yields."""
     # The smallest types hold them. A view has fewer than 2^16 rays: NumPy sorts numbers of 16 bits
     # by radix, in linear time.
     types = np.int32, np.uint16, np.float32

@@ -52,10 +52,7 @@ def clip_planes(view: View, near: float) -> tuple[float, float]:
 
 
 def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> NDArray[np.bool_]:
-    """Which points, (3, n) in camera coordinates (x right, y down, z forward), lie in a view, (n,).
-
-    `planes` are near and far, in the unit of the points.
-    """
+    """Which points, (3, n) in camera coordinates x right, y down, z forward, lie in a view."""
     x, y, z = local
     inside: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
     for coordinate, side in zip((x, y), image_sides(view), strict=True):
@@ -68,8 +65,8 @@ class Frustums:
 
     near : for views that have no near plane of their own, world units, > 0
     centers : (V, 3) float64, relative to the origin
-    beyond_per_unit : (V, 1) float64, growth of `beyond` of `project` for each world unit straight
-        away from a side, as if the image were square, of the same area
+    beyond_per_unit : (V, 1) float64, growth of `beyond` of `project` per world unit away from a
+        side
     """
 
     def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:

@@ -49,14 +49,10 @@ _ADDED = 1 << 16  # splats of a view that are added to the sums at a time
 
 @dataclass(frozen=True)
 class Sampling:
-    """How finely images are divided and splats sampled.
+    """How finely images are divided and splats sampled."""
 
-    cell : least side of a cell, px; see `points.cell_size`
-    density : points per standard deviation that is as long as a cell
-    """
-
-    cell: float = 4.0
-    density: float = 3.7
+    cell: float = 4.0  # least side of a cell, px; see `points.cell_size`
+    density: float = 3.7  # points per standard deviation that is as long as a cell
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -65,11 +61,11 @@ class Sampling:
 
 
 class Measured(NamedTuple):
-    """Sums over views, (M,) each: contribution and error, px^2, and views that hold the centre."""
+    """Sums over views, times their weights, for M Gaussians."""
 
-    contribution: NDArray[np.float64]
-    error: NDArray[np.float64]
-    seen: NDArray[np.int32]
+    contribution: NDArray[np.float64]  # (M,), px^2
+    error: NDArray[np.float64]  # (M,), px^2
+    seen: NDArray[np.int32]  # (M,), views that hold the centre
 
     @classmethod
     def zero(cls, count: int) -> Measured:
@@ -222,10 +218,7 @@ def _integrals(footprints, colors, points):
 
 
 def _evenness(footprints, area):
-    """Share of each splat's optical depth that is even over a cell, ``s^2 / (s^2 + area)``, (n,).
-
-    A splat whose shorter sigma s is much narrower than the cell leaves gaps.
-    """
+    """Share of each optical depth that is even over a cell, near 0 for narrow splats, (n,)."""
     narrow = footprints.sigmas[1] ** 2
     return narrow / (narrow + np.float32(area))
 
@@ -242,10 +235,7 @@ def _transmittance(front, even):
 
 
 def _squared_contrast(front, covered, colors, counts):
-    """``|c_k - B_k|^2`` of points, (m,), given the depth in front, in columns of `counts` points.
-
-    ``B_k = (sum over j > k of T_j a_j c_j) / T_{k+1}``, with a_j the share of the cell `covered`.
-    """
+    """``|c_k - B_k|^2`` of points, (m,), ``B_k = (sum over j > k of T_j a_j c_j) / T_{k+1}``."""
     weight = np.exp(-np.minimum(front, np.float32(_MAX_THICKNESS)))  # T_k
     left = np.maximum(weight * (np.float32(1.0) - covered), np.float32(_LEAST_LEFT))  # T_{k+1}
     weight *= covered  # T_k a_k

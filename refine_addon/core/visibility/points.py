@@ -75,20 +75,14 @@ class Points(NamedTuple):
     """The m points in an image, cell by cell, front to back, of n footprints in C cells.
 
     Of a splat's points in a cell the first has all shares, so that it does not hide itself.
-
-    owners : (m,) int32, rows of the `Footprints`
-    shares : (m,) float32, of the splat's mass
-    counts : (C,) int64, points of each cell, which make a column
-    share_inside, squares : (n,) float64, sums of the shares in the image, and of their squares
-    area : float, of a cell, px^2
     """
 
-    owners: NDArray[np.int32]
-    shares: NDArray[np.float32]
-    counts: NDArray[np.int64]
-    share_inside: NDArray[np.float64]
-    squares: NDArray[np.float64]
-    area: float
+    owners: NDArray[np.int32]  # (m,), rows of the `Footprints`
+    shares: NDArray[np.float32]  # (m,), of the splat's mass
+    counts: NDArray[np.int64]  # (C,), points of each cell: its column
+    share_inside: NDArray[np.float64]  # (n,), sum of the shares in the image
+    squares: NDArray[np.float64]  # (n,), sum of their squares
+    area: float  # of a cell, px^2
 
 
 def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
@@ -181,10 +175,7 @@ def _patches(axes, size, kinds):
 
 
 def _lay_out(axes, size, rows, patches, whole):
-    """The p points of q patches: cells, (p,) uint16, and shares, (p,), `_OUTSIDE` and 0 outside.
-
-    Also the sums of the shares, and of their squares, of each patch, (2, q).
-    """
+    """Cells and shares of p points of q patches, and sums of shares and their squares, (2, q)."""
     table = _lattices()
     sizes = table.sizes.take(patches)  # (q,)
     first = np.cumsum(sizes) - sizes  # (q,), number of each patch's first point
@@ -264,10 +255,7 @@ def _flat_points(footprints, row, view, side):
 
 
 def _merge(owners, shares, squares, counts):
-    """Give the shares of a splat's points in a cell to the first, in place, and update `squares`.
-
-    The others come right behind it; `counts`, (C,), is the points of each cell.
-    """
+    """Give the shares of a splat's adjacent points in a cell to the first; update `squares`."""
     first = np.ones(len(owners), np.bool_)  # whether a point is the first of its splat there
     np.not_equal(owners[1:], owners[:-1], out=first[1:])
     first[np.cumsum(counts) - counts] = True  # the first point of each cell
@@ -285,9 +273,8 @@ def _merge(owners, shares, squares, counts):
 
 @functools.cache
 def _lattices():
-    """All lattices: number ``i len(COUNTS) + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points.
-
-    The last has `FLAT` by `FLAT` points at -1 to 1, in half image sizes.
+    """Lattices: number ``i len(COUNTS) + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points, last
+    `FLAT`.
     """
     axes = [_axis(count) for count in COUNTS]
     steps = (np.arange(FLAT) + 0.5) / FLAT * 2.0 - 1.0

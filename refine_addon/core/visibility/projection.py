@@ -63,26 +63,18 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 class Gaussians:
     """The M splats that can contribute to a picture, in scene frame and sizes, by `spatial_order`.
 
-    index : (M,) int64, rows of the splats
-    means : (3, M) float32
-    covariances : (6, M) float32, xx, xy, xz, yy, yz, zz
-    largest : (M,) float32, longest standard deviation
-    alphas : (M,) float32, 0..1
-    colors : (M, 3) float32, of the constant of the harmonics, >= 0
-    normals : (3, M) float32 or None, unit normals of discs
-    boxes : (C, 7) float32 or None, in files: one for each `CHUNK`, see `boxes_touch`; means,
-        covariances and normals are then (C, k, CHUNK), and a view reads only what it may show
+    In files, means, covariances and normals are (C, k, CHUNK): a view reads the boxes it may show.
     """
 
-    index: NDArray[np.int64]
-    means: NDArray[np.float32]
-    covariances: NDArray[np.float32]
-    largest: NDArray[np.float32]
-    alphas: NDArray[np.float32]
-    colors: NDArray[np.float32]
-    normals: NDArray[np.float32] | None = None
+    index: NDArray[np.int64]  # (M,), rows of the splats
+    means: NDArray[np.float32]  # (3, M)
+    covariances: NDArray[np.float32]  # (6, M): xx, xy, xz, yy, yz, zz
+    largest: NDArray[np.float32]  # (M,), longest standard deviation
+    alphas: NDArray[np.float32]  # (M,), 0..1
+    colors: NDArray[np.float32]  # (M, 3), of the constant of the harmonics, >= 0
+    normals: NDArray[np.float32] | None = None  # (3, M), unit normals of discs
     model: Model = "default"
-    boxes: NDArray[np.float32] | None = None
+    boxes: NDArray[np.float32] | None = None  # (C, 7), in files, see `boxes_touch`
 
     def __len__(self) -> int:
         return len(self.index)
@@ -118,25 +110,16 @@ class Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """The n splats that may reach into an image, front to back; lengths in pixels.
+    """The n splats that may reach into an image, front to back; lengths in pixels."""
 
-    index : (n,) int64, rows of the `Gaussians`
-    centers : (2, n) float32, column and row
-    major, minor : (2, n) float32, principal standard deviations; for discs see `disc_axes`
-    sigmas : (2, n) float32, their lengths, the longer first
-    inside : (n,) bool, whether the centre lies in the frustum
-    alphas : (n,) float32, at the centre
-    discs : (7, n) float32 or None, for exact hits, see `_discs`
-    """
-
-    index: NDArray[np.int64]
-    centers: NDArray[np.float32]
-    major: NDArray[np.float32]
-    minor: NDArray[np.float32]
-    sigmas: NDArray[np.float32]
-    inside: NDArray[np.bool_]
-    alphas: NDArray[np.float32]
-    discs: NDArray[np.float32] | None = None
+    index: NDArray[np.int64]  # (n,), rows of the `Gaussians`
+    centers: NDArray[np.float32]  # (2, n), column and row
+    major: NDArray[np.float32]  # (2, n), a standard deviation long; for discs see `disc_axes`
+    minor: NDArray[np.float32]  # (2, n)
+    sigmas: NDArray[np.float32]  # (2, n), lengths of both
+    inside: NDArray[np.bool_]  # (n,), whether the centre lies in the frustum
+    alphas: NDArray[np.float32]  # (n,), at the centre
+    discs: NDArray[np.float32] | None = None  # (7, n), for exact hits, see `_discs`
 
     def take(self, rows: NDArray[np.int64]) -> Footprints:
         """Some footprints, in that order."""
@@ -331,7 +314,7 @@ def coordinates(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray
 
 
 def _product(matrix, columns):
-    """A matrix (n, n) times columns (n, M), each summed in the same order.
+    """A matrix times columns, (n, M), each summed in the same order.
 
     BLAS rounds by a column's place: a splat would differ in a tile and among all.
     """
@@ -342,10 +325,7 @@ def _product(matrix, columns):
 
 
 def _touches(local, largest, views, planes, low_pass):
-    """Which footprints may reach into the image, (M,): `frustum.contains`, widened to be safe.
-
-    Of `views` the first is drawn; the second is the part of it that counts.
-    """
+    """Which footprints may reach into both `views`, image and window, (M,), on the safe side."""
     x, y, z = local
     touching = (z >= planes[0]) & (z <= planes[1])
     drawn, sides = map(frustum.image_sides, views)
@@ -461,7 +441,6 @@ def _principal(across, down, z, shape, view):
 
 
 def _half_axes(sigmas, direction):
-    """Half axes of these lengths, and the lengths, (2, n) each, the longer first."""
     c, s = direction
     return sigmas[0] * direction, sigmas[1] * np.stack([-s, c]), sigmas
 

@@ -29,24 +29,16 @@ _PIECE = 1 << 15  # hits processed at a time: what stays in the second-level cac
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """The P = C R rays of one view, where columns and rows cross, and their h hits on u splats.
+    """The P = C R rays of one view, where columns and rows cross, and their h hits on u splats."""
 
-    columns, rows : (C,), (R,) int64, ascending; rays are numbered row by row
-    ray : (h,) int32, ascending; the hits of a ray are front to back
-    owner : (h,) int32, the splat as a place in `hit`
-    alpha, log_passed : (h,) float32, alpha and log(1 - alpha)
-    hit : (u,) int64, rows of Gaussians, ascending
-    aims : (2, P) int64 or None, pixels that rays go through instead, see `cast.aimed`
-    """
-
-    columns: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    ray: NDArray[np.int32]
-    owner: NDArray[np.int32]
-    alpha: NDArray[np.float32]
-    log_passed: NDArray[np.float32]
-    hit: NDArray[np.int64]
-    aims: NDArray[np.int64] | None = None
+    columns: NDArray[np.int64]  # (C,), ascending
+    rows: NDArray[np.int64]  # (R,), ascending; rays are numbered row by row
+    ray: NDArray[np.int32]  # (h,), ascending; the hits of a ray are front to back
+    owner: NDArray[np.int32]  # (h,), the splat as a place in `hit`
+    alpha: NDArray[np.float32]  # (h,)
+    log_passed: NDArray[np.float32]  # (h,), log(1 - alpha)
+    hit: NDArray[np.int64]  # (u,), rows of Gaussians, ascending
+    aims: NDArray[np.int64] | None = None  # (2, P), pixels instead, see `cast.aimed`
 
     @property
     def count(self) -> int:
@@ -199,11 +191,7 @@ def in_front(values: NDArray[Any], counts: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def behind(values: NDArray[Any], counts: NDArray[np.int64]) -> NDArray[Any]:
-    """Sum of the values behind each in its column, see `in_front`.
-
-    >>> behind(np.array([1.0, 2.0, 4.0, 8.0]), np.array([3, 1])).tolist()
-    [6.0, 4.0, 0.0, 0.0]
-    """
+    """Sum of values, (m,), behind each in its column, see `in_front`."""
     sums = np.cumsum(values)
     return np.repeat(sums.take(np.cumsum(counts) - 1), counts) - sums
 
@@ -214,10 +202,7 @@ def contrasts(
     colors: NDArray[np.float32],
     counts: NDArray[np.int64],
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield for each channel the colour behind each value less its own, (m,).
-
-    weight, left : (m,) float32, T alpha, and transmittance behind, above 0
-    """
+    """Yield for each channel the colour behind each value less its own, (m,); weight: T alpha."""
     red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
     blue = behind((weight * colors[2]).astype(np.float64), counts)
     for own, light in zip(colors, (red_green.real, red_green.imag, blue), strict=True):

@@ -36,14 +36,12 @@ _SPREAD_BITS = (
 class Scene:
     """The frame of a scene, world units.
 
-    origin : (3,) float64, geometric median of the views' centres
-    size : float > 0, ``sqrt(S + V)``, median squared distances to it of drawable splats and views
-    axes : (3, 3) float64, rotation to the frame: rows are the principal axes of the splats
+    Size is ``sqrt(S + V)``, median squared distances to the origin of drawable splats and of views.
     """
 
-    origin: NDArray[np.float64]
-    size: float
-    axes: NDArray[np.float64]
+    origin: NDArray[np.float64]  # (3,), geometric median of the views' centres
+    size: float  # > 0
+    axes: NDArray[np.float64]  # (3, 3), to the frame: rows are the principal axes of the splats
 
     def positions(
         self, means: NDArray[Any], rows: NDArray[np.int64] | None = None, *, threads: int | None = 1
@@ -96,10 +94,7 @@ def scene_of(
 
 
 def _moments(means, scene):
-    """Sums of `principal_axes` over n drawable splats, (4, 3); of a scene without axes yet.
-
-    A position at distance r has the weight 1 / (1 + r^2)^2, so that a few far ones hardly matter.
-    """
+    """Sums of `principal_axes`, (4, 3), weighted 1 / (1 + r^2)^2: far splats hardly matter."""
     with np.errstate(under="ignore"):
         positions = scene.positions(means)  # (n, 3)
         nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
@@ -108,10 +103,7 @@ def _moments(means, scene):
 
 
 def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Principal axes as the rows of a rotation, least variance first, towards the more splats.
-
-    `total`, (4, 3), are sums of products of coordinates and, last, of coordinates (`_moments`).
-    """
+    """Principal axes as rows of a rotation, least variance first, from `_moments`, (4, 3)."""
     _, vectors = np.linalg.eigh(total[:3])  # in columns
     axes = (vectors * np.where(total[3] @ vectors < 0.0, -1.0, 1.0)).T
     if np.linalg.det(axes) < 0.0:
