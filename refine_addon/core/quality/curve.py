@@ -96,14 +96,14 @@ class Quality:
         return self._at(self._curve(way), share)
 
     def of_views(self, share: float, way: Way = "delete") -> dict[str, float]:
-        """The same of single views: methods gain as much in each as in all together."""
+        """PSNR of single views, dB, taken to gain as much by a method as all views together."""
         gain = self.at(share, way) - self.at(share)
         return {
             name: min(self._at(psnr, share) + gain, PSNR_CAP) for name, psnr in self.views.items()
         }
 
     def at_between(self, share: float, way: Way = "delete") -> float | None:
-        """The same of views in between; None if unknown."""
+        """PSNR of views in between, dB, taken to gain as much by a method; None if unknown."""
         if self.between is None:
             return None
         deleted = self._at(self.between, share)

@@ -234,7 +234,7 @@ class _RemovalRounds:
         self._first = self._sums(every, part(progress, _LOADING, 1.0))
 
     def remove_and_measure(self, left, progress):
-        """Remove all but ascending rows, (n,); sums of these now."""
+        """Remove all but the ascending rows `left`, (n,); `Measured` sums of these now."""
         all_left = len(left) == len(self._rays_hitting)
         now = self._first if all_left else self._sums(left, progress)
         measured = self._measured.error[left], self._measured.contribution[left]

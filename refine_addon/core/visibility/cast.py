@@ -57,13 +57,13 @@ _CROSSING = 1e-3  # a disc of which this much is left of a plane through the cam
 _NO_END = 1e9  # px; beyond any image
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
-"""1 / p and 1 / p^2, p the plastic number: multiples modulo 1 are even (R2; Roberts 2018)."""
+"""1 / p and 1 / p^2, p the plastic number: multiples modulo 1 spread evenly (R2; Roberts 2018)."""
 
 
 class RaySample:
     """Scoring or validation rays of all views, `ViewSet.by_distance`, into one scene.
 
-    With `few_views` of about `VALIDATION_VIEWS` of them: enough to validate, not for a curve.
+    With `few_views` only about `VALIDATION_VIEWS` are cast: enough to validate, not for a curve.
 
     splat_rows : (M,) int64, the splat of each Gaussian
     share : number of rays over the usual number
@@ -169,7 +169,7 @@ def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[
 
 
 def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Ascending columns and rows of about `count` even pixels, which differ for each `number`."""
+    """Ascending columns and rows of about `count` pixels, evenly spread, others by `number`."""
     count = max(count, MIN_RAYS_OF_VIEW)
     columns = max(round(math.sqrt(count * view.width / view.height)), 1)
     columns = min(columns, view.width, max(int(count), 1))

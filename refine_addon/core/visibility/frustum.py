@@ -65,8 +65,7 @@ class Frustums:
 
     near : for views that have no near plane of their own, world units, > 0
     centers : (V, 3) float64, relative to the origin
-    beyond_per_unit : (V, 1) float64, growth of `beyond` of `project` per world unit away from a
-        side
+    beyond_per_unit : (V, 1) float64, growth of `project`'s `beyond` per unit away from a side
     """
 
     def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:

@@ -273,9 +273,7 @@ def _merge(owners, shares, squares, counts):
 
 @functools.cache
 def _lattices():
-    """Lattices: number ``i len(COUNTS) + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points, last
-    `FLAT`.
-    """
+    """Lattice ``i len(COUNTS) + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points, the last `FLAT`."""
     axes = [_axis(count) for count in COUNTS]
     steps = (np.arange(FLAT) + 0.5) / FLAT * 2.0 - 1.0
     flat = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)
