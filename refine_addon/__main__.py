@@ -1,16 +1,10 @@
-"""``python -m refine_addon``, and what ``pip`` installs as ``refine``: the command alone."""
+"""``python -m refine_addon``, and the script ``refine`` that ``pip`` installs."""
 
 import sys
 
 
 def main() -> int:
-    """Run the command on this process's arguments.
-
-    Returns
-    -------
-    int
-        Exit code, see `refine_addon.command.main`.
-    """
+    """Run the command on this process's arguments; exit code as of `refine_addon.command.main`."""
     try:
         # Only here: Ctrl-C may come while these load.
         from . import command

@@ -11,24 +11,14 @@ from typing import Any
 
 from .core.execute import Cancelled, checkpoint
 
-_STEP = 0.1
-"""Seconds after which waiting work asks again whether it was cancelled."""
+_STEP = 0.1  # Seconds between two checks of waiting work for cancelling
 
 _asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
 
 
 def call(function: Callable[[], Any]) -> Any:
-    """Have the main thread call a function, and return what it returns.
-
-    Called on the main thread, it does so at once; on another, it waits until `serve` has done it.
-
-    Raises
-    ------
-    Cancelled
-        See `execute.checkpoint`. The function may have been called or not.
-    Exception
-        What the function raises.
-    """
+    """Call a function on the main thread, at once or when `serve` runs; its result.
+    Raises its error, or `Cancelled`, when it may have been called or not."""
     if threading.current_thread() is threading.main_thread():
         return function()
     answer: Future[Any] = Future()
@@ -43,7 +33,7 @@ def call(function: Callable[[], Any]) -> Any:
 
 
 def serve() -> None:
-    """Make the calls that were asked for, in the main thread."""
+    """Run the waiting calls on the main thread."""
     with contextlib.suppress(queue.Empty):
         while True:
             function, answer = _asked.get_nowait()

@@ -1,7 +1,5 @@
-"""What Blender is told about, and in which order; `unregister` takes it back in reverse.
-
-A module lists its classes in `CLASSES`, and its entries of Blender's menus in `MENUS`.
-"""
+"""Registration with Blender, in order; `unregister` undoes it in reverse.
+A module lists its classes in `CLASSES`, and its entries of Blender's menus in `MENUS`."""
 
 from __future__ import annotations
 
@@ -27,7 +25,6 @@ CLASSES = tuple(cls for module in MODULES for cls in getattr(module, "CLASSES", 
 MENUS = [pair for module in MODULES for pair in getattr(module, "MENUS", {}).items()]
 
 _commands: list[object] = []
-"""Handle of the command, which Blender wants back."""
 
 
 def register() -> None:

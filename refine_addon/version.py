@@ -1,4 +1,4 @@
-"""The version, which stands in blender_manifest.toml and nowhere else."""
+"""The version, from blender_manifest.toml."""
 
 from __future__ import annotations
 

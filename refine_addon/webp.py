@@ -1,4 +1,4 @@
-"""WebP images through Blender's own library, for formats of core that consist of them."""
+"""WebP images through Blender's own library, for core's formats."""
 
 from __future__ import annotations
 
@@ -14,19 +14,16 @@ from numpy.typing import NDArray
 
 from . import main_thread
 
-_LOSSLESS = 100
-"""Quality at which Blender compresses WebP without loss."""
+_LOSSLESS = 100  # Quality at which Blender compresses WebP without loss
 
 
 class BlenderImages:
-    """A codec, see `refine_addon.core.images.Codec`; works on Blender's main thread."""
+    """A codec (`refine_addon.core.images.Codec`) on Blender's main thread."""
 
     def size(self, data: bytes) -> tuple[int, int]:
-        """Return width and height, read from the first bytes of the file.
-
-        A WebP file is a RIFF container. Its first chunk is ``VP8X`` (24 bits each, less 1), or
-        ``VP8L`` (14 bits each, less 1, behind a byte), or ``VP8 `` (14 bits each, behind 6 bytes).
-        """
+        """Width and height from the file's first bytes, a RIFF container.
+        Its first chunk is ``VP8X`` (24 bits each, less 1), ``VP8L`` (14 bits, less 1, behind a
+        byte) or ``VP8 `` (14 bits, behind 6 bytes)."""
         kind, start = data[12:16], data[20:30]
         if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(start) < 10:
             raise ValueError("no WebP image")
@@ -43,11 +40,11 @@ class BlenderImages:
         return sides[0], sides[1]
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
-        """Return the pixels, (height, width, 4), the top row first."""
+        """Pixels, (height, width, 4), top row first."""
         return main_thread.call(partial(self._decode, data))
 
     def encode(self, pixels: NDArray[np.uint8]) -> bytes:
-        """Return a WebP image of pixels (height, width, 4); colours of alpha 0 may be lost."""
+        """A WebP image of pixels, (height, width, 4); colours of alpha 0 may be lost."""
         return main_thread.call(partial(self._encode, pixels))
 
     def _decode(self, data: bytes) -> NDArray[np.uint8]:
@@ -86,6 +83,5 @@ class BlenderImages:
 
 @contextmanager
 def _file() -> Iterator[Path]:
-    """Yield the path of a file for an image, in a folder that is removed."""
     with tempfile.TemporaryDirectory() as folder:
         yield Path(folder) / "image.webp"

@@ -1,7 +1,5 @@
-"""A Blender camera as a view, and a view as a Blender camera; the one place with the axis flip.
-
-Blender's camera looks along -z with y up, a view along +z with y down.
-"""
+"""Blender cameras to views and back; the only place that flips axes.
+Blender's camera looks along -z with y up, a view along +z with y down."""
 
 from __future__ import annotations
 
@@ -19,11 +17,9 @@ from ..core.affine import QUARTER, QUARTERS, quaternion
 from ..core.errors import RefineError
 from ..core.views import View
 
-WEIGHT = "refine_weight"
-"""Custom property of a camera object: how much its view counts, 1 without it."""
+WEIGHT = "refine_weight"  # Custom property of a camera object: the weight of its view, 1 without it
 
-SOURCE = "refine_view"
-"""Custom property of an imported camera: the view of the file in full precision, as JSON."""
+SOURCE = "refine_view"  # Custom property of an imported camera: the file's view, exact, as JSON
 
 UPRIGHT = np.eye(4)
 UPRIGHT[:3, :3] = QUARTER
@@ -34,15 +30,12 @@ SENSOR = 36.0
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
-_RESIDUE = 3e-7
-"""What float32 leaves of the zeros and ones of a quarter turn."""
+_RESIDUE = 3e-7  # Error that float32 leaves in the zeros and ones of a quarter turn
 
-SHEAR = 1e-4
-"""How far from orthonormal the axes of a camera may be."""
+SHEAR = 1e-4  # Largest deviation of a camera's axes from orthonormal
 
 _SIZES = ("fx", "fy", "cx", "cy", "width", "height")
 _NOTED = (*_SIZES, *["rotation", "center", "near", "far", "matrix", "lens", "clip", "upright"])
-"""What is noted of an imported camera."""
 
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.01, 1000.0
 
@@ -50,31 +43,9 @@ _DEFAULT_NEAR, _DEFAULT_FAR = 0.01, 1000.0
 def view_from_camera(
     obj: bpy.types.Object, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
 ) -> View:
-    """Return what a camera object sees.
-
-    The frame is the one that Blender renders: lens, sensor fit, shift, the scene's resolution with
-    its percentage and pixel aspect. An imported camera keeps the image size of its file, and as
-    long as it is neither moved nor changed the file's own numbers.
-
-    Parameters
-    ----------
-    obj : bpy.types.Object
-    scene : bpy.types.Scene
-        For the render size.
-    depsgraph : bpy.types.Depsgraph
-        For animation, constraints, drivers and parents.
-
-    Returns
-    -------
-    View
-        Named after the object.
-
-    Raises
-    ------
-    RefineError
-        If the object is no camera or not a perspective one, is sheared or flat, or if its
-        ``refine_weight`` is no number >= 0.
-    """
+    """View of a camera object as Blender renders it, at the scene's size; named after the object.
+    An imported camera keeps its file's image size and, until moved or changed, the file's
+    numbers."""
     if obj.type != "CAMERA":
         raise RefineError(f"object '{obj.name}': is of type {obj.type}, expected a camera")
     evaluated = obj.evaluated_get(depsgraph)
@@ -104,7 +75,7 @@ def view_from_camera(
 
 
 def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
-    """Return the rendered size in pixels, and the height of a pixel over its width."""
+    """Rendered size, pixels, and a pixel's height over its width."""
     render = scene.render
     width = max(render.resolution_x * render.resolution_percentage // 100, 1)
     height = max(render.resolution_y * render.resolution_percentage // 100, 1)
@@ -112,16 +83,9 @@ def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
 
 
 def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArray[np.float64]:
-    """Return an object's matrix to the world, (4, 4).
-
-    Quarter turns come out exact: Blender's float32 leaves 4e-8 where a zero belongs.
-
-    Raises
-    ------
-    RefineError
-        If the object is not evaluated, being disabled in viewports or excluded, and has
-        animation or constraints that only an evaluation can follow.
-    """
+    """An object's matrix to the world, (4, 4), quarter turns exact: float32 leaves 4e-8 at zeros.
+    `RefineError` if animation or constraints move it, and it is not evaluated (disabled,
+    excluded)."""
     evaluated = obj.evaluated_get(depsgraph)
     if evaluated.is_evaluated:
         return snapped(np.array(evaluated.matrix_world, np.float64))
@@ -139,22 +103,8 @@ def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArr
 
 
 def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
-    """Make a camera object that sees what a view sees.
-
-    It does where the render size has the aspect of the view; of pixels that are not square, the
-    horizontal focal length counts. The view itself is noted on the object, for `view_from_camera`.
-
-    Parameters
-    ----------
-    view : View
-    upright : bool
-        Whether to turn it by `UPRIGHT`, like splats imported with that option.
-
-    Returns
-    -------
-    bpy.types.Object
-        In no collection yet.
-    """
+    """Camera object with a view's frame, in no collection; `upright` turns it by `UPRIGHT`.
+    The render size must have the view's aspect; of pixels that are not square, fx counts."""
     view = view.turned(QUARTER) if upright else view
     name = PurePosixPath(view.name).name or "view"
     data = bpy.data.cameras.new(name)
@@ -180,22 +130,8 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
 
 
 def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -> int | None:
-    """Return by how many quarters about x a camera is to be turned to stand as in its file.
-
-    Parameters
-    ----------
-    obj : bpy.types.Object
-        The camera.
-    view : View
-        What it sees now.
-    axes : (3, 3) float64
-        Rotation to the world of an object that holds splats as their file does.
-
-    Returns
-    -------
-    {0, 1, -1} or None
-        By `QUARTER` or its inverse; None where it was not imported, or stands otherwise.
-    """
+    """Quarters about x (0, 1, -1) that put an imported camera back as in its file, else None.
+    `axes`: (3, 3) rotation to the world of an object that holds splats as their file does."""
     source = _source(obj)
     if not source:
         return None
@@ -208,7 +144,7 @@ def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -
 
 
 def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) -> dict[str, Any]:
-    """Return focal lengths and principal point in pixels, as Blender frames its renders."""
+    """Focal lengths and principal point in pixels, as Blender frames its renders."""
     width, height = size
     fit = data.sensor_fit
     if fit == "AUTO":
@@ -228,20 +164,8 @@ def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) ->
 
 
 def pose(name: str, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the world-to-camera rotation and the centre; a camera's scale means nothing.
-
-    Parameters
-    ----------
-    name : str
-        Of the camera, for messages.
-    matrix : (4, 4) float64
-        From the camera, as Blender has its axes, to the world.
-
-    Raises
-    ------
-    RefineError
-        If the camera is sheared or flat.
-    """
+    """World-to-camera rotation and centre of a (4, 4) camera-to-world matrix with Blender's axes.
+    Its scale is ignored; `RefineError` if it is sheared or flat."""
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     axes = matrix[:3, :3] / np.where(lengths > 0.0, lengths, 1.0)
     if lengths.min() <= 0.0 or np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:
@@ -264,7 +188,7 @@ def _weight(obj: bpy.types.Object) -> float:
 
 
 def snapped(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a (4, 4) matrix with an exact linear part if that is but quarter turns and a scale."""
+    """A (4, 4) matrix, its linear part made exact if it is quarter turns and a scale."""
     linear = matrix[:3, :3]
     scale = np.abs(linear).max()
     signs = np.round(linear / (scale or 1.0))
@@ -309,7 +233,7 @@ def _restored(
     matrix: NDArray[np.float64],
     data: bpy.types.Camera,
 ) -> View:
-    """Return the view with the file's own numbers for whatever nobody touched."""
+    """The view with the file's own numbers wherever nothing was changed."""
     changes: dict[str, Any] = {}
     if np.array_equal(matrix, np.array(source["matrix"])):
         changes.update(rotation=np.array(source["rotation"]), center=np.array(source["center"]))

@@ -15,22 +15,13 @@ from ..mesh.layout import LAYOUT
 from ..mesh.native import is_native
 from .objects import SHEAR, camera_from_view, quarter_turn, view_from_camera, world_matrix
 
-_FEW = 16
-"""So many cameras at most are looked at to tell whether all are to be turned."""
+_FEW = 16  # Cameras looked at, at most, to tell whether all are to be turned
 
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """Which cameras decide: what the panel and the command name, and a .blend keeps.
-
-    Attributes
-    ----------
-    source : {"ACTIVE", "SELECTED", "VISIBLE", "COLLECTION", "FRAMES"}
-    collection : bpy.types.Collection, optional
-        For COLLECTION: its cameras and those of the collections in it, hidden or not.
-    frames : range, optional
-        For FRAMES.
-    """
+    """The cameras that decide, as panel and command name them and a .blend keeps them.
+    COLLECTION uses `collection` with its children, hidden or not; FRAMES uses `frames`."""
 
     source: str
     collection: bpy.types.Collection | None = None
@@ -38,12 +29,12 @@ class CameraChoice:
 
     @classmethod
     def of_scene(cls, scene: bpy.types.Scene) -> CameraChoice:
-        """Return what is chosen in the panel, as the scene keeps it."""
+        """The panel's choice, stored in the scene."""
         settings = scene.refine
         return cls(settings.source, settings.collection, settings.to_frames(scene))
 
     def cameras(self, context: bpy.types.Context) -> list[bpy.types.Object]:
-        """Return the cameras, of any type; of FRAMES all of the scene. Quick enough for drawing."""
+        """The cameras, of any type; for FRAMES all of the scene. Quick enough to draw."""
         layer = context.view_layer
         if self.source == "ACTIVE":
             objects = [context.scene.camera]
@@ -59,19 +50,7 @@ class CameraChoice:
         return cameras
 
     def views(self, context: bpy.types.Context, splats: bpy.types.Object | None = None) -> ViewSet:
-        """Return the views of these cameras.
-
-        Parameters
-        ----------
-        context : bpy.types.Context
-        splats : bpy.types.Object, optional
-            See `views_from_frames`.
-
-        Raises
-        ------
-        RefineError
-            If there is no such camera; and see `view_from_camera`.
-        """
+        """Views of these cameras, one at least; `splats` as in `views_from_frames`."""
         scene = context.scene
         if self.source == "FRAMES":
             return views_from_frames(context, self.frames, splats)
@@ -92,21 +71,8 @@ class CameraChoice:
 
 
 def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
-    """Return by how many quarters about x the cameras that decide are to be turned.
-
-    Known from how splats and cameras were imported, before anything is scored.
-
-    Parameters
-    ----------
-    context : bpy.types.Context
-        Evaluated: matrices are read as they stand. The choice of cameras is that of its scene.
-    splats : bpy.types.Object
-
-    Returns
-    -------
-    {0, 1, -1}
-        See `ViewSet.turn`; 0 where it is not known, or a shot decides.
-    """
+    """Quarters about x that deciding cameras must turn (`ViewSet.turn`); 0 if unknown or a shot.
+    Known from how splats and cameras were imported; the context must be evaluated."""
     choice = CameraChoice.of_scene(context.scene)
     if choice.source == "FRAMES":
         return 0
@@ -123,21 +89,7 @@ def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
 def create_cameras(
     views: ViewSet, collection: bpy.types.Collection, *, upright: bool = False
 ) -> list[bpy.types.Object]:
-    """Make a camera object of each view.
-
-    Parameters
-    ----------
-    views : ViewSet
-    collection : bpy.types.Collection
-        Where to link them.
-    upright : bool
-        See `camera_from_view`.
-
-    Returns
-    -------
-    list of bpy.types.Object
-        In the order of the views.
-    """
+    """A camera object for each view, in order, linked to `collection`; see `camera_from_view`."""
     spread = float(np.sqrt(np.mean(np.var(views.centers, axis=0))))
     cameras = [camera_from_view(view, upright=upright) for view in views]
     for camera in cameras:
@@ -152,25 +104,9 @@ def views_from_frames(
     frames: range,
     splats: bpy.types.Object | None = None,
 ) -> ViewSet:
-    """Return the active camera's view at each frame; an animated shot is a view set.
-
-    Cameras bound to timeline markers take over as they do when the shot is rendered. The frame and
-    the active camera are put back.
-
-    Parameters
-    ----------
-    context : bpy.types.Context
-    frames : range
-    splats : bpy.types.Object, optional
-        Object to be scored: where it moves itself (a turntable), the views move against it, so
-        that all see it where it is now.
-
-    Raises
-    ------
-    RefineError
-        If there is no frame, no active camera at one, or the object's scale is animated; and see
-        `view_from_camera`.
-    """
+    """Views of the active camera at each frame; markers switch cameras as in a render.
+    Where `splats` moves (a turntable), views move against it. Frame and active camera are put back.
+    `RefineError` without frames or a camera, or if the object's scale is animated."""
     scene = context.scene
     if not len(frames):
         raise RefineError(
@@ -199,11 +135,8 @@ def _turn(
     splats: bpy.types.Object | None,
     depsgraph: bpy.types.Depsgraph,
 ) -> int | None:
-    """Return by how many quarters about x cameras are to be turned; see `ViewSet`.
-
-    None where that is not known: unless splats and at least half of the cameras were imported, and
-    all of these cameras are turned alike.
-    """
+    """Quarters about x that these cameras need; None if unknown: unless splats and at least half of
+    the cameras were imported, and all are turned alike."""
     data = None if splats is None else splats.data
     if splats is None or data is None or not (LAYOUT in data or is_native(data)):
         return None
@@ -230,7 +163,7 @@ def _active_camera(scene: bpy.types.Scene) -> bpy.types.Object:
 def _against(
     view: View, obj: bpy.types.Object, now: NDArray[np.float64], then: NDArray[np.float64]
 ) -> View:
-    """Return a view of another frame moved so that it sees the object where that is now."""
+    """A view of another frame, moved to see the object where it stands now."""
     if np.array_equal(now, then):
         return view
     motion = now @ np.linalg.inv(then)

@@ -1,4 +1,4 @@
-"""What is refused before anything is read or written, beyond what single values show."""
+"""Refusals before anything is read or written, beyond those of single values."""
 
 from __future__ import annotations
 
@@ -17,15 +17,7 @@ from .zones import ROLES
 
 
 def check(options: argparse.Namespace) -> None:
-    """Refuse what does not go together, and outputs that would replace something else.
-
-    Raises
-    ------
-    RefineError
-        It is wrong usage.
-    OSError
-        If a report that would be replaced cannot be looked into.
-    """
+    """Refuse options that exclude each other, and outputs that would replace something else."""
     together, inputs = options.together, options.inputs
     places = [options.cameras, options.report, options.pictures]
     for place in filter(None, places if together else [*places, *inputs, options.output]):
@@ -47,7 +39,7 @@ def check(options: argparse.Namespace) -> None:
 
 
 def _rules(options: argparse.Namespace) -> dict[str, object]:
-    """What is said of what does not go together -> whether it is so."""
+    """Message -> whether the options break this rule."""
     name, scene, one, output = options.command, options.scene, options.object, options.output
     together, many = options.together, len(options.inputs) > 1
     needs = f"needs Blender: {BLENDER} {name}"
@@ -92,7 +84,6 @@ def _rules(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
-    """The files of splats to be made."""
     output = options.output
     if output is None or (options.command == "lod" and is_streamed(output)):
         return []
@@ -105,7 +96,7 @@ def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
 
 
 def _check_report(options: argparse.Namespace, made: Sequence[Path | Url]) -> None:
-    """Refuse a report that would replace what is read or written, even with --overwrite."""
+    """Refuse a report that would replace an input or output, even with --overwrite."""
     report, pictures = options.report, options.pictures
     others = [*options.inputs, *made, options.output, options.cameras, options.blend]
     path = os.path.realpath(report)
@@ -122,7 +113,7 @@ def _check_report(options: argparse.Namespace, made: Sequence[Path | Url]) -> No
 
 
 def _refuse_doubles(inputs, made, read=()):
-    """Refuse two inputs of which the same file would be made, or one that replaces another."""
+    """Refuse two inputs with the same output, and outputs that replace inputs."""
     first: dict[str, Path] = {}
     linked = {os.path.realpath(path): path for path in read}
     for path, output in zip(inputs, made, strict=False):

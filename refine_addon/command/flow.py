@@ -12,18 +12,7 @@ from .terminal import complain, described, flush
 
 
 def run(arguments: Sequence[str], *, scene: bool) -> int:
-    """Parse the arguments, check them, do what they say.
-
-    Parameters
-    ----------
-    arguments, scene
-        See `refine_addon.command.main`.
-
-    Returns
-    -------
-    int
-        Exit code: 0 done, 1 failed on an input, 2 wrong usage.
-    """
+    """Parse, check and run; exit code as of `refine_addon.command.main`."""
     parser = options.make_parser()
     try:
         given = parser.parse_args(list(arguments))

@@ -1,4 +1,4 @@
-"""The options of all subcommands, each once, and the settings that they make."""
+"""The options of all subcommands, each once, and the settings they make."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ lod --psnr DB,DB,...    or how close each stays to the original in these views, 
 --overwrite             replace files that exist
 --quiet                 print errors only
 """
-"""Each option, before it the subcommand where that has it in words of its own."""
+"""Each option, after the subcommand where its text differs there."""
 
 _REST = "--report --overwrite --quiet"
 _VIEWS = f"--cameras --source --views --remove-inside --keep-inside --model {_REST}"
@@ -120,26 +120,19 @@ render: render the open scene with splats, by its output settings
 --source --quiet
   {BLENDER} render --source frames:1:250:10
 """
-"""Of each subcommand its purpose, what it takes (inputs and options), and examples."""
+"""For each subcommand its purpose, inputs, options, and examples."""
 
-LAST_FRAME = 1_048_574
-"""The last frame that Blender knows, and with a minus the first."""
+LAST_FRAME = 1_048_574  # Blender's last frame; negative, its first
 
 
 def settings(kind: type, options: argparse.Namespace, **default: Any) -> Any:
-    """Settings of a kind: each field by the option of its name; where none is given, `default`."""
+    """Settings of a kind: each field from the option of its name, else from `default`."""
     values = {field.name: getattr(options, field.name, None) for field in fields(kind)}
     return kind(**({n: value for n, value in values.items() if value is not None} or default))
 
 
 def complete(options: argparse.Namespace) -> None:
-    """Make the settings: ``budget``, ``how`` (the method), ``cleaning`` and ``levels``.
-
-    Raises
-    ------
-    RefineError
-        If a value cannot be.
-    """
+    """Add the settings ``budget``, ``how`` (the method), ``cleaning`` and ``levels``."""
     if options.command == "prune":
         options.budget = settings(Budget, options, ratio=0.5)
     if options.command == "lod":
@@ -153,21 +146,20 @@ def complete(options: argparse.Namespace) -> None:
 
 
 def _name(text: str) -> str:
-    """What is there; a variable that a script did not set is a mistake, not a default."""
+    """A name, not empty: an unset variable of a script is a mistake, not a default."""
     if not text:
         raise RefineError("expected a name, got none")
     return text
 
 
 def _given(text: str) -> Path | Url:
-    """The place of what is read, as it was given."""
     if "\0" in text:
         raise RefineError("a path holds no zero byte")
     return Url(text) if is_url(text) else Path(_name(text))
 
 
 def _made(text: str) -> Path | Url:
-    """The place of what is written, the home folder spelt out."""
+    """An output path, ``~`` expanded."""
     if text == "-":
         raise RefineError("nothing is written to standard output: name a file (./- is one, too)")
     place = _given(text)
@@ -175,7 +167,6 @@ def _made(text: str) -> Path | Url:
 
 
 def _workers(text: str) -> int | str:
-    """How many, or the address of a scheduler."""
     if not text.lstrip("-").isdecimal():
         return _name(text)
     if int(text) < 1:
@@ -191,12 +182,12 @@ def _numbers(text: str) -> tuple[float, ...]:
 
 
 def _volume(text: str) -> tuple[str, Volume | None]:
-    """What was given, and the volume if that is one in numbers, not a name."""
+    """The text, and its volume if it holds numbers, not a name."""
     return _name(text), parse(text)
 
 
 def _source(text: str) -> tuple[str, str | range]:
-    """The kind of source as the panel names it, with the name of a collection or the frames."""
+    """The kind of source as the panel names it, with its collection or frames."""
     kind, colon, rest = text.partition(":")
     if kind == "frames" and colon:
         return "FRAMES", _frames(rest)
@@ -219,7 +210,7 @@ def _frames(text: str) -> range:
 
 
 def _told(take: Callable[[str], Any]) -> Callable[[str], Any]:
-    """The same for argparse, which tells what is wrong with an argument in its own error alone."""
+    """The same for argparse, which shows messages of its own error type only."""
 
     @functools.wraps(take)
     def told(text: str) -> Any:
@@ -240,23 +231,22 @@ _TYPES: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(("OUT", "FILE", "DIR", "FILE.json"), _made),
     **{"NAME": _name, "N|ADDRESS": _workers, "WHICH": _source, "VOLUME": _volume},
 }
-"""What an option takes, by what stands for it in the help; else any text."""
+"""Type of an option by its placeholder in the help; else any text."""
 
-_NAMES = {"-o": "output", "--levels": "shares"}
-"""What options are called elsewhere, if not by their own names."""
+_NAMES = {"-o": "output", "--levels": "shares"}  # Field names of options, where they differ
 
 _CHOICES = {"METHOD": tuple(METHODS), "MODEL": MODELS, "D": tuple(range(5))}
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose complaints can be shown, whatever the arguments hold."""
+    """A parser whose complaints are safe to print, whatever the arguments hold."""
 
     def error(self, message: str) -> NoReturn:
         super().error(printable(message))
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all subcommands; what one does not have is None."""
+    """Parser of all subcommands; options that one lacks are None."""
     parser = _Parser(
         prog="refine",
         description="Prune 3D Gaussian splats by how much the cameras would miss them.",

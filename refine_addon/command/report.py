@@ -18,14 +18,7 @@ from ..version import VERSION
 
 
 def check(path: Path, *, overwrite: bool) -> None:
-    """Refuse a report that could not be written, before the work that it would tell of.
-
-    Raises
-    ------
-    RefineError
-        If it exists and may not be replaced, its name is none that the system takes, or its folder
-        takes no files.
-    """
+    """Refuse a report that could not be written, before the work."""
     refuse_existing(path, overwrite=overwrite)
     try:
         # A link stays one: what it points to is written.
@@ -38,26 +31,7 @@ def check(path: Path, *, overwrite: bool) -> None:
 
 
 def write(path: Path, results: list[Any], seconds: float, overwrite: bool, splats: bool) -> None:
-    """Write the report.
-
-    Parameters
-    ----------
-    path : Path
-        The file to make.
-    results : list of dict
-        One an input.
-    seconds : float
-        How long all of it took.
-    overwrite : bool
-        Whether the file may be replaced.
-    splats : bool
-        Whether splats were written, for the message if the report is not.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be written; the message says what was and what was not.
-    """
+    """Write the report of all results; an error says whether `splats` were written."""
     content = {
         "refine": VERSION,  # first: by this a report is known, see `is_report`
         "python": sys.version.split()[0],
@@ -77,6 +51,6 @@ def write(path: Path, results: list[Any], seconds: float, overwrite: bool, splat
 
 
 def is_report(beginning: bytes) -> bool:
-    """Return whether a file that begins like this is a report, or empty: nothing to be missed."""
+    """Whether a file that begins like this is a report, or empty: safe to replace."""
     words = beginning.split()
     return not words or b"".join(words).startswith(b'{"refine":')

@@ -1,4 +1,4 @@
-"""What all subcommands do alike: go from input to input, say and note what came of each."""
+"""The part common to all subcommands: go from input to input, print and record each result."""
 
 from __future__ import annotations
 
@@ -21,19 +21,7 @@ from .terminal import Terminal, complain, described
 
 
 class Run:
-    """What one call of the command did so far.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-
-    Attributes
-    ----------
-    options : argparse.Namespace
-    terminal : Terminal
-    entries : list of dict
-        Of the report, one an input.
-    """
+    """One call of the command: options, terminal, and the report's entries, one an input."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
@@ -48,7 +36,7 @@ class Run:
         self._cameras: dict[str, Any] = {}
 
     def views(self) -> ViewSet:
-        """Return the views that decide, and note where they are from for the report."""
+        """The deciding views; notes their source for the report."""
         path = self.options.cameras
         if self._views is None and path is not None:
             self._views, self._cameras = read_cameras(path), {"source": "file", "file": str(path)}
@@ -59,7 +47,7 @@ class Run:
         return self._views
 
     def progress(self, name: str) -> Progress:
-        """Return what draws how much of the file under way is done, and the time left."""
+        """Progress callback that draws the share done of the current file, and the time left."""
         done, sizes = len(self.entries), self._sizes
         before, total, several = sum(sizes[:done]), sum(sizes), " in all" if sizes[1:] else ""
 
@@ -71,11 +59,9 @@ class Run:
         return draw
 
     def say(self, label: str, line: str, done: dict[str, Any], *more: str) -> dict[str, Any]:
-        """Say what was done, then what decided, then more and the notes; return the report.
-
-        What decided is which cameras of the scene, since those of a file were named by the user;
-        what had to stay and go; and how many of the splats that were scored no view holds.
-        """
+        """Print what was done, what decided, then more and the notes; the report.
+        What decided: the scene's cameras (the user named a file's), protected and removed splats,
+        and the number of scored splats that no view holds."""
         splats, words, output = done["splats"], self._cameras.get("words"), done["files"]["output"]
         lines = [f"cameras: {words}" if words else "", zones.words(done)]
         if unseen := splats.get("unseen"):
@@ -92,7 +78,7 @@ class Run:
         return done
 
     def each(self, work: Callable[..., dict[str, Any]]) -> None:
-        """Do the work of the object or of every input, with its output if there is to be one."""
+        """Do the work of the object or of each input, with its output if one is wanted."""
         options, output = self.options, self.options.output
         inside = output is not None and options.command != "lod" and not names_file(output)
         if options.inputs and options.command != "info":
@@ -103,7 +89,7 @@ class Run:
                 self.attempt(work, source, output / source.name if inside else output)
 
     def attempt(self, work: Callable[..., dict[str, Any]], source: Any, *output: Any) -> None:
-        """Do one input's work; note its error, so that the others go on."""
+        """Do one input's work; record its error, so that the others go on."""
         label = str(source)
         if not self.entries:
             self._left = TimeLeft()
@@ -120,7 +106,7 @@ class Run:
             complain(message)
 
     def finish(self) -> bool:
-        """Write the report, where one is wanted; return whether an input failed."""
+        """Write the report if wanted; whether an input failed."""
         options, seconds = self.options, time.perf_counter() - self._started
         done = [entry for entry in self.entries if entry["status"] == "done"]
         if options.report is not None:
@@ -130,6 +116,5 @@ class Run:
         return len(done) < len(self.entries)
 
     def _named(self, name: str) -> str:
-        """The name of the file under way, with its place among several."""
         count = len(self._sizes)
         return name if count == 1 else f"file {len(self.entries) + 1} of {count}, {name}"

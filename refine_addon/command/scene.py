@@ -1,4 +1,4 @@
-"""The open scene: whether it is open, which of its cameras decide, its render. Needs Blender."""
+"""The open scene: whether it is open, its deciding cameras, its render. Needs Blender."""
 
 from __future__ import annotations
 
@@ -19,18 +19,8 @@ from .terminal import Terminal
 
 
 def opened(words: Sequence[str] | None = None) -> str:
-    """Return the path of the open .blend, "" if it was never saved.
-
-    Parameters
-    ----------
-    words : sequence of str, optional
-        Blender's command line, by default that of this process.
-
-    Raises
-    ------
-    RefineError
-        If a .blend was named before the command and is not open: Blender goes on without.
-    """
+    """Path of the open .blend, "" if never saved; `words`: Blender's command line.
+    `RefineError` if it names a .blend that is not open: Blender goes on without."""
     words = sys.argv if words is None else words
     starts = (place for place, word in enumerate(words) if word in ("-c", "--command"))
     named = [word for word in words[1 : next(starts, 0)] if word.lower().endswith(".blend")]
@@ -40,16 +30,8 @@ def opened(words: Sequence[str] | None = None) -> str:
 
 
 def views(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
-    """Return the views that decide, and what the report says of them.
-
-    Those of --source; else on an object those chosen in the panel, as the scene keeps it, and on
-    files all visible ones.
-
-    Raises
-    ------
-    RefineError
-        If there is no such object, collection or camera, or no frame; see `CameraChoice.views`.
-    """
+    """The deciding views, and the report's entry on them.
+    Those of --source; else for an object the panel's choice, for files all visible cameras."""
     obj = splat_group.find(options.object) if options.object else None
     choice, why = CameraChoice("VISIBLE"), "of the open scene"
     if obj or options.source:
@@ -78,7 +60,7 @@ def views(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
 
 
 def render(options: argparse.Namespace, terminal: Terminal) -> None:
-    """Render frames of the open scene, each written where its output settings say."""
+    """Render frames of the open scene to its output path."""
     scene, shared = bpy.context.scene, Shared()
     chosen: Any = range(scene.frame_current, scene.frame_current + 1)
     if options.source:

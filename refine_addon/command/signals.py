@@ -1,4 +1,4 @@
-"""Signals that ask to stop: Ctrl-C, a polite kill, a terminal that was closed."""
+"""Signals that ask to stop: Ctrl-C, a polite kill, a closed terminal."""
 
 from __future__ import annotations
 
@@ -11,20 +11,18 @@ from typing import Any
 
 _WORDS = {"SIGINT": "cancelled", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 REASONS = {getattr(signal, name): words for name, words in _WORDS.items() if hasattr(signal, name)}
-"""What each signal is called in a message; Windows lacks the last."""
+"""Name of each signal in messages; Windows lacks the last."""
 
 
 class Stopped(KeyboardInterrupt):
-    """Raised wherever the command is when a signal asks it to stop, whose number it holds."""
+    """Raised wherever the command is when a signal asks it to stop; holds its number."""
 
 
 @contextlib.contextmanager
 def listening(*, last: bool) -> Iterator[Callable[[], None]]:
-    """Listen to signals that are not ignored, and give them back; if `last`, ignore them then.
-
-    Yields a function from whose call on they raise `Stopped`. One that comes before it waits: an
-    exception amid an import can get lost, or come out as NumPy's advice on a broken NumPy.
-    """
+    """Handle signals not ignored, and restore them, or ignore them if `last`.
+    Yields a function; signals before its call wait for it: an exception amid an import can get
+    lost, or come out as NumPy's advice on a broken NumPy."""
     arrived: list[int] = []
     before: dict[int, Any] = {}
     raises = False
@@ -55,14 +53,14 @@ def listening(*, last: bool) -> Iterator[Callable[[], None]]:
 
 
 def reason_and_code(stop: KeyboardInterrupt) -> tuple[str, int]:
-    """What stopped the command, and the exit code by which a shell says so: 130 for Ctrl-C."""
+    """What stopped the command, and its exit code as in shells: 130 for Ctrl-C."""
     # Python's own comes where nobody listens: from a thread, from whoever calls `main`.
     number = stop.args[0] if isinstance(stop, Stopped) else signal.SIGINT
     return REASONS[number], 128 + number
 
 
 def _stopping() -> bool:
-    """Whether what runs now is cleaning up after `Stopped`, which a second must not stop."""
+    """Whether `Stopped` is being cleaned up after, which a second one must not stop."""
     error = sys.exception()
     while error is not None and not isinstance(error, Stopped):
         error = error.__context__

@@ -1,4 +1,4 @@
-"""What each subcommand does and says: of a file of splats, an object, tiles, several files."""
+"""The subcommands: work and messages for a splat file, an object, tiles, several files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .run import Run
 
 
 def run_subcommand(run: Run) -> None:
-    """Do what the options say, from input to input; errors are noted in the run."""
+    """Run the options' subcommand, input by input; the run records errors."""
     options = run.options
     work = {"prune": _prune, "score": _score, "clean": _clean, "lod": _lod, "info": _info}
     if options.command == "render":
@@ -41,7 +41,6 @@ def run_subcommand(run: Run) -> None:
 
 
 def _how(run: Run, name: str) -> dict[str, Any]:
-    """What files and objects are worked on by."""
     options = run.options
     how = {"overwrite": options.overwrite, "progress": run.progress(name)}
     if options.object:
@@ -105,7 +104,7 @@ def _say_pruned(run: Run, label: str, done: dict[str, Any], *more: str) -> dict[
 
 
 def _quality(done: dict[str, Any]) -> str:
-    """What is estimated of the pictures, in words; "" where nothing is."""
+    """The estimated quality in words, "" without."""
     psnr, method = done["estimated_psnr"], done["method"]
     if psnr is None:
         return ""
@@ -175,7 +174,7 @@ def _info(run: Run, source: Path, _output: None) -> dict[str, Any]:
 
 
 def describe(file: core.SplatFile) -> dict[str, Any]:
-    """Return what ``info`` says of a file: counts, degree, extent, rows that are not finite."""
+    """Entry of ``info`` on a file: counts, degree, extent, rows that are not finite."""
     splats, names = file.splats(), file.rows.dtype.names or ()
     pieces = (file.rows[start : start + (1 << 16)] for start in range(0, len(file), 1 << 16))
     finite = (np.logical_and.reduce([np.isfinite(piece[n]) for n in names]) for piece in pieces)
@@ -198,38 +197,28 @@ def describe(file: core.SplatFile) -> dict[str, Any]:
 
 
 def _by(done: dict[str, Any]) -> str:
-    """How many views decided."""
     return f"by {done['views']['used']} of {done['views']['given']} views"
 
 
 def _written(splats: Mapping[str, Any]) -> str:
-    """How many splats a file holds, if its format left some out; else ""."""
+    """The splats in a file, if its format left some out; else ""."""
     return f", {splats['written']:,} written" if splats["left_out"] and splats["written"] else ""
 
 
 def _files(done: dict[str, Any]) -> str:
-    """The same, and what became of the size."""
+    """The same, and the sizes before and after."""
     files = done["files"]
     return f"{_written(done['splats'])}, {_sizes(files['input_bytes'], files['output_bytes'])}"
 
 
 def _sizes(before: int, after: int | None) -> str:
-    """What became of the size of a file; None where only writing tells it."""
+    """File sizes before and after; None if only writing tells."""
     return f"of {size_in_words(before)}" if after is None else sizes_in_words(before, "->", after)
 
 
 def _by_method(predicted: Mapping[str, Any], without: str = "") -> str:
-    """Which quality and time the methods are expected to come to.
+    """Predicted quality and time of the methods but `without`, from a report's numbers.
 
-    Parameters
-    ----------
-    predicted : mapping
-        ``psnr`` and ``seconds`` of a report's ``method`` or ``prices``.
-    without : str
-        The method that is left out.
-
-    Examples
-    --------
     >>> psnr = {"delete": 38.0, "merge": 46.0, "refit": None}
     >>> _by_method({"psnr": psnr, "seconds": {"delete": 1.2, "merge": 2.1, "refit": 8.0}})
     'occlusion about 38 dB in 2 s, merge about 46 dB in 3 s'

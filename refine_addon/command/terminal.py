@@ -1,4 +1,4 @@
-"""What the command prints: sentences, errors and progress, none of which can harm a terminal."""
+"""The command's output: sentences, errors, progress; none can harm a terminal."""
 
 from __future__ import annotations
 
@@ -12,30 +12,24 @@ _CLEAR = "\r\x1b[K"
 
 
 def described(error: Exception) -> str:
-    """Return what is wrong: of what the system refused, with the file."""
+    """An error's message; for those of the system with the file."""
     file = getattr(error, "filename", None)
     return f"{file}: {error.strerror}" if file else reason_of(error)
 
 
 def complain(text: str) -> None:
-    """Print an error, in place of the progress that may stand there."""
+    """Print an error in place of the progress."""
     start = _CLEAR if _is_terminal(sys.stderr) else ""
     _write("stderr", f"{start}refine: error: {printable(text)}\n")
 
 
 def flush() -> None:
-    """Hand on what argparse printed, which is help that nobody may be there to read."""
+    """Flush argparse's help; its reader may be gone."""
     _write("stdout", "")
 
 
 class Terminal:
-    """Where a run says what it does.
-
-    Parameters
-    ----------
-    quiet : bool
-        Whether to say nothing but errors.
-    """
+    """Output of a run; `quiet`: errors only."""
 
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
@@ -47,12 +41,12 @@ class Terminal:
             _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
 
     def draw(self, text: str) -> None:
-        """Show a line until the next takes its place; on a terminal alone."""
+        """Show a line until the next replaces it; on terminals only."""
         if self._draws:
             _write("stderr", f"{_CLEAR}{printable(text)}")
 
     def clear(self) -> None:
-        """Wipe away what was drawn."""
+        """Erase the drawn line."""
         self.draw("")
 
 
@@ -61,7 +55,6 @@ def _is_terminal(stream: TextIO | None) -> bool:
 
 
 def _write(name: Literal["stdout", "stderr"], text: str) -> None:
-    """Write to a stream of the process, at once."""
     stream: TextIO | None = getattr(sys, name)
     if stream is None:  # closed before Python began
         return

@@ -1,4 +1,4 @@
-"""What must stay and what must go, as the options and the open scene say it."""
+"""Protected splats and those the user removes, from the options and the open scene."""
 
 from __future__ import annotations
 
@@ -10,28 +10,16 @@ from ..core import RefineError, Zone
 from ..core.volumes import Role, Volume
 
 ROLES: dict[str, Role] = {"protect": "protect", "remove_inside": "remove", "keep_inside": "keep"}
-"""Options -> what becomes of the splats in a volume."""
+"""Options -> role of their volumes."""
 
 
 def of_files(options: argparse.Namespace) -> tuple[Zone, ...]:
-    """Return the volumes that decide on INPUT files.
-
-    Raises
-    ------
-    RefineError
-        If no object of the open scene has such a name, or one can be no volume.
-    """
+    """The volumes that decide on INPUT files."""
     return tuple(_zone(role, text, volume) for role, text, volume in _named(options))
 
 
 def of_object(options: argparse.Namespace) -> Any:
-    """Return what is demanded of the splats of --object: by the options, and by the scene.
-
-    Raises
-    ------
-    RefineError
-        See `of_files` and `Demands.of_scene`.
-    """
+    """The demands on the splats of --object, from the options and the scene."""
     import bpy
 
     from ..objects import demands, splat_group
@@ -50,7 +38,7 @@ def of_object(options: argparse.Namespace) -> Any:
 
 
 def words(done: dict[str, Any]) -> str:
-    """Return what a report says of it in one line, "" where nothing was demanded."""
+    """The report's demands in one line, "" without."""
     counts = {"protected": "protected", "removed_by_user": "removed by you"}
     splats = done["splats"]
     parts = [f"{splats[key]:,} {what}" for key, what in counts.items() if splats.get(key)]

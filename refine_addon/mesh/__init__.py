@@ -1,1 +1,1 @@
-"""The data of a splat object, mesh or point cloud: attributes, editing, scores, how they show."""
+"""Data of a splat object, mesh or point cloud: attributes, editing, scores, display."""

@@ -1,10 +1,7 @@
-"""Splats as point attributes of a mesh, under the names that the PLY file gives its properties.
-
-Log scales, logit opacities and raw harmonics are stored as they stand in the file: what Blender's
-own importer and KIRI's 3DGS Render (its `vert` form) store, so that meshes of either are read too.
-Point clouds with Blender's own splats hold them otherwise (`native`); their columns come out and
-go in as those of a mesh.
-"""
+"""Splats as point attributes of a mesh, named as the PLY properties.
+Log scales, logit opacities and raw harmonics stay as in the file, as Blender's importer and KIRI's
+3DGS Render (`vert` form) store them; meshes of either can be read. Blender's own splats (`native`)
+are converted to and from such columns."""
 
 from __future__ import annotations
 
@@ -26,20 +23,18 @@ from ..core.formats.registry import scene_name
 from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
 
-_GROUP = 16
-"""Columns that are transposed together: float32 numbers in a cache line of 64 bytes."""
+_GROUP = 16  # Columns transposed together: float32 numbers in a cache line of 64 bytes
 
-_ROWS = 4096
-"""Rows of so many columns that are transposed at a time: 256 kB, which caches hold."""
+_ROWS = 4096  # Rows of so many columns transposed at a time: 256 kB, which caches hold
 
 
 def file_size(checked: SplatObject) -> tuple[int, int]:
-    """Return the bytes that a splat takes in the exported file, and those of all else in it."""
+    """Bytes of one splat in the exported file, and bytes of all else."""
     return checked.layout.row_dtype.itemsize, len(checked.layout.header)
 
 
 def import_notes(source: SplatFile) -> tuple[str, ...]:
-    """Return what a mesh cannot hold of a file, in sentences."""
+    """Sentences on what a mesh cannot hold of a file."""
     notes = []
     names = source.rows.dtype.names or ()
     doubles = [name for name in names if source.rows.dtype[name].str[1:] == "f8"]
@@ -54,7 +49,7 @@ def import_notes(source: SplatFile) -> tuple[str, ...]:
 
 
 def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
-    """Make a mesh with a vertex a splat and an attribute a property; it has no user yet."""
+    """Mesh without users: a vertex for each splat, an attribute for each property."""
     rows = source.rows
     mesh = bpy.data.meshes.new(scene_name(source.path))
     try:
@@ -69,22 +64,14 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
 
 
 def add_vertices(mesh: bpy.types.Mesh, count: int) -> None:
-    """Add vertices to a mesh that has none, not selected as Blender would have them."""
+    """Add vertices to an empty mesh, deselected, unlike Blender's default."""
     mesh.vertices.add(count)
     remove_attribute(mesh, ".select_vert")
 
 
 def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
-    """Read a splat object, in its own frame.
-
-    Parameters
-    ----------
-    checked : SplatObject
-    sh_rest : bool
-        Whether to read the view-dependent coefficients. Without them, `Splats.sh_rest` has one
-        coefficient: NaN where any is not finite, else 0, which is all that scoring looks at, and
-        at 3 M splats of degree 3 spares 0.5 GB.
-    """
+    """Splats of an object, in its own frame. Without `sh_rest`, one coefficient stands for all:
+    NaN where any is not finite, else 0, enough for scoring (0.5 GB less at 3 M of degree 3)."""
     read = _Reader(checked)
     rest = [f"f_rest_{index}" for index in range(rest_count(checked.mesh))]
     count = len(checked)
@@ -112,7 +99,7 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
 
 
 def file_from_object(checked: SplatObject) -> SplatFile:
-    """Return a splat object as the file it would be, in memory; `SplatFile.write` writes it."""
+    """A splat object as a PLY file in memory."""
     groups = _groups_of(checked, frozenset())
     return _file(checked.obj.name, checked.layout, len(checked), groups, dict)
 
@@ -122,16 +109,8 @@ def read_for_file(
     replaced: Collection[str] = (),
     columns: Callable[[], Mapping[str, NDArray[Any]]] = dict,
 ) -> Callable[[], SplatFile]:
-    """Read a splat object; return what makes the file that it would be of that, on any thread.
-
-    Parameters
-    ----------
-    checked : SplatObject
-    replaced : collection of str
-        Properties to write with other values than the object's.
-    columns : callable
-        Returns these, (N,) each, when the file is made.
-    """
+    """Read the object now; the thread-safe callable builds its PLY file.
+    Properties in `replaced` take the values that `columns` gives then, (N,) each."""
     groups = deque(_groups_of(checked, frozenset(replaced)))
     one_by_one = (groups.popleft() for _ in range(len(groups)))  # to be forgotten when written
     return partial(_file, checked.obj.name, checked.layout, len(checked), one_by_one, columns)
@@ -144,7 +123,6 @@ def _file(
     groups: Iterable[tuple[list[str], Sequence[Any]]],
     columns: Callable[[], Mapping[str, NDArray[Any]]],
 ) -> SplatFile:
-    """Return a file of so many splats, from columns that are transposed together."""
     rows, made = np.empty(count, layout.row_dtype), columns()
     for names, planes in groups:
         given = made.keys() & set(names)
@@ -159,7 +137,7 @@ def _file(
 def _groups_of(
     checked: SplatObject, replaced: AbstractSet[str]
 ) -> Iterator[tuple[list[str], Sequence[NDArray[Any] | None]]]:
-    """Yield names and values of columns that are transposed together; None for those replaced."""
+    """Names and values of columns transposed together; None for replaced ones."""
     read, dtype = _Reader(checked), checked.layout.row_dtype
     for names in _groups([column.name for column in checked.layout.columns], dtype):
         if dtype[names[0]].str == "<f4" and not replaced & set(names):
@@ -169,19 +147,12 @@ def _groups_of(
 
 
 def stored_columns(checked: SplatObject) -> Columns:
-    """Return the columns of a splat object by their names, each read when it is asked for."""
+    """Columns of a splat object by name, each read on demand."""
     return _Reader(checked)
 
 
 def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Store columns of a splat object in the attributes that hold them.
-
-    Parameters
-    ----------
-    checked : SplatObject
-    columns : mapping of str to (N,)
-        Properties of the PLY that the object has, of as many splats as there are by now.
-    """
+    """Store columns, (N,) each by PLY property, in the object's attributes."""
     mesh = checked.mesh
     places = {c.name: c.place for c in checked.layout.columns if c.name in columns}
     vectors: dict[str, NDArray[Any]] = {}
@@ -207,10 +178,8 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
 def write_rows(
     checked: SplatObject, rows: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Store what some splats become: columns, (M,) each, of the splats of M rows.
-
-    Column by column, as memory that is taken anew takes longest; all others stay to the bit.
-    """
+    """Store columns, (M,) each, in M rows; other rows stay to the bit.
+    One column at a time: allocating memory takes longest."""
     attributes: dict[str, list[str]] = {}
     for column in checked.layout.columns:
         if column.name in columns:
@@ -225,15 +194,7 @@ def write_rows(
 
 
 def move_columns(checked: SplatObject, layout: Layout) -> None:
-    """Have a mesh hold its columns where another layout has them, and in its types.
-
-    Parameters
-    ----------
-    checked : SplatObject
-        Out of date afterwards.
-    layout : Layout
-        It has all columns of the object, and may have more.
-    """
+    """Move a mesh's columns to the places of `layout`, a superset; `checked` is outdated then."""
     mesh, places = checked.mesh, {column.name: column.place for column in layout.columns}
     stored = stored_columns(checked)
     moving = [c for c in checked.layout.columns if c.place != places[c.name]]
@@ -255,13 +216,13 @@ def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
 
 
 def normals(checked: SplatObject) -> NDArray[np.float32]:
-    """Return the columns nx, ny, nz as (N, 3)."""
+    """Columns nx, ny, nz, (N, 3)."""
     read = _Reader(checked)
     return np.stack([read.stored(name) for name in ("nx", "ny", "nz")], axis=-1)
 
 
 def read_attribute(mesh: bpy.types.Mesh, name: str) -> NDArray[Any]:
-    """Return a point attribute as (N,), or (N, width) for vectors and colours."""
+    """A point attribute, (N,), or (N, width) for vectors and colours."""
     attribute = mesh.attributes[name]
     kind = KINDS[attribute.data_type]
     values: NDArray[Any] = np.empty(len(attribute.data) * kind.width, kind.dtype)
@@ -270,7 +231,7 @@ def read_attribute(mesh: bpy.types.Mesh, name: str) -> NDArray[Any]:
 
 
 def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDArray[Any]) -> None:
-    """Store a point attribute, in place of one of that name if it has another type or domain."""
+    """Store a point attribute, replacing one of another type or domain."""
     attribute = mesh.attributes.get(name)
     if attribute and (attribute.data_type, attribute.domain) != (data_type, "POINT"):
         mesh.attributes.remove(attribute)
@@ -281,10 +242,7 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
 
 
 def digest(checked: SplatObject) -> int:
-    """Return a checksum of what makes an object's splats, but for view-dependent colour.
-
-    How they are drawn counts, too.
-    """
+    """Checksum of an object's splats and drawing model, without view-dependent colour."""
     columns = (column for column in checked.layout.columns if column.name in REQUIRED)
     checksum = 0
     for name in dict.fromkeys(column.attribute for column in columns):
@@ -294,14 +252,14 @@ def digest(checked: SplatObject) -> int:
 
 
 def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:
-    """Remove an attribute if it is there."""
+    """Remove an attribute if it exists."""
     attribute = mesh.attributes.get(name)
     if attribute:
         mesh.attributes.remove(attribute)
 
 
 class _Reader:
-    """Reads the columns of one mesh; keeps the last vector attribute for its other components."""
+    """Reads columns of one mesh; caches the last vector attribute."""
 
     def __init__(self, checked: SplatObject) -> None:
         self.mesh = checked.mesh
@@ -309,10 +267,8 @@ class _Reader:
         self.vectors: dict[str, NDArray[np.float32]] = {}
 
     def stored(self, name: str) -> NDArray[Any]:
-        """Return a column as the file has it; unsigned integers by their bits.
-
-        What is held activated comes in float64, so that it can be written back unchanged.
-        """
+        """A column as in the file, unsigned integers by their bits.
+        Activated values come in float64, so that they can be written back unchanged."""
         column = self.columns[name]
         place = column.place
         values = self._values(place.attribute)
@@ -323,7 +279,6 @@ class _Reader:
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
 
     def _values(self, attribute: str) -> NDArray[Any]:
-        """Return the values of an attribute."""
         if attribute in self.vectors:
             return self.vectors[attribute]
         values = read_attribute(self.mesh, attribute)
@@ -334,7 +289,6 @@ class _Reader:
     __getitem__ = stored
 
     def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
-        """Return float columns as (len(names), N)."""
         values = np.empty((len(names), splat_count(self.mesh)), np.float32)
         pairs = zip(values, names, strict=True)
         # Components of one attribute together: it is read once.
@@ -366,10 +320,8 @@ def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -
 
 
 def _groups(names: list[str], dtype: np.dtype[Any]) -> list[list[str]]:
-    """Split columns into runs of one type that are transposed together.
-
-    A row fills several cache lines: columns read one by one would each fetch the whole file.
-    """
+    """Runs of columns of one type, transposed together.
+    Read one by one, each would fetch the whole file: a row fills several cache lines."""
     groups: list[list[str]] = []
     for name in names:
         if groups and len(groups[-1]) < _GROUP and dtype[groups[-1][0]] == dtype[name]:
@@ -380,14 +332,14 @@ def _groups(names: list[str], dtype: np.dtype[Any]) -> list[list[str]]:
 
 
 def _block(rows: NDArray[Any], names: Sequence[str]) -> NDArray[Any]:
-    """Return columns of one type that lie side by side as a (N, len(names)) view."""
+    """View of adjacent columns of one type, (N, len(names))."""
     first = rows[names[0]]
     shape, strides = (len(rows), len(names)), (rows.strides[0], first.itemsize)
     return np.lib.stride_tricks.as_strided(first, shape, strides, writeable=first.flags.writeable)
 
 
 def _planes(rows: NDArray[Any], names: Sequence[str]) -> NDArray[Any]:
-    """Return columns that lie side by side as (len(names), N), in the machine's byte order."""
+    """Adjacent columns, (len(names), N), in native byte order."""
     block = _block(rows, names)
     planes = np.empty(block.shape[::-1], block.dtype.newbyteorder("="))
     for start in range(0, len(rows), _ROWS):
@@ -396,7 +348,7 @@ def _planes(rows: NDArray[Any], names: Sequence[str]) -> NDArray[Any]:
 
 
 def _interleave(rows: NDArray[Any], names: Sequence[str], planes: Sequence[NDArray[Any]]) -> None:
-    """Write columns into rows: the reverse of `_planes`."""
+    """Write columns into rows; inverse of `_planes`."""
     block = _block(rows, names)
     for start in range(0, len(rows), _ROWS):
         for index, plane in enumerate(planes):

@@ -1,9 +1,6 @@
-"""What others did to splats: Blender moves vertices, and knows nothing of what else makes a splat.
-
-*Apply*, *Join*, a mirror modifier and transforms in edit mode change positions, and leave scales,
-rotations and harmonics as they were. So each splat notes where it was when these were written; the
-note goes with its vertex wherever Blender takes it, and into the file.
-"""
+"""Drift: Blender moved positions, but not scales, rotations and harmonics.
+*Apply*, *Join*, mirror modifiers and transforms in edit mode do so. Each splat notes where it was
+when these were written; the note stays with its vertex in Blender and in files."""
 
 from __future__ import annotations
 
@@ -21,51 +18,40 @@ from . import attributes as mesh_attributes
 from . import native
 from .layout import sh_degree
 
-HOME = "refine_home"
-"""Vector on points: where the splat was when its scales, rotation and harmonics were written."""
+HOME = "refine_home"  # Point vector: position when scales, rotation and harmonics were written
 
 SHAPE = "refine_shape"
-"""Integer on points, by its bits from the lowest: 3, the degree of the object's harmonics then; 13,
-a number for the object (a checksum of its positions); 16, a checksum of the splat's scales and
-rotation, by which it is seen that somebody changed these too. 0 where nothing was noted."""
+"""Point integer by bits, 0 without a note: 3 degree of the object's harmonics; 13 the object
+(checksum of positions); 16 checksum of the splat's scales and rotation, to see them change."""
 
 _DEGREE, _OBJECT, _ORIGIN, _CHECKSUM = 0x7, 0xFFF8, 0xFFFF, 16
-"""Bits of `SHAPE`: degree, object, both, and by how many the checksum is shifted."""
+"""Bits of `SHAPE`: degree, object, both; and the checksum's shift."""
 
 _MIX = np.uint32(0x9E3779B1)
-"""An odd number near 2^32 over the golden ratio, as multiplicative hashing takes it."""
+"""Odd number near 2^32 over the golden ratio, for multiplicative hashing."""
 
-_FEW, _FEW_SHARE = 100, 0.01
-"""Splats that may have been moved each by itself without a word: so many, or this share of all."""
+_FEW, _FEW_SHARE = 100, 0.01  # Splats that may each move without a warning: number, share of all
 
-_SHOWN = 1 << 15
-"""Splats that are looked at, evenly spread, for what the panel says."""
+_SHOWN = 1 << 15  # Splats sampled evenly for the panel's text
 
 
 class Drift(NamedTuple):
-    """What was found that others did to splats: sentences, and whether Mend Splats is of use."""
+    """Sentences on what others did to splats; whether Mend Splats helps."""
 
     told: list[str]
     mendable: bool
 
 
 class Mending(NamedTuple):
-    """What it takes to have splats follow what others did to them.
-
-    Attributes
-    ----------
-    moves : list of Move
-        By what maps which splats were moved that did not follow, but in their positions.
-    regrouped : (N,) int
-        Of each splat whose harmonics stand under the names of another degree, that degree; else 0.
-    """
+    """Repair: `moves`, the maps that only positions followed, with their splats; `regrouped`, (N,),
+    the degree under whose names a splat's harmonics stand, 0 where it is right."""
 
     moves: list[Move]
     regrouped: NDArray[np.int64]
 
 
 def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Note of all splats of a mesh that they are as they should be."""
+    """Note that all splats of a mesh are as they should be."""
     position = mesh_attributes.read_attribute(mesh, "position")
     mesh_attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", position)
     number = (zlib.crc32(position.data) << 3 & _OBJECT) or 1 << 3
@@ -74,17 +60,15 @@ def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
 
 
 def is_stamped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
-    """Tell whether it was noted of a mesh where its splats were."""
+    """Whether a mesh has notes of its splats' positions."""
     kinds = {HOME: "FLOAT_VECTOR", SHAPE: "INT"}
     attributes = ((mesh.attributes.get(name), kind) for name, kind in kinds.items())
     return all(a and (a.data_type, a.domain) == (kind, "POINT") for a, kind in attributes)
 
 
 def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
-    """What others did to the splats of a mesh, None if nothing, or nothing was noted.
-
-    Quick where nothing was done: 10 ms at a million splats. Else counts are estimated by some.
-    """
+    """Drift of a mesh; None without changes or notes.
+    10 ms per million splats if nothing changed; else counts are estimates from a sample."""
     if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
         return None
     moves, looked, loose = notes.moves(max(1, len(notes.codes) // _SHOWN))
@@ -121,17 +105,14 @@ def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
 
 
 def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Callable[[], Mending] | None:
-    """Read what was noted of a mesh; what finds out on any thread what it takes to mend it.
-
-    None where nothing was done to it.
-    """
+    """Read the notes now; a thread-safe callable computes the repair. None if nothing changed."""
     if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
         return None
     return lambda: Mending(notes.moves()[0], notes.regrouped())
 
 
 def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Note anew the splats whose scales and rotations were just written, as by merging."""
+    """Renew the notes of splats whose scales and rotations were just written, as by merging."""
     if not is_stamped(mesh):
         return
     notes, checksums = _Notes(mesh), _checksums(_shapes(mesh))
@@ -143,7 +124,7 @@ def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
 
 
 class _Notes:
-    """What was noted of a mesh, beside what is, for any thread."""
+    """Notes of a mesh and its present values, for any thread."""
 
     def __init__(self, mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
         self.home, self.position, codes = (
@@ -161,14 +142,12 @@ class _Notes:
         self.shapes = [] if self.undisturbed else _shapes(mesh)
 
     def objects(self) -> list[int]:
-        """The numbers of the objects that the splats came from."""
+        """Numbers of the objects that the splats came from."""
         return [int(number) for number in np.unique(self.codes & _OBJECT) if number]
 
     def moves(self, step: int = 1) -> tuple[list[Move], int, int]:
-        """The maps that splats did not follow; how many were looked at, and moved by themselves.
-
-        One splat of `step` is looked at. What was moved by itself goes with most of its object.
-        """
+        """Maps that splats did not follow, from one of `step`; numbers looked at and moved alone.
+        These go with most of their object."""
         rows = np.arange(0, len(self.codes), step)
         looked, codes = len(rows), self.codes[rows]
         rows = rows[(codes >> _CHECKSUM == _checksums(self.shapes, step)) & (codes != 0)]
@@ -188,14 +167,14 @@ class _Notes:
         return [m for m in found if not np.array_equal(m.matrix[:3, :3], still)], looked, lost
 
     def regrouped(self) -> NDArray[np.int64]:
-        """Of each splat whose harmonics stand under names of another degree that degree, else 0."""
+        """The degree under whose names each splat's harmonics stand, 0 where it is right."""
         degrees = np.asarray(self.codes & _DEGREE, np.int64)
         degrees[degrees == self.degree] = 0
         return degrees if self.degree is not None else np.zeros_like(degrees)
 
 
 def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.float32]]:
-    """Return the attributes that hold scales and rotations, (N,) or (N, width) each."""
+    """Attributes with scales and rotations, (N,) or (N, width) each."""
     names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
     if THIRD_SCALE not in mesh.attributes:  # discs
         names.remove(THIRD_SCALE)
@@ -205,7 +184,7 @@ def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.floa
 
 
 def _checksums(shapes: Sequence[NDArray[np.float32]], step: int = 1) -> NDArray[np.uint32]:
-    """Return a checksum of 16 bits of the scales and the rotation of one splat of `step`."""
+    """16-bit checksums of scales and rotation of one splat of `step`."""
     total = np.zeros(len(range(0, len(shapes[0]), step)), np.uint32)
     for values in shapes:
         for plane in values[::step].reshape(len(total), -1).T:

@@ -1,4 +1,4 @@
-"""Changes to the mesh or point cloud of a splat object: which may be, and deleting points fast."""
+"""Changes to a splat object's data: what may change, and fast deletion of points."""
 
 from __future__ import annotations
 
@@ -15,20 +15,15 @@ from ..core.formats.ply import REQUIRED
 from . import attributes as mesh_attributes
 from .layout import splat_count
 
-REMOVE = "refine_remove"
-"""Boolean point attribute: the splats that the budget removes."""
+REMOVE = "refine_remove"  # Boolean point attribute: splats that the budget removes
 
-PROTECT = "refine_protect"
-"""Boolean point attribute: splats that stay, whatever else is said; set by hand."""
+PROTECT = "refine_protect"  # Boolean point attribute, set by hand: splats protected above all else
 
-MUST_GO = "refine_must_go"
-"""Boolean point attribute: splats that go before all others; set by hand."""
+MUST_GO = "refine_must_go"  # Boolean point attribute, set by hand: splats removed before all others
 
-FORCE = "refine_force"
-"""Integer point attribute, for display: 1 what stays in any case, 2 what goes, 0 the rest."""
+FORCE = "refine_force"  # Integer point attribute, for display: 1 protected, 2 removed by user
 
-MARKING = ("BOOLEAN", "FLOAT")
-"""Types of the point attributes that can be named to mark splats."""
+MARKING = ("BOOLEAN", "FLOAT")  # Types of point attributes that can mark splats by name
 
 _GROUP_VALUES = "refine_group_values"
 
@@ -71,11 +66,8 @@ def check_deletable(obj: bpy.types.Object) -> None:
 
 @contextmanager
 def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
-    """Undo what a block did to the data of an object if the block fails, however far it came.
-
-    A copy of the data stands by, which costs nothing: Blender shares attributes until one is
-    changed. Where it is needed, it takes the place and the name of the data, for all its users.
-    """
+    """Undo a block's changes to an object's data, for all its users, if the block fails.
+    The copy costs nothing: Blender shares attributes until one is changed."""
     mesh = obj.data
     before = mesh.copy()
     try:
@@ -90,22 +82,9 @@ def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
 
 
 def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
-    """Delete the marked vertices of an object, and nothing else of it.
-
-    Geometry nodes do it, with the modifier applied: of all ways this is the fastest, and the one
-    that brings along attributes of every type, vertex groups, materials and custom properties.
-
-    Parameters
-    ----------
-    obj : bpy.types.Object
-    remove : (N,) bool
-
-    Raises
-    ------
-    RefineError
-        See `check_deletable`; also if Blender fails. What it did by then is not undone here, but by
-        `all_or_nothing`.
-    """
+    """Delete the marked vertices, (N,) bool, and nothing else; `all_or_nothing` undoes a failure.
+    An applied geometry-nodes modifier is the fastest way, and keeps attributes of every type,
+    vertex groups, materials and custom properties."""
     check_deletable(obj)
     mesh_attributes.remove_attribute(obj.data, REMOVE)
     if not remove.any():
@@ -139,13 +118,7 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
 
 
 def mark(obj: bpy.types.Object, name: str, values: NDArray[Any], *, even_none: bool = True) -> None:
-    """Mark splats by a point attribute of that name, (N,) bool or int32, and no others.
-
-    Raises
-    ------
-    RefineError
-        See `check_writable`.
-    """
+    """Mark exactly these splats by a point attribute, (N,) bool or int32."""
     check_writable(obj)
     if even_none or values.any():
         kind = "BOOLEAN" if values.dtype == np.bool_ else "INT"
@@ -158,7 +131,7 @@ def mark(obj: bpy.types.Object, name: str, values: NDArray[Any], *, even_none: b
 
 
 def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
-    """Mark splats, (N,), as what goes, for all previews; see `mark`."""
+    """Mark splats, (N,), as removed for all previews; see `mark`."""
     mark(obj, REMOVE, remove)
 
 
@@ -167,7 +140,7 @@ def mark_forced(
     protected: NDArray[np.bool_] | None,
     removed: NDArray[np.bool_] | None,
 ) -> None:
-    """Mark, for the 3D views, what stays and what goes in any case: (N,) each, or None."""
+    """Mark protected splats and those removed by the user for the 3D views: (N,) each, or None."""
     force = np.zeros(splat_count(obj.data), np.int32)
     for number, mask in ((2, removed), (1, protected)):
         if mask is not None:
@@ -176,25 +149,8 @@ def mark_forced(
 
 
 def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Return which splats are marked by `PROTECT`, and by an attribute or a vertex group.
-
-    Parameters
-    ----------
-    obj : bpy.types.Object
-    name : str
-        Empty for none.
-
-    Returns
-    -------
-    (N,) bool or None
-        For a vertex group or a float attribute, where the weight is above 0; None without a name
-        where nothing is marked.
-
-    Raises
-    ------
-    RefineError
-        If the object has neither of that name.
-    """
+    """Splats protected by `PROTECT` or by the attribute or vertex group `name` ("" for none), (N,).
+    Weights count above 0. None without a name and marks; `RefineError` if the name is missing."""
     marked = marks(obj, PROTECT)
     if not name:
         return marked
@@ -203,7 +159,6 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None
 
 
 def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
-    """Return which splats an attribute or a vertex group marks, (N,)."""
     attribute = obj.data.attributes.get(name)
     fits = attribute and attribute.data_type in MARKING and attribute.domain == "POINT"
     if fits and name not in REQUIRED:  # what a splat is made of marks nothing
@@ -219,7 +174,7 @@ def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
 
 
 def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Return which splats are marked by hand with `PROTECT` or `MUST_GO`, (N,); None if none is."""
+    """Splats marked by hand with `PROTECT` or `MUST_GO`, (N,); None if none is."""
     attribute = obj.data.attributes.get(name)
     if attribute and (attribute.data_type, attribute.domain) == ("BOOLEAN", "POINT"):
         return mesh_attributes.read_attribute(obj.data, name)
@@ -227,12 +182,12 @@ def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
 
 
 def mark_by_hand(obj: bpy.types.Object, marked: NDArray[np.bool_], name: str = PROTECT) -> None:
-    """Mark the splats of `marked`, (N,), with `PROTECT` or `MUST_GO`, and no others."""
+    """Mark exactly the splats of `marked`, (N,), with `PROTECT` or `MUST_GO`."""
     mark(obj, name, marked, even_none=False)
 
 
 def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
-    """Return the weights of a vertex group; geometry nodes read them all at once."""
+    """Weights of a vertex group, read at once by geometry nodes."""
     tree, storing = _tree("GeometryNodeStoreNamedAttribute", name, "FLOAT", "Value")
     storing.inputs["Name"].default_value = _GROUP_VALUES
     # On a second object with the same mesh: the user's modifiers stay out of it.
@@ -248,7 +203,7 @@ def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
 
 
 def _tree(kind: str, name: str, data_type: str, target: str) -> tuple[Any, bpy.types.Node]:
-    """Geometry nodes: one of a kind, whose input `target` reads a named attribute; that one."""
+    """A geometry-nodes tree around one node, whose input `target` reads an attribute; the node."""
     tree = bpy.data.node_groups.new("REFINE", "GeometryNodeTree")
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")

@@ -12,15 +12,7 @@ from .layout import SplatObject, check
 
 @contextmanager
 def readable(obj: bpy.types.Object) -> Iterator[SplatObject]:
-    """Give an object whose splats can be read: in edit mode a copy as it is by now.
-
-    The copy stands in no scene, and not where the object does.
-
-    Raises
-    ------
-    RefineError
-        See `check`.
-    """
+    """The object, or in edit mode a copy of its present state, in no scene, untransformed."""
     if obj.mode != "EDIT" or obj.type != "MESH":
         yield check(obj)
         return

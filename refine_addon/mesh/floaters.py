@@ -1,4 +1,4 @@
-"""Floaters that were found on a mesh: why each splat may go, and which of them are to go."""
+"""Floaters stored on a mesh: the reason for each splat, and which are to be removed."""
 
 from __future__ import annotations
 
@@ -16,21 +16,13 @@ from . import edit as mesh_edit
 from .layout import SplatObject, splat_count
 from .records import parsed
 
-REASON = "refine_floats"
-"""Integer point attribute: 0, or the place of the splat's reason in `REASONS`, from 1."""
+REASON = "refine_floats"  # Integer point attribute: 0, or the splat's place in `REASONS`, from 1
 
-FOUND = "refine_floaters"
-"""Custom property of the mesh: how many floaters were found for each reason, how sure, as JSON."""
+FOUND = "refine_floaters"  # Custom property of the mesh: floaters by reason, and how sure, JSON
 
 
 def store(checked: SplatObject, cleaned: Cleaned) -> None:
-    """Write what was found to an object's mesh.
-
-    Raises
-    ------
-    RefineError
-        If the object cannot be written to, or no longer has as many splats.
-    """
+    """Write the cleaning result to an object's mesh."""
     mesh_edit.check_writable(checked.obj)
     if len(checked) != len(cleaned.keep):
         raise RefineError(
@@ -48,7 +40,7 @@ def store(checked: SplatObject, cleaned: Cleaned) -> None:
 
 
 def counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None:
-    """Return how many floaters were found for each reason; None if nobody looked since a change."""
+    """Floaters for each reason; None without a search since the last change."""
     try:
         noted = parsed(mesh[FOUND])
         counted = {name: int(noted["counts"][name]) for name in REASONS}
@@ -59,10 +51,7 @@ def counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None
 
 
 def surety(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, float]:
-    """Return how sure it is of each reason that further views see past its splats, 0..1.
-
-    Reasons that nothing is known of are left out, such as all of them where `counts` is None.
-    """
+    """Share of further views that see past the splats of each reason, 0..1, where known."""
     try:
         noted = parsed(mesh[FOUND])["sure"].items()
         return {name: float(share) for name, share in noted if share is not None}
@@ -71,13 +60,7 @@ def surety(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, float]:
 
 
 def mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
-    """Return which splats float for one of these reasons, (N,).
-
-    Raises
-    ------
-    RefineError
-        If nobody looked for floaters since the splats changed.
-    """
+    """Floaters of these reasons, (N,); `RefineError` without a search since the splats changed."""
     if counts(checked.mesh) is None:
         raise RefineError(f"object '{checked.obj.name}': look for floaters first")
     numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
@@ -85,17 +68,11 @@ def mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
 
 
 def mark(checked: SplatObject, reasons: Collection[str]) -> None:
-    """Mark the floaters of these reasons as what goes, for the preview.
-
-    Raises
-    ------
-    RefineError
-        See `mask`; also if the object cannot be written to.
-    """
+    """Mark the floaters of these reasons as removed, for the preview."""
     mesh_edit.mark_removed(checked.obj, mask(checked, reasons))
 
 
 def forget(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Remove what was found."""
+    """Remove the cleaning result."""
     mesh_attributes.remove_attribute(mesh, REASON)
     mesh.pop(FOUND, None)

@@ -1,8 +1,6 @@
-"""Which attribute of an object's data holds which property of a 3DGS PLY: one table, checked here.
-
-The data is a mesh with a vertex a splat, or a point cloud; what is said of a mesh here goes for
-both. Point clouds of Blender 5.3 hold activated values under names of their own: see `native`.
-"""
+"""The table of which attribute holds which property of a 3DGS PLY, checked here.
+"Mesh" means a mesh with a vertex for each splat, or a point cloud. Point clouds of Blender 5.3 hold
+activated values under other names: see `native`."""
 
 from __future__ import annotations
 
@@ -23,12 +21,9 @@ from ..core.splats import MODELS, Model
 from . import native
 from .native import Place
 
-LAYOUT = "refine_layout"
-"""Custom property of the mesh: how the file it came from was laid out, as JSON."""
+LAYOUT = "refine_layout"  # Custom property of the mesh: layout of its file, JSON
 
-MODEL = "refine_model"
-"""Custom property of the mesh: how its splats are drawn, where the file it came from did not say;
-one of `rendering.MODELS`."""
+MODEL = "refine_model"  # Custom property: one of `rendering.MODELS`, if the file named none
 
 
 class Kind(NamedTuple):
@@ -61,10 +56,10 @@ STORAGE = {
     "f4": "FLOAT",
     "f8": "FLOAT",
 }
-"""Type of a PLY property -> type of the attribute that holds it; u4 by its bits, f8 rounded."""
+"""Type of a PLY property -> type of its attribute; u4 by its bits, f8 rounded."""
 
 PLACES = {name: Place("position", axis, ("FLOAT_VECTOR",)) for axis, name in enumerate("xyz")}
-"""Properties that Blender keeps as components of a vector."""
+"""Properties that Blender keeps as vector components."""
 
 NORMAL_PLACES = {
     f"n{axis}": Place("normal", index, ("FLOAT_VECTOR",)) for index, axis in enumerate("xyz")
@@ -73,11 +68,9 @@ NORMAL_PLACES = {
 
 _COUNT = rb"([\r\n]element[ \t]+vertex[ \t]+)[0-9]+"
 
-_LONGEST_NAME = 63
-"""Bytes of the longest name that Blender gives an attribute."""
+_LONGEST_NAME = 63  # Bytes of Blender's longest attribute name
 
-_MOST_NAMES = 8
-"""Names of attributes that an error lists at most."""
+_MOST_NAMES = 8  # Attribute names listed by an error, at most
 
 _TAKEN = {
     *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
@@ -93,16 +86,7 @@ _TYPES = ("MESH", "POINTCLOUD")
 
 @dataclass(frozen=True)
 class Column:
-    """One property of the file and where the mesh holds it.
-
-    Attributes
-    ----------
-    name : str
-        Name of the PLY property.
-    dtype : str
-        Its type in the file, as in ``"<f4"``.
-    place : Place
-    """
+    """A PLY property, its type in the file as in ``"<f4"``, and its place in the mesh."""
 
     name: str
     dtype: str
@@ -116,42 +100,26 @@ class Column:
 
 @dataclass(frozen=True)
 class Layout:
-    """The columns of a splat mesh in the order of its file, and the file's header.
-
-    Attributes
-    ----------
-    columns : tuple of Column
-    header : bytes
-    """
+    """Columns of a splat mesh in file order, and the file's header."""
 
     columns: tuple[Column, ...]
     header: bytes
 
     @property
     def row_dtype(self) -> np.dtype[Any]:
-        """Type of one row of the file."""
+        """Type of a row of the file."""
         return _row(self.columns)
 
     @property
     def model(self) -> Model:
-        """How the splats are drawn."""
+        """One of `rendering.MODELS`."""
         return stated_model(self.header, self.row_dtype) or MODELS[0]
 
 
 @dataclass(frozen=True)
 class SplatObject:
-    """An object that holds splats, and in which attributes: what `check` returns.
-
-    An operation makes it once, where it begins. It is out of date as soon as splats or attributes
-    come or go.
-
-    Attributes
-    ----------
-    obj : bpy.types.Object
-        A mesh or a point cloud.
-    layout : Layout
-        Which attribute of its data holds what.
-    """
+    """Checked splat object with its layout, made once per operation by `check`.
+    Out of date as soon as splats or attributes come or go."""
 
     obj: bpy.types.Object
     layout: Layout
@@ -162,43 +130,31 @@ class SplatObject:
         return self.obj.data
 
     def __len__(self) -> int:
-        """Return the number of splats."""
         return splat_count(self.obj.data)
 
 
 def splat_count(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> int:
-    """Return how many splats a mesh or a point cloud has, if it has any."""
+    """Splats of a mesh or a point cloud."""
     return len(mesh.points if hasattr(mesh, "points") else mesh.vertices)
 
 
 def looks_like_splats(obj: bpy.types.Object | None) -> bool:
-    """Tell whether an object is worth offering to the splat tools; cheap enough for a poll."""
+    """Whether to offer an object to the splat tools; cheap enough for a poll."""
     if obj is None or obj.type not in _TYPES:
         return False
     return holds_splats(obj.data)
 
 
 def holds_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
-    """Tell the same of an object's data."""
+    """The same for an object's data."""
     attributes = data.attributes
     return ("opacity" in attributes and "f_dc_0" in attributes) or native.is_native(data)
 
 
 def check(obj: bpy.types.Object) -> SplatObject:
-    """Find out that an object holds splats, and in which attributes.
-
-    Returns
-    -------
-    SplatObject
-        Its layout is the one remembered from the import, or the standard one with all scalar
-        attributes.
-
-    Raises
-    ------
-    RefineError
-        If the object is neither mesh nor point cloud, is in edit mode, holds four vertices a splat,
-        or lacks an attribute; also if an attribute has the wrong type or lies on the wrong domain.
-    """
+    """The object with its layout: the one of its import, or the standard one.
+    `RefineError` in edit mode, with four vertices a splat, or for a missing or mistyped
+    attribute."""
     label = f"object '{obj.name}'"
     if obj.type not in _TYPES:
         raise RefineError(
@@ -221,13 +177,7 @@ def check(obj: bpy.types.Object) -> SplatObject:
 
 
 def layout_of(obj: bpy.types.Object) -> Layout:
-    """Return the layout of an object with splats, without a look at its attributes' types.
-
-    Raises
-    ------
-    RefineError
-        If its harmonics are those of no degree.
-    """
+    """Layout of a splat object, attribute types unchecked."""
     layout = _remembered(obj.data) or _standard(obj)
     model = obj.data.get(MODEL)
     if model in MODELS and THIRD_SCALE in (column.name for column in layout.columns):
@@ -236,12 +186,12 @@ def layout_of(obj: bpy.types.Object) -> Layout:
 
 
 def sh_degree(mesh: bpy.types.Mesh) -> int:
-    """Return the spherical-harmonics degree of a splat mesh, 0 to 4."""
+    """Spherical-harmonics degree of a splat mesh, 0 to 4."""
     return REST_COUNTS.get(rest_count(mesh), 0)
 
 
 def export_bytes(obj: bpy.types.Object) -> int | None:
-    """Return how large the exported file is, None if there can be none; cheap enough to draw."""
+    """Size of the exported file, bytes, None if there is none; cheap enough to draw."""
     try:
         layout = layout_of(obj)
     except RefineError:
@@ -250,14 +200,14 @@ def export_bytes(obj: bpy.types.Object) -> int | None:
 
 
 def rest_count(mesh: bpy.types.Mesh) -> int:
-    """Return how many ``f_rest_*`` properties a mesh has attributes for."""
+    """Number of ``f_rest_*`` properties that a mesh has attributes for."""
     if native.is_native(mesh):
         return 3 * native.harmonics(mesh)
     return sum(f"f_rest_{index}" in mesh.attributes for index in range(max(REST_COUNTS)))
 
 
 def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
-    """Return the layout that the import noted, None if there is none that can be read."""
+    """Layout noted by the import, None if there is none or it cannot be read."""
     try:
         noted = json.loads(mesh[LAYOUT])
         places = _native_places(mesh)
@@ -283,10 +233,8 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
 
 
 def merged(layouts: Sequence[Layout]) -> Layout:
-    """The layout of meshes that are joined: all columns of each, those of the first first.
-
-    A column has a type that holds the values of all. How many rows there are stands on the mesh.
-    """
+    """Layout of joined meshes: columns of all, the first's first, in types that hold all values.
+    The number of rows stands on the mesh."""
     first, columns = layouts[0], dict[str, Column]()
     for column in (column for layout in layouts for column in layout.columns):
         known = columns.setdefault(column.name, column)
@@ -306,7 +254,7 @@ def merged(layouts: Sequence[Layout]) -> Layout:
 
 
 def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
-    """Return a layout with further columns: harmonics after the others, all else at the end."""
+    """A layout with further columns: harmonics after the others, the rest at the end."""
     columns = list(layout.columns)
     for column in more:
         index = len(columns)
@@ -324,7 +272,7 @@ def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
 
 
 def note(mesh: bpy.types.Mesh | bpy.types.PointCloud, layout: Layout) -> None:
-    """Note on a mesh how a file of it is laid out."""
+    """Note on a mesh the layout of its file."""
     mesh[LAYOUT] = json.dumps(
         {
             "header": layout.header.decode("latin-1"),
@@ -334,18 +282,16 @@ def note(mesh: bpy.types.Mesh | bpy.types.PointCloud, layout: Layout) -> None:
 
 
 def _native_places(mesh: bpy.types.Mesh) -> dict[str, Place]:
-    """Return where a mesh of Blender's own splats holds their properties, nothing for others."""
     return native.places(native.harmonics(mesh)) if native.is_native(mesh) else {}
 
 
 def _plain(dtype: str, attribute: str, component: int = 0) -> Place:
-    """Return the place of a property that is held as it stands in the file."""
     kind = "FLOAT_VECTOR" if attribute in ("position", "normal") else STORAGE[dtype[1:]]
     return Place(attribute, component, (kind,))
 
 
 def _standard(obj: bpy.types.Object) -> Layout:
-    """Return the layout of the reference implementation for what the object has."""
+    """The reference implementation's layout for the object's attributes."""
     attributes = obj.data.attributes
     rest = [f"f_rest_{index}" for index in range(rest_count(obj.data))]
     if len(rest) not in REST_COUNTS:
@@ -370,7 +316,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
 
 
 def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
-    """Return columns of the plain point attributes that are neither taken nor ours."""
+    """Columns of plain point attributes, neither taken nor ours."""
     dtypes = {"FLOAT": "<f4", "INT": "<i4", "INT8": "<i1"}
     return [
         Column(attribute.name, dtype, _plain(dtype, attribute.name))
@@ -412,21 +358,7 @@ def _is(attribute: bpy.types.Attribute | None, kinds: tuple[str, ...]) -> bool:
 
 
 def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> tuple[Column, ...]:
-    """Add an attribute for each property of a file to a mesh, and note the file's layout on it.
-
-    Parameters
-    ----------
-    mesh : bpy.types.Mesh
-    rows : numpy.dtype
-        Type of the file's rows.
-    header : bytes
-        The file's header.
-
-    Returns
-    -------
-    tuple of Column
-        Where each property is to go, in the order of the file.
-    """
+    """Add an attribute for each property of a file, note its layout; places in file order."""
     columns = []
     for name in rows.names or ():
         kind = rows[name].str
@@ -444,5 +376,4 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
 
 
 def _row(columns: Sequence[Column]) -> np.dtype[Any]:
-    """Type of a row of a file with these columns."""
     return np.dtype([(column.name, column.dtype) for column in columns])

@@ -1,9 +1,6 @@
-"""Blender's own Gaussian splats: a point cloud with activated values under names of its own.
-
-Blender 5.3 imports 3DGS files as point clouds of type ``GAUSSIAN_SPLAT``. What its importers write
-is in docs/conventions.md; the attributes alone decide here, so that such a point cloud is known in
-older versions too, and one that geometry nodes made.
-"""
+"""Blender's own Gaussian splats: a point cloud with activated values, named differently.
+Blender 5.3 imports 3DGS files as point clouds of type ``GAUSSIAN_SPLAT`` (docs/conventions.md).
+Attributes alone decide here, so older versions and geometry nodes work too."""
 
 from __future__ import annotations
 
@@ -18,22 +15,17 @@ from ..core.splats import opacity, scales, single_log_scales, single_logits
 
 BASE, SCALE, ROTATION, HARMONIC = "radiance:base", "scale", "rotation", "radiance:sh_"
 
-TYPE = "GAUSSIAN_SPLAT"
-"""Of point clouds that Blender draws as splats, since 5.3."""
+TYPE = "GAUSSIAN_SPLAT"  # Type of point clouds that Blender draws as splats, since 5.3
 
 NAMES = f"{BASE}, {SCALE}, {ROTATION}"
-"""For messages."""
 
-FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")
-"""Types of `BASE`: that of 5.3, and what holds the same four numbers in 5.0 and older, which have
-no ``FLOAT4``."""
+FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")  # Types of `BASE`: 5.3's, and that of 5.0 without it
 
-_MOST = 24
-"""Harmonics of degree 4, beyond the constant."""
+_MOST = 24  # Harmonics of degree 4, without the constant
 
 
 class Coding(NamedTuple):
-    """How values of a file become those of an attribute, and back, in float64."""
+    """Conversion of a file's values to those of an attribute and back, float64."""
 
     to_file: Callable[[NDArray[Any]], NDArray[Any]]
     to_attribute: Callable[[NDArray[Any]], NDArray[Any]]
@@ -44,19 +36,8 @@ LOGIT = Coding(single_logits, opacity)
 
 
 class Place(NamedTuple):
-    """Where a mesh or point cloud holds a property of the file.
-
-    Attributes
-    ----------
-    attribute : str
-        Name of the attribute.
-    component : int
-        Which number of a vector; 0 for plain attributes.
-    kinds : tuple of str
-        Types that the attribute may have; the first is the one to make.
-    coding : Coding, optional
-        Where it is not held as it stands in the file.
-    """
+    """Attribute, vector component (0 for plain ones), allowed types (the first is made), and coding
+    (None where stored as in the file) of a property."""
 
     attribute: str
     component: int
@@ -65,22 +46,20 @@ class Place(NamedTuple):
 
 
 def is_native(data: bpy.types.ID) -> bool:
-    """Tell whether an object's data is a point cloud with the attributes of Blender's splats."""
+    """Whether an object's data is a point cloud with the attributes of Blender's splats."""
     attributes = getattr(data, "attributes", ())
     return hasattr(data, "points") and BASE in attributes and SCALE in attributes
 
 
 def harmonics(cloud: bpy.types.PointCloud) -> int:
-    """Return how many attributes a point cloud has for harmonics beyond the constant."""
+    """Attributes of a point cloud for harmonics, without the constant."""
     return sum(f"{HARMONIC}{index}" in cloud.attributes for index in range(_MOST))
 
 
 def places(count: int) -> dict[str, Place]:
-    """Return where a point cloud with `count` harmonics holds the properties of a splat.
-
-    The number in the name of a harmonic counts as in the file, without the constant: ``sh_10``
-    comes after ``sh_9``. Each holds red, green and blue, where a file has all of red first.
-    """
+    """Places of a splat's properties in a point cloud with `count` harmonics.
+    ``sh_10`` follows ``sh_9``; each holds red, green and blue, where a file has all of red
+    first."""
     by_name = {f"f_dc_{channel}": Place(BASE, channel, FOUR_FLOATS) for channel in range(3)}
     for channel in range(3):
         for index in range(count):
@@ -95,7 +74,7 @@ def places(count: int) -> dict[str, Place]:
 
 
 def lost_base(obj: bpy.types.Object) -> bool:
-    """Tell whether an object is what an older Blender leaves of 5.3's splats: all but `BASE`."""
+    """Whether an object is what an older Blender leaves of 5.3's splats: all but `BASE`."""
     if obj.type != "POINTCLOUD":
         return False
     attributes = obj.data.attributes
@@ -104,7 +83,7 @@ def lost_base(obj: bpy.types.Object) -> bool:
 
 
 def refuse_lost_base(obj: bpy.types.Object) -> None:
-    """Raise `RefineError` for what is left of Blender's splats where their colours were lost."""
+    """Raise `RefineError` for Blender's splats that lost their colours (`lost_base`)."""
     if lost_base(obj):
         raise RefineError(
             f"object '{obj.name}': has no attribute {BASE}, which holds colour and opacity: "

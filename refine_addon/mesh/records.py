@@ -9,11 +9,5 @@ from typing import Any
 
 @lru_cache(maxsize=16)
 def parsed(text: str) -> Any:
-    """Return a record as values, which nobody may change: panels ask whenever they are drawn.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is no text, or no JSON.
-    """
+    """A JSON record, read-only, cached for panels; TypeError or ValueError if it is none."""
     return json.loads(text)

@@ -1,4 +1,4 @@
-"""Scores on a mesh: attributes to look at and select by, and a record of how they came to be."""
+"""Scores on a mesh: point attributes, and a record of the scoring."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ from .layout import SplatObject
 from .records import parsed
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
-"""Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
+"""Point attributes: score, rank from 0 (removed first) to 1, number of views that hold it."""
 
 SCORED = "refine_scored"
-"""Boolean point attribute: which splats have a score. Neither those that had to go have one,
-nor those that were joined or added since, for which Blender writes False."""
+"""Boolean point attribute: has a score. False if removed by the user, and, by Blender's default, if
+added later."""
 
-RECORD = "refine_scores"
-"""Custom property of the mesh: how its scores came to be, as JSON."""
+RECORD = "refine_scores"  # Custom property of the mesh: record of its scoring, JSON
 
 
 def store(
@@ -43,31 +42,9 @@ def store(
     together: tuple[str, int, NDArray[np.float64]] | None = None,
     seconds: float | None = None,
 ) -> None:
-    """Write scores to the attributes of an object's mesh, and record how they came to be.
-
-    Parameters
-    ----------
-    checked : SplatObject
-    scores : Scores
-    method : Method
-        What they were made with.
-    origin : dict, optional
-        See `staleness.origin`.
-    cameras : list of (str, int), optional
-        Name of each view given, and how many splats lie in it.
-    protected : (N,) bool, optional
-        Which splats the curve takes to stay.
-    together : (str, int, (N,) float64), optional
-        Where other objects were scored with it: a name for the scoring, how many splats all have,
-        and ranks of this object's among all; the curve is that of all then.
-    seconds : float, optional
-        How long scoring took.
-
-    Raises
-    ------
-    RefineError
-        If the object cannot be written to, or no longer has as many splats.
-    """
+    """Write scores and their record to an object's mesh. `cameras`: name and splats of each view;
+    `protected`: (N,) bool, protected in the curve; `together`, if scored with other objects: its
+    name, splats of all, and ranks among all, (N,); `origin`: see `staleness.origin`."""
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
     if len(checked) != len(scores.values):
@@ -105,13 +82,7 @@ def store(
 
 
 def forget(checked: SplatObject) -> None:
-    """Remove the scores of an object, with all that shows them and goes by them.
-
-    Raises
-    ------
-    RefineError
-        If the object cannot be written to.
-    """
+    """Remove an object's scores and all that shows or uses them."""
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
     for name in (SCORE, RANK, SEEN, SCORED, mesh_edit.REMOVE):
@@ -121,14 +92,14 @@ def forget(checked: SplatObject) -> None:
 
 
 def digest(mask: NDArray[np.bool_] | None) -> list[int]:
-    """Return how many splats a mask, (N,) bool, marks, and a checksum of which; [0, 0] if none."""
+    """Number of splats in a mask, (N,) bool, and a checksum of which; [0, 0] if none."""
     if mask is None or not mask.any():
         return [0, 0]
     return [int(np.count_nonzero(mask)), zlib.crc32(np.packbits(mask).tobytes())]
 
 
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
-    """Return how a mesh was scored, None if it was not."""
+    """Record of a mesh's scoring, None without."""
     try:
         recorded: dict[str, Any] = parsed(mesh[RECORD])
         complete = recorded.keys() >= {"splats", "settings", "views_given", "views_used"}
@@ -140,7 +111,7 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
 def move_origin(
     mesh: bpy.types.Mesh, before: NDArray[np.float64], after: NDArray[np.float64]
 ) -> None:
-    """Have scores hold for an object whose matrix, (4, 4), changed while its splats stayed."""
+    """Keep scores valid for an object whose (4, 4) matrix changed while its splats stayed."""
     recorded = record(mesh) or {}
     origin = recorded.get("origin")
     if origin and np.allclose(origin.get("matrix", np.nan), before, rtol=0.0, atol=1e-6):
@@ -149,19 +120,8 @@ def move_origin(
 
 
 def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | None = None) -> Scores:
-    """The scores that the meshes of objects hold, as of one.
-
-    Parameters
-    ----------
-    group : sequence of SplatObject
-    removed : (N,) bool, optional
-        Splats of all that have to go, and need no score.
-
-    Raises
-    ------
-    RefineError
-        If one was not scored, or has splats that were not; or not all were scored together.
-    """
+    """Scores of several objects as of one; splats of `removed`, (N,) of all, need none.
+    `RefineError` if others have none, or objects were not scored together."""
     records, columns, start = [], [], 0
     removed = np.zeros(sum(map(len, group)), np.bool_) if removed is None else removed
     for checked in group:
@@ -205,7 +165,6 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
 
 
 def _has_scores(mesh: bpy.types.Mesh) -> bool:
-    """Tell whether a mesh has the attributes that `stored_scores` reads."""
     kinds = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
     attributes = ((mesh.attributes.get(name), kind) for name, kind in kinds.items())
     return all(attribute and attribute.data_type == kind for attribute, kind in attributes)

@@ -1,9 +1,6 @@
-"""Which splats are selected and hidden: Blender's own vertex selection, kept by undo and files.
-
-A mesh has the attributes of edit mode, ``.select_vert`` and ``.hide_vert``; while it is in that
-mode, its vertices there have both. A point cloud has ``.selection``, and the same for what is
-hidden, of which Blender itself knows nothing.
-"""
+"""Selected and hidden splats: Blender's vertex selection, kept by undo and files.
+Meshes use ``.select_vert`` and ``.hide_vert``, in edit mode the vertices there; point clouds
+``.selection`` and the same for hidden, which Blender itself ignores."""
 
 from __future__ import annotations
 
@@ -22,17 +19,17 @@ HIDDEN = ".hide_vert"
 
 
 def name_of(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> str:
-    """Return the attribute that holds what is selected."""
+    """Attribute that holds the selection."""
     return ".selection" if hasattr(mesh, "points") else ".select_vert"
 
 
 def selected(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    """Which splats of an object are selected, (N,)."""
+    """Selected splats of an object, (N,)."""
     return _in_edit(obj, "select") if _in_edit_mode(obj) else _chosen(obj)
 
 
 def hidden(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    """Which splats of an object are hidden, (N,)."""
+    """Hidden splats of an object, (N,)."""
     return _in_edit(obj, "hide") if _in_edit_mode(obj) else _flags(obj.data, HIDDEN)
 
 
@@ -42,30 +39,18 @@ def _in_edit(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
 
 
 def select(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
-    """Select splats, (N,) bool, and no others; hidden ones stay unselected.
-
-    Raises
-    ------
-    RefineError
-        If the object belongs to a library.
-    """
+    """Select exactly these splats, (N,) bool; hidden ones stay unselected."""
     away = hidden(obj)
     _store(obj, wanted & ~away, away)
 
 
 def hide(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
-    """Hide splats, (N,) bool, and no others; what is hidden is selected no more.
-
-    Raises
-    ------
-    RefineError
-        If the object belongs to a library.
-    """
+    """Hide exactly these splats, (N,) bool, and deselect them."""
     _store(obj, selected(obj) & ~wanted, wanted)
 
 
 def count(obj: bpy.types.Object) -> int:
-    """Return how many splats are selected; quick enough to draw."""
+    """Number of selected splats; quick enough to draw."""
     if _in_edit_mode(obj):
         return int(obj.data.total_vert_sel)
     return int(np.count_nonzero(_chosen(obj)))

@@ -1,1 +1,1 @@
-"""What panel and command do with splat objects: one, several as a scene, levels; what must stay."""
+"""Operations of panel and command on splat objects: one, several as a scene, levels."""

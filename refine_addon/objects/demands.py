@@ -1,4 +1,4 @@
-"""What must stay of a splat object and what must go, as a scene and the command line say it."""
+"""Protected splats and those removed by the user, from the scene and the command line."""
 
 from __future__ import annotations
 
@@ -25,59 +25,36 @@ from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject, splat_count
 from ..mesh.records import parsed
 
-FACTS = "refine_forced"
-"""Custom property of the mesh: how many splats must stay and go, or why nobody knows, as JSON."""
+FACTS = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
 
 UNFIT = "expected a mesh, or an empty that is shown as a cube or a sphere"
 
 _MOST_MASKS = 16  # that are kept; 1 MB each at a million splats
 
-_masks: dict[bytes, NDArray[np.bool_]] = {}
-"""Which points lie in which volume, by a digest of both."""
+_masks: dict[bytes, NDArray[np.bool_]] = {}  # Points in each volume, by a digest of both
 
 
 @dataclass(frozen=True, eq=False)
 class Demands:
-    """What must stay and what must go.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Vertex groups and attributes of the splats that protect, see `mesh.edit.protected_mask`;
-        what is marked by `mesh.edit.PROTECT` is protected, and what is marked by
-        `mesh.edit.MUST_GO` must go, without being named.
-    zones : tuple of Zone
-        Volumes in the world.
-    """
+    """Protected splats and those removed by the user; `zones`: volumes in the world.
+    `names`: protecting vertex groups and attributes; `PROTECT` and `MUST_GO` (`mesh.edit`) always
+    count."""
 
     names: tuple[str, ...] = ()
     zones: tuple[Zone, ...] = ()
 
     @classmethod
     def of_scene(cls, scene: bpy.types.Scene) -> Demands:
-        """Return what the panel lists, as the scene keeps it.
-
-        Raises
-        ------
-        RefineError
-            See `zone`.
-        """
+        """The panel's lists, stored in the scene."""
         settings = scene.refine
         zones = (zone(item.role.lower(), item.object, idle=True) for item in listed(scene))
         return cls((settings.protect,) if settings.protect else (), tuple(zones))
 
     def __add__(self, other: Demands) -> Demands:
-        """Return both together."""
         return Demands(self.names + other.names, self.zones + other.zones)
 
     def forced(self, checked: SplatObject) -> Forced:
-        """Return what must stay and what must go of an object's splats.
-
-        Raises
-        ------
-        RefineError
-            See `mesh.edit.protected_mask` and `core.volumes.forced`.
-        """
+        """Protected and removed splats of an object."""
         protected = None
         for name in ("", *self.names):
             mask = mesh_edit.protected_mask(checked.obj, name)
@@ -92,13 +69,7 @@ class Demands:
             raise RefineError(f"object '{checked.obj.name}': {error}") from error
 
     def of_each(self, group: Sequence[SplatObject]) -> list[Forced]:
-        """What must stay and what must go of each object; a name protects in those that have it.
-
-        Raises
-        ------
-        RefineError
-            See `forced`; also if no object has a name that protects.
-        """
+        """The same for each object; a name protects in those that have it, one at least."""
         if len(group) == 1:
             return [self.forced(group[0])]
         having = {name: _having(group, name) for name in self.names}
@@ -112,7 +83,7 @@ NONE = Demands()
 
 
 def _having(group: Sequence[SplatObject], name: str) -> list[SplatObject]:
-    """Objects that have a vertex group or an attribute of that name to protect; one at least."""
+    """Objects with a protecting vertex group or attribute of that name; one at least."""
     having, error = [], None
     for member in group:
         try:
@@ -126,10 +97,7 @@ def _having(group: Sequence[SplatObject], name: str) -> list[SplatObject]:
 
 
 def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
-    """Return the volumes that the panel lists, but for those that are in the scene no more.
-
-    The list keeps an object alive that was deleted from the scene.
-    """
+    """Volumes listed and still in the scene: the list keeps deleted objects alive."""
     return [
         item
         for item in scene.refine.volumes
@@ -138,29 +106,21 @@ def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
 
 
 def world_means(checked: SplatObject) -> NDArray[np.float64]:
-    """Return the centres of an object's splats in the world, (N, 3)."""
+    """Centres of an object's splats in the world, (N, 3)."""
     matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
     return moved(mesh_attributes.read_attribute(checked.mesh, "position"), matrix)
 
 
 def can_be_volume(obj: bpy.types.Object) -> bool:
-    """Tell whether an object can be a volume, at first sight; one of splats has no faces."""
+    """Whether an object may be a volume, at first sight; splat objects have no faces."""
     if obj.type == "MESH":
         return bool(obj.data.polygons or obj.modifiers)
     return _is_shape(obj)
 
 
 def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
-    """Return what an object of the scene demands, as a volume in the world.
-
-    A mesh counts as it is evaluated, with modifiers; an empty as it is drawn.
-
-    Raises
-    ------
-    RefineError
-        If it is neither, or cannot be evaluated. Whether a mesh is closed is found out when it is
-        used.
-    """
+    """An object as a volume in the world: a mesh evaluated with modifiers, an empty as drawn.
+    Whether a mesh is closed is checked when it is used."""
     label, graph = f"object '{obj.name}'", bpy.context.evaluated_depsgraph_get()
     make: Callable[[], Volume]
     if obj.type == "MESH":
@@ -182,20 +142,12 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
 
 
 def _is_shape(obj: bpy.types.Object) -> bool:
-    """Tell whether an object is an empty that is drawn as a volume."""
     return obj.type == "EMPTY" and obj.empty_display_type in {"CUBE", "SPHERE"}
 
 
 def mark(checked: SplatObject, forced: Forced) -> None:
-    """Mark for the previews what must stay and what must go, and record how many splats that is.
-
-    What must go is also marked as what goes, unless scores or floaters tell that.
-
-    Raises
-    ------
-    RefineError
-        If the object cannot be written to.
-    """
+    """Mark protected and removed splats for previews, and record their numbers.
+    Removed ones also get `REMOVE`, unless scores or floaters set it."""
     mesh, removed = checked.mesh, forced.removed
     mesh_edit.mark_forced(checked.obj, forced.protected, removed)
     scored = mesh_scores.record(mesh) is not None
@@ -212,13 +164,7 @@ def mark(checked: SplatObject, forced: Forced) -> None:
 
 
 def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced]:
-    """Mark what a scene demands of each object, and return it.
-
-    Raises
-    ------
-    RefineError
-        See `Demands`; it is recorded as well.
-    """
+    """Mark a scene's demands on each object; the demands of each."""
     try:
         each = Demands.of_scene(scene).of_each(group)
         for checked, forced in zip(group, each, strict=True):
@@ -231,14 +177,8 @@ def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced
 
 
 def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
-    """Return what `mark` recorded of a mesh; nothing if splats came or went since.
-
-    Returns
-    -------
-    dict
-        ``protected`` and ``removed_by_user``, how many; ``volumes``, how many each holds by its
-        label; or ``error``, why that is not known.
-    """
+    """``protected``, ``removed_by_user``, ``volumes`` (splats by label), or ``error``, as marked.
+    Empty if splats came or went since."""
     try:
         recorded = parsed(mesh[FACTS])
         if recorded["splats"] != splat_count(mesh):
@@ -258,7 +198,7 @@ def _record(mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:
 def _surface(
     obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return vertices, (V, 3), and triangles, (T, 3), of a mesh with its modifiers."""
+    """Vertices, (V, 3), and triangles, (T, 3), of a mesh with its modifiers."""
     evaluated = obj.evaluated_get(depsgraph)
     if not evaluated.is_evaluated:
         if obj.modifiers:
@@ -281,14 +221,13 @@ def _surface(
 
 @dataclass(frozen=True, eq=False)
 class _CachedVolume:
-    """A volume whose last answers are kept: sliders ask for the same ones again and again."""
+    """A volume that caches its last answers: sliders repeat the same questions."""
 
     label: str
     key: bytes
     make: Callable[[], Volume]
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which points, (N, 3), lie inside, (N,); nobody may change it."""
         key = _digest(self.key, points)
         if key not in _masks:
             try:

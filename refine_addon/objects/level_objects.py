@@ -1,4 +1,4 @@
-"""Levels of detail as objects beside the one that they were made of."""
+"""Levels of detail as objects beside their original."""
 
 from __future__ import annotations
 
@@ -12,35 +12,16 @@ from ..core.lod import Level
 from ..mesh.layout import SplatObject, check
 from . import splat_group
 
-FACTS = "refine_lod"
-"""Custom property of the object of a level: what is known of it, as in the report of files."""
+FACTS = "refine_lod"  # Custom property of a level object: its stats, as in the report of files
 
-LEVEL_OF = "refine_level_of"
-"""Custom property of the object of a level: the object that it was made of."""
+LEVEL_OF = "refine_level_of"  # Custom property of a level object: its original
 
 
 def add_levels(
     checked: SplatObject, levels: Sequence[Level], distance: float
 ) -> bpy.types.Collection:
-    """Make an object of each level, in a new collection of the scene; the original stays.
-
-    The objects are copies of the original in all but the splats. They are named after it with
-    ``_lod1`` and so on, and hidden, in renders too: all stand where the original does.
-
-    Parameters
-    ----------
-    checked : SplatObject
-        The original.
-    levels : sequence of Level
-        Of its splats as they stand in the world.
-    distance : float
-        How far the views are from what they see, world units; see `viewing_distance`.
-
-    Raises
-    ------
-    RefineError
-        See `splat_group.apply`; nothing is left of the levels then.
-    """
+    """Copy the original as an object for each level, ``_lod1`` and so on, in a new collection.
+    Hidden, as all stand in one place; nothing is left on an error. `distance`: views to scene."""
     name = checked.obj.name
     collection = bpy.data.collections.new(f"{name} levels")
     with _nothing_left(collection):
@@ -65,20 +46,14 @@ def add_levels(
 
 
 def has_levels(obj: bpy.types.Object | None) -> bool:
-    """Return whether an object is a level, or has some."""
+    """Whether an object is a level, or has some."""
     if obj is None:
         return False
     return LEVEL_OF in obj or any(each.get(LEVEL_OF) == obj for each in bpy.data.objects)
 
 
 def levels_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return an object and its levels, the finest first, given it or one of them.
-
-    Raises
-    ------
-    RefineError
-        If it has none.
-    """
+    """An object and its levels, finest first, from any of them; `RefineError` without levels."""
     original = obj.get(LEVEL_OF) or obj
     levels = [each for each in bpy.data.objects if each.get(LEVEL_OF) == original]
     if not levels:
@@ -88,7 +63,6 @@ def levels_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
 
 @contextmanager
 def _nothing_left(collection: bpy.types.Collection) -> Iterator[None]:
-    """Remove a new collection with its objects and their data if the block fails."""
     try:
         yield
     except BaseException:

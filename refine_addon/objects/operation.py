@@ -1,4 +1,4 @@
-"""What the command does with an object of the open scene."""
+"""The command's operations on an object of the open scene."""
 
 from __future__ import annotations
 
@@ -51,33 +51,9 @@ def prune_object(
     dry_run: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Prune an object of the open scene, export what stays, save the .blend.
-
-    Parameters
-    ----------
-    name : str
-        Of the object.
-    views, budget, method, pictures, overwrite, dry_run, progress
-        See `core.operations.prune_file`.
-    demands : Demands
-        What must stay and what must go.
-    output : Path, optional
-        The file to make, in the format that its suffix names.
-    save : bool
-        Whether to delete the splats from the object and save the .blend.
-
-    Returns
-    -------
-    dict
-        The report.
-
-    Raises
-    ------
-    RefineError
-        See `core.operations.run` and `gather`; also if there is no such object, it cannot be
-        changed, or the .blend cannot be saved. What was exported by then stays; the object is as it
-        was.
-    """
+    """Prune an object of the open scene, export the result, save the .blend (`save`); the report.
+    See `core.operations.prune_file`. On an error an exported file stays, and the object as it
+    was."""
     checked = check(find(name))
     save = save and not dry_run
     method = possible([checked], method)
@@ -121,10 +97,7 @@ def score_object(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Score an object of the open scene, and write it to a PLY; nothing in the scene changes.
-
-    Parameters and errors as `prune_object`.
-    """
+    """Score an object of the open scene into a PLY, the scene unchanged; see `prune_object`."""
     checked = check(find(name))
     return run(
         lambda form: _scene(checked, demands, None, form), score_scene(views, method),
@@ -135,7 +108,7 @@ def score_object(
 def _scene(
     checked: SplatObject, demands: Demands, harmonics: bool | None, form: Format | None
 ) -> Scene:
-    """The object as it stands in the world; the frame of the views is the world."""
+    """The object in the world, which is also the views' frame."""
     row, fixed = mesh_attributes.file_size(checked)
     sizes: tuple[float, int] = (row, fixed)
     if form is not None:
@@ -154,7 +127,6 @@ def _scene(
 
 
 def _save(exported: Path | None) -> None:
-    """Save the .blend."""
     try:
         bpy.ops.wm.save_mainfile()
     except RuntimeError as error:

@@ -1,10 +1,7 @@
-"""What the panel and the command do to splat objects, one or several alike: score, apply, export.
-
-Several are one scene: scored against one another, and under one budget. An operation begins with
-`mesh.layout.check`, which makes sure that an object holds splats; lists of its `SplatObject` are
-what the functions here take. Each either does all it says, or raises `RefineError` and leaves the
-scene as it was.
-"""
+"""Operations of panel and command on splat objects: score, apply, export.
+Several objects are one scene: scored together, under one budget. `mesh.layout.check` makes the
+`SplatObject` of each. Each function does all it says, or raises `RefineError` and changes
+nothing."""
 
 from __future__ import annotations
 
@@ -41,21 +38,12 @@ from . import demands
 from .demands import Demands
 from .transforms import read_to_move, uneven_notes
 
-Members = list["SplatObject"]
-"""The objects, by name; one at least."""
+Members = list["SplatObject"]  # Objects by name; one at least
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a budget does to objects, or would.
-
-    Attributes
-    ----------
-    kept, removed : int
-        Splats that stay and go.
-    bytes_before, bytes_after : int
-        Size of the exported files.
-    """
+    """Effect of a budget: splats kept and removed, bytes of the exported files before and after."""
 
     kept: int
     removed: int
@@ -64,14 +52,7 @@ class Outcome:
 
     @classmethod
     def of(cls, count: int, kept: int, row_bytes: int, fixed_bytes: int) -> Outcome:
-        """What keeping so many of `count` splats does to a file.
-
-        Parameters
-        ----------
-        count, kept : int
-        row_bytes, fixed_bytes : int
-            What a splat takes in a file of all splats, and all else in it.
-        """
+        """Effect of keeping so many splats of `row_bytes` in a file with `fixed_bytes` besides."""
         # The header says how many splats follow, in as many digits as that takes.
         shorter = len(str(count)) - len(str(kept))
         sizes = (fixed_bytes + row_bytes * count, fixed_bytes - shorter + row_bytes * kept)
@@ -79,10 +60,7 @@ class Outcome:
 
 
 def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.types.Object]:
-    """The splat objects that are worked on, by name: the selected ones.
-
-    Only the active one where it is alone, or not selected itself; quick enough for drawing.
-    """
+    """Selected splat objects by name, or the active one if not selected. Quick enough to draw."""
     selected = [obj for obj in layer.objects.selected if mesh_layout.looks_like_splats(obj)]
     if active not in selected:
         return [active]
@@ -90,13 +68,7 @@ def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.typ
 
 
 def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
-    """The objects of `chosen`, all of which hold splats.
-
-    Raises
-    ------
-    RefineError
-        See `mesh.layout.check`; also if two of them share their data.
-    """
+    """Checked objects of `chosen`; `RefineError` if two share their data."""
     group = [active if o == active.obj else mesh_layout.check(o) for o in chosen(layer, active.obj)]
     owners: dict[bpy.types.Mesh, str] = {}
     for member in group:
@@ -111,17 +83,17 @@ def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
 
 
 def forced(scene: bpy.types.Scene, group: Members) -> Forced:
-    """Which splats of all objects must stay and must go, as a scene says it; see `Demands`."""
+    """Protected and removed splats of all objects, by the scene; see `Demands`."""
     return _as_one(Demands.of_scene(scene).of_each(group), group)
 
 
 def refresh(scene: bpy.types.Scene, group: Members) -> Forced:
-    """Mark what a scene demands of each object, and return it; see `demands.refresh`."""
+    """Mark the scene's demands on each object; see `demands.refresh`."""
     return _as_one(demands.refresh(scene, group), group)
 
 
 def check_forced(scene: bpy.types.Scene, group: Members, before: Forced) -> None:
-    """Refuse objects of which other splats must stay or go than before."""
+    """Raise `RefineError` if other splats are protected or removed than before."""
     now = forced(scene, group)
     pairs = ((before.protected, now.protected), (before.removed, now.removed))
     if any(not np.array_equal(*map(_or_none, pair)) for pair in pairs):
@@ -135,7 +107,6 @@ def _or_none(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
 
 
 def _as_one(each: Sequence[Forced], group: Members) -> Forced:
-    """What is demanded of several objects as of one, without facts."""
     masks = []
     for name in ("protected", "removed"):
         parts = [getattr(one, name) for one in each]
@@ -146,34 +117,21 @@ def _as_one(each: Sequence[Forced], group: Members) -> Forced:
 
 
 def _rows(counts: Iterable[int]) -> list[slice]:
-    """Which of all splats are those of each object, of which each has so many."""
+    """Slices of each object's splats in the concatenated arrays."""
     ends = np.cumsum(list(counts)).tolist()
     return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def parts_of(mask: NDArray[np.bool_] | None, group: Members) -> list[NDArray[np.bool_]]:
-    """What a mask of all objects' splats, (N,), says of each object's; None marks none."""
+    """Each object's part of a mask of all splats, (N,); None marks none."""
     whole = np.zeros(sum(map(len, group)), np.bool_) if mask is None else mask
     return [whole[rows] for rows in _rows(map(len, group))]
 
 
 def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splats:
-    """The splats of objects as they stand in the world, for scoring.
-
-    Modifiers are not looked at: what is scored is what is exported.
-
-    Parameters
-    ----------
-    group : sequence of SplatObject
-    whole : bool or None
-        Whether to read view-dependent colour, for merging; scales must be uniform then. None reads
-        that of objects whose scale is, for an estimate of the pictures' quality.
-
-    Raises
-    ------
-    RefineError
-        If a matrix cannot be applied; names the object.
-    """
+    """Splats of objects in the world, for scoring; modifiers are ignored, as in exports.
+    `whole` reads view-dependent colour, for merging, and needs uniform scales; None reads it where
+    scales are uniform, to estimate the pictures' quality. `RefineError` names the object."""
     parts = []
     for checked in group:
         matrix = _matrix(checked)
@@ -193,13 +151,13 @@ def _matrix(checked: SplatObject) -> NDArray[np.float64]:
 
 
 def possible(group: Sequence[SplatObject], method: Method) -> Method:
-    """The method for some objects: where the scale of one is uneven, merging only deletes."""
+    """The method; where an object's scale is uneven, merging only deletes."""
     even = all(is_uniform(_matrix(member)) for member in group)
     return method if even or not isinstance(method, Merge) else Occlusion(method.views)
 
 
 def modifier_notes(obj: bpy.types.Object) -> list[str]:
-    """A sentence if modifiers show the object otherwise than it is scored and exported."""
+    """A sentence if modifiers make an object look other than it is scored and exported."""
     drawing = ("REFINE", "KIRI")  # these draw splats and move none
     names = [m.name for m in obj.modifiers if m.show_viewport and not m.name.startswith(drawing)]
     if not names:
@@ -211,7 +169,7 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
 
 
 def drift_notes(checked: SplatObject) -> list[str]:
-    """What others did to an object's splats, in sentences; see `mesh.drift`."""
+    """Sentences on drift; see `mesh.drift`."""
     drift = mesh_drift.found(checked.mesh)
     if drift is None:
         return []
@@ -222,17 +180,7 @@ def drift_notes(checked: SplatObject) -> list[str]:
 def store(
     group: Members, scores: Scores, method: Method, origins: Sequence[dict[str, Any]], **facts: Any
 ) -> None:
-    """Write scores of all objects' splats to their meshes; see `mesh.scores.store` for the facts.
-
-    Parameters
-    ----------
-    group : list of SplatObject
-    scores : Scores
-        Of the splats of `gather`.
-    method : Method
-    origins : sequence of dict
-        Of each object.
-    """
+    """Write scores of `gather`'s splats to each mesh, with its origin; see `mesh.scores.store`."""
     _check_counts(group, len(scores.values))
     ranks, scoring, all_scored = rank(scores.values), uuid.uuid4().hex, scores.scored is None
     protected = parts_of(facts.pop("protected", None), group)
@@ -253,24 +201,8 @@ def store(
 def stored_arguments(
     group: Members, budget: Budget, demanded: Forced, method: Method, views: ViewSet | None = None
 ) -> dict[str, Any]:
-    """The arguments of `prune` for Apply, which goes by the scores that the objects hold.
-
-    Parameters
-    ----------
-    group : list of SplatObject
-    budget : Budget
-    demanded : Forced
-        What must stay and what must go; see `forced`.
-    method : Method
-    views : ViewSet, optional
-        What merging and refitting go by; None where splats are deleted.
-
-    Raises
-    ------
-    RefineError
-        If an object was not scored, not with the others, or some of it needs scores now that had
-        to go then; also see `gather`.
-    """
+    """Arguments of `prune` from stored scores; `views` for merging and refitting, None to delete.
+    `RefineError` if splats have no scores, or objects were not scored together."""
     sizes = [mesh_attributes.file_size(member) for member in group]
     return {
         "splats": None if views is None else gather(group, whole=True),
@@ -286,23 +218,13 @@ def stored_arguments(
 
 
 def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
-    """Mark the splats that do not stay, (N,) of all objects."""
+    """Mark splats outside `keep`, (N,) of all objects."""
     for member, going in zip(group, parts_of(~keep, group), strict=True):
         mesh_edit.mark_removed(member.obj, going)
 
 
 class Frame(NamedTuple):
-    """What is to be known of an object to prepare a change of its splats on any thread.
-
-    Attributes
-    ----------
-    count : int
-        Its splats.
-    degree : int
-        Of its harmonics.
-    matrix : (4, 4) float64
-        From the world to the object.
-    """
+    """Input of `changes` of an object: splats, degree of harmonics, world-to-object (4, 4)."""
 
     count: int
     degree: int
@@ -310,17 +232,8 @@ class Frame(NamedTuple):
 
 
 class Change(NamedTuple):
-    """What is to become of the splats of an object.
-
-    Attributes
-    ----------
-    keep : (N,) bool
-        Which stay; K of them.
-    rows : (M,) int64
-        Which of the K change, ascending.
-    columns : dict of str to (M,)
-        What their properties become, in the object's frame.
-    """
+    """Change of an object's N splats: `keep`, (N,), K of them; `rows`, (M,) of the K, ascending;
+    `columns`, new values of these M by property, in the object's frame."""
 
     keep: NDArray[np.bool_]
     rows: NDArray[np.int64]
@@ -336,15 +249,7 @@ def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
 
 
 def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
-    """What is to become of each object's splats; touches nothing of Blender's.
-
-    Parameters
-    ----------
-    frames : sequence of Frame
-        Of each object.
-    result : Result
-        What was decided of all of them.
-    """
+    """Change of each object's splats, from the result for all; arrays only."""
     found, first, merged = [], 0, result.merged
     for frame, rows in zip(frames, _rows(frame.count for frame in frames), strict=True):
         keep = result.keep[rows]
@@ -366,24 +271,9 @@ def _deletion(keep: NDArray[np.bool_]) -> Change:
 
 
 def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
-    """Delete the splats that do not stay, and store what the others became: in all objects or none.
-
-    Everything else of the objects and their meshes stays: attributes, vertex groups, custom
-    properties, materials, modifiers. The scores stay to be looked at, but the next apply asks for
-    new ones, as they hold for all splats together.
-
-    Parameters
-    ----------
-    group : sequence of SplatObject
-    parts : sequence of Change
-        See `changes`.
-
-    Raises
-    ------
-    RefineError
-        See `mesh_edit.check_deletable`; also if there are no longer as many splats, or an object
-        would be left without any.
-    """
+    """Delete the splats that are not kept and store changed values: in all objects or none.
+    All else stays, scores to be looked at only: they hold for all splats together. `RefineError` if
+    the number of splats changed, or an object would end up empty."""
     _check_counts(group, sum(len(part.keep) for part in parts))
     outcomes = []
     for checked, part in zip(group, parts, strict=True):
@@ -404,12 +294,12 @@ def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
 
 
 def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
-    """Delete the splats of an object that do not stay, (N,); see `apply`."""
+    """Delete an object's splats outside `keep`, (N,); see `apply`."""
     return apply([checked], [_deletion(keep)])
 
 
 def reduce_object(checked: SplatObject, change: Change) -> None:
-    """Delete what does not stay, store what the others became, and drop the scores' record."""
+    """Delete removed splats, store changed ones, drop the scores' record."""
     mesh_edit.delete_vertices(checked.obj, ~change.keep)
     mesh_attributes.write_rows(checked, change.rows, change.columns)
     if change.columns:
@@ -431,21 +321,8 @@ def _check_counts(group: Sequence[SplatObject], count: int) -> None:
 def read_for_export(
     checked: SplatObject, *, apply_transform: bool = False
 ) -> Callable[[], SplatFile]:
-    """Read an object; what makes its PLY file of that, in memory, on any thread.
-
-    The file is in the layout that the object was imported with.
-
-    Parameters
-    ----------
-    checked : SplatObject
-    apply_transform : bool
-        Whether the splats are to be as they stand in the world, harmonics turned with them.
-
-    Raises
-    ------
-    RefineError
-        If the transform is to be applied and cannot be, being flat.
-    """
+    """Read an object; a thread-safe callable builds its PLY in memory, in the imported layout.
+    `apply_transform` puts splats into the world, harmonics turned; not if the matrix is flat."""
     if not apply_transform:
         return mesh_attributes.read_for_file(checked)
     names, move = read_to_move(checked, _matrix(checked))
@@ -453,13 +330,13 @@ def read_for_export(
 
 
 def export_notes(checked: SplatObject, *, apply_transform: bool = False) -> list[str]:
-    """What is to be said of an exported object; see `drift_notes`, `uneven_notes`."""
+    """Notes on an exported object; see `drift_notes`, `uneven_notes`."""
     uneven = uneven_notes(checked, _matrix(checked)) if apply_transform else []
     return [*drift_notes(checked), *uneven]
 
 
 def find(name: str) -> bpy.types.Object:
-    """The object of that name, or raise `RefineError` with those that hold splats."""
+    """The object of that name; else `RefineError` lists those with splats."""
     obj = bpy.context.scene.objects.get(name)
     if obj is None:
         names = [o.name for o in bpy.context.scene.objects if mesh_layout.looks_like_splats(o)]

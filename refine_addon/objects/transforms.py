@@ -1,7 +1,5 @@
-"""Transforms that splats follow as a whole: baked, joined, and put right where others moved them.
-
-Each does all it says, or raises `RefineError` and leaves the scene as it was.
-"""
+"""Transforms of whole splat objects: bake, join, mend.
+Each does all it says, or raises `RefineError` and changes nothing."""
 
 from __future__ import annotations
 
@@ -32,14 +30,13 @@ from . import demands
 
 _NORMALS = ("nx", "ny", "nz")
 
-_ROWS = 1 << 14
-"""Splats that are moved at a time, on one thread."""
+_ROWS = 1 << 14  # Splats moved at a time on one thread
 
 _TRANSFORM = (
     *("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale"),
     *("delta_location", "delta_rotation_euler", "delta_rotation_quaternion", "delta_scale"),
 )
-"""Properties of an object that make its transform."""
+"""Transform properties of an object."""
 
 
 def read_to_move(
@@ -49,31 +46,9 @@ def read_to_move(
     mend: bool = False,
     harmonics: int = 0,
 ) -> tuple[set[str], Callable[[], tuple[dict[str, NDArray[Any]], int]]]:
-    """Read a splat object to move its splats as a whole.
-
-    Parameters
-    ----------
-    checked : SplatObject
-    matrix : (4, 4) float64, optional
-        By what; in the object's frame.
-    mend : bool
-        Whether scales, rotations, harmonics and normals are first to follow what others did to the
-        positions: see `mesh.drift`.
-    harmonics : int
-        How many beyond the constant there are to be at least, zeros behind the splats' own.
-
-    Returns
-    -------
-    names : set of str
-        Properties that change; none where nothing is to be done.
-    work : callable
-        On any thread: what they become, (N,) each, and how many splats were mended.
-
-    Raises
-    ------
-    RefineError
-        See `core.affine.check_affine`.
-    """
+    """Read an object to move its splats by `matrix`, (4, 4) in its frame, first repaired if `mend`.
+    The properties that change (none if nothing does), and a thread-safe callable for their values,
+    (N,), and the number mended. `harmonics`: least number beyond the constant, zeros added."""
     matrix = np.eye(4) if matrix is None else matrix
     check_affine(matrix)
     find = mesh_drift.mending(checked.mesh) if mend else None
@@ -120,8 +95,6 @@ def _moved(
 
 
 def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> None:
-    """Write into columns what some splats become."""
-
     def move_some(part: slice) -> None:
         rows = move.rows[part]
         values = values_by_name(baked(splats.take(rows), move.matrix))
@@ -133,7 +106,7 @@ def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> 
 
 
 def _regrouped(rest: NDArray[Any], degrees: NDArray[np.int64]) -> NDArray[Any]:
-    """Harmonics, (N, K, 3), of which some stand under the names of a lower degree; 0 for none."""
+    """Harmonics, (N, K, 3), some of them under the names of a lower degree; 0 for none."""
     rest = np.array(rest)
     for degree in np.unique(degrees[degrees > 0]).tolist():
         rows, own = degrees == degree, above_constant(degree)
@@ -144,7 +117,7 @@ def _regrouped(rest: NDArray[Any], degrees: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def _turned_normals(normals: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[Any]:
-    """Return normals, (M, 3), of surfaces that a matrix moved; zeros, as most files have, stay."""
+    """Normals, (M, 3), of surfaces moved by a matrix; zeros, as most files have, stay."""
     if not normals.any():
         return normals
     turned = normals @ np.linalg.inv(matrix[:3, :3])
@@ -153,7 +126,7 @@ def _turned_normals(normals: NDArray[np.float32], matrix: NDArray[np.float64]) -
 
 
 def uneven_notes(checked: SplatObject, matrix: NDArray[np.float64]) -> list[str]:
-    """Return a sentence if colours cannot follow a matrix, (4, 4), exactly."""
+    """A sentence if colours cannot follow a (4, 4) matrix exactly."""
     if is_uniform(matrix) or not mesh_layout.sh_degree(checked.mesh):
         return []
     return [
@@ -163,13 +136,7 @@ def uneven_notes(checked: SplatObject, matrix: NDArray[np.float64]) -> list[str]
 
 
 def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) -> None:
-    """Store what the splats of objects became by `read_to_move`: in all of them or none.
-
-    Raises
-    ------
-    RefineError
-        See `mesh.edit.check_changeable`.
-    """
+    """Store results of `read_to_move`: in all objects or none."""
     for checked, _ in parts:
         mesh_edit.check_changeable(checked.obj)
     with ExitStack() as stack:
@@ -180,28 +147,9 @@ def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) ->
 
 
 def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:
-    """Move splats as their objects are moved, and take the objects' transforms away.
-
-    What they look like, and where they are in the world, stays; so do children, and scores hold.
-    Parents still move the objects. What others did before is mended first.
-
-    Parameters
-    ----------
-    group : sequence of SplatObject
-    location : bool
-        Whether the objects' origins go to that of the world, or of their parents.
-
-    Returns
-    -------
-    list of str
-        Notes.
-
-    Raises
-    ------
-    RefineError
-        See `mesh.edit.check_deletable` and `read_to_move`; also if an object is animated or
-        constrained.
-    """
+    """Move splats by their object's transform and reset it (`location`: its origin too); notes.
+    Look, world positions, children and scores stay; parents still move it. Drift is mended first.
+    `RefineError` also if an object is animated or constrained."""
     notes, parts = [], []
     for checked in group:
         mesh_edit.check_deletable(checked.obj)
@@ -216,7 +164,7 @@ def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:
 
 
 def _check_still(obj: bpy.types.Object) -> None:
-    """Refuse an object that something else will put where it was."""
+    """Raise if animation or constraints would move the object back."""
     animated = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
     if animated or obj.constraints:
         what = "animated" if animated else "constrained"
@@ -227,7 +175,6 @@ def _check_still(obj: bpy.types.Object) -> None:
 
 
 def _own_matrix(obj: bpy.types.Object, *, location: bool) -> NDArray[np.float64]:
-    """Return the transform that an object has beside those of its parents, (4, 4)."""
     matrix = snapped(np.array(obj.matrix_basis, np.float64))
     if not location:
         matrix[:3, 3] = 0.0
@@ -239,7 +186,7 @@ def _own_matrix(obj: bpy.types.Object, *, location: bool) -> NDArray[np.float64]
 
 
 def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
-    """Take away an object's own transform; children stay where they are, and scores hold."""
+    """Reset an object's own transform; children stay in place, and scores hold."""
     bpy.context.view_layer.update()
     before = obj.matrix_world.copy()
     place = obj.matrix_basis.translation.copy()
@@ -256,20 +203,14 @@ def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
 
 
 class Joined(NamedTuple):
-    """By what matrices splats are in the frame of the first object, and their columns there."""
+    """Matrices to the first object's frame, and the splats' columns there."""
 
     matrices: list[NDArray[np.float64]]
     columns: list[dict[str, NDArray[Any]]]
 
 
 def read_to_join(group: Sequence[SplatObject]) -> Callable[[Progress], Joined]:
-    """Read objects; what moves their splats into the frame of the first, on any thread.
-
-    Raises
-    ------
-    RefineError
-        See `join`.
-    """
+    """Read objects; a thread-safe callable moves their splats into the first one's frame."""
     matrices, most = _to_first(group), max(mesh_layout.rest_count(m.mesh) for m in group)
     parts = [
         read_to_move(member, matrix, mend=True, harmonics=most // 3)[1]
@@ -283,31 +224,10 @@ def read_to_join(group: Sequence[SplatObject]) -> Callable[[Progress], Joined]:
 
 
 def join(group: Sequence[SplatObject], found: Joined | None = None) -> list[str]:
-    """Put the splats of several objects into one, which keep what they look like and all they have.
-
-    The others go; their children are parented to the one. Marks, vertex groups and properties come
-    along; where one has no such property, it is 0 for its splats. Harmonics of a lower degree are
-    filled up with zeros, which they mean. Scores do not come along.
-
-    Parameters
-    ----------
-    group : sequence of SplatObject
-        Meshes. The first has the splats afterwards; it keeps its place and name.
-    found : Joined, optional
-        What the callable of `read_to_join` has returned; None to do that now. It does not count if
-        an object was moved since.
-
-    Returns
-    -------
-    list of str
-        What was filled in, and what else does not stay to the digit, in sentences.
-
-    Raises
-    ------
-    RefineError
-        See `mesh.edit.check_changeable` and `read_to_move`; also if one is a point cloud, or
-        Blender fails.
-    """
+    """Put the splats of meshes into the first, looking the same; notes on what was filled in.
+    Marks, vertex groups and properties come along, 0 where missing, harmonics filled up with zeros;
+    scores do not. The others go, children parented to the first. `found`: void if an object moved
+    since `read_to_join`."""
     matrices, most = _to_first(group), max(mesh_layout.rest_count(m.mesh) for m in group)
     refuse_mixed([member.layout.model for member in group])
     pairs = zip(group, matrices, strict=True)
@@ -328,7 +248,6 @@ def join(group: Sequence[SplatObject], found: Joined | None = None) -> list[str]
 
 
 def _to_first(group: Sequence[SplatObject]) -> list[NDArray[np.float64]]:
-    """The matrices from the frames of objects that can be joined to that of the first."""
     for member in group:
         mesh_edit.check_changeable(member.obj)
         if member.obj.type != "MESH":
@@ -346,7 +265,7 @@ def _to_first(group: Sequence[SplatObject]) -> list[NDArray[np.float64]]:
 
 @contextmanager
 def _workbench() -> Iterator[bpy.types.Collection]:
-    """Give a collection of the scene; all that is in it goes afterwards."""
+    """Temporary collection of the scene; its content is removed afterwards."""
     bench = bpy.data.collections.new("REFINE join")
     bpy.context.scene.collection.children.link(bench)
     try:
@@ -358,7 +277,6 @@ def _workbench() -> Iterator[bpy.types.Collection]:
 
 
 def _remove(obj: bpy.types.Object) -> None:
-    """Remove an object, and its data if nothing else uses it."""
     data = obj.data
     bpy.data.objects.remove(obj)
     if not data.users:
@@ -366,7 +284,7 @@ def _remove(obj: bpy.types.Object) -> None:
 
 
 def _copied(member: SplatObject, bench: bpy.types.Collection, rest: int) -> bpy.types.Object:
-    """A mesh object with a copy of an object's splats, with so many harmonics, without scores."""
+    """A mesh object with a copy of an object's splats, `rest` harmonics, and no scores."""
     obj = bpy.data.objects.new("REFINE join", member.mesh.copy())
     bench.objects.link(obj)
     mesh_scores.forget(mesh_layout.check(obj))
@@ -380,7 +298,7 @@ def _copied(member: SplatObject, bench: bpy.types.Collection, rest: int) -> bpy.
 
 
 def _made_alike(parts: Sequence[SplatObject], group: Sequence[SplatObject]) -> list[str]:
-    """Have objects hold the same columns in the same attributes; tell what some lack, in notes."""
+    """Give objects the same columns in the same attributes; notes on what some lack."""
     notes = []
     layout = mesh_layout.merged([part.layout for part in parts])
     for part, member in zip(parts, group, strict=True):
@@ -396,7 +314,6 @@ def _made_alike(parts: Sequence[SplatObject], group: Sequence[SplatObject]) -> l
 
 
 def _as_one(parts: Sequence[bpy.types.Object]) -> bpy.types.Object:
-    """Return the first of several mesh objects, in which all vertices are by then."""
     bpy.context.view_layer.update()
     first, count = parts[0], sum(len(part.data.vertices) for part in parts)
     others = [part.data for part in parts[1:]]
@@ -415,7 +332,6 @@ def _as_one(parts: Sequence[bpy.types.Object]) -> bpy.types.Object:
 
 
 def _give(obj: bpy.types.Object, source: bpy.types.Object) -> None:
-    """Give an object the data of another in place of its own."""
     old = obj.data
     name = old.name
     obj.data = source.data
@@ -425,7 +341,7 @@ def _give(obj: bpy.types.Object, source: bpy.types.Object) -> None:
 
 
 def _replace(obj: bpy.types.Object, parent: bpy.types.Object) -> None:
-    """Remove an object; another becomes the parent of its children, which stay where they are."""
+    """Remove an object; another becomes parent of its children, which stay in place."""
     back = parent.matrix_world.inverted() @ obj.matrix_world
     for child in list(obj.children):
         inverse = back @ child.matrix_parent_inverse

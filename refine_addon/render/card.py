@@ -1,8 +1,5 @@
-"""Splats of a render drawn on the graphics card, by the shader of the 3D views.
-
-On Blender's main thread, where the 3D views draw, too; core's renderer (`core.pictures`) does the
-same where there is no card.
-"""
+"""Splats of a render drawn on the graphics card, on Blender's main thread.
+`core.pictures` does the same without a card."""
 
 from __future__ import annotations
 
@@ -19,24 +16,17 @@ from ..core.views import View
 from ..viewport import shader
 from ..viewport.arrays import Eye, as_texture, colors, farthest_first, in_front, pack
 
-_FARTHEST = 1e6
-"""Far plane over the near plane, where a view has none nearer."""
+_FARTHEST = 1e6  # Far plane over the near plane, if a view has none nearer
 
 
 def available() -> bool:
-    """Tell whether there is a card that Blender draws on; to be asked on the main thread."""
+    """Whether Blender draws on a graphics card; main thread only."""
     return not bpy.app.background and gpu.platform.device_type_get() != "SOFTWARE"
 
 
 def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], NDArray[np.float64]]:
-    """What draws splats on the card as `core.pictures.draw` does, on the main thread.
-
-    Parameters
-    ----------
-    splats, view, layers
-        As `core.pictures.draw` takes them, in perspective, the splats the same from all directions.
-        They are sorted and packed here, on any thread.
-    """
+    """Draws splats on the card as `core.pictures.draw` does, on the main thread; arguments alike.
+    Perspective and constant colours only. Sorting and packing happen here, on any thread."""
     matrix = np.empty((3, 4))  # world to camera: x right, y up, z back
     matrix[:, :3] = np.array([1.0, -1.0, -1.0])[:, None] * view.rotation
     matrix[:, 3] = -matrix[:, :3] @ view.center
@@ -77,7 +67,7 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
         walls = [shader.texture(limit, 1, "R32F") for limit in limits]
 
         def between(number: int) -> NDArray[np.float64]:
-            """Splats between two walls, (4, H, W), colours times alpha, the top row first."""
+            """Splats between two walls, (4, H, W), colours times alpha, top row first."""
             numbers = (view.width, view.height, view.near, 1.0)
             numbers += (True, number < len(walls), number > 0)
             ends = {"near_depths": walls[number - 1]} if number else {}

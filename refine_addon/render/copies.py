@@ -1,4 +1,4 @@
-"""Copies of a scene that are rendered in its place, so that its own settings are never touched."""
+"""Copies of a scene rendered in its place, so that its own settings stay untouched."""
 
 from __future__ import annotations
 
@@ -10,22 +10,11 @@ import bpy
 
 from ..core.execute import Cancelled
 
-MARK = "refine_render"
-"""Custom property of such a copy: the scene that it is of."""
+MARK = "refine_render"  # Custom property of a copy: its original scene
 
 
 class Step(NamedTuple):
-    """A render to be done by Blender.
-
-    Attributes
-    ----------
-    scene : str
-        Name of the scene to be rendered.
-    animation : bool
-        Whether as an animation, which writes files.
-    what : str
-        What is rendered, in a few words.
-    """
+    """A render for Blender: its scene's name, whether an animation (writes files), a label."""
 
     scene: str
     animation: bool
@@ -33,11 +22,8 @@ class Step(NamedTuple):
 
 
 def copied(scene: bpy.types.Scene, what: str) -> bpy.types.Scene:
-    """A copy that renders what the scene does, without compositing and sequencer.
-
-    Of several view layers it renders the first that the scene does. Menus of scenes leave it out,
-    as all names that begin with a dot.
-    """
+    """A copy that renders what the scene does, without compositor and sequencer, one view layer.
+    Its name begins with a dot, so menus leave it out."""
     copy = scene.copy()
     copy.name = f".REFINE {what}"
     copy[MARK] = scene
@@ -50,13 +36,7 @@ def copied(scene: bpy.types.Scene, what: str) -> bpy.types.Scene:
 
 
 def existing(name: str) -> bpy.types.Scene:
-    """A copy by its name; an undo may have removed it.
-
-    Raises
-    ------
-    Cancelled
-        If it is not there.
-    """
+    """A copy by its name; raises `Cancelled` if an undo has removed it."""
     scene = bpy.data.scenes.get(name)
     if scene is None:
         raise Cancelled
@@ -64,7 +44,7 @@ def existing(name: str) -> bpy.types.Scene:
 
 
 def set_frames(name: str, frames: Sequence[int]) -> bpy.types.Scene:
-    """Have a copy render some frames, evenly apart, and go to the first of them."""
+    """Make a copy render evenly spaced frames, and go to the first."""
     scene = existing(name)
     scene.frame_start, scene.frame_end = frames[0], frames[-1]
     scene.frame_step = frames[1] - frames[0] if frames[1:] else 1
@@ -74,7 +54,7 @@ def set_frames(name: str, frames: Sequence[int]) -> bpy.types.Scene:
 
 
 def remove_all() -> None:
-    """Remove all copies; a window that shows one shows its scene again."""
+    """Remove all copies; windows that show one show its scene again."""
     for window in bpy.context.window_manager.windows:
         if MARK in window.scene:
             window.scene = window.scene[MARK]
@@ -87,7 +67,7 @@ def remove_all() -> None:
 
 
 def write_exr(scene: bpy.types.Scene, path: Path) -> None:
-    """Have renders of a copy write images with all passes, which `core.images` reads."""
+    """Make a copy write images with all passes for `core.images`."""
     render, settings = scene.render, scene.render.image_settings
     _set_format(settings, "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER")
     settings.color_depth, settings.exr_codec = "32", "NONE"
@@ -100,14 +80,14 @@ def write_exr(scene: bpy.types.Scene, path: Path) -> None:
 
 
 def write_png(scene: bpy.types.Scene) -> None:
-    """Have images of a copy saved as PNG of 16 bits, as fast as that goes."""
+    """Make a copy save 16-bit PNG, as fast as possible."""
     settings = scene.render.image_settings
     _set_format(settings, "IMAGE", "PNG")
     settings.color_mode, settings.color_depth, settings.compression = "RGB", "16", 0
 
 
 def show_as_stored(scene: bpy.types.Scene) -> None:
-    """Give a copy the view transform that shows colours of sRGB as they are."""
+    """Give a copy the view transform that shows sRGB colours as they are."""
     view = scene.view_settings
     view.view_transform, view.look = "Standard", "None"
     view.exposure, view.gamma, view.use_curve_mapping = 0.0, 1.0, False

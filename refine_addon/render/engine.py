@@ -1,7 +1,5 @@
-"""The render engine that draws splats among what `meshes` rendered; used by copies of scenes alone.
-
-Blender calls it in a thread of its own, on what it evaluated for this render.
-"""
+"""The render engine that draws splats among the layers of `meshes`; for copies of scenes only.
+Blender calls it on a thread of its own, with the data evaluated for this render."""
 
 from __future__ import annotations
 
@@ -29,40 +27,16 @@ from ..mesh.layout import SplatObject, check, splat_count
 from . import card
 from .meshes import drawn_by_us
 
-_FAR = 1e4
-"""Scene sizes from which a camera without perspective is seen as one with it: less than .1 pixels
-apart in an image of 1000."""
+_FAR = 1e4  # Scene sizes to a camera without perspective: an error below 0.1 of 1000 pixels
 
 
 @dataclass(eq=False)
 class Shared:
-    """What a render is told, and tells.
-
-    Attributes
-    ----------
-    layers : callable or None
-        Gives what was rendered besides splats, of the next frame, or None.
-    transparent : bool
-        Whether what lies behind everything is left transparent.
-    card : bool
-        Whether splats are drawn on the graphics card, by the main thread (`main_thread.serve`).
-    finished : Path or None
-        Folder of pictures that are drawn already, to be shown once more.
-    splats : int
-        How many were drawn in the last frame.
-    frames : list of int
-        Those that were drawn.
-    renders : int
-        How many of Blender's renders a frame takes.
-    engine : str
-        What rendered all but the splats, "" where there is nothing else.
-    picture : (4, H, W) or None
-        The last one, as `drawing.draw` returns it.
-    error : BaseException or None
-        Why drawing ended.
-    stopped : bool
-        Whether Esc was pressed; Blender forgets one that came as its render began.
-    """
+    """State shared with a render, settings first.
+    `layers`: gives the next frame's other layers. `card`: draw on the main thread
+    (`main_thread.serve`). `finished`: folder of pictures to show again. `splats`: of the last
+    frame. `renders`: Blender's for each frame. `engine`: of all else, or "". `picture`: the last
+    one, (4, H, W). `stopped`: Esc; Blender forgets one pressed as its render began."""
 
     layers: Callable[[], Layers | None] | None = None
     transparent: bool = False
@@ -111,7 +85,6 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.error_set(str(error))
 
     def _picture(self, depsgraph: bpy.types.Depsgraph, shared: Shared) -> NDArray[np.float64]:
-        """What the camera sees, as `draw` does."""
         scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
         view, away = _place(depsgraph, self.camera_override or scene.camera, size)
         splats = _splats(depsgraph, view.center)
@@ -140,10 +113,8 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
 
 
 def _place(depsgraph, camera, size):
-    """How a camera sees, and how far behind it the view stands.
-
-    A view is a pinhole, so that of a camera without perspective stands far away.
-    """
+    """View of a camera, and how far it stands back.
+    A view is a pinhole, so that of a camera without perspective stands far away."""
     data, render = camera.data, depsgraph.scene.render
     if data.type not in {"PERSP", "ORTHO"}:
         raise RefineError(
@@ -160,7 +131,6 @@ def _place(depsgraph, camera, size):
 
 
 def _cropped(view: View, render: bpy.types.RenderSettings) -> View:
-    """A view cut to the border that is rendered."""
     if not render.use_border:
         return view
     # In the precision of Blender: .7 of 240 columns are 168, and 167 with more digits.
@@ -173,10 +143,8 @@ def _cropped(view: View, render: bpy.types.RenderSettings) -> View:
 
 
 def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
-    """All splats that a render shows, in the world, in the colours that they show to an eye.
-
-    Instances are among them. Modifiers are not looked at, as in the 3D views.
-    """
+    """All splats of a render in the world, with instances, in the colours that `eye` sees.
+    Modifiers are ignored, as in the 3D views."""
     parts = []
     for instance in depsgraph.object_instances:
         obj = instance.object.original
@@ -197,9 +165,7 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
 
 def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
     """A picture, (4, H, W) display-referred, as linear pixels, (H * W, 4), lowest row first.
-
-    By the curve of sRGB (IEC 61966-2-1), which the view transform of the copy takes back.
-    """
+    By the sRGB curve (IEC 61966-2-1), which the copy's view transform inverts."""
     colors, alphas = picture[:3], picture[3]
     straight = (colors / np.maximum(alphas, 1e-6)).clip(0.0, 1.0)
     curved = ((straight + 0.055) / 1.055) ** 2.4

@@ -1,4 +1,4 @@
-"""From a scene to rendered frames: what Blender renders, one after another."""
+"""From a scene to rendered frames: Blender's renders, one after another."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .meshes import Meshes, drawn_by_us
 
 
 def refuse(scene: bpy.types.Scene) -> None:
-    """Raise `RefineError` for what cannot be rendered."""
+    """Raise `RefineError` for scenes that cannot be rendered."""
     label = f"scene '{scene.name}'"
     if scene.camera is None:
         raise RefineError(f"{label}: has no camera; add one, or make one the active camera")
@@ -31,7 +31,7 @@ def refuse(scene: bpy.types.Scene) -> None:
 
 
 def left_out(scene: bpy.types.Scene) -> list[str]:
-    """What the scene asks for and a render with splats does without, in sentences."""
+    """Sentences on scene settings that a render with splats ignores."""
     render, told = scene.render, []
     asked = {"depth of field": scene.camera.data.dof.use_dof, "motion blur": render.use_motion_blur}
     if blurred := [name for name, is_asked in asked.items() if is_asked]:
@@ -48,29 +48,9 @@ def left_out(scene: bpy.types.Scene) -> list[str]:
 def steps(
     scene: bpy.types.Scene, frames: Sequence[int], shared: Shared, *, write: bool
 ) -> Generator[copies.Step | None, None, None]:
-    """Yield what Blender has to render for some frames, one after another.
-
-    Whoever renders them asks for the next when one is over. Where None is yielded there is nothing
-    to render, and Blender may do something else meanwhile. All that is made for them is removed
-    when the last is over, or the generator is closed.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-        Is not changed.
-    frames : sequence of int
-    shared : Shared
-        What becomes known of the render.
-    write : bool
-        Whether pictures are written where the scene's output settings say.
-
-    Raises
-    ------
-    RefineError
-        See `refuse`; also if a step has failed.
-    Cancelled
-        If a step was stopped.
-    """
+    """Yield Blender's renders for some frames; the caller renders each before the next.
+    At None Blender may do other things. Cleans up at the end or when closed. `write`: pictures go
+    to the scene's output. `RefineError` if a step failed, `Cancelled` if one was stopped."""
     refuse(scene)
     with _made(shared) as folder:
         meshes, whole = Meshes(scene, folder), _whole(scene, "whole")
@@ -98,7 +78,6 @@ def steps(
 
 
 def _whole(scene: bpy.types.Scene, what: str) -> str:
-    """Make a copy that our engine renders; its name."""
     copy = copies.copied(scene, what)
     copy.render.engine = REFINE_engine.bl_idname
     copy.render.use_overwrite, copy.render.use_placeholder = True, False  # see `_is_there`
@@ -107,13 +86,12 @@ def _whole(scene: bpy.types.Scene, what: str) -> str:
 
 
 def _check(shared: Shared, frame: int) -> None:
-    """Raise why a frame was not drawn, if it was not."""
     if shared.error is not None or shared.frames[-1:] != [frame]:
         raise shared.error or Cancelled
 
 
 def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
-    """Tell whether the file of a frame is there and stays; else make one in its place if wanted."""
+    """Whether a frame's file exists and stays; else make a placeholder if wanted."""
     path = Path(bpy.path.abspath(copies.existing(name).render.frame_path(frame=frame)))
     there = path.exists()
     if placeholder and not there:

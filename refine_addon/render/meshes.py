@@ -1,4 +1,4 @@
-"""What is not splats: rendered by the scene's own engine, with the depth of each pixel."""
+"""Everything but splats: rendered by the scene's own engine, with depths."""
 
 from __future__ import annotations
 
@@ -23,60 +23,38 @@ _RENDERED = {
     *("GPENCIL", "EMPTY"),  # an empty may stand for a collection
 }
 
-_MARK = "refine_out_of_sight"
-"""Custom property of such an object: the property that was changed."""
+_MARK = "refine_out_of_sight"  # Custom property of a hidden object: the property that was changed
 
 _BY_RAYS = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES"}
-"""Objects that cameras can be told not to see; EEVEE does not look at that for instances."""
+"""Types that can be hidden from cameras; EEVEE ignores that for instances."""
 
-_TILE = 128
-"""Pixels along each side of a tile that the processor renders, at most."""
+_TILE = 128  # Largest tile side rendered by the processor, pixels
 
-_WORLD_SAMPLES = 16
-"""Rays a pixel of the world alone, at most."""
+_WORLD_SAMPLES = 16  # Rays in each pixel of the world, at most
 
-_FARTHEST = 0.999
-"""Share of the camera's range beyond which a depth is that of nothing: EEVEE of 4.3 says so."""
+_FARTHEST = 0.999  # Share of the range beyond which there is nothing: EEVEE of 4.3 says so
 
-_INFINITE = 1e9
-"""Depth beyond which there is nothing: Cycles says 1e10."""
+_INFINITE = 1e9  # Depth beyond which there is nothing: Cycles reports 1e10
 
-_PIXELS = 1 << 18
-"""Pixels that the view transform is applied to at a time."""
+_PIXELS = 1 << 18  # Pixels per call of the view transform
 
-_MOMENT = 0.01
-"""Seconds that Blender may stand still."""
+_MOMENT = 0.01  # Seconds that Blender may stand still
 
 
 Steps = Generator[copies.Step | None, None, Callable[[], Layers] | None]
 
 
 def drawn_by_us(obj: bpy.types.Object) -> bool:
-    """Tell whether an object holds splats that Blender does not draw itself."""
+    """Whether an object holds splats that Blender does not draw itself."""
     return looks_like_splats(obj) and not (
         obj.type == "POINTCLOUD" and getattr(obj.data, "type", "") == native.TYPE
     )
 
 
 class Meshes:
-    """What a scene shows besides splats, rendered frame by frame.
-
-    What lets light through is rendered apart, so that splats between it and what stands behind it
-    are seen.
-
-    Parameters
-    ----------
-    scene : bpy.types.Scene
-    folder : Path
-        For files between the steps.
-
-    Attributes
-    ----------
-    engine : str
-        What renders them, "" where there is nothing to render.
-    renders : int
-        How many renders of Blender's a frame takes.
-    """
+    """A scene without its splats, rendered frame by frame through files in `folder`.
+    See-through objects are rendered apart, so that splats behind them are seen. `engine`: what
+    renders them, "" if there is nothing; `renders`: Blender's renders for each frame."""
 
     def __init__(self, scene: bpy.types.Scene, folder: Path) -> None:
         self._folder = folder
@@ -109,10 +87,7 @@ class Meshes:
         self.engine = bpy.data.scenes[self._any].render.engine if self._any else ""
 
     def layers(self, frame: int) -> Steps:
-        """Yield what has to be rendered of a frame; return what gives it as layers, on any thread.
-
-        Where None is yielded Blender may do something else.
-        """
+        """Yield a frame's renders (None: Blender may work); a thread-safe reader of its layers."""
         if not self._any:
             return None
         files = []
@@ -136,10 +111,8 @@ class Meshes:
         return partial(blended, (yield from self._shown(pictures)))
 
     def _rendered(self, name, frame, label):
-        """Render a frame of a copy; return the file, under another name.
-
-        Blender takes Esc for itself, and writes nothing of what it has not finished.
-        """
+        """Render a frame of a copy; the renamed file.
+        Blender handles Esc itself, and writes no unfinished file."""
         copies.set_frames(name, [frame])
         yield copies.Step(name, animation=True, what="meshes")
         try:
@@ -149,7 +122,7 @@ class Meshes:
             raise Cancelled from None
 
     def _copy(self, scene, what, *, cycles=False, samples=0):
-        """Make a copy; by Cycles if there is no other way, or told so; with few rays if told so."""
+        """Make a copy: by Cycles if needed or asked for, with few rays if asked for."""
         copy = copies.copied(scene, what)
         copies.write_exr(copy, self._folder / f"{what}_######")
         copy.render.film_transparent = True
@@ -175,11 +148,8 @@ class Meshes:
         return copy
 
     def _shown(self, pictures):
-        """Linear colours, (3, H, W) each, as the view transform of the scene shows them.
-
-        Only Blender knows the transform, and applies it where it saves an image. So much is done
-        between two yields that Blender stands still for a tenth of a second.
-        """
+        """Linear colours, (3, H, W) each, after the scene's view transform.
+        Only Blender knows it, for saved images; each stretch stops it for 0.1 s."""
         tall = np.concatenate(pictures, axis=1)
         rows = max(_PIXELS // tall.shape[2], 1)
         bands = []
@@ -189,7 +159,6 @@ class Meshes:
         return np.split(np.concatenate(bands, axis=1), len(pictures), axis=1)
 
     def _band_shown(self, band):
-        """Some rows of linear colours, (3, R, W), as they are shown."""
         scene, path = copies.existing(self._any), str(self._folder / "shown.png")
         height, width = band.shape[1:]
         pixels = np.ones((height, width, 4), np.float32)
@@ -210,20 +179,19 @@ class Meshes:
 
 
 def _has_card() -> bool:
-    """Tell whether EEVEE has a graphics card to render on; without one it takes minutes."""
+    """Whether EEVEE has a graphics card; without one it takes minutes."""
     if not bpy.app.background or not sys.platform.startswith("linux"):
         return True
     return Path("/dev/dri").exists() or Path("/dev/nvidia0").exists()
 
 
 def _lets_through(obj: bpy.types.Object, glass: bool) -> bool:
-    """Tell whether a material may let light through; by Cycles also one of glass."""
+    """Whether a material may be see-through; with `glass` (Cycles) also glass."""
     trees = {slot.material.node_tree for slot in obj.material_slots if slot.material} - {None}
     return any(_is_clear(node, glass) for tree in trees for node in _nodes(tree))
 
 
 def _nodes(tree):
-    """Nodes of a tree and of the groups in it."""
     for node in tree.nodes:
         yield node
         if getattr(node, "node_tree", None) is not None:
@@ -246,10 +214,8 @@ def _is_clear(node: bpy.types.Node, glass: bool) -> bool:
 
 @contextmanager
 def out_of_sight(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
-    """Leave objects out of renders within the block; they cast shadows, and lights shine on them.
-
-    Each is marked until it is as it was: an undo or a file may bring it back as it is then.
-    """
+    """Hide objects from cameras in the block; shadows and light stay.
+    Each is marked until restored: an undo or a file may bring it back hidden."""
     for obj in objects:
         seen_by_rays = obj.type in _BY_RAYS and obj.instance_type == "NONE"
         name = "visible_camera" if seen_by_rays else "hide_render"
@@ -263,7 +229,7 @@ def out_of_sight(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
 
 
 def restore() -> None:
-    """Show all objects again that are left out."""
+    """Show all hidden objects again."""
     for obj in bpy.data.objects:
         name = obj.get(_MARK)
         if name is not None:

@@ -1,8 +1,5 @@
-"""What engines have rendered, from files to layers: arrays alone, for any thread.
-
-Layers are blended as splats are, in the colours that are shown, which only Blender makes of light.
-So there are three steps: `read`, Blender's view transform of its pictures, its layers.
-"""
+"""Rendered passes, from files to layers: arrays only, for any thread.
+Layers blend as splats do, in shown colours; hence `read`, Blender's view transform, its layers."""
 
 from __future__ import annotations
 
@@ -17,12 +14,11 @@ from numpy.typing import NDArray
 from ..core.images import read_exr
 from ..core.pictures import Layers, in_order
 
-_ROUNDS = 2
-"""Pixels by which known depths are spread to pixels at edges without one."""
+_ROUNDS = 2  # Pixels that known depths spread into edges without one
 
 
 class Pass(NamedTuple):
-    """What was rendered together: colours times alpha, (3, H, W), alphas and depths, (H, W)."""
+    """Rendered together: colours times alpha, (3, H, W), alphas and depths, (H, W)."""
 
     colors: NDArray[np.float32]
     alphas: NDArray[np.float32]
@@ -33,29 +29,9 @@ Blended = tuple[list[NDArray[np.float32]], Callable[[Sequence[NDArray[np.float32
 
 
 def read(files: Sequence[tuple[Path, Path]], world: Path | None, far: float) -> Blended:
-    """Read and remove files of what was rendered.
-
-    Parameters
-    ----------
-    files : sequence of (Path, Path)
-        Colours and depths of each pass.
-    world : Path or None
-        What is behind all of them.
-    far : float
-        Depths from which on there is nothing.
-
-    Returns
-    -------
-    pictures : list of (3, H, W) float32
-        What the view transform is to be applied to.
-    layers : callable
-        Gives layers by what these are shown as.
-
-    Raises
-    ------
-    RefineError
-        See `read_exr`.
-    """
+    """Read and remove files, (colours, depths) of each pass and of the world behind.
+    The pictures, (3, H, W) float32, for the view transform, and a callable that makes layers of the
+    transformed ones. Depths from `far` on hold nothing."""
     passes = []
     for colors, depths in files:
         one = _read(colors)
@@ -65,7 +41,7 @@ def read(files: Sequence[tuple[Path, Path]], world: Path | None, far: float) -> 
 
 
 def _blended(passes: Sequence[Pass], world: NDArray[np.float32] | None) -> Blended:
-    """Each pass as if it were opaque, and all as they are seen without splats; see `read`."""
+    """Each pass as if opaque, and all blended without splats; see `read`."""
     nothing = np.zeros_like(passes[0].colors if passes else world)
     seen = [each for each in passes if each.alphas.any()]
     passes = seen or [Pass(nothing, nothing[0], nothing[0])]
@@ -75,10 +51,7 @@ def _blended(passes: Sequence[Pass], world: NDArray[np.float32] | None) -> Blend
     over = over / np.maximum(share, 1e-6) if world is None else over + left * world
 
     def layers(shown: Sequence[NDArray[np.float32]]) -> Layers:
-        """Where there are no splats they show what Blender does.
-
-        The background makes up for what blending shown colours does not.
-        """
+        """Layers that look like Blender's without splats: the background corrects the blending."""
         pairs = zip(seen, shown, strict=False)
         opaque = [each._replace(colors=each.alphas * colors) for each, colors in pairs]
         layers = in_order(opaque or passes)
@@ -89,7 +62,6 @@ def _blended(passes: Sequence[Pass], world: NDArray[np.float32] | None) -> Blend
 
 
 def _read(path: Path) -> Pass:
-    """Colours, alphas and depths of a file, which is removed."""
     channels = {name.split(".", 1)[-1]: values for name, values in read_exr(path).items()}
     path.unlink()
     colors = np.stack([channels[f"Combined.{letter}"] for letter in "RGB"])
@@ -98,11 +70,9 @@ def _read(path: Path) -> Pass:
 
 
 def _known(depths, alphas, far):
-    """Depth of what is seen in each pixel, (H, W), 0 where it has none.
-
-    Engines write that of one ray a pixel, which may miss what others hit: at an edge the nearest
-    depth beside it is taken. What is seen and has no depth anywhere near is taken to be in front.
-    """
+    """Depth of each pixel, (H, W), 0 where empty.
+    Engines trace one ray, which may miss: edges take the nearest depth beside, others are in
+    front."""
     known = np.where(depths >= far, np.float32(np.inf), depths)
     for _ in range(_ROUNDS):
         padded = np.pad(known, 1, constant_values=np.inf)

@@ -1,4 +1,4 @@
-"""Cameras from files: as objects of the scene, by themselves or with the splats they lie beside."""
+"""Cameras from files, as objects: alone, or with the splats beside them."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ from .operator_bases import Answer, Job, Needing, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
-FOLDER = "refine_folder"
-"""Custom property of an imported object: the folder of its file."""
+FOLDER = "refine_folder"  # Custom property of an imported object: its file's folder
 
 SET_RESOLUTION: dict[str, Any] = {
     "name": "Set Render Size",
@@ -36,7 +35,7 @@ SET_RESOLUTION: dict[str, Any] = {
     "one, so that renders show what the camera saw",
     "options": {"SKIP_SAVE"},
 }
-"""A property of the operators that import cameras."""
+"""Property of the operators that import cameras."""
 
 _ABOVE = 3  # folders above the splats in which their cameras are looked for
 
@@ -74,9 +73,7 @@ class REFINE_OT_import_cameras(Job, Needing, bpy.types.Operator, ImportHelper):
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Ask for the file; upright by default where the splats are.
-
-        A JSON file that was dropped may hold splats: then it is theirs to ask.
-        """
+        A dropped JSON file may hold splats, whose import asks then."""
         self.by_hand = True
         path = self.properties.filepath
         if path.lower().endswith(INDEX_NAMES):
@@ -95,7 +92,7 @@ class REFINE_OT_import_cameras(Job, Needing, bpy.types.Operator, ImportHelper):
         return {"RUNNING_MODAL"}
 
     def gather(self, _context: Context) -> tuple[list[SplatObject], Path]:
-        """The file to read."""
+        """The path."""
         path = Path(bpy.path.abspath(self.filepath))
         if len(self.files) > 1 and path.suffix not in _OF_MODELS:
             raise RefineError(f"got {len(self.files)} files, expected one of cameras")
@@ -103,11 +100,11 @@ class REFINE_OT_import_cameras(Job, Needing, bpy.types.Operator, ImportHelper):
 
     @staticmethod
     def compute(path: Path, _progress: Progress) -> ViewSet:
-        """What the file holds, or of a COLMAP model all of its folder."""
+        """The file's views; of a COLMAP model, the whole folder's."""
         return read_cameras(path.parent if path.suffix in _OF_MODELS else path)
 
     def put(self, context: Context, _group: list[SplatObject], path: Path, views: ViewSet) -> None:
-        """Import the cameras into a collection of their own."""
+        """Make camera objects."""
         collection = add_cameras(self, context, views, path)
         if (splats := _imported_splats(context)) is not None:
             warn_of_turn(self, context, splats)
@@ -115,7 +112,7 @@ class REFINE_OT_import_cameras(Job, Needing, bpy.types.Operator, ImportHelper):
 
 
 class REFINE_FH_cameras(bpy.types.FileHandler):
-    """Lets camera files be dropped on the 3D view."""
+    """Camera files dropped on the 3D view."""
 
     bl_idname = "REFINE_FH_cameras"
     bl_label = "Splat Cameras (REFINE)"
@@ -124,7 +121,7 @@ class REFINE_FH_cameras(bpy.types.FileHandler):
 
     @classmethod
     def poll_drop(cls, context: Context) -> bool:
-        """Tell whether files can be dropped here."""
+        """Whether files can be dropped here."""
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
@@ -134,17 +131,8 @@ def add_cameras(
     views: ViewSet,
     path: Path,
 ) -> bpy.types.Collection:
-    """Make objects of cameras, in a collection of their own, and have these decide.
-
-    Parameters
-    ----------
-    operator : bpy.types.Operator
-        With the properties ``upright`` and ``set_resolution``.
-    context : Context
-    views : ViewSet
-    path : Path
-        Where they come from.
-    """
+    """Make camera objects in a new collection named after `path`, which decides from now on.
+    The operator has the properties ``upright`` and ``set_resolution``."""
     scene = context.scene
     name = "Cameras" if path.is_dir() or path.stem in _USUAL_NAMES else f"Cameras {path.stem}"
     collection = bpy.data.collections.new(name)
@@ -164,36 +152,33 @@ def add_cameras(
 
 
 def suggest_resolution(operator: Any, context: Context) -> None:
-    """Have an operator that asks set the render size where nobody has chosen size or camera."""
+    """Default of ``set_resolution``: true where nobody has chosen size or camera."""
     if not operator.properties.is_property_set("set_resolution"):
         operator.set_resolution = _is_untouched(context.scene)
 
 
 def warn_of_turn(operator: bpy.types.Operator, context: Context, splats: bpy.types.Object) -> None:
-    """Report if only one of splats and the cameras that decide was imported upright."""
+    """Report if only one of splats and deciding cameras was imported upright."""
     context.view_layer.update()  # or what was just made stands at the origin
     if turn := known_turn(context, splats):
         operator.report({"WARNING"}, Alignment(turn, known=True).turned())
 
 
 def target_collection(context: Context) -> bpy.types.Collection:
-    """Return the active collection, or the scene's where that one belongs to a library."""
+    """Active collection, or the scene's where that is a library's."""
     active = context.collection
     return context.scene.collection if active is None or active.library else active
 
 
 def cameras_beside(folder: Path) -> Path | None:
-    """Return what holds the cameras of splats in a folder: there, or in the folders above.
-
-    Trained scenes have their splats some folders below their cameras, in
-    ``point_cloud/iteration_30000``.
-    """
+    """Camera file of splats in a folder, there or above.
+    Trained scenes have splats some folders below, in ``point_cloud/iteration_30000``."""
     places = (folder, *folder.parents[:_ABOVE])
     return next((found[0] for place in places if (found := cameras_in(place))), None)
 
 
 def capture_folder(obj: bpy.types.Object | None) -> Path | None:
-    """Return where to look for the cameras of a splat object; None where nothing tells."""
+    """Folder to search for cameras of a splat object; None if unknown."""
     stored = obj.get(FOLDER) if obj is not None else None
     if not isinstance(stored, str) or not stored or not os.path.isdir(stored):
         return None
@@ -202,7 +187,7 @@ def capture_folder(obj: bpy.types.Object | None) -> Path | None:
 
 
 def _imported_splats(context: Context) -> bpy.types.Object | None:
-    """Return the splats that cameras are imported for: the active ones, else any imported ones."""
+    """Splats that cameras are imported for: the active ones, else any imported ones."""
     if mesh_layout.looks_like_splats(context.object):
         return context.object
     splats = (obj for obj in context.scene.objects if FOLDER in obj)
@@ -210,12 +195,12 @@ def _imported_splats(context: Context) -> bpy.types.Object | None:
 
 
 def _is_upright(obj: bpy.types.Object) -> bool:
-    """Tell whether an object stands as *Upright* turns it; float32 leaves 7.5e-8 of the zeros."""
+    """Whether an object stands as *Upright* turns it; float32 leaves 7.5e-8 of the zeros."""
     return np.allclose(np.array(obj.matrix_world)[:3, :3], UPRIGHT[:3, :3], atol=SHEAR)
 
 
 def _is_untouched(scene: bpy.types.Scene) -> bool:
-    """Tell whether a scene has the size and no more than the camera that Blender starts with."""
+    """Whether a scene has the size and at most the camera that Blender starts with."""
     render = scene.render
     size = (render.resolution_x, render.resolution_y, render.resolution_percentage)
     cameras = [obj for obj in scene.objects if obj.type == "CAMERA"]

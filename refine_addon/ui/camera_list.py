@@ -1,4 +1,4 @@
-"""What lies in the view of each camera that scored, and how much of its picture changes."""
+"""Splats in each scoring camera's view, and the change of its picture."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import bpy
 from ..core.quality.curve import in_words
 from .wrapped import counted
 
-_MOST = 8
-"""Cameras that are shown."""
+_MOST = 8  # Cameras shown
 
 
 class Camera(NamedTuple):
-    """A camera: its view's name, splats in it, estimated dB or None, and whether it is far away."""
+    """View's name, splats in it, estimated dB or None, whether it is far away."""
 
     name: str
     seen: int
@@ -25,10 +24,7 @@ class Camera(NamedTuple):
 
 
 def cameras(record: dict[str, Any], psnr: Mapping[str, float]) -> list[Camera]:
-    """The cameras of the record of a scoring; first those of no use, then what changes most.
-
-    `psnr` says how close the pictures of views stay, dB, as far as that is estimated.
-    """
+    """Cameras of a record: useless ones first, then by change; `psnr`: known dB by view."""
     far = set((record.get("alignment") or {}).get("far", ()))
     each = (
         Camera(name, seen, psnr.get(name), name in far)

@@ -1,4 +1,4 @@
-"""The trade in one picture: dB over the share removed, a curve a method, and the budget's line."""
+"""The trade as a chart: dB over the share removed, a curve each method, a line for the budget."""
 
 from __future__ import annotations
 
@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 
 from ..core.quality.curve import UNSEEN, WAYS, Quality, Way
 
-Color = tuple[float, float, float]
-"""Red, green and blue, sRGB in 0..1."""
+Color = tuple[float, float, float]  # sRGB, 0..1
 
-WIDTH = 11
-"""Edge of the chart in units of the interface, about as wide as the sidebar is by default."""
+WIDTH = 11  # Edge of the chart in interface units, about the sidebar's default width
 
 NAMES: dict[Way, str] = {"delete": "Occlusion", "merge": "Merge", "refit": "Refit"}
 
-_BORDER, _SWATCH, _STEP = 4, 8, 10
-"""Pixels that Blender leaves free around an icon; of a patch of colour; dB between two lines."""
+_BORDER, _SWATCH, _STEP = 4, 8, 10  # Pixels of Blender's border, of a patch; dB between two lines
 
 _ON_DARK: dict[Way, Color] = {
     "delete": (0.34, 0.71, 0.91), "merge": (0.90, 0.62, 0.0), "refit": (0.18, 0.75, 0.56),
@@ -33,7 +30,7 @@ _previews: list[bpy.utils.previews.ImagePreviewCollection] = []
 
 
 def register() -> None:
-    """Make a place for the icons."""
+    """Make a collection of icons."""
     _previews.append(bpy.utils.previews.new())
 
 
@@ -43,7 +40,7 @@ def unregister() -> None:
 
 
 def look(preferences: bpy.types.Preferences) -> tuple[int, Color]:
-    """Pixels of an edge, and the colour of text, as the preferences ask for them."""
+    """Edge in pixels and text colour, from the preferences."""
     system, theme = preferences.system, preferences.themes[0].user_interface
     # A unit of the interface has so many pixels; without a screen the scale is 0.
     unit = round(18 * (system.ui_scale or 1.0)) + 2 * max(int(system.pixel_size), 1)
@@ -52,7 +49,7 @@ def look(preferences: bpy.types.Preferences) -> tuple[int, Color]:
 
 
 def ways(quality: Quality) -> tuple[Way, ...]:
-    """Those that the curve tells of, from instant to best."""
+    """Methods on the curve, from instant to best."""
     return WAYS if quality.foretold else WAYS[:1]
 
 
@@ -63,24 +60,14 @@ def lowest(quality: Quality) -> int:
 
 
 def picture(quality: Quality, share: float, size: int, ink: Color) -> NDArray[np.uint8]:
-    """The chart, (size, size, 4) uint8, lowest row first: RGB times alpha, and alpha.
-
-    Parameters
-    ----------
-    quality : Quality
-    share : float
-        Of the splats that goes, 0 to 1.
-    size : int
-    ink : tuple of float
-        Colour of the lines; light ones stand on a dark ground.
-    """
+    """The chart, (size, size, 4) uint8, lowest row first, RGB times alpha.
+    `share`: of splats removed, 0 to 1; `ink`: colour of lines; light ink means a dark ground."""
     canvas = np.zeros((size, size, 4), np.float32)
     rows, columns = np.arange(size)[:, None] + 0.5, np.arange(size) + 0.5
     shares, low, unit = columns / size, lowest(quality), size / 212
     colors = _ON_DARK if sum(ink) > 1.5 else _ON_LIGHT
 
     def paint(distance, width, color, strength=1.0):
-        """Paint where the distance from a line, pixels, is small."""
         alpha = strength * (0.5 * width + 0.5 - distance).clip(0.0, 1.0)
         alpha = np.broadcast_to(alpha, (size, size))[..., None]
         canvas[:] = canvas * (1.0 - alpha) + alpha * np.array([*color, 1.0])
@@ -101,7 +88,7 @@ def picture(quality: Quality, share: float, size: int, ink: Color) -> NDArray[np
 
 
 def show(quality: Quality, share: float) -> None:
-    """Make the picture anew, and the patches of colour that name its curves."""
+    """Update the picture and the colour patches of its curves."""
     size, ink = look(bpy.context.preferences)
     _upload("chart", picture(quality, share, size, ink))
     for way, color in (_ON_DARK if sum(ink) > 1.5 else _ON_LIGHT).items():
@@ -110,7 +97,7 @@ def show(quality: Quality, share: float) -> None:
 
 
 def draw(layout: bpy.types.UILayout, quality: Quality) -> None:
-    """Draw the picture that was made last, its names and its numbers; folded at first."""
+    """Draw the picture with names and numbers; folded at first."""
     header, body = layout.panel("REFINE_price", default_closed=True)
     header.label(text="Price")
     if not body:
@@ -125,7 +112,7 @@ def draw(layout: bpy.types.UILayout, quality: Quality) -> None:
 
 
 def icon(name: str) -> int:
-    """The number of an icon; 0 where there is none."""
+    """Number of an icon; 0 without."""
     return _previews[0][name].icon_id if _previews and name in _previews[0] else 0
 
 

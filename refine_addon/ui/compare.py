@@ -1,4 +1,4 @@
-"""*Compare*: what the active camera sees now, what it would see after *Apply*, and what differs."""
+"""*Compare*: the active camera's picture now, after *Apply*, and their difference."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .operator_bases import Job, OnScored
 from .operators import apply_arguments, selected
 
 NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
-"""The pictures as images of the file, made anew by each comparison."""
+"""Image names of the pictures, replaced by each comparison."""
 
 
 class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
@@ -36,7 +36,7 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
     doing = "Comparing"
 
     def gather(self, context: Context) -> tuple[Members, Any]:
-        """What Apply would decide by, the splats, and the view of the active camera."""
+        """Apply's arguments, the splats, and the active camera's view."""
         view = CameraChoice("ACTIVE").views(context, context.object)[0]
         group = selected(context)
         forced = splat_group.forced(context.scene, group)
@@ -46,7 +46,7 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> tuple[Comparison, float | None]:
-        """Both states, drawn, of the splats that stay; the estimated PSNR, dB."""
+        """Both pictures of the kept splats; the estimated PSNR, dB."""
         arguments, splats, view = job
         decided = 0.6 if arguments["method"].changes else 0.1  # of the time, by then
         result = prune(**arguments, partial=True, progress=part(progress, 0.0, decided))
@@ -55,7 +55,7 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
         return comparison, result.report["estimated_psnr"]
 
     def put(self, context: Context, _group: Members, _job: Any, result: Any) -> None:
-        """Put the pictures into images, show them, and say how close they are."""
+        """Put the pictures into images, show them, report the PSNR."""
         comparison, estimated = result
         plan = plans.stored(context.object, context.scene.refine)
         if plan is not None:
@@ -72,13 +72,12 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
 
 
 def measured(obj: bpy.types.Object, settings: Any) -> str:
-    """A sentence on what was measured of the plan of the moment, "" if nothing was."""
+    """A sentence on the measurement of the current plan, "" without."""
     measured: Comparison | None = (plans.stored(obj, settings) or {}).get("measured")
     return f"Measured in '{measured.view.name}': {measured.psnr:.1f} dB" if measured else ""
 
 
 def _show(context: Context, images: list[bpy.types.Image]) -> None:
-    """Show images side by side in a window of their own, unless all are shown already."""
     manager = context.window_manager
     shown = [
         area.spaces.active.image
@@ -101,7 +100,7 @@ def _show(context: Context, images: list[bpy.types.Image]) -> None:
 
 
 def _split(context: Context, window: bpy.types.Window, count: int) -> list[bpy.types.Area]:
-    """Split a window of one area into several of one width; return them from left to right."""
+    """Split a window's only area into several of one width, left to right."""
     (rest,) = window.screen.areas
     areas: list[bpy.types.Area] = []
     for left in range(count, 1, -1):
@@ -112,7 +111,7 @@ def _split(context: Context, window: bpy.types.Window, count: int) -> list[bpy.t
 
 
 def _fit(names: list[str]) -> None:
-    """Show the whole of images wherever they are shown; Blender's timer calls it once."""
+    """Fit images into their editors; called once by Blender's timer."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             space = area.spaces.active

@@ -37,11 +37,11 @@ class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
-        """The tooltip of a button."""
+        """A button's tooltip."""
         return next(text for name, _, text in WHAT if name == properties.what)
 
     def act(self, context: bpy.types.Context) -> Answer:
-        """Delete them, but for those that must stay, and say how many they were."""
+        """Delete them, except protected ones, and report their number."""
         checked, settings = mesh_layout.check(context.object), context.scene.refine
         forced = Demands.of_scene(context.scene).forced(checked)
         if self.what == "SELECTED":

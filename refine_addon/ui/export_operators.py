@@ -36,7 +36,7 @@ _FORMATS = (
     (".ply", ".ply", "In the layout that was imported"),
     *((form.suffix, form.suffix, f"It {form.loss}") for form in FORMATS),
 )
-"""The formats of an export as Blender lists them, with tooltips."""
+"""Export formats as Blender lists them, with tooltips."""
 
 
 class Exporting(Job, OnSplats, ExportHelper):
@@ -55,18 +55,18 @@ class Exporting(Job, OnSplats, ExportHelper):
 
     @staticmethod
     def new_name(obj: bpy.types.Object) -> str:
-        """Return the name that the file browser proposes."""
+        """Name proposed by the file browser."""
         raise NotImplementedError
 
     def invoke(self, context: Context, event: bpy.types.Event) -> Answer:
-        """Ask where; whoever picks what exists in the browser means to replace it."""
+        """Ask where; picking an existing file means to replace it."""
         self.by_hand = self.overwrite = True
         if not self.filepath:
             self.filepath = self.new_name(context.object)
         return ExportHelper.invoke(self, context, event)
 
     def say(self, notes: list[str], what: str) -> None:
-        """Say what was written, and what of it to mind."""
+        """Report what was written, with notes."""
         for note in notes:
             self.report({"WARNING"}, note)
         self.report({"INFO"}, what)
@@ -92,7 +92,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
 
     @staticmethod
     def new_name(obj: bpy.types.Object) -> str:
-        """Return a name that no file beside the .blend has yet."""
+        """A name that no file beside the .blend has yet."""
         mesh = obj.data
         pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
         name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
@@ -101,7 +101,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
 
     def check(self, _context: Context) -> bool:
-        """Bring name and format together, whichever was changed; return whether either changed."""
+        """Match name and format, whichever changed; whether either did."""
         before = self.filepath, self.suffix
         name = without_suffix(self.filepath)
         typed = self.filepath[len(name) :].lower()
@@ -112,7 +112,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         return before != (self.filepath, self.suffix)
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """What is written where, and what of it to mind; or what cannot be written."""
+        """Object, path and notes; raises for what cannot be written."""
         checked, moved = mesh_layout.check(context.object), self.apply_transform
         target = expanded(bpy.path.abspath(self.filepath))
         refuse_existing(target, overwrite=self.overwrite)
@@ -122,7 +122,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> SplatFile:
-        """The file, written."""
+        """Write the file."""
         read, target, overwrite, _ = job
         report(progress, 0.0, target.name)
         file = read()
@@ -130,7 +130,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         return file
 
     def put(self, _context: Context, _group: list[SplatObject], job: Any, file: SplatFile) -> None:
-        """Say what was written."""
+        """Report what was written."""
         _, target, _, to_mind = job
         if (form := format_named(target)) is not None:
             self.report({"INFO"}, "; ".join(notes(file, form, np.ones(len(file), np.bool_))))
@@ -151,11 +151,11 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
 
     @staticmethod
     def new_name(obj: bpy.types.Object) -> str:
-        """Return the name of a folder; it is made."""
+        """Name of a folder, which is made."""
         return f"{level_objects.levels_of(obj)[0].name}_levels"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """What is written where, the finest level first, and what of it to mind."""
+        """Levels, finest first, path and notes."""
         objects = level_objects.levels_of(mesh_layout.check(context.object).obj)
         moved = self.apply_transform
         each = [mesh_layout.check(obj) for obj in objects]
@@ -172,7 +172,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> int:
-        """How many levels were written."""
+        """Write the levels; their number."""
         files, width, target, overwrite, _ = job
         with folder_for(target, overwrite=overwrite) as made:
             scene = None
@@ -186,7 +186,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
         return len(files)
 
     def put(self, _context: Context, _group: list[SplatObject], job: Any, count: int) -> None:
-        """Say what was written."""
+        """Report what was written."""
         _, _, target, _, notes = job
         self.say(notes, f"Wrote {count} levels, the finest as it is, to {target}")
 

@@ -1,4 +1,4 @@
-"""The operator that finds floaters, by what the cameras see."""
+"""The operator that finds floaters by what the cameras see."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> Cleaned:
-        """What floats."""
+        """The floaters."""
         arguments, masks = job
         return clean(*arguments, **masks, progress=progress)
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, cleaned: Any) -> None:
-        """Store what was found, mark it as what goes, and say it."""
+        """Store the floaters, mark them as removed, report them."""
         floaters.store(group[0], cleaned)
         floaters.mark(group[0], context.scene.refine.to_reasons())
         self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")

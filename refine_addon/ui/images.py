@@ -1,4 +1,4 @@
-"""Pictures as images of the file, which the Image Editor shows."""
+"""Pictures as images of the .blend, for the Image Editor."""
 
 from __future__ import annotations
 
@@ -8,19 +8,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-_OURS = "refine_image"
-"""Custom property of these images: the name. An image without it is the user's."""
+_OURS = "refine_image"  # Custom property of our images: the name. Images without it are the user's.
 
 
 def put(name: str, pixels: NDArray[Any]) -> bpy.types.Image:
-    """Return an image of the file that holds pixels, in place of the one before of that name.
-
-    Parameters
-    ----------
-    name : str
-    pixels : (H, W, 3) or (H, W, 4) floating
-        Display-referred, 0..1, with alpha not multiplied; the top row first.
-    """
+    """The .blend's image of that name, replaced by pixels, (H, W, 3 or 4).
+    Display-referred, 0..1, alpha not multiplied, top row first."""
     height, width, channels = pixels.shape
     ours = (each for each in bpy.data.images if not each.library and each.get(_OURS) == name)
     old = next(ours, None)

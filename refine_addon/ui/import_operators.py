@@ -1,4 +1,4 @@
-"""The operator that brings files of splats into the scene, and dropping them on the view."""
+"""The operator that imports splat files, and dropping them on the view."""
 
 from __future__ import annotations
 
@@ -38,11 +38,9 @@ from .operator_bases import FAILURES, Answer, Job, Needing, described, idle, in_
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
-_ROWS = 1 << 16
-"""Rows that are read before the next look at whether the import was cancelled."""
+_ROWS = 1 << 16  # Rows read between two checks for cancelling
 
-FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)
-"""What a file browser shows."""
+FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)  # File browser's filter
 
 
 class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
@@ -76,7 +74,7 @@ class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
     doing = "Reading splats"
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
-        """Ask for the files, or only for the options where files were dropped."""
+        """Ask for files, or only for options where files were dropped."""
         self.by_hand = True
         preferences.suggest(self, context, "upright")
         if not self.properties.is_property_set("cameras"):
@@ -85,7 +83,7 @@ class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
         return self.invoke_popup(context)
 
     def draw(self, context: Context) -> None:
-        """Draw the options, and name the cameras that would be taken before they are."""
+        """Draw the options, and name the cameras that would come along."""
         layout, browser = self.layout, context.space_data
         layout.prop(self, "upright")
         path = self._paths()[0]
@@ -105,14 +103,14 @@ class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
         column.prop(self, "set_resolution")
 
     def gather(self, _context: Context) -> tuple[list[SplatObject], Any]:
-        """The files to read, and that of the cameras beside them if it is to be read too."""
+        """The files to read, and the camera file beside them if wanted."""
         paths = self._paths()
         cameras = cameras_beside(paths[0].parent) if self.cameras else None
         return [], (paths, cameras, self.level)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> tuple[list[SplatFile], ViewSet | None, list[Any]]:
-        """Files, views, and what is wrong with those that cannot be read; these stop no others."""
+        """Files, views, and errors of unreadable ones, which stop no others."""
         (paths, cameras, level), files, views, errors = job, [], None, []
         for index, path in enumerate(paths):
             progress_of_file = part(progress, index / len(paths), (index + 1) / len(paths))
@@ -128,7 +126,7 @@ class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
         return files, views, errors
 
     def put(self, context: Context, _group: list[SplatObject], job: Any, read: Any) -> None:
-        """Make an object of each file, and of each camera."""
+        """Make an object of each file and camera."""
         (paths, cameras, _), (files, views, errors), imported = job, read, []
         for file in files:
             try:
@@ -176,7 +174,7 @@ class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
 
 
 class REFINE_FH_ply(bpy.types.FileHandler):
-    """Lets splat files be dropped on the 3D view."""
+    """Splat files dropped on the 3D view."""
 
     bl_idname = "REFINE_FH_ply"
     bl_label = "Gaussian Splats (REFINE)"
@@ -188,12 +186,11 @@ class REFINE_FH_ply(bpy.types.FileHandler):
 
     @classmethod
     def poll_drop(cls, context: Context) -> bool:
-        """Tell whether files can be dropped here."""
+        """Whether files can be dropped here."""
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
 def _read(path: Path, level: int, progress: Progress) -> SplatFile:
-    """Return what a file holds, with all its bytes in memory."""
     report(progress, 0.0, "")
     file = read_splats(path, level=level)
     if not len(file):

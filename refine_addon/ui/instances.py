@@ -12,7 +12,6 @@ from .operator_bases import Answer, AtOnce, Needing, idle, in_object_mode
 
 
 def _instances(context: bpy.types.Context) -> str:
-    """Return that the active object must instance splats, "" if it does."""
     obj = context.object
     if obj is not None and not looks_like_splats(obj) and any(placings([obj])):
         return ""
@@ -28,7 +27,7 @@ class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):
     needs = (idle, in_object_mode, _instances)
 
     def act(self, context: bpy.types.Context) -> Answer:
-        """Copy them with their data to where they are seen; the instance is shown no more."""
+        """Copy them with their data to where they are seen, and hide the instance."""
         empty, real = context.object, []
         for place in list(placings([empty])):
             copy = place.obj.copy()
@@ -49,7 +48,7 @@ class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):
 
 
 def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
-    """Draw what the active object instances, and the button; whether it instances splats."""
+    """Draw the active object's instances and the button; whether it instances splats."""
     if _instances(context):
         return False
     count = sum(splat_count(place.obj.data) for place in placings([context.object]))

@@ -1,4 +1,4 @@
-"""What operators have in common: what they need to run, and how they say what went wrong."""
+"""Common parts of operators: needs, threads, error messages."""
 
 from __future__ import annotations
 
@@ -16,70 +16,61 @@ from ..mesh.layout import SplatObject
 from . import running
 from .running import Running
 
-Answer = set[str]
-"""What Blender is told of an operator: FINISHED, CANCELLED, RUNNING_MODAL or PASS_THROUGH."""
+Answer = set[str]  # FINISHED, CANCELLED, RUNNING_MODAL or PASS_THROUGH
 
-Need = Callable[[bpy.types.Context], str]
-"""Returns what an operator lacks to run, "" if nothing."""
+Need = Callable[[bpy.types.Context], str]  # Gives what an operator lacks to run, "" if nothing
 
-FAILURES = (RefineError, MemoryError)
-"""What an operator reports as an error; all else is a fault of the program."""
+FAILURES = (RefineError, MemoryError)  # Exceptions reported as errors; all others are bugs
 
 
 def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
-    """Report an error to the user, and return that nothing was done."""
+    """Report an error to the user; CANCELLED."""
     operator.report({"ERROR"}, described(error))
     return {"CANCELLED"}
 
 
 def described(error: Exception) -> str:
-    """Return one of `FAILURES` as a sentence."""
+    """One of `FAILURES` as a sentence."""
     if isinstance(error, MemoryError):
         return f"not enough memory ({error})" if str(error) else "not enough memory"
     return str(error)
 
 
 def idle(_context: bpy.types.Context) -> str:
-    """Return why another operation has to be over first, "" if none works on a thread."""
+    """A need: no other operation may run on a thread."""
     return running.refusal()
 
 
 def in_object_mode(context: bpy.types.Context) -> str:
-    """Return that object mode is needed, "" in it."""
+    """A need: object mode."""
     return "" if context.mode == "OBJECT" else "Go to object mode first"
 
 
 def on_splats(context: bpy.types.Context) -> str:
-    """Return that the active object must hold splats, "" if it does."""
+    """A need: the active object holds splats."""
     if mesh_layout.looks_like_splats(context.object):
         return ""
     return "Select an object that holds splats: import a file of splats"
 
 
 def out_of_edit_mode(context: bpy.types.Context) -> str:
-    """Return that the active object must leave edit mode, "" if it is not in it."""
+    """A need: the active object is not in edit mode."""
     return "Leave edit mode first" if context.object.mode == "EDIT" else ""
 
 
 def scored(context: bpy.types.Context) -> str:
-    """Return that the active object needs scores, "" if it has them."""
+    """A need: the active object has scores."""
     return "" if mesh_scores.record(context.object.data) else "Score the splats first"
 
 
 class Needing:
-    """An operator that can run if nothing of what it needs is missing.
-
-    Attributes
-    ----------
-    needs : tuple of Need
-        Asked in this order.
-    """
+    """An operator that can run if none of its `needs`, in order, is missing."""
 
     needs: tuple[Need, ...] = (idle,)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
+        """Whether the operator can run; Blender shows why not."""
         missing = next(filter(None, (need(context) for need in cls.needs)), "")
         if missing:
             cls.poll_message_set(missing)
@@ -99,14 +90,14 @@ class OnScored(OnSplats):
 
 
 class AtOnce:
-    """An operator that does all of it when it is clicked, without a thread."""
+    """An operator without a thread."""
 
     def act(self, context: bpy.types.Context) -> Answer:
-        """Do it; what is raised of `FAILURES` is reported as an error."""
+        """Do it; `FAILURES` are reported as errors."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> Answer:
-        """Do it, or report why it cannot be done."""
+        """Do it, or report why not."""
         try:
             return self.act(context)
         except FAILURES as error:
@@ -114,42 +105,31 @@ class AtOnce:
 
 
 class Job:
-    """An operator that works beside the window, with a bar to watch and a key to cancel.
-
-    It is three functions and a name. Meanwhile all events but Esc go on to the rest of the window.
-    Before anything is written to an object, it is compared with what it was.
-
-    Attributes
-    ----------
-    doing : str
-        What it does.
-    offers : str
-        What progress calls the part of the work that offers what it has reached when it is
-        cancelled (`Result.stopped`).
-    """
+    """An operator on a thread, with progress bar and Esc: three functions and a name, `doing`.
+    Other events go on to the window. Objects are compared with what they were before writing.
+    `offers`: the stage whose partial result is kept on cancel (`Result.stopped`)."""
 
     doing = offers = ""
-    by_hand = False
-    """Whether somebody watches: set by `invoke`, or before a file browser calls `execute`."""
+    by_hand = False  # Somebody watches: set by `invoke`, or before a file browser's `execute`
     _running: Running | None = None
 
     def gather(self, context: bpy.types.Context) -> tuple[list[SplatObject], Any]:
-        """The objects that `put` writes to, and all that `compute` needs, or what refuses it."""
+        """Objects that `put` writes to, and the input of `compute`; or raise why not."""
         raise NotImplementedError
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> Any:
-        """What comes of it; on any thread, with arrays alone."""
+        """The result; on any thread, with arrays only."""
         raise NotImplementedError
 
     def put(
         self, context: bpy.types.Context, group: list[SplatObject], job: Any, result: Any
     ) -> None:
-        """Write it to the objects, which are as they were: all of it, or nothing."""
+        """Write the result to the unchanged objects: all or nothing."""
         raise NotImplementedError
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
-        """Do it beside the window."""
+        """Start the work on a thread."""
         self.by_hand = True
         return self.execute(context)
 
@@ -166,7 +146,7 @@ class Job:
         return {"FINISHED"}
 
     def launch(self, context: bpy.types.Context) -> Answer:
-        """Read the scene, start the thread, and have Blender call `modal` from now on."""
+        """Read the scene, start the thread, and have Blender call `modal`."""
         try:
             self._running = Running(self, context, *self.gather(context))
         except FAILURES as error:
@@ -175,7 +155,7 @@ class Job:
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Wait for the thread, and put what it found."""
+        """Wait for the thread, then put its result."""
         now = self._running
         if now is None:
             return {"CANCELLED"}
@@ -187,13 +167,13 @@ class Job:
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """End the thread where Blender ends the operator: its window is closed, or its file."""
+        """End the thread when Blender ends the operator, closing its window or file."""
         if (now := self._running) is not None:
             self._over(context, now)
             now.worker.end()
 
     def _looked(self, context: bpy.types.Context, now: Running) -> Answer:
-        """Look how far the thread is; what is no failure is a fault, which Blender prints."""
+        """Check the thread; errors other than failures are bugs, which Blender prints."""
         try:
             main_thread.serve()
             if not now.done():
@@ -213,7 +193,6 @@ class Job:
         return {"FINISHED"}
 
     def _over(self, context: bpy.types.Context, now: Running) -> None:
-        """Let go of what ran, once."""
         if self._running is not None:
             self._running = None
             now.over(context)

@@ -1,7 +1,5 @@
 """Operators that score and prune splat objects.
-
-Read `REFINE_OT_apply` from `gather` to `put` to see what runs when *Apply* is clicked.
-"""
+Read `REFINE_OT_apply` from `gather` to `put` to see what runs when *Apply* is clicked."""
 
 from __future__ import annotations
 
@@ -32,20 +30,16 @@ from . import plans, staleness
 from .operator_bases import Answer, Job, OnScored, OnSplats, in_object_mode
 from .wrapped import counted
 
-_SCORED = 0.97
-"""Share of the time of a scoring after which only the splats in each view are to be counted."""
+_SCORED = 0.97  # Share of the scoring's time after which only splats in each view are counted
 
 
 def chosen_views(context: Context) -> ViewSet:
-    """Return the views of the cameras that the panel names."""
+    """Views of the panel's cameras."""
     return CameraChoice.of_scene(context.scene).views(context, context.object)
 
 
 def apply_arguments(context: Context, group: Members, forced: Forced) -> dict[str, Any]:
-    """The arguments of `prune` for the selected objects, by the settings of the panel.
-
-    `forced` is what must stay and what must go.
-    """
+    """Arguments of `prune` for the selected objects, from the panel's settings."""
     settings = context.scene.refine
     method = splat_group.possible(group, settings.to_method())
     views = chosen_views(context) if method.changes else None
@@ -58,7 +52,6 @@ def selected(context: Context) -> Members:
 
 
 def _of_objects(group: Members) -> str:
-    """How many objects were worked on, if more than one."""
     return f" of {len(group)} objects" if len(group) > 1 else ""
 
 
@@ -71,7 +64,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
     doing = "Scoring splats"
 
     def gather(self, context: Context) -> tuple[Members, Any]:
-        """The arguments of `score`, and where all of it stood (`staleness.origin`)."""
+        """The arguments of `score`, and the origin of all (`staleness.origin`)."""
         settings = context.scene.refine
         method, views = settings.to_method(), chosen_views(context)
         group = selected(context)
@@ -92,7 +85,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> tuple[Scores, NDArray[np.int64], float]:
-        """Scores, how many splats lie in each view, (V,), and how many seconds scoring took."""
+        """Scores, splats in each view, (V,), and seconds of scoring."""
         (arguments, _), start = job, time.perf_counter()
         scores = score(**arguments, progress=part(progress, 0.0, _SCORED))
         seconds = time.perf_counter() - start
@@ -102,7 +95,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         return scores, frustum.census(means, arguments["views"], progress=rest), seconds
 
     def put(self, context: Context, group: Members, job: Any, result: Any) -> None:
-        """Store the scores on the meshes and say what came of it."""
+        """Store the scores on the meshes and report them."""
         (arguments, origins), (scores, counts, seconds) = job, result
         pairs = zip(arguments["views"], counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
@@ -125,14 +118,11 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
 
 
 class _Applied(NamedTuple):
-    """What was decided of all objects, and what is to become of each."""
-
     result: Result
     changes: list[Change]
 
     @property
     def stopped(self) -> BaseException | None:
-        """By what it was ended early, if it was; see `Job.offers`."""
         return self.result.stopped
 
 
@@ -146,12 +136,12 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
     offers = REFITTING
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
-        """Delete at once; merge and refit beside the window."""
+        """Delete at once; merge and refit on a thread."""
         self.by_hand = context.scene.refine.to_method().changes
         return self.execute(context)
 
     def gather(self, context: Context) -> tuple[Members, Any]:
-        """The arguments of `prune`, what must stay and go, and what `changes` needs."""
+        """The arguments of `prune`, the demands, and the input of `changes`."""
         group = selected(context)
         for member in group:
             mesh_edit.check_deletable(member.obj)
@@ -161,13 +151,13 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> _Applied:
-        """Which splats stay, and what they become."""
+        """The kept splats and their new values."""
         arguments, _, frames = job
         result = prune(**arguments, partial=True, progress=progress)
         return _Applied(result, splat_group.changes(frames, result))
 
     def put(self, context: Context, group: Members, job: Any, applied: Any) -> None:
-        """Delete what does not stay, and change what does."""
+        """Delete removed splats, and change kept ones."""
         (arguments, forced, _), result = job, applied.result
         context.view_layer.update()
         if arguments["method"].changes:  # on a thread, while volumes can be moved
@@ -224,7 +214,7 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         return list(lod(*arguments, **masks, progress=progress))
 
     def put(self, _context: Context, group: Members, job: Any, made: Any) -> None:
-        """Make the objects and say what each level costs."""
+        """Make the objects and report each level's cost."""
         (splats, views, levels, _), _ = job
         collection = level_objects.add_levels(group[0], made, viewing_distance(splats, views))
         counts = [

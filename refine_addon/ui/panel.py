@@ -1,4 +1,4 @@
-"""The tab REFINE in the 3D view's sidebar, by what an artist does: it draws what is stored."""
+"""The tab REFINE in the 3D view's sidebar, by an artist's steps; it only draws what is stored."""
 
 from __future__ import annotations
 
@@ -45,7 +45,6 @@ class _InSidebar:
 
 
 def _named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
-    """A column of settings with their names beside them."""
     column = layout.column()
     column.use_property_split = True
     column.use_property_decorate = False
@@ -53,12 +52,12 @@ def _named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
 
 
 class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
-    """What is to be pruned, and how it is seen."""
+    """Splats to prune, and their display."""
 
     bl_label = "1 Splats"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the import, what the active object holds, and the ways to see it."""
+        """Draw the import, the active object's content, and the display modes."""
         layout, obj = self.layout, context.object
         layout.operator("refine.import_ply", icon="IMPORT")
         if mesh_layout.looks_like_splats(obj):
@@ -74,7 +73,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
 
 
 class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
-    """Who decides."""
+    """Cameras that decide."""
 
     bl_label = "2 Cameras"
 
@@ -113,7 +112,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
 
 
 class REFINE_PT_prune(_InSidebar, bpy.types.Panel):
-    """The dial: how, how much, and what that costs."""
+    """Method, budget, and their cost."""
 
     bl_label = "3 Prune"
 
@@ -146,13 +145,13 @@ class REFINE_PT_prune(_InSidebar, bpy.types.Panel):
 
 
 class REFINE_PT_clean(_InSidebar, bpy.types.Panel):
-    """What the cameras see past."""
+    """Floaters."""
 
     bl_label = "Clean"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the strength, how many splats float by that, and the buttons."""
+        """Draw the strength, its number of floaters, and the buttons."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.row(align=True).prop(settings, "strength", expand=True)
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
@@ -170,13 +169,13 @@ class REFINE_PT_clean(_InSidebar, bpy.types.Panel):
 
 
 class REFINE_PT_protect(_InSidebar, bpy.types.Panel):
-    """What must stay and what must go."""
+    """Protected splats and those removed by the user."""
 
     bl_label = "Protect"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw marks, volumes, and how many splats they concern."""
+        """Draw marks, volumes, and the splats in them."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
         facts = demands.facts(obj.data) if mesh_layout.looks_like_splats(obj) else {}
         layout.prop(settings, "protect", text="", icon="GROUP_VERTEX", placeholder="Vertex group")
@@ -204,7 +203,7 @@ class REFINE_PT_protect(_InSidebar, bpy.types.Panel):
 
 
 class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):
-    """The ways out."""
+    """Export, levels, render."""
 
     bl_label = "Deliver"
 
@@ -223,10 +222,8 @@ class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):
 
 
 def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
-    """Draw how far an operator is that works on a thread, if it is one of these.
-
-    To be called last: Blender 4.3 draws a label as a bar that takes the place of one in a panel.
-    """
+    """Draw the running operator's progress, last of all:
+    in a panel, Blender 4.3 replaces a bar by a label drawn later."""
     now = running.now()
     if now is not None and now.operator in names:
         layout.progress(factor=now.factor, text=now.share)
@@ -236,7 +233,6 @@ def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *name
 def _draw_objects(
     layout: bpy.types.UILayout, context: bpy.types.Context, objects: Sequence[bpy.types.Object]
 ) -> None:
-    """Draw what the objects hold that are worked on."""
     obj = context.object
     count = sum(mesh_layout.splat_count(each.data) for each in objects)
     degree = max(mesh_layout.sh_degree(each.data) for each in objects)
@@ -257,7 +253,6 @@ def _draw_plan(
     record: dict[str, Any] | None,
     plan: dict[str, Any] | None,
 ) -> None:
-    """Draw what the budget comes to, and what the cameras do not know of it."""
     obj = context.object
     if record is None:
         lost = mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes
@@ -281,7 +276,7 @@ def _draw_plan(
 
 
 def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
-    """Draw the ways to see splats as splats; those that need scores wait for them."""
+    """Draw the display modes; those that need scores wait for them."""
     now, attributes = viewport_draw.mode(), obj.data.attributes if obj else ()
     needs = {"HEAT": mesh_scores.RANK, "STAYS": mesh_edit.REMOVE, "GOES": mesh_edit.REMOVE}
     grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
@@ -295,12 +290,10 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
 
 
 def _record(obj: bpy.types.Object | None) -> dict[str, Any] | None:
-    """The record of an object's scoring, None without."""
     return mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
 
 
 def _model_is_open(obj: bpy.types.Object) -> bool:
-    """Whether the file of splats did not say how they are drawn."""
     try:
         layout = mesh_layout.layout_of(obj)
     except RefineError:
@@ -313,7 +306,6 @@ def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 
 def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
-    """What changed since the objects that are worked on were scored."""
     objects = splat_group.chosen(context.view_layer, obj)
     question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
     return cached(question, context, lambda: staleness.changes(context, *objects))

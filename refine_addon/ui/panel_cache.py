@@ -1,4 +1,4 @@
-"""What panels say of the scene, computed once until the scene changes, not at each draw."""
+"""Values for panels, computed once until the scene changes, not at each draw."""
 
 from __future__ import annotations
 
@@ -13,23 +13,11 @@ Answer = TypeVar("Answer")
 _answers: dict[Hashable, Any] = {}
 
 _EVENTS = ("depsgraph_update_post", "frame_change_post", "undo_post", "redo_post", "load_post")
-"""Handlers that are called after anything changed, the settings too."""
 
 
 def cached(what: Hashable, context: bpy.types.Context, compute: Callable[[], Answer]) -> Answer:
-    """What `compute` returns of the active object and the settings, until anything changes.
-
-    What a script changes without telling Blender, such as a custom property, is seen after the next
-    change.
-
-    Parameters
-    ----------
-    what : hashable
-        Names the value, beside the object and the settings.
-    context : bpy.types.Context
-    compute : callable
-        Reads the scene, the active object and the panel's settings, and nothing else.
-    """
+    """Value of `compute` (of the scene, active object, settings), kept until anything changes.
+    A script's silent changes, such as custom properties, show after the next change."""
     obj, settings = context.object, context.scene.refine
     names = set(settings.bl_rna.properties.keys()) - {"rna_type", "name"}
     values = repr([getattr(settings, name) for name in sorted(names)])
@@ -45,13 +33,13 @@ def _forget(*_arguments: object) -> None:
 
 
 def register() -> None:
-    """Hear of changes."""
+    """Add the handlers."""
     for event in _EVENTS:
         getattr(bpy.app.handlers, event).append(_forget)
 
 
 def unregister() -> None:
-    """Hear of changes no more."""
+    """Remove the handlers."""
     for event in _EVENTS:
         getattr(bpy.app.handlers, event).remove(_forget)
     _forget()

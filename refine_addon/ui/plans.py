@@ -1,7 +1,5 @@
-"""What the budget of the panel comes to: worked out when its slider rests, not when drawn.
-
-So is what must stay and go: it is marked anew when a volume or a mark has changed.
-"""
+"""Plans: the budget's effect, computed when the slider rests, not when drawn.
+Protected and removed splats likewise: marked anew after a volume or a mark has changed."""
 
 from __future__ import annotations
 
@@ -28,24 +26,21 @@ from ..objects import demands, splat_group
 from ..objects.splat_group import Outcome
 from . import camera_list, chart, running
 
-REST = 0.2
-"""Seconds without a change after which a slider has come to rest."""
+REST = 0.2  # Seconds without a change after which a slider rests
 
 WAYS: dict[str, Way] = {"occlusion": "delete", "merge": "merge", "refit": "refit"}
-"""What each method does of those whose scores know what hides what."""
+"""What each method does after scoring with occlusion."""
 
-_made: list[tuple[Any, dict[str, Any]]] = []
-"""The last plan, and what it depends on; one at most."""
+_made: list[tuple[Any, dict[str, Any]]] = []  # The last plan, and its key; one at most
 
 _waiting: list[tuple[str, str]] = []
-"""Names of scene and objects that are to be marked as soon as the slider rests."""
+"""Scene and objects, by name, to be marked when the slider rests."""
 
-_edited: set[str] = set()
-"""Names of objects in edit mode whose marks have changed, and are counted after it."""
+_edited: set[str] = set()  # Objects in edit mode, by name, with changed marks, to be counted later
 
 
 def changed(context: bpy.types.Context) -> None:
-    """Have the plan for another budget made when the slider rests, in scripts at once."""
+    """Plan another budget when the slider rests, in scripts at once."""
     obj = getattr(context, "object", None)  # not in every editor
     if bpy.app.background:
         refresh(context)
@@ -54,18 +49,15 @@ def changed(context: bpy.types.Context) -> None:
 
 
 def refresh(context: bpy.types.Context) -> None:
-    """Make the plan of the active object if it has scores, and mark what goes."""
+    """Plan for the active object if it has scores, and mark removed splats."""
     obj = getattr(context, "object", None)
     if obj is not None:
         _refresh(context.scene, [obj])
 
 
 def mark_again(context: bpy.types.Context) -> None:
-    """Mark soon which splats must stay and go: that may have changed.
-
-    Of the active object, or else the first that is visible, and of others that are selected, or
-    have marks or scores.
-    """
+    """Mark soon which splats are protected and removed.
+    Of the active or first visible object, and others selected, marked or scored."""
     active = getattr(context, "object", None)
     objects = [obj for obj in context.scene.objects if mesh_layout.looks_like_splats(obj)]
     first = [active] if active in objects else [obj for obj in objects if obj.visible_get()][:1]
@@ -78,24 +70,24 @@ def mark_again(context: bpy.types.Context) -> None:
 
 
 def mark_after_edit_mode(obj: bpy.types.Object) -> None:
-    """Have all marked again when an object leaves edit mode, in which nothing can be counted."""
+    """Mark all again when an object leaves edit mode, where nothing can be counted."""
     _edited.add(obj.name)
 
 
 def ask(context: bpy.types.Context) -> None:
-    """Have the plan of the active object made soon where it is missing; called when drawn."""
+    """Plan soon for the active object if no plan exists; called when drawn."""
     obj, settings = context.object, context.scene.refine
     if not bpy.app.background and not _waiting and stored(obj, settings) is None and _can_have(obj):
         _wait(context.scene, [obj], 0.0)
 
 
 def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
-    """The plan if it is that of an object and a budget as they are, else None."""
+    """The plan of this object and budget, else None."""
     return _made[0][1] if _made and _made[0][0] == _key(obj, settings) else None
 
 
 def shown(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
-    """The plan to draw: while another is made that of another budget, of the same scores."""
+    """The plan to draw: while a new one is made, the last of the same scores."""
     same = _waiting and _made and _made[0][0][0] == _key(obj, settings)[0]
     return _made[0][1] if same else stored(obj, settings)
 
@@ -103,8 +95,6 @@ def shown(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
 def sentence(plan: dict[str, Any]) -> str:
     """What a plan without an error keeps.
 
-    Examples
-    --------
     >>> plan = {"splats": 100, "kept": 50, "bytes_before": 5e6, "bytes_after": 2.5e6}
     >>> sentence(plan | {"about": False})
     'Keeps 50 of 100, 2.5 of 5.0 MB'
@@ -115,7 +105,7 @@ def sentence(plan: dict[str, Any]) -> str:
 
 
 def price(plan: dict[str, Any] | None, method: str) -> str:
-    """What a method of the dial costs with the budget of a plan, dB and seconds, "" if unknown."""
+    """A method's cost under a plan's budget, dB and seconds, "" if unknown."""
     curve: Quality | None = plan.get("quality") if plan else None
     if plan is None or curve is None or plan["closed"] != (method == ClosedForm.name):
         return ""
@@ -132,15 +122,7 @@ def price(plan: dict[str, Any] | None, method: str) -> str:
 
 
 def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
-    """What the cameras do not know, as far as it matters to a plan without an error.
-
-    Parameters
-    ----------
-    plan : dict
-        See `stored`.
-    record : dict
-        The record of the scoring.
-    """
+    """What cameras of a scoring (`record`) do not know, if it matters to an errorless plan."""
     alignment = Alignment.from_facts(record.get("alignment"))
     curve, share, texts = plan["quality"], plan["share"], [alignment.turned()]
     if record["views_used"] == 1:
@@ -165,19 +147,16 @@ def _sentence(note: str) -> str:
 
 
 def _can_have(obj: bpy.types.Object) -> bool:
-    """Whether an object can have a plan: it is scored, and may be written to."""
     return _is_ours(obj) and mesh_scores.record(obj.data) is not None
 
 
 def _is_ours(obj: bpy.types.Object) -> bool:
-    """Whether an object holds splats that may be marked."""
     if not mesh_layout.looks_like_splats(obj) or obj.mode == "EDIT":
         return False
     return not obj.data.library and not obj.library
 
 
 def _key(obj: bpy.types.Object, settings: Any) -> Any:
-    """What a plan depends on: the objects that *Apply* would work on, scores, and settings."""
     objects = splat_group.chosen(bpy.context.view_layer, obj)
     scorings = [
         (
@@ -196,7 +175,7 @@ def _key(obj: bpy.types.Object, settings: Any) -> Any:
 
 
 def _wait(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: float) -> None:
-    """Have `_refresh` done after so long, or later if it is asked for others meanwhile."""
+    """Schedule `_refresh`, later if it is asked for others meanwhile."""
     asked = [(scene.name, obj.name) for obj in objects]
     _waiting[:] = [*asked, *(pair for pair in _waiting if pair not in asked)]
     if bpy.app.timers.is_registered(_rested):
@@ -205,7 +184,6 @@ def _wait(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: 
 
 
 def _rested() -> None:
-    """Do what is waited for; Blender's timer calls it once."""
     pairs = [(bpy.data.scenes.get(scene), bpy.data.objects.get(name)) for scene, name in _waiting]
     objects = [obj for scene, obj in pairs if scene is not None and obj is not None]
     if objects:
@@ -215,7 +193,7 @@ def _rested() -> None:
 
 
 def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> None:
-    """Make the plans of objects, without scores mark what must stay and go; the first one last."""
+    """Plan for the objects, or without scores mark their demands; the first one last."""
     done: set[bpy.types.Object] = set()
     firsts = []
     for obj in objects:
@@ -236,7 +214,6 @@ def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> Non
 
 
 def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
-    """Decide by the budget as *Apply* would, and mark what goes."""
     settings, record = scene.refine, mesh_scores.record(obj.data) or {}
     group = splat_group.members(bpy.context.view_layer, mesh_layout.check(obj))
     forced, budget = splat_group.refresh(scene, group), settings.to_budget()
@@ -281,7 +258,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
 
 @persistent
 def _undone(*_: object) -> None:
-    """Mark anew what may be marked as before or after a step, and draw the chart that belongs."""
+    """After undo or redo, mark again what may differ, and draw the right chart."""
     _made.clear()
     if not bpy.app.background:
         (mark_again if bpy.context.scene.refine.volumes else changed)(bpy.context)
@@ -289,7 +266,7 @@ def _undone(*_: object) -> None:
 
 @persistent
 def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
-    """Hear of volumes that move, of splats that move under them, and of the end of edit mode."""
+    """Watch moving volumes, splats moving under them, and the end of edit mode."""
     if depsgraph is None or bpy.app.background:
         return
     edited = {bpy.data.objects.get(name) for name in _edited} - {None}
@@ -313,13 +290,13 @@ _EVENTS = {
 
 
 def register() -> None:
-    """Hear of changes."""
+    """Add the handlers."""
     for event, heard in _EVENTS.items():
         getattr(bpy.app.handlers, event).append(heard)
 
 
 def unregister() -> None:
-    """Hear of changes no more, and make no more plans."""
+    """Remove the handlers, and plan no more."""
     for event, heard in _EVENTS.items():
         getattr(bpy.app.handlers, event).remove(heard)
     if bpy.app.timers.is_registered(_rested):

@@ -1,4 +1,4 @@
-"""What a user sets once: defaults of the panel in scenes into which splats are imported."""
+"""Preferences: the panel's defaults in scenes that splats are imported into."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty
 
 from .properties import METHOD, UPRIGHT_TEXT, VIEWS, RefineSettings
 
-PACKAGE = __package__.rpartition(".")[0]
-"""The name under which the extension is enabled, such as ``bl_ext.user_default.refine_addon``."""
+PACKAGE = __package__.rpartition(".")[0]  # Such as ``bl_ext.user_default.refine_addon``
 
-DEFAULTS = ("method", "views")
-"""The preferences that are settings of a scene, by the same names."""
+DEFAULTS = ("method", "views")  # Preferences that are scene settings of the same name
 
 
 class RefinePreferences(bpy.types.AddonPreferences):
-    """Defaults, in the preferences of Blender beside the extension."""
+    """Defaults, in Blender's preferences beside the extension."""
 
     bl_idname = PACKAGE
 
@@ -36,28 +34,27 @@ class RefinePreferences(bpy.types.AddonPreferences):
 
 
 def give_defaults(context: bpy.types.Context) -> None:
-    """Set what nobody has set in a scene yet; in a window only: scripts say what they want."""
+    """Fill a scene's unset settings; in a window only, as scripts say what they want."""
     chosen = _chosen(context)
     if chosen is not None and not bpy.app.background:
         fill(context.scene.refine, chosen)
 
 
 def fill(settings: RefineSettings, chosen: RefinePreferences) -> None:
-    """Set what a user prefers, and has not set in these settings yet."""
+    """Set preferred values that these settings do not set yet."""
     for name in DEFAULTS:
         if chosen.is_property_set(name) and not settings.is_property_set(name):
             setattr(settings, name, getattr(chosen, name))
 
 
 def suggest(operator: Any, context: bpy.types.Context, name: str) -> None:
-    """Give an operator that asks for its options the default of one that was not given."""
+    """Give an operator that asks for its options the default of one not given."""
     chosen = _chosen(context)
     if chosen is not None and not operator.properties.is_property_set(name):
         setattr(operator, name, getattr(chosen, name))
 
 
 def _chosen(context: bpy.types.Context) -> RefinePreferences | None:
-    """Return the preferences; None where the extension is not enabled as one."""
     addon = context.preferences.addons.get(PACKAGE)
     if addon is None:
         return None

@@ -1,4 +1,4 @@
-"""What the user sets in the panel, and its conversion to the settings of core."""
+"""The panel's settings, and their conversion to those of core."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ METHODS = (
         "Merges, then fits what stays to what all splats looked like: closest, and slowest",
     ),
 )
-"""The dial, from instant to best, by the names of core."""
+"""The dial, from instant to best, by core's names."""
 
 HINTS = {
     "closed-form": "rows stay as they were",
@@ -59,7 +59,7 @@ HINTS = {
     "merge": "what goes is merged",
     "refit": "merged, then fitted",
 }
-"""What the panel says of each before there are scores."""
+"""The panel's text on each method before there are scores."""
 
 BUDGETS = (
     ("ratio", "Share", "Remove this share of the splats"),
@@ -67,7 +67,7 @@ BUDGETS = (
     ("max_mb", "File Size", "Keep as many splats as fit in a file of this size"),
     ("psnr", "Quality", "Remove as many splats as leave the pictures this close to the unpruned"),
 )
-"""Kinds of budget, by the names that core gives them."""
+"""Kinds of budget, by core's names."""
 
 UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
@@ -97,14 +97,14 @@ DRAWN = (
     ),
     ("2dgs", "2DGS", "Flat discs without a third scale"),
 )
-"""How splats are drawn, by the names of `rendering.MODELS` and in their order."""
+"""Drawing models, by the names of `rendering.MODELS` and in their order."""
 
 STRENGTHS = (
     ("CAREFUL", "Careful", "What stands in front of surfaces, and small clusters by themselves"),
     ("USUAL", "Usual", "Also huge veils, and needles that cross the pictures"),
     ("STRONG", "Strong", "Also what floats and changes no picture visibly, near cameras too"),
 )
-"""How much of what floats goes."""
+"""How many of the floaters are removed."""
 
 _REASONS = {
     "CAREFUL": ("front", "isolated"),
@@ -143,7 +143,6 @@ def _set_model(_settings: RefineSettings, value: int) -> None:
 
 
 def _mark_floaters(settings: RefineSettings, context: bpy.types.Context) -> None:
-    """Mark what floats by the strength chosen as what goes, if it was looked for."""
     obj = getattr(context, "object", None)  # not in every editor
     if not mesh_layout.looks_like_splats(obj) or floaters.counts(obj.data) is None:
         return
@@ -156,7 +155,6 @@ def _mark_floaters(settings: RefineSettings, context: bpy.types.Context) -> None
 def _protectable(
     _settings: RefineSettings, context: bpy.types.Context, _text: str
 ) -> Iterator[str]:
-    """Suggest what the active object has that can protect splats."""
     obj = context.object
     if mesh_layout.looks_like_splats(obj):
         yield from (group.name for group in obj.vertex_groups)
@@ -168,13 +166,9 @@ def _protectable(
 
 
 def decimal(value: float) -> float:
-    """Return the number that the user typed: Blender keeps 0.29 as 0.28999999165534973.
+    """The number as typed: else the panel would remove other splats than the command.
 
-    Without this, the panel would remove another number of splats than the command.
-
-    Examples
-    --------
-    >>> decimal(0.28999999165534973)
+    >>> decimal(0.28999999165534973)  # as Blender keeps 0.29
     0.29
     """
     return float(str(np.float32(value)))
@@ -263,7 +257,7 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
 
     @property
     def ratio(self) -> float:
-        """The share of the splats to remove, 0 to 1, of which `percent` is a hundred times."""
+        """Share of splats to remove, 0 to 1, from `percent`."""
         return decimal(decimal(self.percent) / 100.0)
 
     @ratio.setter
@@ -271,29 +265,17 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         self.percent = 100.0 * value
 
     def to_method(self) -> Method:
-        """The method of core; raises `RefineError` where a value cannot be."""
+        """Core's method."""
         return CORE_METHODS[self.method](self.views)
 
     def to_budget(self) -> Budget:
-        """Return the budget of core.
-
-        Raises
-        ------
-        RefineError
-            If it cannot be.
-        """
+        """Core's budget."""
         value = getattr(self, self.budget)
         amount: dict[str, Any] = {self.budget: value if self.budget == "keep" else decimal(value)}
         return Budget(**amount)
 
     def to_levels(self) -> Levels:
-        """Return the levels of detail of core.
-
-        Raises
-        ------
-        RefineError
-            If they cannot be.
-        """
+        """Core's levels of detail."""
         try:
             shares = tuple(float(word) for word in self.levels.split(","))
         except ValueError as error:
@@ -303,11 +285,11 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         return Levels(shares)
 
     def to_frames(self, scene: bpy.types.Scene) -> range:
-        """Return the frames whose views count."""
+        """Frames whose views count."""
         return range(scene.frame_start, scene.frame_end + 1, self.frame_step)
 
     def to_reasons(self) -> tuple[str, ...]:
-        """Why a splat counts as a floater, by the names of core."""
+        """Reasons for floaters, by core's names."""
         return _REASONS[self.strength]
 
 

@@ -34,7 +34,7 @@ class REFINE_OT_protect(AtOnce, Needing, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
-        """Return the tooltip of a button."""
+        """A button's tooltip."""
         return next(text for name, _, text in _ITEMS if name == properties.mark)
 
     def act(self, context: bpy.types.Context) -> Answer:
@@ -62,7 +62,7 @@ class REFINE_OT_protect(AtOnce, Needing, bpy.types.Operator):
 
 
 def _mark_in_edit_mode(obj: bpy.types.Object, name: str, value: bool) -> None:
-    """Change the marks of the selected vertices, which Blender itself has to write there."""
+    """Change marks of selected vertices, which only Blender can write there."""
     mesh = obj.data
     marks = mesh.attributes.get(name)
     if marks and (marks.data_type, marks.domain) != ("BOOLEAN", "POINT"):

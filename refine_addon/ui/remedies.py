@@ -1,4 +1,4 @@
-"""Operators on the cameras that decide: a ring of them around the splats, and a turn of all."""
+"""Operators on deciding cameras: a ring of them around the splats, and a turn of all."""
 
 from __future__ import annotations
 
@@ -20,14 +20,11 @@ from ..objects import demands, splat_group
 from .operator_bases import Answer, AtOnce, OnSplats
 from .wrapped import counted
 
-_INNER = (5.0, 95.0)
-"""Percentiles of the splats' positions that a ring frames: floaters far away do not count."""
+_INNER = (5.0, 95.0)  # Percentiles of positions that a ring frames: far floaters do not count
 
-_ELEVATIONS = (15.0, 40.0)
-"""Degrees above the horizon of the cameras of a ring, by turns."""
+_ELEVATIONS = (15.0, 40.0)  # Degrees above the horizon of a ring's cameras, in turn
 
-_MARGIN = 1.1
-"""How many times as far away a camera stands as would just do."""
+_MARGIN = 1.1  # Distance of a camera over the least that frames all
 
 
 class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
@@ -47,7 +44,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
     )
 
     def act(self, context: bpy.types.Context) -> Answer:
-        """Turn them, those whose place is animated by a parent."""
+        """Turn them, or the parents that animate them."""
         context.view_layer.update()  # or what a script just made stands at the origin
         cameras = _deciding(context)
         roots = _roots(cameras, context.object)
@@ -101,7 +98,7 @@ class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
 
 
 def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """The cameras that decide, of a shot all of it; raises `RefineError` without one."""
+    """Deciding cameras, of a shot all of it; raises `RefineError` without one."""
     scene, choice = context.scene, CameraChoice.of_scene(context.scene)
     cameras = choice.cameras(context)
     if choice.source == "FRAMES":
@@ -113,7 +110,7 @@ def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 
 def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> list[bpy.types.Object]:
-    """What to turn for cameras to turn without the splats, or raise `RefineError`."""
+    """Objects to turn so that cameras turn without the splats; else `RefineError`."""
     ancestors = [splats]  # of the splats, with themselves
     while ancestors[-1].parent:
         ancestors.append(ancestors[-1].parent)
@@ -139,7 +136,6 @@ def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> lis
 
 
 def _ball(checked: mesh_layout.SplatObject) -> tuple[mathutils.Vector, float]:
-    """Middle and radius of the ball around most of an object's splats, or raise `RefineError`."""
     means = demands.world_means(checked)
     means = means[np.isfinite(means).all(axis=1)]
     if not len(means):
@@ -152,7 +148,6 @@ def _ball(checked: mesh_layout.SplatObject) -> tuple[mathutils.Vector, float]:
 def _camera(
     scene: bpy.types.Scene, middle: mathutils.Vector, away: mathutils.Vector, radius: float
 ) -> bpy.types.Object:
-    """Make a camera in a direction; it frames the ball in renders of the scene's size."""
     data, render = bpy.data.cameras.new("Ring"), scene.render
     width = render.resolution_x * render.pixel_aspect_x
     height = render.resolution_y * render.pixel_aspect_y
@@ -168,7 +163,6 @@ def _camera(
 
 
 def _join(context: bpy.types.Context, ring: bpy.types.Collection) -> None:
-    """Have a ring decide with the cameras that decide already."""
     scene, settings = context.scene, context.scene.refine
     parent = settings.collection if settings.source == "COLLECTION" else None
     if parent and not parent.library:

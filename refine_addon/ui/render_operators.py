@@ -1,7 +1,5 @@
-"""*Render with Splats*: an operator that has Blender do one render after another, and waits.
-
-F12 does not show splats: the status bar says which button does.
-"""
+"""*Render with Splats*: an operator that has Blender do one render after another.
+F12 does not show splats: the status bar names the right button."""
 
 from __future__ import annotations
 
@@ -27,45 +25,35 @@ from .operator_bases import FAILURES, Answer, Needing, fail, idle
 from .running import Running, now
 from .wrapped import counted
 
-IMAGE = "Render with Splats"
-"""Name of the image that shows the last frame."""
+IMAGE = "Render with Splats"  # Name of the image with the last frame
 
 _ENDS_UNSEEN = bpy.app.version < (5, 0, 0)
-"""Whether Blender frees what a render draws with while it goes on, unless a window shows its scene.
+"""Blender frees a running render's GPU data unless a window shows its scene. See its
+`RE_FreeUnusedGPUResources`; one frame in sixty ended Blender 4.3 on X11."""
 
-See `RE_FreeUnusedGPUResources` in its source; one frame of sixty ended Blender 4.3 on X11.
-"""
-
-_SETTLED = 0.5
-"""Seconds after a render in which windows have drawn themselves; see `_draw_whole`."""
+_SETTLED = 0.5  # Seconds after a render until windows have drawn; see `_draw_whole`
 
 
 NOTICE = "Splats are not in this render: use Render > Render with Splats"
-"""What is said."""
 
 IN_BACKGROUND = "refine: splats are not in this render; use --command refine render"
-"""What is said where there is no window."""
 
-_LINGERS = 10.0
-"""Seconds that it stays when the render is over."""
+_LINGERS = 10.0  # Seconds that it stays after the render
 
 _until: list[float] = []
 
 
 @dataclass
 class _Watch:
-    """One render of Blender's during which Esc is watched for."""
-
     escaped: bool = False
     over: bool = False
 
 
 _watch = _Watch(over=True)
-"""The one under way."""
 
 
 def _watch_anew() -> None:
-    """Watch for Esc ahead of what waits for it so far, in all windows: one may show the render."""
+    """Watch for Esc ahead of other handlers, in all windows: one may show the render."""
     global _watch
     _watch.over, _watch = True, _Watch()
     for window in bpy.context.window_manager.windows:
@@ -74,7 +62,7 @@ def _watch_anew() -> None:
 
 
 def no_render(_context: bpy.types.Context) -> str:
-    """Return that a render has to be over first, "" if none is under way."""
+    """A need: no render runs."""
     return "A render is under way" if bpy.app.is_job_running("RENDER") else ""
 
 
@@ -120,7 +108,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: REFINE_OT_render) -> str:
-        """Return the tooltip of a button."""
+        """A button's tooltip."""
         if properties.animation:
             return "Render all frames with splats, and write them where the scene's Output says"
         return str(cls.__doc__)
@@ -138,7 +126,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         return self._finished(context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
-        """Start the first render, unless there is nobody to watch."""
+        """Start the first render, unless nobody watches."""
         if bpy.app.background or context.window is None:
             return self.execute(context)
         self._begin(context)
@@ -162,7 +150,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         return {"PASS_THROUGH"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Clean up where Blender ends the operator: its window is closed, or its file."""
+        """Clean up when Blender ends the operator, closing its window or file."""
         self._over(context)
 
     def _begin(self, context: bpy.types.Context) -> None:
@@ -176,11 +164,8 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         self._next: copies.Step | None = None
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
-        """Take what the last render came to, or start the next one.
-
-        An Esc may wait behind this event, and Blender's renders forget it when they begin: one
-        begins at the next event.
-        """
+        """Take the last render's result, or start the next one at the next event:
+        an Esc may wait behind this one, and renders forget it as they begin."""
         try:
             if self._shared.stopped or self._steps is None:
                 return self._stopped(context)
@@ -204,7 +189,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def _render(self, context: bpy.types.Context, step: copies.Step) -> None:
-        """Have Blender render; only the first time it opens what shows renders, as F12 does."""
+        """Make Blender render; the first time it opens its render view, as F12 does."""
         number, total = len(self._shared.frames) + 1, len(self._frames)
         worker = self._running.worker
         worker.what = f"frame {number} of {total}: {step.what}" if total > 1 else step.what
@@ -228,7 +213,6 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         _watch_anew()
 
     def _show(self) -> None:
-        """Show the last frame wherever a render is shown."""
         picture, self._shared.picture = self._shared.picture, None
         if picture is None:
             return
@@ -260,7 +244,6 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         return {"CANCELLED"}
 
     def _over(self, context: bpy.types.Context) -> None:
-        """Remove all that was made for the render."""
         _watch.over = True
         if self._steps is not None:
             self._steps.close()
@@ -273,13 +256,13 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
 
 def _draw_whole() -> None:
-    """Have windows drawn whole: where a scene was changed, 4.3 leaves the top bar empty."""
+    """Redraw whole windows: where a scene changed, 4.3 leaves the top bar empty."""
     for window in bpy.context.window_manager.windows:
         window.screen.show_statusbar = window.screen.show_statusbar
 
 
 def draw_buttons(layout: bpy.types.UILayout) -> None:
-    """Draw the buttons of the panel, and how far a render is."""
+    """Draw the panel's buttons and a render's progress."""
     column = layout.column(align=True)
     column.operator("refine.render", text="Render with Splats", icon="RENDER_STILL")
     text = "Render Animation"
@@ -298,7 +281,7 @@ def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
 
 
 def register() -> None:
-    """Say it when F12 leaves splats out, and clean up after steps back."""
+    """Add handlers: for F12 without splats, and to clean up after undo."""
     for calls, handler in _handlers():
         calls.append(handler)
 
@@ -317,7 +300,7 @@ def _handlers():
 
 @persistent
 def _began(scene: bpy.types.Scene, *_: object) -> None:
-    """Look whether a render leaves splats out; called on the thread that renders."""
+    """Check whether a render leaves splats out; runs on the rendering thread."""
     if copies.MARK in scene:
         return
     shown = (layer.objects for layer in scene.view_layers if layer.use)
@@ -331,7 +314,6 @@ def _began(scene: bpy.types.Scene, *_: object) -> None:
 
 
 def _say() -> float | None:
-    """Say it until the render has been over for a while."""
     if bpy.app.is_job_running("RENDER"):
         _until[0] = time.monotonic() + _LINGERS
     over = time.monotonic() > _until[0]
@@ -344,7 +326,7 @@ def _say() -> float | None:
 
 @persistent
 def _returned(*_: object) -> None:
-    """Remove what a step back, or a file, has brought of a render that is over."""
+    """Remove leftovers of a finished render that an undo or a file brought back."""
     if not bpy.app.is_job_running("RENDER"):
         copies.remove_all()
         restore()

@@ -1,4 +1,4 @@
-"""The operation that works on a thread: one at most, as panels, polls and menus see it."""
+"""The operation on a thread, one at most, as panels, polls and menus see it."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from .worker import Worker
 
-_STEP = 0.05
-"""Seconds between two events of the timer, at each of which the thread is looked at."""
+_STEP = 0.05  # Seconds between two looks at the thread
 
 
 class Target(NamedTuple):
-    """An object as it was read: known by its number in this session, which an undo keeps."""
+    """An object as read, known by its number in this session, which an undo keeps."""
 
     name: str
     uid: int
@@ -29,28 +28,16 @@ class Target(NamedTuple):
 
     @classmethod
     def of(cls, checked: SplatObject) -> Target:
-        """What an object is now."""
+        """An object's present state."""
         obj, mesh = checked.obj, checked.mesh
         splats = mesh.session_uid, len(checked), mesh_attributes.digest(checked)
         return cls(obj.name, obj.session_uid, obj.mode, splats)
 
 
 class Running:
-    """An operation while it runs: all that an operator holds of it, dropped when it is over.
-
-    Blender keeps operators in its history, which must not keep splats in memory.
-
-    Attributes
-    ----------
-    operator : str
-        Name of the operator, as a button has it.
-    job
-        What was gathered from the scene.
-    worker : Worker
-        Where given, what stands for one: how far a render is, and how it is stopped.
-    waits : str
-        What has to happen before the result can be written, "" if nothing.
-    """
+    """A running operation; dropped at its end, as Blender's history must not keep splats.
+    `operator`: its name; `job`: data from the scene; `worker`: or a render's stand-in; `waits`:
+    what must happen before the result is written, "" if nothing."""
 
     def __init__(
         self,
@@ -70,7 +57,7 @@ class Running:
         self.tell(context)
 
     def objects(self) -> list[bpy.types.Object]:
-        """The objects that are to be written to; raises `RefineError` once one was deleted."""
+        """Objects to write to; raises `RefineError` once one was deleted."""
         there = {obj.session_uid: obj for obj in bpy.data.objects}
         found = [there.get(target.uid) for target in self._targets]
         for obj, target in zip(found, self._targets, strict=True):
@@ -81,7 +68,7 @@ class Running:
         return found
 
     def done(self) -> bool:
-        """Whether the thread has ended and its result can be written; see `waits`."""
+        """Whether the thread ended and its result can be written; see `waits`."""
         pairs = zip(self.objects(), self._targets, strict=True)
         if self.worker.running():
             return False
@@ -93,7 +80,7 @@ class Running:
         return not self.waits
 
     def unchanged(self) -> list[SplatObject]:
-        """The objects, whose splats are still those that were read; raises `RefineError` else."""
+        """The objects; `RefineError` if their splats changed since."""
         group = [mesh_layout.check(obj) for obj in self.objects()]
         for checked, target in zip(group, self._targets, strict=True):
             if Target.of(checked).splats != target.splats:
@@ -104,18 +91,18 @@ class Running:
 
     @property
     def at_escape(self) -> str:
-        """What Esc does at this moment."""
+        """What Esc does now."""
         keeps = self._offers and self.worker.what == self._offers and not self.waits
         return "keeps what that has reached" if keeps else "cancels"
 
     @property
     def factor(self) -> float:
-        """How much is done, 0 to 1."""
+        """Share done, 0 to 1."""
         return self.worker.fraction
 
     @property
     def share(self) -> str:
-        """How much is done and how long the rest takes, as short as a bar wants it."""
+        """Share done and time left, short enough for a bar."""
         if self.waits:
             return "done"
         left = self._left.seconds(self.factor)
@@ -123,14 +110,14 @@ class Running:
 
     @property
     def sentence(self) -> str:
-        """What is being done, and what Esc does."""
+        """The current work, and what Esc does."""
         if self.waits:
             return f"{self.doing}: {self.waits} (Esc {self.at_escape})"
         what = f" ({self.worker.what})" if self.worker.what else ""
         return f"{self.doing}{what}; Esc {self.at_escape}"
 
     def tell(self, context: bpy.types.Context) -> None:
-        """Say in status bar and panels how far it is, if there is news."""
+        """Show news of the progress in status bar and panels."""
         text = f"{self.sentence}: {self.share}"
         if text != self._told:
             self._told = text
@@ -138,7 +125,7 @@ class Running:
             redraw_panels(context)
 
     def over(self, context: bpy.types.Context) -> None:
-        """Stop what still works, and clear the bars."""
+        """Stop workers and clear the bars."""
         self.worker.cancel()
         if self in _now:
             _now.clear()
@@ -153,12 +140,12 @@ _now: list[Running] = []
 
 
 def now() -> Running | None:
-    """Return what runs, if anything does."""
+    """The running operation, if any."""
     return _now[0] if _now else None
 
 
 def refusal() -> str:
-    """Return why nothing else can be started, "" where it can."""
+    """Why nothing else can be started, "" if it can."""
     running = now()
     if running is None:
         return ""
@@ -166,7 +153,6 @@ def refusal() -> str:
 
 
 def _clear_bars() -> None:
-    """Clear the status bars of all workspaces: another may have been chosen meanwhile."""
     for window in bpy.context.window_manager.windows if now() is None else ():
         for workspace in bpy.data.workspaces:
             with bpy.context.temp_override(window=window, workspace=workspace):
@@ -174,7 +160,7 @@ def _clear_bars() -> None:
 
 
 def redraw_panels(context: bpy.types.Context) -> None:
-    """Have the sidebars of the 3D views drawn again, and not the views themselves."""
+    """Redraw the sidebars of the 3D views, and not the views themselves."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type != "VIEW_3D":
@@ -185,12 +171,12 @@ def redraw_panels(context: bpy.types.Context) -> None:
 
 
 def register() -> None:
-    """End the work where another file is loaded."""
+    """End the work when another file is loaded."""
     bpy.app.handlers.load_pre.append(_end)
 
 
 def unregister() -> None:
-    """Undo `register`, and end the work: Blender drops the operator without a word."""
+    """Undo `register`, and end the work: Blender drops the operator silently."""
     running = now()
     if running is not None:
         _end()
@@ -200,7 +186,6 @@ def unregister() -> None:
 
 @persistent
 def _end(*_arguments: object) -> None:
-    """End the work, where its scene goes away."""
     if (running := now()) is not None:
         _now.clear()
         running.worker.end()

@@ -1,4 +1,4 @@
-"""Operators on the selection of splats: what changes it at once, and what is done with it."""
+"""Operators on the selection of splats: what changes it at once, and its uses."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: Context, properties: bpy.types.AnyType) -> str:
-        """Return the tooltip of a button."""
+        """A button's tooltip."""
         return next(text for name, _, text in ACTIONS if name == properties.action)
 
     def act(self, context: Context) -> Answer:
@@ -88,7 +88,7 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: Context, properties: bpy.types.AnyType) -> str:
-        """Return the tooltip of a button."""
+        """A button's tooltip."""
         return next(text for name, _, text in SETS if name == properties.what)
 
     def act(self, context: Context) -> Answer:
@@ -101,7 +101,6 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
     def _taken(self, context: Context, checked: SplatObject) -> NDArray[np.bool_]:
-        """Return which splats are taken, (N,)."""
         settings, columns = context.scene.refine, mesh_attributes.stored_columns(checked)
         if self.what == "FAINT":
             return opacity(columns["opacity"]) < settings.select_opacity
@@ -133,7 +132,7 @@ class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
     shrink: BoolProperty(name="Shrink", description="Leave out those at the edge")
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """Places, and what is selected."""
+        """Positions, and the selection."""
         checked = mesh_layout.check(context.object)
         mesh_edit.check_writable(checked.obj)
         chosen = _some(checked.obj, selection.selected(checked.obj))
@@ -142,7 +141,7 @@ class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> NDArray[np.bool_]:
-        """The wider or narrower selection, (N,)."""
+        """The grown or shrunk selection, (N,)."""
         means, chosen, shrink = job
         neighbours = picking.neighbours_of(means, progress=progress)
         return (picking.shrunk if shrink else picking.grown)(neighbours, chosen)
@@ -160,7 +159,7 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def act(self, context: Context) -> Answer:
-        """Copy the object, and delete from each what the other holds."""
+        """Copy the object, and delete from each the other's splats."""
         checked = mesh_layout.check(context.object)
         chosen = _some(checked.obj, selection.selected(checked.obj))
         mesh_edit.check_deletable(checked.obj)
@@ -186,7 +185,6 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
 
 
 def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a selection, (N,), or raise `RefineError` if it has no splat."""
     if not chosen.any():
         raise RefineError(f"object '{obj.name}': no splat is selected")
     return chosen

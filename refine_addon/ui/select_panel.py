@@ -14,11 +14,10 @@ _ICONS = (
     *("CHECKBOX_HLT", "CHECKBOX_DEHLT", "SELECT_DIFFERENCE"),
     *("HIDE_ON", "PIVOT_CURSOR", "HIDE_OFF"),
 )
-"""Of `ACTIONS`."""
 
 
 class SelectSettings:
-    """What the tools and the box *Select* go by; part of `RefineSettings`."""
+    """Settings of the tools and the box *Select*; part of `RefineSettings`."""
 
     select_radius: FloatProperty(
         name="Radius",
@@ -58,7 +57,7 @@ class SelectSettings:
 
 
 class REFINE_PT_select(bpy.types.Panel):
-    """What is selected, how, and what for."""
+    """The selection, its tools and its uses."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -68,11 +67,11 @@ class REFINE_PT_select(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether there are splats to select."""
+        """Whether there are splats to select."""
         return mesh_layout.looks_like_splats(context.object)
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the count, the tools, what else takes splats, and what is done with them."""
+        """Draw the count, the tools, other ways to select, and the uses."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
         total = mesh_layout.splat_count(obj.data)
         text = f"{selected_count(context):,} of {total:,} selected"
@@ -102,7 +101,6 @@ class REFINE_PT_select(bpy.types.Panel):
 
 
 def _draw_uses(layout: bpy.types.UILayout) -> None:
-    """Draw what is done with what is selected."""
     row = layout.row(align=True)
     for mark, text, icon in (("STAY", "Stay", "LOCKED"), ("GO", "Go", "TRASH"), ("NONE", "", "X")):
         row.operator("refine.protect", text=text, icon=icon).mark = mark

@@ -1,4 +1,4 @@
-"""Tools of the toolbar that select the splats one sees: brush, lasso, box, sphere, colour."""
+"""Toolbar tools that select the splats one sees: brush, lasso, box, sphere, colour."""
 
 from __future__ import annotations
 
@@ -39,12 +39,10 @@ _KEYS: dict[Mode, dict[str, bool]] = {
     "INTERSECT": {"shift": True, "ctrl": True},
 }
 
-_STEP = 0.03
-"""Seconds between two looks at whether the thread knows what the view shows."""
+_STEP = 0.03  # Seconds between two looks at the thread that sees the view
 
 
 def _in_view(context: Context) -> str:
-    """Return that a 3D view is needed, "" in one."""
     return "" if context.region_data else "Select over a 3D view"
 
 
@@ -76,7 +74,7 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: Context, event: bpy.types.Event) -> Answer:
-        """Follow the mouse until the button is released and it is known what the view shows."""
+        """Follow the mouse until the button is released and the view's splats are known."""
         stroke = self._stroke
         if stroke is None or event.type in {"ESC", "RIGHTMOUSE"}:
             return self._over(context, kept=False)
@@ -99,7 +97,7 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: Context) -> None:
-        """End where Blender ends the operator: its window is closed, or its file."""
+        """End when Blender ends the operator, closing its window or file."""
         self._over(context, kept=False)
 
     def _over(self, context: Context, *, kept: bool) -> Answer:
@@ -116,20 +114,18 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
 
 
 def _place(context: Context, event: bpy.types.Event) -> tuple[float, float]:
-    """Return where the mouse is, from the upper left of the region, pixels."""
     below = context.region.height - 1 - event.mouse_region_y
     return event.mouse_region_x + 0.5, below + 0.5
 
 
 def _draw(stroke: Stroke, region: int) -> None:
-    """Draw a stroke's outline into its view."""
     if bpy.context.region.as_pointer() == region:
         height = bpy.context.region.height
         _line([(x, height - y) for x, y in stroke.outline()])
 
 
 def _line(places: list[tuple[float, float]]) -> None:
-    """Draw a line, black beside white, to be seen on both."""
+    """Draw a line, black beside white, visible on both."""
     program = gpu.shader.from_builtin("UNIFORM_COLOR")
     for shift, shade in ((1.0, 0.0), (0.0, 1.0)) if places else ():
         beside = [(x + shift, y - shift) for x, y in places]
@@ -158,7 +154,7 @@ _OBJECT_KEYS = (
     _key("refine.grow_selection", "NUMPAD_MINUS", ("shrink", True), ctrl=True),
     _key("refine.delete", "DEL", ("what", "SELECTED")),
 )
-"""Keys beside those of the mouse in object mode. Edit mode has its own for these."""
+"""Keys in object mode, besides the mouse's. Edit mode has its own."""
 
 _ICONS = {
     "BRUSH": "ops.generic.select_circle",
@@ -184,7 +180,7 @@ def _draw_settings(
 
 
 def selected_count(context: Context) -> int:
-    """Return how many splats of the active object are selected."""
+    """Number of selected splats of the active object."""
     return cached("selected", context, lambda: selection.count(context.object))
 
 
@@ -193,7 +189,6 @@ def _draw_brush(context: Context, _tool: bpy.types.WorkSpaceTool, place: tuple[i
 
 
 def _tool(shape: str, mode: str) -> type[bpy.types.WorkSpaceTool]:
-    """Return the tool of a shape in a mode of Blender."""
     label, text = next((label, text) for name, label, text in SHAPES if name == shape)
     keys = tuple(
         _key("refine.select_stroke", "LEFTMOUSE", ("shape", shape), ("mode", mode), **held)
@@ -221,7 +216,7 @@ _tools: list[type[bpy.types.WorkSpaceTool]] = []
 
 
 def register() -> None:
-    """Add the tools to the toolbar of object mode, and of edit mode of meshes."""
+    """Add the tools to the toolbars of object mode and mesh edit mode."""
     for mode in ("OBJECT", "EDIT_MESH"):
         for number, (shape, *_) in enumerate(SHAPES):
             tool = _tool(shape, mode)
@@ -230,7 +225,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take the tools away."""
+    """Remove the tools."""
     while _tools:
         bpy.utils.unregister_tool(_tools.pop())
     selecting.forget()

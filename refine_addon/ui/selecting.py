@@ -1,8 +1,5 @@
-"""What a tool selects from the press of the button to its release, while a thread looks.
-
-What the view shows is computed on a thread when the button is pressed, and kept: the next stroke
-from the same place finds it there. Until it is known the way of the mouse is recorded.
-"""
+"""A tool's stroke, from press to release, while a thread computes what the view shows.
+This is kept for further strokes from the same place; until it is known the mouse is recorded."""
 
 from __future__ import annotations
 
@@ -29,21 +26,19 @@ from ..mesh.layout import SplatObject
 from ..viewport import draw as viewport_draw
 from .worker import Worker
 
-LEAST_SIDE = 2
-"""Pixels: a box or a lasso that is narrower was a click, which takes nothing."""
+LEAST_SIDE = 2  # Pixels: a narrower box or lasso was a click, which selects nothing
 
 
-_kept: dict[object, Prepared | Sight] = {}
-"""Of the last stroke: splats are prepared once, and looked at once a view."""
+_kept: dict[object, Prepared | Sight] = {}  # The last stroke's splats, and what each view shows
 
 
 def forget() -> None:
-    """Let go of what the last stroke saw."""
+    """Free what the last stroke saw."""
     _kept.clear()
 
 
 def _read(context: Context) -> tuple[NDArray[np.bool_], Callable[[Progress], dict]]:
-    """Which splats are selected, (N,), and what a thread calls to see what `_kept` is to hold."""
+    """Selected splats, (N,), and what a thread calls to fill `_kept`."""
     obj, region, eye = context.object, context.region, context.region_data
     matrix = world_matrix(obj, context.evaluated_depsgraph_get())
     camera = (
@@ -71,14 +66,14 @@ def _read(context: Context) -> tuple[NDArray[np.bool_], Callable[[Progress], dic
 
 
 def _drawn(checked: SplatObject, away: NDArray[np.bool_]) -> Splats:
-    """Return the splats of an object, those that views do not show, (N,), without opacity."""
+    """An object's splats; those that views do not show, (N,), get no opacity."""
     splats = mesh_attributes.splats_from_object(checked, sh_rest=False)
     logits = np.where(away, np.float32(-np.inf), splats.opacity_logits)
     return replace(splats, opacity_logits=logits)
 
 
 def _not_drawn(checked: SplatObject) -> NDArray[np.bool_]:
-    """Return which splats the views do not show, (N,): hidden ones, and those of no such mode."""
+    """Splats that views do not show, (N,): hidden ones, and those of other display modes."""
     away, mode = selection.hidden(checked.obj), viewport_draw.mode()
     if mode in {"STAYS", "GOES"} and mesh_edit.REMOVE in checked.mesh.attributes:
         going = mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
@@ -87,26 +82,9 @@ def _not_drawn(checked: SplatObject) -> NDArray[np.bool_]:
 
 
 class Stroke:
-    """One stroke of a tool over a view, begun where the button was pressed.
-
-    Attributes
-    ----------
-    shape, mode : str
-        See `select_tools.SHAPES` and `picking.Mode`.
-    path : list of (float, float)
-        Where the mouse was: column and row of the region from its upper left, pixels.
-    released : bool
-        Whether the button is.
-    before : (N,) bool
-        What was selected.
-    selected : (N,) bool or None
-        What is to be, as far as it is known.
-
-    Raises
-    ------
-    RefineError
-        If the object cannot be read.
-    """
+    """A tool's stroke over a view, from the press of the button to its release.
+    `shape`, `mode`: see `select_tools.SHAPES`, `picking.Mode`; `path`: columns and rows from the
+    region's upper left, pixels; `before`, `selected`: (N,), the latter as far as known."""
 
     def __init__(
         self, context: Context, shape: str, mode: picking.Mode, at: tuple[float, float]
@@ -124,13 +102,7 @@ class Stroke:
         self._worker = Worker(look)
 
     def follow(self) -> bool:
-        """Take what the stroke covers by now; tell whether that is known.
-
-        Raises
-        ------
-        RefineError
-            What the thread raised.
-        """
+        """Select what the stroke covers by now; whether that is known. Raises a thread's error."""
         if self._sight is None:
             if self._worker.running():
                 return False
@@ -143,12 +115,12 @@ class Stroke:
         return True
 
     def sentence(self) -> str:
-        """How many splats are to be selected."""
+        """How many splats will be selected."""
         chosen = self.before if self.selected is None else self.selected
         return f"{int(np.count_nonzero(chosen)):,} of {len(chosen):,} splats selected"
 
     def outline(self) -> list[tuple[float, float]]:
-        """Corners of what is drawn over the view, closed; columns and rows."""
+        """Closed outline over the view; columns and rows."""
         (x, y), (u, v) = self.path[0], self.path[-1]
         if self.shape == "SPHERE":
             return circle((x, y), math.hypot(u - x, v - y))
@@ -159,7 +131,7 @@ class Stroke:
         return [(x, y), (u, y), (u, v), (x, v), (x, y)] if self.shape == "BOX" else []
 
     def end(self, *, kept: bool) -> None:
-        """Select what the stroke covers, or show the selection as it was before."""
+        """Select what the stroke covers, or restore the former selection."""
         if not kept or self.selected is None:
             self._worker.cancel()
             viewport_draw.select(self.obj.data.session_uid, self.before)
@@ -169,7 +141,6 @@ class Stroke:
             viewport_draw.show("SCENE")  # or nobody would see it
 
     def _taken(self, seen: Sight) -> NDArray[np.bool_]:
-        """Which splats the stroke covers, (N,)."""
         (x, y), (u, v) = self.path[0], self.path[-1]
         if self.shape == "BRUSH":
             for place in range(self._painted, len(self.path)):
@@ -194,6 +165,6 @@ class Stroke:
 
 
 def circle(middle: tuple[float, float], radius: float) -> list[tuple[float, float]]:
-    """Corners of a circle, closed."""
+    """Points of a circle, closed."""
     turns = np.linspace(0.0, 2.0 * np.pi, 49)
     return (np.stack([np.cos(turns), np.sin(turns)], axis=1) * radius + middle).tolist()

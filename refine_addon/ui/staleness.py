@@ -1,8 +1,5 @@
-"""What scores were made with, and what of it has changed since: asked while the panel is drawn.
-
-Only what a few numbers tell is compared: where the object stands, the cameras and their lenses,
-the settings. What was done to the splats themselves is not looked for.
-"""
+"""Origin of scores, and what changed since: transforms, cameras, settings, not edits of splats.
+Cheap, as the panel asks at each draw."""
 
 from __future__ import annotations
 
@@ -17,8 +14,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 
-_NOISE = 1e-6
-"""Of the largest number beside it: what another machine may make of the same numbers."""
+_NOISE = 1e-6  # Relative to the largest number beside it: difference that another machine may make
 
 _FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
 
@@ -31,7 +27,7 @@ _WORDS = {
 
 
 def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
-    """Where an object and the cameras that the panel names are, and the rest that decides: JSON."""
+    """An object's transform, the panel's cameras, and the settings that decide: JSON."""
     method = context.scene.refine.to_method()
     return {
         "matrix": np.array(obj.matrix_world).tolist(),
@@ -44,11 +40,7 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
 
 
 def changes(context: bpy.types.Context, *objects: bpy.types.Object) -> list[str]:
-    """What changed since any of the objects was scored, in a few words each.
-
-    Without scores, or scored by a script that recorded no origin, an object has no changes.
-    Matrices are read as they stand.
-    """
+    """Changes since any object was scored, in few words; none without an origin."""
     found: dict[str, None] = {}
     for obj in objects:
         record = mesh_scores.record(obj.data) or {}
@@ -69,7 +61,7 @@ def changes(context: bpy.types.Context, *objects: bpy.types.Object) -> list[str]
 
 
 def _same(one: Any, other: Any, scale: float = 0.0) -> bool:
-    """Whether values of JSON are the same but for noise in numbers, which stand in lists."""
+    """Whether JSON values are equal up to noise in lists of numbers."""
     if isinstance(one, list) and isinstance(other, list):
         scale = max((abs(each) for each in one if isinstance(each, float)), default=0.0)
         pairs = zip(one, other, strict=False)
@@ -80,14 +72,12 @@ def _same(one: Any, other: Any, scale: float = 0.0) -> bool:
 
 
 def _marked(obj: bpy.types.Object, kind: int) -> list[int]:
-    """Which splats are marked to stay, 1, or to go, 2, in short."""
     if mesh_edit.FORCE not in obj.data.attributes:
         return mesh_scores.digest(None)
     return mesh_scores.digest(mesh_attributes.read_attribute(obj.data, mesh_edit.FORCE) == kind)
 
 
 def _cameras(context: bpy.types.Context) -> list[Any]:
-    """What tells the cameras that decide from others; of a shot, its frames."""
     scene, settings = context.scene, context.scene.refine
     if settings.source == "FRAMES":
         frames = settings.to_frames(scene)
@@ -106,7 +96,6 @@ def _cameras(context: bpy.types.Context) -> list[Any]:
 
 
 def _numbers(camera: bpy.types.Object, frame: tuple[int, int, float]) -> tuple[float, ...]:
-    """What makes the view of a camera: its axes and its place, its lens, its weight."""
     matrix, data = np.array(camera.matrix_world), camera.data
     weight = camera.get(WEIGHT, 1.0)
     return (

@@ -1,4 +1,4 @@
-"""Operators that move splats as a whole, and what is noticed of what others did to them."""
+"""Operators that move whole splat objects, and notices of drift."""
 
 from __future__ import annotations
 
@@ -24,11 +24,9 @@ from . import plans, wrapped
 from .operator_bases import Answer, AtOnce, Job, OnSplats, in_object_mode
 from .wrapped import counted
 
-_SOON = 0.1
-"""Seconds until new splats are noted: Blender's operator that made them is over by then."""
+_SOON = 0.1  # Seconds until new splats are noted: Blender's operator is over by then
 
-_known: dict[int, Drift | None] = {}
-"""What was found of each object's data, by its number in this session, until it changes."""
+_known: dict[int, Drift | None] = {}  # Drift by the data's number in this session, until it changes
 
 
 class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
@@ -56,7 +54,6 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
 
 
 def _several(context: Context) -> str:
-    """Return that several objects are needed, "" if they are selected."""
     chosen = splat_group.chosen(context.view_layer, context.object)
     return "" if len(chosen) > 1 else "Select several objects that hold splats"
 
@@ -71,14 +68,14 @@ class REFINE_OT_join(Job, OnSplats, bpy.types.Operator):
     doing = "Joining splats"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """The selected objects, the active one first, and what moves their splats."""
+        """The selected objects, active first, and what moves their splats."""
         group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
         group.sort(key=lambda member: member.obj != context.object)
         return group, transforms.read_to_join(group)
 
     @staticmethod
     def compute(move: Any, progress: Progress) -> transforms.Joined:
-        """Splats, sizes, rotations and harmonics in the frame of the active object."""
+        """Splats, sizes, rotations and harmonics in the active object's frame."""
         return move(progress)
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, found: Any) -> None:
@@ -100,7 +97,7 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
     doing = "Mending splats"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """The selected objects to which something was done, and what was noted of them."""
+        """Selected objects with drift, and their notes."""
         mesh_layout.check(context.object)
         chosen = splat_group.chosen(context.view_layer, context.object)
         drifted = {obj.data: obj for obj in chosen if of(obj)}
@@ -111,7 +108,7 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
 
     @staticmethod
     def compute(moves: Any, progress: Progress) -> Any:
-        """The maps by which others moved splats, and the rest of each splat moved by them."""
+        """The maps that moved splats, and values repaired by them."""
         return run_all(lambda move: move(), moves, progress=progress, threads=1)
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, found: Any) -> None:
@@ -124,7 +121,7 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
 
 
 def of(obj: bpy.types.Object) -> Drift | None:
-    """Return what others did to an object's splats, None if nothing; asked once for each change."""
+    """Drift of an object, None if none; computed once for each change."""
     if obj.mode == "EDIT":
         return None
     key = obj.data.session_uid
@@ -137,7 +134,7 @@ def of(obj: bpy.types.Object) -> Drift | None:
 
 
 def _in_view(context: Context) -> list[str]:
-    """Return a line for each object in a view that is to be mended: the panel may be closed."""
+    """A line for each object in a view that needs mending: the panel may be closed."""
     return [
         f"'{obj.name}' was transformed by Blender's own tools: Mend Splats in the tab REFINE"
         for obj in context.visible_objects
@@ -146,7 +143,7 @@ def _in_view(context: Context) -> list[str]:
 
 
 def draw(layout: bpy.types.UILayout, context: Context, objects: Sequence[bpy.types.Object]) -> None:
-    """Draw what others did to the splats of objects, and the buttons that move splats."""
+    """Draw the objects' drift, and the buttons that move splats."""
     drifts = [drift for drift in map(of, objects) if drift]
     for sentence in dict.fromkeys(s for drift in drifts for s in drift.told):
         wrapped.label(layout, context, sentence, icon="ERROR")
@@ -172,7 +169,7 @@ def _draw_object(menu: bpy.types.Menu, context: Context) -> None:
 
 @persistent
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
-    """Look again at what changed; note soon where new splats are."""
+    """Forget drift of what changed; note new splats soon."""
     for update in depsgraph.updates if depsgraph else ():
         if update.is_updated_geometry:
             data = getattr(update.id.original, "data", update.id.original)
@@ -183,14 +180,12 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
 
 @persistent
 def _changed(*_: object) -> None:
-    """Look again at all."""
     _known.clear()
     if any(_is_new(data) for data in (*bpy.data.meshes, *bpy.data.pointclouds)):
         _note_soon()
 
 
 def _is_new(data: object) -> bool:
-    """Tell whether an object's data holds splats of which nothing was noted."""
     return (
         isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud))
         and mesh_layout.holds_splats(data)
@@ -200,7 +195,7 @@ def _is_new(data: object) -> bool:
 
 
 def _note_soon() -> None:
-    """Note where new splats are, once Blender is idle: nothing is written while it works."""
+    """Note new splats once Blender is idle: nothing may be written while it works."""
     if not bpy.app.background and not bpy.app.timers.is_registered(_note):
         bpy.app.timers.register(_note, first_interval=_SOON)
 
@@ -218,7 +213,7 @@ _EVENTS = ("undo_post", "redo_post", "load_post")
 
 
 def register() -> None:
-    """Hear of changes."""
+    """Add the handlers."""
     viewport_draw.warned_by.append(_in_view)
     bpy.app.handlers.depsgraph_update_post.append(_updated)
     for event in _EVENTS:

@@ -30,16 +30,16 @@ class REFINE_OT_view(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        """Tell whether there is a window to draw in."""
+        """Whether there is a window to draw in."""
         return not bpy.app.background
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: Any) -> str:
-        """Return the tooltip of a button."""
+        """A button's tooltip."""
         return next(text for mode, _, text in MODES if mode == properties.mode)
 
     def execute(self, _context: bpy.types.Context) -> Answer:
-        """Draw, or stop it."""
+        """Draw, or stop."""
         draw.show(self.mode)
         return {"FINISHED"}
 

@@ -1,4 +1,4 @@
-"""The list of volumes in the panel: objects that say what must stay and what must go."""
+"""The panel's list of volumes: objects that protect splats or remove them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,12 @@ ROLES = (
         2,
     ),
 )
-"""What becomes of the splats in a volume, by the names that core gives it in small letters."""
+"""Roles of volumes, by core's names, in small letters there."""
 
 _OUTSIDE, _OUTSIDE_KEPT = 0.25, 0.02
-"""Share of the splats that lie beyond each face of a new volume: it holds their middle half, or
-nearly all of them where it keeps what is inside."""
+"""Share of splats beyond each face of a new volume; the latter where it keeps what is inside."""
 
-_LEAST_HALF = 1e-3
-"""Half the least width of a new volume, world units: flat splats make no flat one."""
+_LEAST_HALF = 1e-3  # Half width, world units, at least: flat splats make no flat volume
 
 SHAPES = (
     ("BOX", "Box", "A new box around the middle of the splats"),
@@ -79,11 +77,11 @@ class REFINE_OT_add_volume(AtOnce, Needing, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
-        """Return the tooltip of a button."""
+        """A button's tooltip."""
         return next(role[2] for role in ROLES if role[0] == properties.role)
 
     def act(self, context: bpy.types.Context) -> Answer:
-        """Add it, selected, so that it can be moved; the splats stay active."""
+        """Add it, selected to be moved; the splats stay active."""
         checked = mesh_layout.check(context.object)
         if self.shape == "SELECTED":
             objects = _selected_volumes(context)
@@ -97,7 +95,7 @@ class REFINE_OT_add_volume(AtOnce, Needing, bpy.types.Operator):
 
 
 def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the selected objects that are not listed yet, or raise `RefineError` if none fits."""
+    """Selected objects not listed yet; raises `RefineError` if none fits."""
     listed = {item.object for item in context.scene.refine.volumes}
     objects = [o for o in context.selected_objects if not mesh_layout.looks_like_splats(o)]
     objects = [obj for obj in objects if obj not in listed]
@@ -111,7 +109,7 @@ def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
 def _new_empty(
     context: bpy.types.Context, checked: mesh_layout.SplatObject, shape: str, role: str
 ) -> bpy.types.Object:
-    """Return a new empty around the middle half of the splats, or nearly all if they are kept."""
+    """A new empty around the middle half of the splats, or nearly all if they are kept."""
     means = demands.world_means(checked)
     means = means[np.isfinite(means).all(axis=1)]
     if not len(means):

@@ -10,20 +10,11 @@ from typing import Any
 
 from ..core.execute import Cancelled, Progress, checked_by
 
-PATIENCE = 0.7
-"""Seconds that a thread has to end once it was cancelled; then it is left to itself."""
+PATIENCE = 0.7  # Seconds that a cancelled thread has to end before it is left alone
 
 
 class Worker:
-    """A call, ``work(progress)``, that runs while the window stays alive.
-
-    Attributes
-    ----------
-    fraction : float
-        How much is done, 0 to 1.
-    what : str
-        What is being done, in a word or two.
-    """
+    """``work(progress)`` on a thread; `fraction` done, 0 to 1, of `what`, a word or two."""
 
     def __init__(self, work: Callable[[Progress], Any]) -> None:
         self.fraction, self.what = 0.0, ""
@@ -33,11 +24,8 @@ class Worker:
         self._thread.start()
 
     def running(self) -> bool:
-        """Whether there is still something to wait for.
-
-        Work that has not ended `PATIENCE` after it was cancelled, such as the packing of a file, is
-        not: it ends by itself at its next checkpoint, and what comes of it is dropped.
-        """
+        """Whether there is still something to wait for: not `PATIENCE` after cancelling.
+        Such work, like packing a file, ends at its next checkpoint, and its result is dropped."""
         late = self.cancelled and time.monotonic() - self._cancelled > PATIENCE
         return not late and self._thread.is_alive()
 
@@ -57,7 +45,7 @@ class Worker:
         self._thread.join(PATIENCE)
 
     def result(self) -> Any:
-        """What the work came to, or raises what it raised; keeps neither."""
+        """The work's result or error; keeps neither."""
         if self.cancelled and self._thread.is_alive():
             raise Cancelled
         self._thread.join()

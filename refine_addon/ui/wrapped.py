@@ -1,4 +1,4 @@
-"""Sentences in a panel, broken into lines where it ends: Blender cuts what is wider."""
+"""Sentences in a panel, wrapped to its width: Blender cuts what is wider."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from functools import lru_cache
 import blf
 import bpy
 
-_TAKEN = 52
-"""Pixels of a sidebar at scale 1 that are not text: margins, tabs, scroll bar."""
+_TAKEN = 52  # Pixels of a sidebar at scale 1 without text: margins, tabs, scroll bar
 
-_ICON = 30
-"""Pixels that an icon and the gaps around it take of a line, at scale 1."""
+_ICON = 30  # Pixels of an icon and its gaps at scale 1
 
-_USUAL = 280
-"""Pixels that the sidebar has where nothing tells, which is its default at scale 1."""
+_USUAL = 280  # Pixels of the sidebar if unknown: its default at scale 1
 
 
 def label(
@@ -35,7 +32,7 @@ def label(
 
 
 def counted(number: int, what: str) -> str:
-    """Return how many there are.
+    """A number of things in words.
 
     >>> counted(1, "camera"), counted(1200, "view")
     ('1 camera', '1,200 views')
@@ -45,7 +42,7 @@ def counted(number: int, what: str) -> str:
 
 @lru_cache(maxsize=64)
 def lines(text: str, width: int, points: float) -> tuple[str, ...]:
-    """Return a text in lines that are at most so many pixels wide; a word is never broken."""
+    """A text in lines of at most `width` pixels; words stay whole."""
     blf.size(0, points)
     broken: list[str] = []
     for word in text.split():

@@ -1,7 +1,5 @@
-"""What the 3D view draws of splats, as arrays: what is uploaded, its order, its colours.
-
-No Blender here. The rules are those of the reference implementation (`core.splats`).
-"""
+"""Arrays of splats for the 3D view: uploads, order, colours. No Blender here.
+The rules are those of the reference implementation (`core.splats`)."""
 
 from __future__ import annotations
 
@@ -25,30 +23,22 @@ from ..core.splats import (
     scales,
 )
 
-WIDTH = 4096
-"""Columns of a texture that holds a value a splat, row by row."""
+WIDTH = 4096  # Columns of a texture with one value for each splat, row by row
 
-MOST = 1 << 24
-"""Splats drawn at most: float32, in which a texture holds their order, counts no further."""
+MOST = 1 << 24  # Splats drawn at most: float32, which holds their order, counts no further
 
-STAYS, GOES = 1, 2
-"""What stays and what goes in any case, as `mesh.edit.FORCE` has it."""
+STAYS, GOES = 1, 2  # Protected and removed, as in `mesh.edit.FORCE`
 
 MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (0.45, 0.0, 1.0)}
-"""Their tints, visible on white as on black. Neither is a colour of the heat map, nor that of what
-goes by the budget, nor `SELECTED`."""
+"""Tints, visible on white and black, unlike the heat map, the budget's tint, and `SELECTED`."""
 
-SELECTED, SELECTED_SHARE = (1.0, 0.1, 0.75), 0.6
-"""What is selected is shown in this colour, by that share."""
+SELECTED, SELECTED_SHARE = (1.0, 0.1, 0.75), 0.6  # Tint of selected splats, and its share
 
-SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}
-"""How much of a colour that tint is, by mode of the view."""
+SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}  # Share of the tint, by mode
 
 _LARGEST_KEY = 65535.0
-"""Of 16 bits."""
 
 _LARGEST_HALF = 65504.0
-"""Of float16."""
 
 _OKLAB_TO_LMS = np.array(
     [
@@ -68,22 +58,9 @@ _LMS_TO_RGB = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Packed:
-    """The M drawable splats of a mesh, in its order.
-
-    Attributes
-    ----------
-    vertices : (M,) int32
-        Which vertices of the mesh they are.
-    means : (M, 3) float32
-        In the mesh's frame.
-    covariances : (M, 6) float32
-        xx, xy, xz, yy, yz, zz in the mesh's frame.
-    opacities : (M,) float32
-    harmonics : (M, K, 3) float16
-        All coefficients of red, green, blue, the constant one first.
-    model : {"default", "antialiased", "2dgs"}
-        How they are drawn.
-    """
+    """The M drawable splats of a mesh, in its order and frame.
+    `vertices`: (M,) int32 into the mesh; `covariances`: (M, 6), xx, xy, xz, yy, yz, zz;
+    `harmonics`: (M, K, 3), the constant first; `model`: "default", "antialiased" or "2dgs"."""
 
     vertices: NDArray[np.int32]
     means: NDArray[np.float32]
@@ -93,21 +70,12 @@ class Packed:
     model: Model = "default"
 
     def __len__(self) -> int:
-        """Tell how many there are."""
         return len(self.means)
 
 
 class Eye(NamedTuple):
-    """Where a view looks from, in a mesh's frame.
-
-    Attributes
-    ----------
-    row : (4,) float64
-        The depth of a point p before the view is ``row[:3] @ p + row[3]``.
-    place : (3,) float64
-        The centre of projection; without perspective, the direction of view.
-    perspective : bool
-    """
+    """Eye of a view in a mesh's frame: depth of p is ``row[:3] @ p + row[3]``.
+    `place`: the centre of projection, (3,); without perspective the view's direction."""
 
     row: NDArray[np.float64]
     place: NDArray[np.float64]
@@ -115,7 +83,7 @@ class Eye(NamedTuple):
 
 
 def pack(splats: Splats) -> Packed:
-    """What is drawn of splats."""
+    """The drawable splats, packed."""
     opacities = opacity(splats.opacity_logits).astype(np.float32)  # (N,)
     shown = drawable(splats) & (opacities >= ALPHA_CUT)
     vertices = np.flatnonzero(shown).astype(np.int32)
@@ -135,15 +103,8 @@ def pack(splats: Splats) -> Packed:
 
 
 def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> NDArray[np.int32]:
-    """Splats in the order in which fewer of them are chosen, (M,).
-
-    Parameters
-    ----------
-    packed : Packed
-    ranks : (M,) floating, optional
-        Of their scores: the highest first. Without them, opacity times the sum of
-        squared standard deviations: about the area that is seen.
-    """
+    """Splats by importance, (M,): fewer are drawn by taking the first.
+    By ranks of scores, else by opacity times the sum of squared deviations: about the seen area."""
     if ranks is None:
         sizes = packed.covariances[:, 0] + packed.covariances[:, 3] + packed.covariances[:, 5]
         worth = packed.opacities * sizes
@@ -153,14 +114,7 @@ def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> N
 
 
 def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
-    """Display-referred colours with opacity, (M, 4).
-
-    Parameters
-    ----------
-    packed : Packed
-    eye : Eye, optional
-        From where they are seen; without it, the constant colour.
-    """
+    """Display-referred colours with opacity, (M, 4), seen from `eye`, else the constant colour."""
     rgba = np.empty((len(packed), 4), np.float32)
     rgba[:, 3] = packed.opacities
     for chunk in pieces(len(packed)):
@@ -175,11 +129,8 @@ def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
 
 
 def ramp() -> NDArray[np.float64]:
-    """Colours of the heat map, dark blue (goes first) to yellow (goes last), (256, 3) sRGB in 0..1.
-
-    Lightness rises evenly in OKLab (Ottosson 2020) from .25 to .93 while the hue goes from blue
-    by magenta and orange to yellow: who sees no hue still sees the order.
-    """
+    """Heat map, dark blue (removed first) to yellow (removed last), (256, 3) sRGB in 0..1.
+    Lightness rises evenly in OKLab (Ottosson 2020) from 0.25 to 0.93, readable without hue."""
     t = np.linspace(0.0, 1.0, 256)
     lightness = 0.25 + 0.68 * t
     hue = np.radians(265.0 + 200.0 * t)
@@ -191,15 +142,7 @@ def ramp() -> NDArray[np.float64]:
 
 
 def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Colour of each rank in 0..1 with opacity, (M, 4).
-
-    Parameters
-    ----------
-    packed : Packed
-    ranks : (M,) floating
-    ramp : (C, 3) float64
-        Colours from rank 0 to 1.
-    """
+    """Colours of ranks in 0..1 with opacity, (M, 4); `ramp`: (C, 3) colours from rank 0 to 1."""
     index = np.nan_to_num(ranks) * (len(ramp) - 1) + 0.5
     rgba = np.empty((len(packed), 4), np.float32)
     rgba[:, :3] = ramp[np.clip(index, 0, len(ramp) - 1).astype(np.int64)]
@@ -210,14 +153,14 @@ def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDAr
 def tinted(
     rgba: NDArray[np.float32], tint: tuple[float, float, float], share: float
 ) -> NDArray[np.float32]:
-    """Colours, (M, 4), of which a share is the tint."""
+    """Colours, (M, 4), mixed with a share of the tint."""
     mixed = rgba.copy()
     mixed[:, :3] = (1.0 - share) * np.clip(rgba[:, :3], 0.0, 1.0) + share * np.array(tint)
     return mixed
 
 
 def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> NDArray[np.float32]:
-    """Colours, (M, 4), with those of what stays and goes in any case, (M,), tinted."""
+    """Colours, (M, 4), tinted for protected and removed splats, (M,)."""
     if force is None or mode not in SHARES:
         return rgba
     mixed = rgba.copy()
@@ -230,7 +173,7 @@ def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> 
 def in_front(
     means: NDArray[np.float32], eye: Eye, near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Tell which means, (M, 3), lie behind the near plane of a view, (V,), and their depths."""
+    """Means, (M, 3), beyond the near plane, (V,) rows, and their depths."""
     with np.errstate(over="ignore", invalid="ignore"):
         depths = means @ eye.row[:3].astype(np.float32) + np.float32(eye.row[3])
     shown = np.flatnonzero((depths > near) & (depths < np.inf))
@@ -238,21 +181,9 @@ def in_front(
 
 
 def farthest_first(depths: NDArray[np.float32], *, perspective: bool) -> NDArray[np.int64]:
-    """Order of depths, the largest first; nearly equal ones keep their order.
-
-    Depths are rounded to 16 bits, for which NumPy has a radix sort, 8 times as fast as its sort of
-    float32. In perspective their logarithms are rounded, to steps of some 1e-4 of the depth.
-
-    Parameters
-    ----------
-    depths : (V,) float32
-        Finite; in perspective above 0.
-    perspective : bool
-
-    Returns
-    -------
-    (V,) int64
-    """
+    """Order of finite depths, (V,), largest first; nearly equal ones keep theirs.
+    Depths, or in perspective their logarithms (steps of 1e-4), are rounded to 16 bits: NumPy's
+    radix sort is 8 times as fast as its float32 sort."""
     if not len(depths):
         return np.empty(0, np.int64)
     values = np.log(depths) if perspective else depths
@@ -264,10 +195,8 @@ def farthest_first(depths: NDArray[np.float32], *, perspective: bool) -> NDArray
 
 
 def as_texture(values: NDArray[Any]) -> NDArray[np.float32]:
-    """Values, (M,) or (M, C), as rows of `WIDTH` texels: (R, WIDTH * C) float32.
-
-    The last row is filled with zeros; there is at least one.
-    """
+    """Values, (M,) or (M, C), as rows of `WIDTH` texels, (R, WIDTH * C) float32.
+    The last row is padded with zeros; there is at least one."""
     columns = 1 if values.ndim == 1 else values.shape[1]
     rows = max(1, math.ceil(len(values) / WIDTH))
     texels = np.zeros((rows, WIDTH * columns), np.float32)
@@ -276,7 +205,7 @@ def as_texture(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def first_of_each(counts: list[int], most: int) -> list[int]:
-    """Tell how many splats of each object are drawn if `most` are in all: equal shares."""
+    """Splats drawn of each object if `most` are drawn in all: equal shares."""
     total = sum(counts)
     if total <= most:
         return list(counts)
@@ -284,14 +213,12 @@ def first_of_each(counts: list[int], most: int) -> list[int]:
 
 
 def _half(values: NDArray[Any]) -> NDArray[Any]:
-    """Finite values, those beyond the range of float16 as its ends."""
     if values.size and max(values.max(), -values.min()) > _LARGEST_HALF:
         return np.clip(values, -_LARGEST_HALF, _LARGEST_HALF)
     return values
 
 
 def _directions(means: NDArray[np.float32], eye: Eye) -> NDArray[np.float32]:
-    """Unit vectors from the eye to the means, (M, 3)."""
     if not eye.perspective:
         toward = eye.place / np.linalg.norm(eye.place)
         return np.broadcast_to(toward.astype(np.float32), means.shape)
@@ -302,7 +229,7 @@ def _directions(means: NDArray[np.float32], eye: Eye) -> NDArray[np.float32]:
 
 
 def same(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
-    """Tell whether two arrays hold the same, or both are None."""
+    """Whether two arrays are equal, or both None."""
     if one is None or other is None:
         return one is other
     return np.array_equal(one, other)

@@ -1,4 +1,4 @@
-"""What there is to draw: the splats of meshes, packed once, and their textures."""
+"""The drawn data: splats of meshes, packed once, and their textures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .placing import Placing, is_edited
 
 
 class Marks(NamedTuple):
-    """What a mesh says of its splats, each one value a splat, or None."""
+    """Marks of a mesh's splats, each one value for each splat, or None."""
 
     ranks: NDArray[Any] | None = None
     going: NDArray[Any] | None = None
@@ -37,30 +37,9 @@ class Marks(NamedTuple):
 
 @dataclass(eq=False)
 class MeshSplats:
-    """The splats of a mesh.
-
-    Attributes
-    ----------
-    signature : tuple
-        What they were packed from.
-    future : Future or None
-        While the M drawable splats are packed.
-    packed : Packed or None
-        Once they are.
-    read : Marks
-        Of all N vertices, as they were last read.
-    marks : Marks
-        Of the packed splats: ranks of the scores, what the plan removes, what stays and what goes
-        in any case, what is selected, what is hidden.
-    important : (M,) int32 or None
-        The packed splats, the ones that matter most first.
-    degree : int
-        Of the harmonics.
-    scored, marked : int
-        Rise where ranks, and what stays and goes in any case, have changed.
-    kinds : tuple of int
-        Which of `arrays.MARKS` there are.
-    """
+    """The splats of a mesh, its N vertices packed to M drawable ones.
+    `signature`: what was packed; `future`, while packing; `read`: marks of the N; `marks`: of the
+    M; `important`: (M,), most important first; `scored`, `marked`: counters of changes."""
 
     signature: tuple[Any, ...] = ()
     future: Future[Packed] | None = None
@@ -76,7 +55,7 @@ class MeshSplats:
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """The place of an object in the textures: rows ``start`` to ``start + count``."""
+    """Place of an object in the textures: rows ``start`` to ``start + count``."""
 
     held: MeshSplats
     packed: Packed
@@ -92,16 +71,9 @@ class Slot:
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """The splats of several objects in one set of textures, so that they blend as one.
-
-    Attributes
-    ----------
-    slots : mapping of (int, int) to Slot
-        By the keys of `Placing`.
-    means, covariances, more_covariances : GPUTexture
-        A texel a splat: place and number of the slot; xx, xy, xz, yy; yz, zz, number of the model
-        and 0.
-    """
+    """Splats of several objects in shared textures, so that they blend as one.
+    `slots`: by keys of `Placing`. Texels: `means`: place and slot; `covariances`: xx, xy, xz, yy;
+    `more_covariances`: yz, zz, model, 0."""
 
     slots: dict[tuple[int, int], Slot]
     means: gpu.types.GPUTexture | None
@@ -115,20 +87,8 @@ class Atlas:
 
 
 class Content:
-    """What all views draw from.
-
-    Attributes
-    ----------
-    pool : ThreadPoolExecutor
-        One thread for what takes longer than a frame: arrays only.
-    atlas : Atlas
-    refused : set of int
-        Identities of meshes that look like splats at first sight alone.
-    changes : int
-        Rises where what goes or is hidden has changed, while the splats are the same.
-    selections : int
-        Rises where what is selected has changed.
-    """
+    """Data shared by all views. `pool`: one thread for array work longer than a frame.
+    `refused`: meshes that only looked like splats; `changes`, `selections`: counters of changes."""
 
     def __init__(self) -> None:
         self.pool = ThreadPoolExecutor(1, "refine-view")
@@ -140,16 +100,16 @@ class Content:
         self.refused: set[int] = set()
 
     def has_changed(self, mesh: int | None = None) -> None:
-        """Look at a mesh again before it is drawn; at all of them by default."""
+        """Look at a mesh again before it is drawn, by default at all."""
         self._stale.update(self._held if mesh is None else [mesh])
         self.refused.difference_update(list(self.refused) if mesh is None else [mesh])
 
     def marks(self) -> set[int]:
-        """Tell which of `arrays.MARKS` there are among the splats that are drawn."""
+        """The `arrays.MARKS` among drawn splats."""
         return {mark for slot in self.atlas.slots.values() for mark in slot.held.kinds}
 
     def select(self, mesh: int, chosen: NDArray[np.bool_]) -> None:
-        """Show splats of a mesh, (N,), as selected, whatever it says, until it changes."""
+        """Show splats of a mesh, (N,), as selected until it changes."""
         held = self._held.get(mesh)
         if held is not None and held.packed is not None and held.signature[0] == len(chosen):
             held.read = held.read._replace(selected=chosen)
@@ -157,7 +117,7 @@ class Content:
             self.selections += 1
 
     def selection(self) -> gpu.types.GPUTexture:
-        """A texel for each row of the atlas: 1 where the splat is selected, else 0."""
+        """A texel for each row of the atlas: 1 if selected, else 0."""
         key = (self.atlas, self.selections)
         if self._selection is None or self._selection[0] != key:
             flags = np.zeros(self.atlas.rows, np.float32)
@@ -168,30 +128,18 @@ class Content:
         return self._selection[1]
 
     def pending(self) -> bool:
-        """Tell whether splats are being packed."""
+        """Whether splats are being packed."""
         return any(held.future for held in self._held.values())
 
     def ready(self) -> bool:
-        """Tell whether splats have been packed that no view has drawn."""
+        """Whether packed splats wait for a view."""
         return any(held.future and held.future.done() for held in self._held.values())
 
     def update(
         self, places: Iterable[Placing], existing: Callable[[], set[tuple[int, int]]]
     ) -> dict[tuple[int, int], NDArray[np.float64]]:
-        """Make what is needed to draw splats.
-
-        Parameters
-        ----------
-        places : iterable of Placing
-            Of objects in edit mode it is drawn what `read_edited` read last.
-        existing : callable
-            Gives the keys of all splats of the file.
-
-        Returns
-        -------
-        mapping of (int, int) to (4, 4) float64
-            Matrices to the world of those that can be drawn by now, by their place in `atlas`.
-        """
+        """Prepare splats; (4, 4) world matrices of those ready, by key. In edit mode as last read.
+        `existing` gives keys of all splats of the file."""
         for held in self._held.values():  # also of meshes that have gone since it began
             if held.future and held.future.done():
                 held.packed, held.future, held.important = held.future.result(), None, None
@@ -217,19 +165,13 @@ class Content:
         return wanted
 
     def read_edited(self, obj: bpy.types.Object) -> None:
-        """Read an object in edit mode; not while Blender draws, as its mesh is brought up to date.
-
-        Raises
-        ------
-        RefineError
-            If it holds no splats that can be read.
-        """
+        """Read an object in edit mode; not while Blender draws, as it updates the mesh."""
         self._stale.discard(obj.data.session_uid)
         with readable(obj) as checked:
             self._read(checked, obj.data.session_uid)
 
     def _read(self, checked: SplatObject, uid: int) -> None:
-        """Read of a mesh what has changed; `uid` is the identity of the mesh that is drawn."""
+        """Read a mesh's changes; `uid` identifies the drawn mesh."""
         mesh = checked.mesh
         held = self._held.setdefault(uid, MeshSplats())
         held.degree = sh_degree(mesh)
@@ -248,7 +190,6 @@ class Content:
             self._mark(held)
 
     def _mark(self, held: MeshSplats) -> None:
-        """Note which of the splats that are drawn matter, and which the plan removes."""
         packed, before = held.packed, held.marks
         if packed is None:
             return
@@ -269,7 +210,6 @@ class Content:
     def _place(
         self, wanted: set[tuple[int, int]], existing: Callable[[], set[tuple[int, int]]]
     ) -> None:
-        """Make the textures again if splats came or became others."""
         slots = self.atlas.slots
         fresh = {
             key for key in wanted if key in slots and slots[key].packed is self._held[key[1]].packed
@@ -286,7 +226,6 @@ class Content:
 
 
 def _atlas(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> Atlas:
-    """Make the textures of some objects, with at most `MOST` splats in all."""
     packs = [held[mesh].packed for _, mesh in keys]
     counts = first_of_each([len(packed) for packed in packs], MOST)
     means = np.empty((sum(counts), 4), np.float32)

@@ -1,4 +1,4 @@
-"""The drawing of splats, on and off, and what keeps it true to the scene."""
+"""Drawing of splats, on and off, and what keeps it true to the scene."""
 
 from __future__ import annotations
 
@@ -22,61 +22,56 @@ from .content import Content
 from .view import Camera, View
 
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
-"""What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
+"""Nothing, all splats, colours by rank, what Apply keeps, what it removes."""
 
-SHOWN = "refine_shown"
-"""Custom property of the scene: which of `MODES` was shown when the file was saved."""
+SHOWN = "refine_shown"  # Custom property of the scene: the mode shown when the file was saved
 
-_TICK = 0.03
-"""Seconds between two looks at whether the thread has sorted more splats."""
+_TICK = 0.03  # Seconds between two looks at the sorting thread
 
-_EDIT_REST = 0.3
-"""Seconds without a change in edit mode after which the splats are drawn as they are by then."""
+_EDIT_REST = 0.3  # Seconds without a change in edit mode before splats are drawn anew
 
-_VIEWS = 16
-"""Regions whose pictures are kept on the graphics card."""
+_VIEWS = 16  # Regions whose pictures stay on the graphics card
 
 
-warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []
-"""Who is asked, whenever a view is drawn, for warnings that are written into it."""
+warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []  # Give warnings for the view
 
 
 _state: Any = SimpleNamespace(
     mode="OFF", failure="", content=Content(), views={}, handles=[], edited_at=0.0, reads=False
 )
-"""What is kept while splats are drawn, in memory alone; `views` are of regions."""
+"""State while splats are drawn, in memory only; `views` by region."""
 
 
 def mode() -> str:
-    """Tell which of `MODES` is shown."""
+    """The one of `MODES` shown."""
     return _state.mode
 
 
 def failure() -> str:
-    """Tell why nothing can be drawn here, or an empty text."""
+    """Why nothing can be drawn here, or ""."""
     return _state.failure
 
 
 def complete() -> bool:
-    """Tell whether every view shows all it is to show."""
+    """Whether every view shows all it should."""
     return all(view.complete for view in _state.views.values()) and not _state.content.pending()
 
 
 def drawn(region: bpy.types.Region) -> int:
-    """Tell how many splats a region shows."""
+    """Number of splats that a region shows."""
     view = _state.views.get(region.as_pointer())
     return view.count if view else 0
 
 
 def select(mesh: int, chosen: NDArray[np.bool_]) -> None:
-    """Show splats of a mesh, (N,), as selected while a tool selects them; nothing is stored."""
+    """Show splats of a mesh, (N,), as selected during a tool's stroke; nothing is stored."""
     if _state.mode != "OFF":
         _state.content.select(mesh, chosen)
         _redraw()
 
 
 def show(wanted: str) -> None:
-    """Draw splats in all 3D views, or stop it."""
+    """Draw splats in all 3D views, or stop."""
     if wanted == "OFF":
         stop()
         return
@@ -88,7 +83,7 @@ def show(wanted: str) -> None:
 
 
 def stop() -> None:
-    """Draw nothing, and forget all that was held."""
+    """Stop drawing and free everything."""
     if _state.mode == "OFF":
         return
     _state.mode = "OFF"
@@ -102,7 +97,7 @@ def stop() -> None:
 
 
 def register() -> None:
-    """Have views call what draws in them, and Blender what keeps it true."""
+    """Add draw callbacks and handlers."""
     add = bpy.types.SpaceView3D.draw_handler_add
     for work, kind in ((_draw, "POST_VIEW"), (_draw_legend, "POST_PIXEL")):
         _state.handles.append(add(partial(_guarded, work), (), "WINDOW", kind))
@@ -112,7 +107,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Draw nothing, and undo `register`."""
+    """Stop drawing and undo `register`."""
     stop()
     for handler, names in _LISTENERS.items():
         for name in names:
@@ -128,7 +123,7 @@ def _forget(*_: object) -> None:
 
 
 def _guarded(work: Callable[[], None]) -> None:
-    """Draw; after the first failure splats are drawn no more, and their points are shown again."""
+    """Draw; after a failure stop, and show points again."""
     if _state.mode == "OFF" or _state.failure:
         return
     try:
@@ -171,7 +166,6 @@ def _draw_legend() -> None:
 
 
 def _tick() -> float | None:
-    """Redraw the views that have more to show, until none has."""
     if _state.mode == "OFF":
         return None
     ready = _state.content.ready()
@@ -183,7 +177,6 @@ def _tick() -> float | None:
 
 
 def _read_edited() -> float | None:
-    """Read the objects in edit mode once nothing has changed there for a moment."""
     waits = _EDIT_REST - (time.monotonic() - _state.edited_at)
     if waits > 0.0:
         return waits
@@ -206,7 +199,7 @@ def _redraw() -> None:
 
 
 def _hide_points() -> None:
-    """Hide the plain points of what is drawn, in all windows, or show them again."""
+    """Hide the plain points of drawn splats in all windows, or show them."""
     for depsgraph in placing.graphs():
         placing.hide_points(depsgraph, None if _state.mode == "OFF" else _state.content.refused)
 
@@ -218,7 +211,7 @@ def _areas() -> list[bpy.types.Area]:
 
 @persistent
 def _saving(*_: object) -> None:
-    """Note in the file what is shown, where that says anything of its splats."""
+    """Note the mode in the file, if that says anything of its splats."""
     if bpy.app.background:
         return
     for scene in bpy.data.scenes:
@@ -228,7 +221,6 @@ def _saving(*_: object) -> None:
 
 @persistent
 def _opened(*_: object) -> None:
-    """Show what was shown when the file was saved."""
     wanted = bpy.context.scene.get(SHOWN) if not bpy.app.background else None
     if wanted in MODES:
         show(wanted)
@@ -269,4 +261,3 @@ _LISTENERS: dict[Callable[..., None], tuple[str, ...]] = {
     _opened: ("load_post",),
     _saving: ("save_pre",),
 }
-"""What is called at which events of Blender."""

@@ -1,8 +1,5 @@
-"""What is drawn over splats: see-through meshes, edges of volumes, and what the colours mean.
-
-Blender draws such meshes without depth, so what lies before splats cannot be told from what lies
-behind them. They are mixed over all splats, the nearest face of each pixel, lit from the viewer.
-"""
+"""Overlays over splats: see-through meshes, edges of volumes, the legend.
+Blender draws such meshes without depth, so they are mixed over all splats, lit from the viewer."""
 
 from __future__ import annotations
 
@@ -22,23 +19,17 @@ from numpy.typing import NDArray
 from ..mesh.layout import looks_like_splats
 from .arrays import GOES, MARKS, STAYS, ramp
 
-_OPAQUE = 0.995
-"""Opacity from which on Blender draws a mesh with its depth."""
+_OPAQUE = 0.995  # Opacity from which on Blender draws a mesh with depth
 
-_COLORS = {"PROTECT": MARKS[STAYS], "REMOVE": MARKS[GOES], "KEEP": MARKS[GOES]}
-"""By the role of a volume."""
+_COLORS = {"PROTECT": MARKS[STAYS], "REMOVE": MARKS[GOES], "KEEP": MARKS[GOES]}  # By role
 
-_FILLED = {"SOLID", "TEXTURED"}
-"""Display types of objects whose faces are drawn."""
+_FILLED = {"SOLID", "TEXTURED"}  # Display types with drawn faces
 
 WORDS = {"HEAT": ("goes first", "goes last"), "STAYS": ("What stays",), "GOES": ("What goes",)}
-"""What is written in a view, by mode; of the heat map at both ends of its bar."""
 
-MARKED = {STAYS: "Protected", GOES: "Must go"}
-"""What is written beside the tint of what stays and goes in any case."""
+MARKED = {STAYS: "Protected", GOES: "Must go"}  # Text beside tints of protected and removed splats
 
-_REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}
-"""Marks that no splat has in a mode."""
+_REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}  # Marks that no splat has in a mode
 
 _WIDE, _HIGH, _EDGE, _FONT = 220, 10, 16, 12  # pixels at scale 1
 _GAP = 6  # between the bar and the words above it
@@ -50,16 +41,14 @@ _TURN = np.linspace(0.0, 2.0 * np.pi, 49)
 
 
 def is_xray(shading: bpy.types.View3DShading) -> bool:
-    """Tell whether a view sees through all meshes."""
+    """Whether a view sees through all meshes."""
     seen = {"SOLID": shading.show_xray, "WIREFRAME": shading.show_xray_wireframe}
     return bool(seen.get(shading.type))
 
 
 def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
-    """Draw edges of volumes into a view, and meshes that are to be mixed with what it shows.
-
-    Where it has no depths of what hides others, they are of something else: see `view.View`.
-    """
+    """Draw edges of volumes into a view, and meshes to be mixed with it.
+    Without `has_depths`, depths are those of something else; see `view.View`."""
     shading = context.space_data.shading
     if mixed and shading.type != "WIREFRAME":
         if not has_depths:
@@ -78,7 +67,6 @@ def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
 
 
 def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
-    """Mix the faces of a mesh that are seen through with what has been drawn."""
     shading = context.space_data.shading
     materials = [slot.material for slot in obj.material_slots] or [None]
     colors = np.array([_color(obj, material, shading) for material in materials], np.float32)
@@ -120,7 +108,6 @@ def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
 def _color(
     obj: bpy.types.Object, material: bpy.types.Material | None, shading: bpy.types.View3DShading
 ) -> tuple[float, ...]:
-    """Colour of a material in a view, as it is shown, and its opacity."""
     color, opacity = (0.8, 0.8, 0.8, 1.0), 1.0
     if shading.type == "SOLID":
         if shading.color_type == "OBJECT":
@@ -138,7 +125,7 @@ def _color(
 
 
 def _edges(shape: str) -> NDArray[np.float64]:
-    """The ends of the edges of a cube, (24, 3), or of the pieces of three circles, (288, 3)."""
+    """Ends of a cube's edges, (24, 3), or of the pieces of three circles, (288, 3)."""
     if shape == "SPHERE":
         circle = np.stack([np.cos(_TURN), np.sin(_TURN), np.zeros_like(_TURN)], axis=1)
         pieces = np.stack([circle[:-1], circle[1:]], axis=1).reshape(-1, 3)
@@ -154,10 +141,7 @@ def draw_legend(
     marks: Collection[int] = (),
     warnings: Collection[str] = (),
 ) -> None:
-    """Draw the legend of a mode, and of marks that splats have (`MARKED`), into a view.
-
-    Warnings stand above it, a line each.
-    """
+    """Draw the legend of a mode and of marks (`MARKED`) into a view, warnings above it."""
     if mode not in WORDS and not marks and not warnings:
         return
     scale = context.preferences.system.ui_scale
@@ -192,13 +176,11 @@ def _write(text: str, x: float, y: float) -> None:
 
 
 def _beside_tools(context: bpy.types.Context) -> int:
-    """Pixels of a view that the toolbar covers."""
     regions = (region for region in context.area.regions if region.type == "TOOLS")
     return sum(region.width for region in regions if region.x <= context.region.x)
 
 
 def _bar(x: float, y: float, wide: float, high: float, colors: Any) -> None:
-    """Draw colours, (C, 3), side by side."""
     places = [
         (x + wide * k / (len(colors) - 1), y + up) for k in range(len(colors)) for up in (0, high)
     ]
@@ -207,7 +189,6 @@ def _bar(x: float, y: float, wide: float, high: float, colors: Any) -> None:
 
 
 def _shape(kind: str, places: Any, colors: Any) -> Callable[[], None]:
-    """What draws corners, with a colour of each."""
     program = gpu.shader.from_builtin("SMOOTH_COLOR")
     content = {"pos": np.asarray(places, np.float32), "color": np.asarray(colors, np.float32)}
     return partial(batch_for_shader(program, kind, content).draw, program)

@@ -1,9 +1,6 @@
-"""Where splats stand in a view: objects of the view layer, and instances of collections.
-
-Blender draws a mesh without faces as points, and has no switch for that. What it draws is an
-evaluated copy of the object, which no file, undo step or script ever gets to see: on that copy the
-object is shown as its bounding box. The object itself is not touched.
-"""
+"""Places of splats in a view: objects of the view layer, and instances of collections.
+Blender draws a mesh without faces as points, and has no switch for that. So its evaluated copy,
+which no file, undo step or script sees, is shown as its bounding box; the object is untouched."""
 
 from __future__ import annotations
 
@@ -17,22 +14,12 @@ from numpy.typing import NDArray
 
 from ..mesh.layout import looks_like_splats, splat_count
 
-_DEEPEST = 8
-"""Collections that stand in each other as instances, at most; Blender draws no more."""
+_DEEPEST = 8  # Deepest nesting of instances; Blender draws no more
 
 
 class Placing(NamedTuple):
-    """Splats at a place.
-
-    Attributes
-    ----------
-    key : (int, int)
-        Tells this place of these splats from others: the identities of what instances the object,
-        if anything, and of the object, in one number; the identity of the mesh.
-    obj : bpy.types.Object
-    matrix : (4, 4) float64
-        To the world.
-    """
+    """An object with splats and its (4, 4) matrix to the world.
+    `key`: identity of the object and its instancers in one number, and of the mesh."""
 
     key: tuple[int, int]
     obj: bpy.types.Object
@@ -40,7 +27,7 @@ class Placing(NamedTuple):
 
 
 def placings(objects: list[bpy.types.Object]) -> Iterator[Placing]:
-    """Give the splats among some objects of a scene, and among those that they instance."""
+    """Splats among some objects of a scene, and among their instances."""
     for obj in objects:
         yield from _placed(obj, obj.matrix_world, 0, 0)
 
@@ -56,7 +43,7 @@ def every() -> set[tuple[int, int]]:
 
 
 def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> Iterator[Placing]:
-    """Give an object's own splats, or those of its instances, given the matrix to the world."""
+    """An object's own splats, or those of its instances, given its matrix to the world."""
     chain = (chain << 32) + obj.session_uid
     if looks_like_splats(obj):
         if splat_count(obj.data):
@@ -72,7 +59,7 @@ def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> It
 
 
 def hide_points(depsgraph: bpy.types.Depsgraph, refused: Container[int] | None) -> None:
-    """Show splats of a view layer as bounding boxes, but for refused meshes; all points by None."""
+    """Show a view layer's splats as bounding boxes, but for refused meshes; None: as points."""
     for obj, evaluated in _copies(depsgraph):
         hidden = refused is not None and obj.data.session_uid not in refused
         wanted = "BOUNDS" if hidden and not is_edited(obj) else obj.display_type
@@ -81,12 +68,12 @@ def hide_points(depsgraph: bpy.types.Depsgraph, refused: Container[int] | None) 
 
 
 def is_edited(obj: bpy.types.Object) -> bool:
-    """Tell whether splats are in edit mode, of this object or of another that shares them."""
+    """Whether splats are in edit mode, in this object or another with the same data."""
     return obj.mode == "EDIT" or getattr(obj.data, "is_editmode", False)
 
 
 def graphs() -> Iterator[bpy.types.Depsgraph]:
-    """Give what is evaluated for each window."""
+    """Dependency graphs of all windows."""
     for window in bpy.context.window_manager.windows:
         yield window.view_layer.depsgraph
 

@@ -1,9 +1,6 @@
 """The two shaders: splats into a picture of their own, and that picture into the view.
-
-EWA splatting (Zwicker et al. 2002, Eq. 31) by the rules of the reference implementation. Colours
-are blended as they are encoded for the display, as splats are trained; a view's own framebuffer
-would decode them first. So splats are blended in a picture apart, and put into the view as a whole.
-"""
+EWA splatting (Zwicker et al. 2002, Eq. 31) by the reference implementation's rules. Colours blend
+display-encoded, as in training; a view's framebuffer would decode them, hence the picture."""
 
 from __future__ import annotations
 
@@ -38,8 +35,8 @@ struct ViewData {
   vec4 choices;
 };
 """
-"""size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, whether
-depth is tested, whether what lies before `near_depths` is left out."""
+"""size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, depth
+test, omit splats before `near_depths`."""
 
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
@@ -232,7 +229,7 @@ void main()
 
 @cache
 def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
-    """Shader of splats, and the quad that is drawn once for each."""
+    """Splat shader, and the quad drawn for each."""
     info = gpu.types.GPUShaderCreateInfo()
     info.typedef_source(_CONSTANTS + _VIEW)
     info.uniform_buf(0, "ViewData", "view_data")
@@ -261,21 +258,13 @@ def picture() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
 
 
 def forget() -> None:
-    """Let go of the shaders."""
+    """Free the shaders."""
     splats.cache_clear()
     picture.cache_clear()
 
 
 def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.GPUTexture:
-    """Rows of texels on the graphics card.
-
-    Parameters
-    ----------
-    values : (R, C * channels) float32
-    channels : int
-    kind : str
-        Format of the texture.
-    """
+    """Values, (R, C * channels), as texels on the graphics card."""
     size = (values.shape[1] // channels, values.shape[0])
     flat = np.ascontiguousarray(values, np.float32).reshape(-1)
     return gpu.types.GPUTexture(size, format=kind, data=gpu.types.Buffer("FLOAT", len(flat), flat))
@@ -288,19 +277,8 @@ def blend(
     numbers: Sequence[float],
     count: int,
 ) -> gpu.types.GPUFrameBuffer:
-    """Draw splats into a picture, which is cleared before.
-
-    Parameters
-    ----------
-    picture : gpu.types.GPUTexture
-    textures : dict of str to gpu.types.GPUTexture
-        What the shader of `splats` reads; held by the caller until they are drawn.
-    projection : (4, 4) float64
-    numbers : sequence of 7 float
-        The rest of ``ViewData``, but for its last.
-    count : int
-        How many splats of the order.
-    """
+    """Clear a picture and draw `count` splats; `numbers`: ``ViewData`` but for its last.
+    `textures`: inputs of the shader of `splats`, held by the caller until drawn."""
     data = np.zeros(24, np.float32)
     data[:16], data[16:23] = projection.T.reshape(-1), numbers
     block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(data), data))

@@ -1,8 +1,5 @@
-"""What one 3D view shows: its order of the splats, their colours from its eye, its picture.
-
-While a view moves, the splats that matter most are sorted at once and drawn; once it rests, all of
-them are sorted and coloured on the thread, and drawn when that is done.
-"""
+"""One 3D view: its order of splats, their colours from its eye, its picture.
+While it moves, the most important are sorted at once; at rest, a thread sorts and colours all."""
 
 from __future__ import annotations
 
@@ -31,28 +28,16 @@ from .arrays import (
 )
 from .content import Atlas, Content, Marks, Slot
 
-REST = 0.2
-"""Seconds without a change after which a view rests."""
+REST = 0.2  # Seconds without a change after which a view rests
 
-TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55
-"""What goes is shown in this colour, by that share."""
+TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55  # Tint of splats that the budget removes, and its share
 
 
-BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)
-"""What is drawn while a view moves: at most so many splats, each so many pixels wide."""
+BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)  # Splats drawn while moving, at most; pixels each
 
 
 class Camera(NamedTuple):
-    """Where a view looks from and how.
-
-    Attributes
-    ----------
-    view : (4, 4) float64
-        World to camera: x right, y up, z back.
-    projection : (4, 4) float64
-    size : (int, int)
-        Pixels across and up.
-    """
+    """World to camera, (4, 4), x right, y up, z back; projection; pixels across and up."""
 
     view: NDArray[np.float64]
     projection: NDArray[np.float64]
@@ -75,8 +60,6 @@ class Camera(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """What the thread needs of one object."""
-
     slot: Slot
     marks: Marks
     important: NDArray[np.int32] | None
@@ -84,30 +67,18 @@ class _Part(NamedTuple):
 
 
 _Sorted = tuple[NDArray[np.float32], int, NDArray[np.float32] | None]
-"""What the thread computed: the order of splats as a texture, how many are drawn, their colours."""
+"""The thread's result: order as a texture, number drawn, colours."""
 
 
 class _Order(NamedTuple):
-    """The splats that are drawn, on the graphics card."""
-
     texture: gpu.types.GPUTexture
     count: int
     key: object
 
 
 class View:
-    """One region of a 3D view.
-
-    Attributes
-    ----------
-    depths : (H, W) float32 or None
-        Of what Blender has drawn; None where nothing hides what is behind it (Blender 5 keeps
-        depths of what X-ray shows), or Blender kept none.
-    complete : bool
-        Whether it shows all it is to show.
-    count : int
-        Splats that are shown.
-    """
+    """One region of a 3D view. `complete`: shows all it should; `count`: splats shown.
+    `depths`: (H, W) that Blender drew; None if none hide (Blender 5 keeps depths of X-ray)."""
 
     def __init__(self) -> None:
         self._picture: gpu.types.GPUTexture | None = None
@@ -124,7 +95,7 @@ class View:
         self.count = 0
 
     def due(self) -> bool:
-        """Tell whether drawing again would show more."""
+        """Whether drawing again would show more."""
         if self._job:
             return self._job[2].done()
         return not self.complete and time.monotonic() - self._changed >= REST
@@ -138,19 +109,8 @@ class View:
         *,
         solid: bool,
     ) -> None:
-        """Draw some objects into the framebuffer of the view.
-
-        Parameters
-        ----------
-        content : Content
-        places : mapping of (int, int) to (4, 4) float64
-            See `Content.update`.
-        camera : Camera
-        mode : str
-            One of `draw.MODES`.
-        solid : bool
-            Whether anything but splats is in the view that hides what is behind it.
-        """
+        """Draw objects (matrices of `Content.update`) into the view, by a mode of `draw.MODES`.
+        `solid`: whether anything else in the view hides what is behind it."""
         atlas = content.atlas
         if not places:
             self.complete, self.count = not content.pending(), 0
@@ -176,7 +136,7 @@ class View:
         _put(self._picture)
 
     def _moves(self, key: bytes) -> bool:
-        """Tell whether the view, or an object in it, has moved in the last moments."""
+        """Whether the view, or an object in it, moved in the last moments."""
         now = time.monotonic()
         if key != self._camera_key:
             self._changed = now if self._camera_key else 0.0
@@ -184,7 +144,6 @@ class View:
         return now - self._changed < REST
 
     def _take(self) -> None:
-        """Take what the thread has computed."""
         if self._job is None or not self._job[2].done():
             return
         order_key, colors_key, future = self._job
@@ -196,10 +155,8 @@ class View:
             self._colors_key, self._colored = colors_key, order_key[0]
 
     def _start(self, pool, key, parts, near, mode, few):
-        """Have all splats sorted, and coloured if they look otherwise from here.
-
-        Where nothing is seen yet, only those that matter most, in their constant colours.
-        """
+        """Sort and recolour all splats on the thread, if needed.
+        If nothing is shown yet, only the most important ones, in constant colours."""
         objects = [(p.slot.number, p.slot.held.marked) for p in parts]
         colors_key: tuple[Any, ...] = (key[0], mode, objects)
         if mode == "HEAT":
@@ -215,7 +172,6 @@ class View:
         self._job = (key, colors_key, work)
 
     def _sort(self, key, shown, camera, mode, most):
-        """Sort the splats that matter most, at once."""
         if self._order is None or self._order.key != key:
             order = _order(_parts(shown, camera), camera.near, mode, most)
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
@@ -267,10 +223,8 @@ def _parts(shown: list[tuple[Slot, NDArray[Any]]], camera: Camera) -> list[_Part
 def _sort_and_color(
     parts: list[_Part], near: float, mode: str, rows: int | None, few: int | None = None
 ) -> _Sorted:
-    """Sort splats and, in textures of so many rows, colour them; on the thread.
-
-    With `few`, only so many are sorted, and colours are constant.
-    """
+    """Sort splats, and colour them in textures of `rows`; on the thread.
+    With `few`, only so many, in constant colours."""
     order = _order(parts, near, mode, few)
     if rows is None:
         return as_texture(order), len(order), None
@@ -282,7 +236,6 @@ def _sort_and_color(
 
 
 def _colored(part: _Part, mode: str, *, constant: bool) -> NDArray[np.float32]:
-    """Colours of an object's splats in a mode, (M, 4)."""
     packed, forced = part.slot.packed, part.marks.forced
     if mode == "HEAT" and part.marks.ranks is not None:
         rgba = heat(packed, part.marks.ranks, ramp())
@@ -295,7 +248,6 @@ def _colored(part: _Part, mode: str, *, constant: bool) -> NDArray[np.float32]:
 
 
 def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) -> NDArray[Any]:
-    """Rows of the textures that are drawn, the farthest first."""
     counts = [part.slot.count for part in parts]
     counts = counts if most is None else first_of_each(counts, most)
     rows, depths = zip(
@@ -326,10 +278,8 @@ def _in_view(
 
 
 def _depths(size: tuple[int, int]) -> NDArray[np.float32] | None:
-    """Depths that Blender has drawn in the view, (H, W), None where it kept none.
-
-    EEVEE of 4.3 leaves zeros where overlays are off.
-    """
+    """Depths that Blender drew in the view, (H, W), None where it kept none.
+    EEVEE of 4.3 leaves zeros where overlays are off."""
     width, height = size
     buffer = gpu.types.Buffer("FLOAT", width * height)
     gpu.state.active_framebuffer_get().read_depth(0, 0, width, height, data=buffer)
@@ -338,7 +288,6 @@ def _depths(size: tuple[int, int]) -> NDArray[np.float32] | None:
 
 
 def _put(picture: gpu.types.GPUTexture) -> None:
-    """Put a picture into the framebuffer that is bound."""
     program, quad = shader.picture()
     gpu.state.blend_set("ALPHA_PREMULT")
     gpu.state.depth_test_set("NONE")
