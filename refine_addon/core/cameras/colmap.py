@@ -86,10 +86,7 @@ def lens_note(counts: Mapping[Model, int], thing: str) -> str:
 
 
 def find_colmap(folder: Path) -> tuple[Path, str] | None:
-    """Folder of a model and the suffix to read, or ``None``.
-
-    Looks in the folder itself, then ``sparse/0``, ``sparse`` and ``colmap/sparse/0``.
-    """
+    """Folder of a model (this, sparse/0, sparse or colmap/sparse/0) and its suffix, or None."""
     for place in (".", "sparse/0", "sparse", "colmap/sparse/0"):
         for suffix in SUFFIXES:
             if all(is_file(folder / place / f"{stem}{suffix}") for stem in MODEL_FILES[:2]):
@@ -98,10 +95,7 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
 
 
 def read_colmap(folder: Path, suffix: str) -> ViewSet:
-    """Views of a COLMAP model, sorted by image name like in the 3DGS loader.
-
-    COLMAP's own order may differ between text and binary. Errors name the byte or the line.
-    """
+    """Views of a COLMAP model, sorted by image name, as text and binary may differ in order."""
     cameras, images = (CameraPlace(folder / f"{stem}{suffix}") for stem in MODEL_FILES[:2])
     binary = suffix == ".bin"
     lenses: dict[int, tuple[Any, ...]] = {}
@@ -157,7 +151,6 @@ class _Binary:
         return struct.unpack_from(f"<{layout}", self.data, start)
 
     def skip(self, count: int, what: str) -> int:
-        """Skip bytes; the offset at which they start."""
         start = self.offset
         if count > len(self.data) - start:
             self.truncated(f"{what}: expected {count} more bytes")
@@ -165,7 +158,6 @@ class _Binary:
         return start
 
     def name(self, what: str) -> str:
-        """Next text, up to a zero byte."""
         end = self.data.find(b"\0", self.offset)
         if end < 0:
             self.truncated(f"{what}: expected a zero byte after the name")
@@ -217,7 +209,6 @@ def _binary_images(file: CameraPlace) -> Iterator[Any]:
 
 
 def _lines(file: CameraPlace) -> Iterator[tuple[CameraPlace, bytes]]:
-    """Yield place and text of each line that is no comment."""
     with opened(file) as (stream, _):
         for number, text in enumerate(stream, 1):
             line = text.strip()
@@ -228,7 +219,6 @@ def _lines(file: CameraPlace) -> Iterator[tuple[CameraPlace, bytes]]:
 
 
 def _text_cameras(file: CameraPlace) -> Iterator[Any]:
-    """Place, id and `_lens` of each camera."""
     for place, line in _lines(file):
         if not line:
             continue

@@ -45,10 +45,7 @@ LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
 
 
 def read_transforms(path: Path, data: object) -> ViewSet:
-    """Views of a ``transforms.json``, in the order of its frames.
-
-    Images are looked for beside `path` if ``w`` or ``h`` is missing. Errors name frame and key.
-    """
+    """Views of a ``transforms.json``, in order; sizes may come from images beside `path`."""
     place = CameraPlace(path)
     shared = place.members(data, ("frames",))
     frames = place.at("'frames'").items(shared["frames"])
@@ -69,7 +66,6 @@ def read_transforms(path: Path, data: object) -> ViewSet:
 
 
 def _view(place, values, name, world, remarks):
-    """View of a frame; notes what is done to its pose."""
     name = place.at("'file_path'").text(values.maps[0].get("file_path", name))
     axes, center = _pose(place.at("'transform_matrix'"), values["transform_matrix"], remarks)
     size = _size(place, values, name)
@@ -83,10 +79,7 @@ def _view(place, values, name, world, remarks):
 
 
 def _pose(place, value, remarks):
-    """The camera's axes (x right, y down, z forward) as columns, and its centre.
-
-    A uniform scale is removed: it moves points along rays, which changes no picture.
-    """
+    """Camera axes (x right, y down, z forward) as columns, and centre; uniform scales go."""
     matrix = place.matrix(value, (3, 4), 4)
     if len(matrix) > 3 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         place.at("row 3").fail(f"expected [0, 0, 0, 1], got {matrix[3].tolist()}")

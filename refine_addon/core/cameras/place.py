@@ -70,11 +70,10 @@ class CameraPlace(Place):
         return matrix
 
     def view(self, name: str, pose: Pose, lens: Lens) -> View:
-        """View of a camera; errors name this place.
+        """View of a camera; surrogates in `name`, which cannot be printed, become "?".
 
-        `pose` is the rotation (3, 3), world to camera (x right, y down, z forward), and the centre,
-        world units; `lens` is (fx, fy), (cx, cy), (width, height) in pixels. Surrogates in `name`
-        become "?".
+        `pose`: rotation (3, 3), world to camera, and centre; `lens`: two focal lengths, the
+        principal point, width and height, pixels.
         """
         (rotation, center), ((fx, fy), (cx, cy), (width, height)) = pose, lens
         if np.abs(center).max() > LARGEST_NUMBER:

@@ -29,9 +29,8 @@ def read_cameras(path: Path | str) -> ViewSet:
     ----------
     path : path-like
         A ``cameras.json`` of the reference 3DGS implementation, a ``transforms.json`` of nerfstudio
-        or instant-ngp, any file of a COLMAP model, or a folder. A folder is searched for
-        ``cameras.json``, ``transforms.json``, ``transforms_train.json`` and a COLMAP model (here,
-        in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``). ``~`` is the home folder.
+        or instant-ngp, any file of a COLMAP model, or a folder, searched for these in this order
+        (models in itself, ``sparse/0``, ``sparse``, ``colmap/sparse/0``). ``~`` is the home folder.
 
     Returns
     -------
@@ -62,7 +61,6 @@ def cameras_in(folder: Path) -> list[Path]:
 
 
 def _read_folder(folder: Path) -> ViewSet:
-    """Read the preferred cameras of a folder; the note names the others."""
     found, colmap = cameras_in(folder), find_colmap(folder)
     if not found:
         CameraPlace(folder).fail(
@@ -81,7 +79,6 @@ def _read_folder(folder: Path) -> ViewSet:
 
 
 def _read_json_cameras(path: Path) -> ViewSet:
-    """Read a JSON file in either of the two formats."""
     data, place = read_json(path), CameraPlace(path)
     if isinstance(data, list):
         if not data:
@@ -95,11 +92,7 @@ def _read_json_cameras(path: Path) -> ViewSet:
 
 
 def _inria_view(file: CameraPlace, index: int, item: object) -> View:
-    """View of a camera as the reference 3DGS implementation writes it.
-
-    Columns of ``rotation`` (camera to world) are x right, y down, z forward; ``position`` is the
-    centre. Some forks add ``cx`` and ``cy``, pixels.
-    """
+    """View of a reference 3DGS camera; ``rotation`` is camera to world, ``cx`` is optional."""
     place = file.at(f"camera {index}")
     camera = place.members(item)
     if "transform" in camera and "position" not in camera:

@@ -1,8 +1,7 @@
-"""Formats known only by the file's name: ``.splat`` and ``.ksplat``.
+"""``.splat`` and ``.ksplat``, formats known only by the file's name.
 
 ``.splat`` (antimatter15) is 32 bytes a splat. ``.ksplat`` (GaussianSplats3D by mkkellogg), levels
-0 to 2, is only read: a header, a header for each section, then the sections. In levels 1 and 2 a
-section has buckets; a coordinate is 16 bits around the bucket's centre.
+0 to 2, is only read; in levels 1 and 2 a coordinate is 16 bits around the centre of a bucket.
 """
 
 from __future__ import annotations
@@ -69,8 +68,6 @@ def _write_splat(stream, splats):
 
 
 class _Section(NamedTuple):
-    """The header of a section, and where the section begins."""
-
     place: Place
     start: int
     splats: int
@@ -186,7 +183,6 @@ def _buckets(section, data):
 
 
 def _named(suffix):
-    """`Format.matches` of files with this suffix that are no PLY."""
     return lambda path, head: (
         path.suffix.lower() == suffix and bool(head) and not head.startswith(b"ply")
     )

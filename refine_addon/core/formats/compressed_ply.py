@@ -1,8 +1,7 @@
 """SuperSplat's compressed PLY: 16 bytes a splat, in chunks of 256 that share their ranges.
 
-Position (11, 10, 11 bits), log scale (11, 10, 11) and colour (8 each) are fractions of the chunk's
-ranges; opacity has 8 bits, the three smaller components of the rotation 10 each, harmonics 8 each.
-Splats are sorted, so that those of a chunk are near each other and its ranges small.
+Position and log scale (11, 10, 11 bits) and colour (8 each) are fractions of the chunk's ranges;
+opacity has 8 bits, the smaller components of the rotation 10 each, harmonics 8 each.
 """
 
 from __future__ import annotations
@@ -109,7 +108,6 @@ def _read(path, data):
 
 
 def _chunks_of(piece):
-    """Chunks of the splats of a piece; pieces begin with a chunk."""
     return slice(piece.start // SPLATS, -(-piece.stop // SPLATS))
 
 

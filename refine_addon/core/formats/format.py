@@ -23,45 +23,25 @@ CHUNK = 1 << 15
 
 @dataclass(frozen=True)
 class Format:
-    """A format of splat files; `write` is None if it is only read.
-
-    Attributes
-    ----------
-    suffix : str
-        In lower case; names the format of an output.
-    matches : callable
-        ``matches(path, head)``: whether a file with these first bytes is of this format.
-    write : callable or None
-        ``write(stream, splats)``; all of the splats can be drawn.
-    degree : int
-        Highest degree of harmonics that it holds.
-    loss : str
-        What it does to splats, as a sentence without its subject.
-    sizes : callable or None
-        ``sizes(count, degree)``: bytes of one splat, and of everything else at most; None if
-        files are compressed as a whole.
-    models : tuple of str
-        Models that a file can name.
-    """
+    """A format of splat files, other than plain PLY."""
 
     name: str
-    suffix: str
+    suffix: str  # in lower case
     matches: Callable[[Path, bytes], bool]
     read: Callable[[Path, NDArray[np.uint8]], SplatFile]
+    # Gets splats that can be drawn; None if the format is only read.
     write: Callable[[BinaryIO, Splats], None] | None = None
-    degree: int = 0
-    loss: str = ""
+    degree: int = 0  # highest of the harmonics
+    loss: str = ""  # what it does to splats, as a sentence without its subject
+    # Of a count and a degree: bytes of one splat, and of the rest at most; None if compressed.
     sizes: Callable[[int, int], tuple[float, int]] | None = None
-    models: tuple[Model, ...] = MODELS[:1]
+    models: tuple[Model, ...] = MODELS[:1]  # those that a file can name
 
 
 def new_file(
     path: Path, origin: tuple[str, int], count: int, degree: int, model: Model = "default"
 ) -> tuple[SplatFile, Splats]:
-    """New plain PLY of `count` splats in memory, and its splats as views to be assigned to.
-
-    `origin` holds the fields of `Origin`. The splats have a third scale in every model.
-    """
+    """New plain PLY of `count` splats in memory, and the splats, with third scale, to be set."""
     rows, splats = empty_rows(count, degree)
     header = with_model(new_header(rows.dtype, count), model)
     return SplatFile(path, rows, header, origin=Origin(*origin)), splats
@@ -96,9 +76,9 @@ def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
 
 
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Index (N,) of the largest component of unit quaternions (N, 4), the others (N, 3) in order.
+    """Index (N,) of the largest component of unit quaternions (N, 4), and the others (N, 3).
 
-    The first of equal components counts. Signs are flipped where the largest is negative.
+    The first of equals counts. Signs are flipped where the largest is negative.
     """
     largest = np.abs(q).argmax(axis=1)
     others = np.take_along_axis(q, _OTHERS[largest], axis=1)

@@ -1,8 +1,7 @@
 """Binary glTF (``.glb``) with KHR_gaussian_splatting: plain accessors, activated values.
 
-Rotations are x y z w, scales linear, opacities 0..1. glTF's y points up where that of captures
-points down: half a turn about z, which changes signs only, takes one to the other. The transforms
-of nodes are applied.
+Rotations are x y z w. glTF's y points up where that of captures points down: half a turn about z,
+which changes signs only, takes one to the other. The transforms of nodes are applied.
 """
 
 from __future__ import annotations
@@ -43,8 +42,6 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # between the frames of captures a
 
 
 class _Document(NamedTuple):
-    """A file: its place, its JSON and its binary chunk."""
-
     place: Place
     content: dict[str, Any]
     binary: NDArray[np.uint8]
@@ -92,8 +89,6 @@ class _Document(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """The splats of a primitive."""
-
     splats: int
     degree: int
     logs: bool  # whether scales are held as their logarithms, as in drafts of the extension
@@ -171,7 +166,6 @@ def _opened(path, data):
 
 
 def _listed(holder, key, place):
-    """List, empty if it is not there."""
     return place.at(key).items(holder.get(key, []))
 
 
@@ -192,7 +186,6 @@ def _moved(frame, node, place):
 
 
 def _parts(document, mesh, place):
-    """Primitives of splats of a mesh."""
     parts = []
     for number, item in enumerate(_listed(mesh, "primitives", place)):
         where = place.at(f"primitives[{number}]")
@@ -332,7 +325,6 @@ def _json(attributes, count, low, high):
 
 
 def _sizes(count, degree):
-    """Bytes of a splat and of the rest, at most: the numbers in the JSON have varying length."""
     longest = [-1.1754943508222875e-38] * 3
     text, _ = _json(_attributes(degree), count, longest, longest)
     _, row = _json(_attributes(degree), 1, longest, longest)

@@ -1,8 +1,7 @@
 """Plain 3DGS PLY: read through a memory map, written with the kept rows unchanged.
 
-Only the columns used are read from the disk. ASCII is parsed into memory and written as binary.
 plyfile parses the header, without comments (of any encoding), with plain line ends and with row
-counts of 0, since it would allocate memory for the rows.
+counts of 0, since it would allocate memory for the rows. ASCII is written as binary.
 """
 
 from __future__ import annotations
@@ -72,32 +71,16 @@ class Origin(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """A 3DGS PLY file, opened; or a file of another format, as the PLY that holds the same splats.
-
-    Attributes
-    ----------
-    rows : (N,) structured
-        The vertex element, one field for each property; read-only and mapped if binary.
-    header : bytes
-        With ``end_header`` and its line end.
-    before, after : (M,) uint8
-        Bytes of the body before and after the vertex rows.
-    indexing : tuple of str
-        Names of other elements whose rows hold indices of splats.
-    origin : Origin or None
-        Set where the file is no binary PLY; `write` writes a binary PLY.
-    remarks : tuple of str
-        Sentences for the user about how it was read.
-    """
+    """An opened 3DGS PLY file, or the PLY that holds the splats of a file of another format."""
 
     path: Path
-    rows: NDArray[Any]
-    header: bytes
+    rows: NDArray[Any]  # (N,) structured, one field a property; read-only and mapped if binary
+    header: bytes  # with ``end_header`` and its line end
     before: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     after: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
-    indexing: tuple[str, ...] = ()
-    origin: Origin | None = None
-    remarks: tuple[str, ...] = ()
+    indexing: tuple[str, ...] = ()  # other elements whose rows hold indices of splats
+    origin: Origin | None = None  # set where the file is no binary PLY
+    remarks: tuple[str, ...] = ()  # for the user, about how it was read
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -128,12 +111,10 @@ class SplatFile:
         return stated_model(self.header, self.rows.dtype) or "default"
 
     def drawn_as(self, model: Model | None) -> SplatFile:
-        """The file with its splats drawn as another model; None leaves it as it is.
+        """The file with its splats drawn as another model; None keeps that of the file.
 
-        Raises
-        ------
-        RefineError
-            For an unknown model, or if splats without a third scale are to be other than discs.
+        `RefineError` if the model is unknown, or splats without a third scale are to be other than
+        discs.
         """
         if model is None or model == self.model:
             return self
@@ -177,14 +158,12 @@ class SplatFile:
         path : path-like
             Written completely or not at all. ``~`` is the home folder.
         keep : (N,) bool, optional
-            Rows to write; all by default.
+            All by default.
         columns : mapping of str to (N,), optional
             Properties to set. Existing ones keep their place and type; new ones are appended with
             the type of their array (float32 -> ``float``).
         overwrite : bool
             Whether an existing file may be replaced, even the one that was read.
-        threads : int, optional
-            Number of threads that gather rows, while others are written.
 
         Raises
         ------
@@ -388,9 +367,9 @@ def has_lists(element: Any) -> bool:
 
 
 def row_ranges(header: Header, available: int) -> list[slice]:
-    """Bytes of each element's rows in a body of `available` bytes, up to the first with lists.
+    """Bytes of each element's rows in a binary body, up to the first element with lists.
 
-    `RefineError` for more rows than the body can hold, before memory is allocated for them.
+    Refuses more rows than `available` bytes can hold, before memory is allocated for them.
     """
     ranges, least, text = [], 0, header.order == TEXT
     for element, count in zip(header.elements, header.counts, strict=True):
@@ -524,10 +503,7 @@ def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:
 
 
 def with_model(raw: bytes, model: Model) -> bytes:
-    """Header with a comment that states the model; unchanged if it says so already.
-
-    A header that says nothing stays unchanged for "default".
-    """
+    """Header that states the model in a comment; unchanged where it has this model already."""
     if (model_of(raw) or "default") == model:
         return raw
     lines = [line for line in _lines(raw) if not _MODEL_COMMENT.fullmatch(line)]
@@ -537,7 +513,6 @@ def with_model(raw: bytes, model: Model) -> bytes:
 
 
 def _line_end(raw: bytes) -> bytes:
-    """Line end of a header's first line, "ply"."""
     return next(end for end in (b"\r\n", b"\n", b"\r") if raw.startswith(end, 3))
 
 

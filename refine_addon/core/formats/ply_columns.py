@@ -22,8 +22,7 @@ REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}  # number of ``f_rest_*`` -> deg
 def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> Splats:
     """Splats from all of `REQUIRED` and any ``f_rest_*``, (N,) each; discs without ``scale_2``.
 
-    The harmonics are all of red, then green, then blue, as in the reference implementation. Arrays
-    are views of a structured array where the fields of a group are adjacent, otherwise copies.
+    Harmonics are all of red, then green, then blue. Views of adjacent fields, otherwise copies.
     """
     names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
     count = sum(name.startswith("f_rest_") for name in names)
@@ -64,10 +63,7 @@ def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
 
 
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
-    """Views of splats, (N,) each, by the names and in the order of a 3DGS PLY without normals.
-
-    Types are those of `splats`; discs (2DGS) have no third scale.
-    """
+    """Views of splats, (N,) each, by name in the order of a 3DGS PLY; discs have two scales."""
     coefficients = splats.sh_rest.shape[1]
     axes = 2 if splats.model == "2dgs" else 3
     planes = [splats.sh_rest[:, k, channel] for channel in range(3) for k in range(coefficients)]
@@ -93,7 +89,7 @@ class Columns(Protocol):
 
 
 class ChangedColumns(Mapping[str, "NDArray[Any]"]):
-    """Stored columns in which M `rows` (ascending) get new values, rounded once to the stored type.
+    """Stored columns with new values in `rows`, ascending, rounded once to the stored type.
 
     A column is copied when it is read; `put` writes a binary PLY without such copies.
     """
@@ -115,10 +111,7 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
         return len(self._values)
 
     def put(self, chunk: NDArray[Any], dtype: np.dtype[Any], piece: slice, kept: Keep) -> None:
-        """Put the values into the bytes of the kept rows of a piece, (n,) void.
-
-        `dtype` is a row's, with all these properties; `kept` selects among the piece's rows.
-        """
+        """Put the values into `chunk`, kept rows of a piece as bytes (n,); `dtype` is a row's."""
         low, high = np.searchsorted(self._rows, (piece.start, piece.stop))
         rows, taken = self._rows[low:high] - piece.start, np.arange(low, high)
         if kept is not None:

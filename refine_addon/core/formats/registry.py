@@ -42,8 +42,7 @@ _HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed 
 def read_splats(path: Path | str, model: Model | None = None, level: int = 0) -> SplatFile:
     """Open a file of splats of any format, known by its content.
 
-    A plain PLY is mapped. Any other format becomes, in memory, the plain PLY that holds the same
-    splats; `SplatFile.origin` names the format.
+    A plain PLY is mapped. Other formats become the plain PLY of the same splats, in memory.
 
     Parameters
     ----------
@@ -119,13 +118,8 @@ def write_splats(
 ) -> None:
     """Write the kept splats of a file in the format that the suffix of `path` names.
 
-    A plain PLY keeps all rows and properties, see `SplatFile.write` also for the parameters. Other
-    formats leave out splats that cannot be drawn.
-
-    Raises
-    ------
-    RefineError
-        As `SplatFile.write`; if no splat is left, or the format lacks a column or is not written.
+    A plain PLY keeps all rows and properties, see `SplatFile.write` also for parameters and errors.
+    Other formats leave out splats that cannot be drawn.
 
     Examples
     --------

@@ -1,9 +1,8 @@
 """SOG by PlayCanvas: ``meta.json`` and WebP images, in a ZIP archive or in a folder.
 
-A splat is one pixel in each image: 16 bits of the logarithm of each coordinate, three components
-of the rotation in 8, opacity in 8, scales and colours as places in tables of 256 values, harmonics
-as an entry of a palette. Version 1, only read, names no version: a table is even steps between two
-ends, one for each axis or channel, and opacity is a logit.
+A splat is a pixel in each image: logarithms of coordinates in 16 bits, rotation and opacity in 8,
+scales, colours and a palette of harmonics by tables of 256 values. Version 1, only read and not
+named in the file, has even steps between two ends as tables, and opacity logits.
 """
 
 from __future__ import annotations
@@ -59,10 +58,7 @@ _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 class Bundle:
-    """A ``meta.json`` and the files that it names; `files` holds the size of each, bytes.
-
-    ``opened(name, limit)`` gives the bytes of a file beside it and refuses more than `limit`.
-    """
+    """A ``meta.json`` and its files: `files` has sizes, ``opened(name, limit)`` gives bytes."""
 
     def __init__(
         self, place: Place, meta: dict[str, Any], opened: Callable, files: dict[Path, int]
@@ -237,11 +233,7 @@ def _read_archive(path, data):
 
 
 def bundle_beside(path: Path) -> Bundle:
-    """Open a ``meta.json`` with the images beside it.
-
-    `RefineError`, here or in `Bundle.read`, for damage, another version, a file that lies
-    elsewhere, or no library for images.
-    """
+    """Open a ``meta.json`` with the images beside it."""
     place = Place(path)
 
     def held(there, limit):
@@ -285,10 +277,7 @@ def _write(stream, splats):
 
 
 def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
-    """Yield name and bytes of `META`, then of the images; rows keep the order of `splats`.
-
-    `RefineError`, naming `path`, if there is no library for images, or too many splats for one.
-    """
+    """Yield name and bytes of `META`, then of the images, with rows in the order of `splats`."""
     count, codec = len(splats), codec_for(path)
     across = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)  # nearly square, divisible by 4
     if across > _MOST_PIXELS:
@@ -346,11 +335,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
 
 
 def _tabulated(values):
-    """Table of 256 values, and the place of the nearest for each of `values`.
-
-    Half are equal steps over the range, so that the error is at most half a step; half are
-    quantiles.
-    """
+    """Table of 256 values, half even steps, half quantiles, and each value's nearest place."""
     flat = np.sort(values, axis=None)
     half = _TABLE // 2
     shares = np.linspace(0.0, 1.0, half)
@@ -364,8 +349,7 @@ def _tabulated(values):
 def _grouped(rows):
     """Group from 0 on for each of N rows (N, D): similar rows share one.
 
-    Every group is halved at its mean along the axis of largest variance, until there are 65,536
-    groups or half as many as rows.
+    Groups are halved at the mean of their widest axis, up to 65,536 or half as many as rows.
     """
     columns = np.ascontiguousarray(np.asarray(rows, np.float32).T)  # (D, N)
     labels = np.zeros(rows.shape[0], np.int64)

@@ -1,7 +1,7 @@
 """SPZ files by Niantic: 16 to 20 bytes a splat and one for each harmonic, compressed as a whole.
 
-Versions 2 and 3 are one gzip stream; version 3 is written. Version 4, only read, is a header, a
-table and a zstd stream for each attribute; it needs a module for zstd, which Blender brings.
+Versions 2 and 3 (written) are one gzip stream. Version 4 (only read) has a zstd stream for each
+attribute, which needs a module that Blender brings.
 """
 
 from __future__ import annotations
@@ -53,8 +53,6 @@ _STEP = 1 << 12  # bytes of gzip unpacked at a time, into at most 4 MB
 
 
 class _Header(NamedTuple):
-    """The fields of the header."""
-
     magic: bytes
     version: int
     splats: int
@@ -69,7 +67,6 @@ class _Header(NamedTuple):
         return {"mean": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": turn, "rest": rest}
 
     def needed(self) -> int:
-        """Bytes of all attributes."""
         return self.splats * sum(self.widths().values())
 
 
@@ -79,7 +76,6 @@ def _matches(path, head):
 
 
 def _read(path, data):
-    """Read a file; version 4 needs a module for zstd."""
     if not data[: len(SPZ)].tobytes().startswith(SPZ):
         header, body = _unpacked(path, data)
     else:
@@ -127,7 +123,6 @@ def _parsed(path, head, size):
 
 
 def _unpacked(path, data):
-    """Header and attributes of a gzip stream."""
     engine, body, at = zlib.decompressobj(16 + zlib.MAX_WBITS), bytearray(), 0
     try:
         head = engine.copy().decompress(data.data, _HEADER.size)
@@ -148,7 +143,6 @@ def _unpacked(path, data):
 
 
 def _streams(path, data, header):
-    """Attributes of version 4, concatenated."""
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
     (at,) = _TABLE_AT.unpack(data[_HEADER.size : first].tobytes())
@@ -246,10 +240,7 @@ def _write(stream, splats):
 
 
 def _fraction(splats):
-    """Bits of a position behind the point: 12 as in other writers, where coordinates allow.
-
-    Fewer for the largest coordinates, more below 32, where the largest has some 2^17 steps.
-    """
+    """Bits of a position behind the point: 12 as in other writers, if the scene's size allows."""
     farthest = float(np.abs(splats.means).max())
     _, bits = math.frexp(farthest)  # before the point
     most = _LARGEST_CODE.bit_length() - bits

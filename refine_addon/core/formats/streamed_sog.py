@@ -1,9 +1,8 @@
 """Streamed SOG by PlayCanvas: levels of detail of a scene in chunks, as viewers load them.
 
-``lod-meta.json`` holds a tree over space, which follows the finest level. Each leaf, a chunk, names
-for each level the rows of a SOG folder with its splats. As in splat-transform, consecutive chunks
-share a folder of up to `UNIT` splats. Viewers choose a chunk's level by its size in the image, so
-a chunk is no wider than the distance from which the cameras saw the scene.
+``lod-meta.json`` holds a tree over space. Each leaf, a chunk, names for each level its rows of a
+SOG folder. As in splat-transform, consecutive chunks share a folder of up to `UNIT` splats. Viewers
+choose a chunk's level by its size, so it is no wider than cameras were away.
 """
 
 from __future__ import annotations
@@ -45,10 +44,7 @@ _FOLDER = re.compile(rf"(\d+_\d+)/{re.escape(META)}")  # LEVEL_NUMBER, as in spl
 
 
 def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
-    """Read a level of a streamed SOG (0 is the finest), with the environment.
-
-    `RefineError` if it is damaged, has no such level, or names a file that lies elsewhere.
-    """
+    """Read a level of a streamed SOG (0 is the finest), with the environment."""
     place = Place(path)
     meta = place.members(place.parsed(data.tobytes()))
     if meta.get("version", VERSION) != VERSION:
@@ -130,8 +126,8 @@ def _planted(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
     """Tree over positions (N, 3), and its number of chunks.
 
     A leaf is a chunk's number; a branch is axis, value, subtree below, subtree of the rest. Chunks
-    of more than `UNIT` splats, or of more than `LEAST` and wider than `width`, are halved across
-    their longest side at the median.
+    above `UNIT`, or above `LEAST` and wider than `width`, are halved at the median of the longest
+    side.
     """
     numbers = itertools.count()
 
@@ -153,11 +149,10 @@ def _planted(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
 
 
 class StreamedSog:
-    """A streamed SOG, written level by level.
+    """A streamed SOG, written level by level into `folder`, see `folder_for`, until `publish`.
 
-    The chunks follow `finest`, the positions (N, 3) of the finest level, and are at most `width`
-    wide where they hold many splats. SOG folders are made in `folder`, see `folder_for`, until
-    `publish`.
+    Chunks follow the `finest` level's positions (N, 3); those of many splats are at most `width`
+    wide.
     """
 
     def __init__(self, finest: NDArray[Any], width: float, folder: Path) -> None:
@@ -169,10 +164,7 @@ class StreamedSog:
         self._counts: list[int] = []  # splats of each level
 
     def add(self, splats: Splats) -> int:
-        """Write the next level, the finest first, and give the bytes of its files.
-
-        `RefineError` if there is no library for images, `OSError` if a file cannot be written.
-        """
+        """Write the next level, the finest first: the bytes of its files."""
         level, size = len(self._counts), 0
         self._counts.append(len(splats))
         means, unit = np.asarray(splats.means, np.float64), np.empty(0, np.intp)
@@ -207,9 +199,7 @@ class StreamedSog:
     def publish(self, path: Path, *, overwrite: bool) -> None:
         """Move the folders beside `path`, under free names, and write the index there.
 
-        A replaced index and its folders stay until the new index is in place: one of the two is
-        whole whenever this stops. `RefineError` if it may not be replaced, `OSError` if it cannot
-        be written, `Cancelled` with everything as it was.
+        A replaced index and its folders stay until the new one is in place: one is always whole.
         """
         checkpoint()
         refuse_existing(path, overwrite=overwrite)
@@ -238,7 +228,6 @@ class StreamedSog:
                 folder.rmdir()
 
     def _index(self, names: list[str]) -> dict[str, Any]:
-        """Content of ``lod-meta.json``, with folders of these names."""
         return {
             "version": VERSION,
             "asset": {"generator": GENERATOR},
@@ -251,7 +240,6 @@ class StreamedSog:
         }
 
     def _branch(self, node: Any) -> dict[str, Any]:
-        """JSON of a part of the tree."""
         if isinstance(node, int):
             bound = {"min": self._low[node].tolist(), "max": self._high[node].tolist()}
             return {"bound": bound, "lods": self._rows[node]}
@@ -263,10 +251,7 @@ class StreamedSog:
 
 @contextlib.contextmanager
 def folder_for(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Yield an empty folder, removed at the end, to make the `StreamedSog` of index `path` in.
-
-    `RefineError` if `path` may not be replaced or written; its folder is made if missing.
-    """
+    """Yield an empty folder beside `path`, removed at the end; refuses what may not be replaced."""
     with new_folder(path.parent):
         refuse_existing(path, overwrite=overwrite)
         _folders_of(path)

@@ -100,10 +100,10 @@ def measured_field(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> MeasuredField:
-    """The drawable splats `rows` as merging needs them, from `sums` (2, N): contribution and error.
+    """The drawable splats `rows` as merging needs them; `sums`, (2, N): contribution and error.
 
-    A view weighs 1 / distance^2, as the pixels that a splat covers, or `BESIDE` of that. Cameras
-    count as at least `NEAR_RELATIVE` scene sizes away.
+    Views weigh 1 / distance^2, of at least `NEAR_RELATIVE` scene sizes, and `BESIDE` of that if the
+    centre is not in them.
     """
     count = len(rows)
     shapes = (3,), (6,), (), (), (), (3,), (3,), (3,), ()
@@ -138,9 +138,9 @@ def measured_field(
 
 
 def _viewing(means, views, closest):
-    """Direction, deviation (`Field`), area of a pixel at the splat, count of views with its centre.
+    """Mean direction, its deviation, area of a pixel at the splat, number of views with its centre.
 
-    Areas are in world units squared. Cameras count as at least `closest` away.
+    Cameras count as at least `closest` away.
     """
     points = means.T
     rows, columns = np.triu_indices(3)

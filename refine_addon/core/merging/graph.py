@@ -56,11 +56,7 @@ _ROUNDED = np.uint32(4)  # last bits of a distance in float32, in which equal on
 
 
 class MergeGraph:
-    """Splats, the pairs of them that may be merged, and the cost of each operation.
-
-    `field` is changed in place; neighbours are those in the frame of `scene`; `penalty` is the
-    merge penalty, times `DISC_PENALTY` for discs.
-    """
+    """Splats, pairs that may be merged, and the cost of each operation; `field` is changed."""
 
     def __init__(
         self, field: Field, scene: Scene, penalty: float, *, threads: int | None = None
@@ -224,7 +220,6 @@ class MergeGraph:
 
 
 def _least_costs(error: Costs, first: Rows, second: Rows, cost: Costs) -> Costs:
-    """Cost of each splat's cheapest operation, (N,)."""
     best = error.copy()
     np.minimum.at(best, first, cost)
     np.minimum.at(best, second, cost)
@@ -261,9 +256,7 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Most of the nearest neighbours of points (N, 3), in scene sizes: (N, min(count, N - 1)).
-
-    Nearest first, ties by index; `count` is at most 16.
+    """Most of the nearest neighbours of points (N, 3): (N, min(count, N - 1)), ties by index.
 
     Examples
     --------

@@ -1,9 +1,8 @@
 """Merging: reduce splats to a number by the cheapest merges and deletions.
 
-`pairs` prices a merge and makes the merged splat, `graph` carries out operations. Before each
-stage but the first the kept splats are measured again, as visibility changes. Splats in files,
-larger than memory, are divided into boxes, along other planes in each stage. One ranking of the
-operations of all boxes decides how many each keeps. Splats that merge nothing keep their bits.
+Before each stage but the first the kept splats are measured again, as visibility changes. Splats in
+files are divided into boxes, along other planes in each stage; one ranking of the operations of all
+boxes decides how many each keeps. Splats that merge nothing keep their bits.
 """
 
 from __future__ import annotations
@@ -27,9 +26,8 @@ from .graph import MergeGraph
 from .pairs import as_splats
 
 Measure = Callable[[Splats, Array, Progress], Array]
-"""``measure(splats, expected, progress)``: sums (2, n) of the kept splats, with degree 0.
-
-`expected`, (2, n), is the prediction of the stage before, right but for changed visibility."""
+"""``measure(splats, expected, progress)``: sums (2, n) of the kept splats, of degree 0; `expected`,
+the prediction, is right but for changed visibility."""
 
 STAGE = 0.5
 """Share that each of very many stages leaves. At least a half: regions count a splat whose cheapest
@@ -74,14 +72,8 @@ class Merged:
 def merge_penalty(share: float) -> float:
     """Factor on the cost of merging, from the share of the splats that is removed, 0 to 1.
 
-    `PENALTY` times the square root of (1 - share) / share. Errors of neighbours that are deleted
-    together add up before they are squared; merging keeps the mass, so it gets cheaper the more are
-    removed. Half or twice the factor costs at most 0.3 dB on three scenes.
-
-    Examples
-    --------
-    >>> merge_penalty(0.5)
-    2.0
+    Errors of neighbours deleted together add up before they are squared, so merging gets cheaper
+    the more are removed. Half or twice the factor costs at most 0.3 dB on three scenes.
     """
     share = min(max(share, 1e-3), 1.0 - 1e-3)
     return PENALTY * math.sqrt((1.0 - share) / share)
@@ -100,18 +92,11 @@ def merge(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Merged:
-    """Reduce splats to `keep_count` by the merges and deletions that cost the pictures least.
+    """Reduce splats to `keep_count` at the least cost to the pictures, in the frame of the views.
 
-    Parameters
-    ----------
-    sums : (2, N) floating
-        Contribution and error of each splat, see `field.Field`.
-    keep_count : int
-        More are kept if more are protected. Undrawable splats go first.
-    began : int, optional
-        Number of splats before any were removed, which decides `merge_penalty`; by default N.
-    deleted, protected : (N,) bool, optional
-        Splats deleted before anything is merged; splats neither removed nor changed.
+    `sums`, (2, N), are contribution and error (`field.Field`). `began`, N by default, is the count
+    before any were removed, for `merge_penalty`. `deleted` splats go first, then undrawable ones;
+    `protected` ones are neither removed nor changed, so more may be kept.
     """
     total, left = len(splats), splats
     # Of each splat left: which of the N it is, and for how many of them it stands, 0 if deleted.
@@ -194,7 +179,6 @@ class _Stage:
     threads: int | None
 
     def at_once(self, keep_count, progress):
-        """`reduced` for all splats together."""
         rows, measured = self.measured(part(progress, 0.0, 0.3))
         graph = self.graph(measured, measured.seen_and_whole())
         del measured
@@ -220,10 +204,7 @@ class _Stage:
         return MergeGraph(measured.with_bias(whole), self.scene, self.penalty, threads=self.threads)
 
     def reduced(self, rows, graph, keep_count, progress):
-        """Kept splats, at least `keep_count`; which of N they are; members; predicted sums.
-
-        Undrawable splats go first, then the graph of the splats in `rows`, (M,), is reduced.
-        """
+        """Kept splats, at least `keep_count`; which they are, (N,); members; predicted sums."""
         splats, threads = self.splats, self.threads
         keep = self.members > 0
         excess = max(int(np.count_nonzero(keep)) - keep_count, 0)
@@ -261,10 +242,9 @@ class _Stage:
 
 
 def _blend(splats, members, share, left, into, progress, threads):
-    """Write harmonics of merged splats: means of those of their members, by shares of the colour.
+    """Write harmonics of merged splats: means over `members`, (m,), grouped, into rows of `left`.
 
-    `members`, (m,), are grouped; `into` are the rows in `left`. Rounded to float32, so that tiles
-    and files give the same.
+    Rounded to float32, so that tiles and files give the same.
     """
     starts, largest = np.flatnonzero(np.diff(into, prepend=-1)), np.finfo(np.float32).max
 

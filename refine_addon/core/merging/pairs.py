@@ -50,15 +50,15 @@ class Pairs(NamedTuple):
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
     """Costs and results of merging pairs of rows (M,), all of contribution above 0.
 
-    `tilt` standard deviations of the viewing directions are added to their mean.
+    They are viewed `tilt` standard deviations from their mean direction.
     """
     return _price(_gather(splats, first, second, np.float64), tilt)
 
 
 def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Real:
-    """Costs of merges, (M,) float32: means over two viewing directions; infinite from `limit` on.
+    """Costs of merges (M,), float32: means over two viewing directions; infinite from `limit` on.
 
-    Computed in float32 from the steps between means on; for discs, of thickness 0, in float64.
+    Computed in float64 for discs, whose thickness is 0, in float32 for others.
     """
     # What leaves the range of float32 costs infinity, or NaN: it is not merged.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
@@ -81,8 +81,7 @@ class _Side(NamedTuple):
 class _Ends(NamedTuple):
     """The two splats of M pairs, and means over the two; all in float32, or all in float64.
 
-    The unit of length, of which results are independent, is the root of the sum of a pair's
-    variances, so that squares of areas fit into float32.
+    The unit is a pair's root sum of variances, so that squares of areas fit into float32.
     """
 
     model: Model
@@ -139,10 +138,7 @@ def _gather(splats: Field, first: Index, second: Index, kind: type[np.floating[A
 
 
 def _price(ends: _Ends, tilt: float) -> Pairs:
-    """Costs and results of merges, (M,) each, viewed from one direction.
-
-    Masses and inner products are over 2 pi, which cancels; i, j and m name the signals.
-    """
+    """Costs and results from one direction, (M,) each; masses are over 2 pi, which cancels."""
     color, rest, blur = ends.color, ends.rest, ends.blur
     direction = _unit(ends.direction + tilt * ends.deviation) if tilt else ends.direction
     plane = across(direction.T)
@@ -238,7 +234,7 @@ def _base(ellipse: Footprint, area: Real, blur: Real, model: Model) -> Real:
 
 
 def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
-    """Ellipses that cover as much as discs with their low-pass (`disc_axes`), along the same axes.
+    """Ellipses that cover as much as discs with their low-pass (`disc_axes`), on the same axes.
 
     `sharp` is without the low-pass; `blur` is the low-pass variance of other splats.
     """
@@ -330,9 +326,8 @@ def _mixture(one: Real, two: Real, step: Real, share: Real) -> Array:
 def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Array:
     """Covariances, (M, 6), of discs that look like given ones from where they are viewed.
 
-    With M the mean of ``v v'`` over viewing directions v, the disc's normal n minimizes ``n' C n``
-    for ``n' M n = 1``: ``C n = l M n``. Projected along ``a = M n`` it leaves ``C - l a a'``. That
-    is `flat` in coordinates in which M is I.
+    The normal n has ``C n = l M n``, l least, M the mean of ``v v'`` over viewing directions v;
+    what is left is ``C - l M n (M n)'``. For M = I that is `flat`.
     """
     beside = deviation - np.einsum("ij,ij->i", deviation, direction)[:, None] * direction
     size = np.maximum(np.sqrt(np.einsum("ij,ij->i", beside, beside)), ASIDE)
@@ -349,7 +344,6 @@ def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Ar
 
 
 def _full(covariances: Array) -> Array:
-    """Symmetric matrices, (M, 3, 3), of their upper halves, (M, 6)."""
     full: Array = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     return full
 
@@ -397,7 +391,6 @@ def _dot(one: Real, other: Real) -> Real:
 
 
 def _unit(vectors: Real) -> Real:
-    """Vectors, (3, M), with length 1; zero vectors stay 0."""
     length = np.sqrt(_dot(vectors, vectors))
     length[length == 0.0] = 1.0
     return np.asarray(vectors / length)

@@ -248,7 +248,6 @@ class LinearView:
         return result
 
     def _sum(self, values, owner, kind=np.float32):
-        """Sums over the hits of each splat, (u,)."""
         return np.bincount(owner, values, len(self.hit)).astype(kind, copy=False)
 
 
@@ -268,12 +267,10 @@ def _basis(shapes: Shapes, view: View) -> Singles:
 
 
 def _dot(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Inner products of vectors, three components each, (u,)."""
     return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
 
 
 def _squared(polynomial: Singles, sums: Sequence[Singles]) -> Singles:
-    """Sums over hits of squared polynomials, (u,)."""
     a, b, c = polynomial
     result = a * a * sums[0] + (b * b + 2.0 * a * c) * sums[2] + c * c * sums[4]
     result += 2.0 * b * (a * sums[1] + c * sums[3])
@@ -290,8 +287,7 @@ def linear_view(
 ) -> tuple[LinearView, Shapes]:
     """A view's rays as a linear function of the splats that they hit, and the shapes of these.
 
-    `truth` (3, P) are the colours to be seen, `colors` (3, u) those of the splats hit. At most 2^16
-    rays. Gaussians beyond `shapes`, the first ones, do not change.
+    `truth` (3, P), of at most 2^16 rays, is to be seen; `colors` (3, u) are of the splats hit.
     """
     rays, transmittance = visible
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit
@@ -347,10 +343,7 @@ def _floats(halves: NDArray[np.uint16]) -> Singles:
 
 
 def _steepness_on_discs(discs: Singles, step: list[Singles]) -> Singles:
-    """`_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
-
-    With d scaled to the disc's plane, ``d / (1 + g d)``, C of the disc is that of a Gaussian.
-    """
+    """`_steepness` (7, h) of hits on discs, with d in the disc's plane: ``d / (1 + g d)``."""
     across, down = step
     depth = 1.0 + discs[4] * across + discs[5] * down
     ahead = depth > BEHIND

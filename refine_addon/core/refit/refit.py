@@ -193,9 +193,9 @@ def refit_on(
 
 
 def _solve(linear, movable, damping, before, *, progress, threads):
-    """Change of N splats' parameters, (22, N), and `before` with this round added.
+    """Change of the parameters, (22, N), and `before` updated by this round.
 
-    `before` holds K, the sum of D over rounds, and what they leave of J'r, (22, N) each.
+    `before` holds K and the rest of J'r that the next round takes over, (22, N) each.
     """
     index = linear.shapes.gaussians.index
     moving = movable[:, index]
@@ -256,10 +256,10 @@ def _dot(one: Singles, other: Singles) -> float:
 
 
 def _worthwhile(change: Singles) -> Singles:
-    """A change, (22, N), with moves of means shortened: ``m max(1 - (LEAST_MOVE / |m|)^2, 0)``.
+    """A change, (22, N), with moves of means shortened (Breiman's garrote).
 
-    A move changes the depth order, which no derivative knows: that costs a squared error in
-    proportion to the move, where the gain grows with its square. This is Breiman's garrote.
+    A move changes the depth order, which no derivative knows: a squared error in proportion to the
+    move, where the gain grows with its square.
     """
     means = change[MEAN]
     squared = np.maximum(np.square(means).sum(axis=0), np.float32(_NOTHING))
@@ -302,7 +302,6 @@ def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
 
 
 def _limited(vectors: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
-    """Vectors, (3, n), no longer than a length."""
     lengths = np.linalg.norm(vectors, axis=0)
     return np.asarray(vectors * np.minimum(1.0, longest / np.maximum(lengths, longest)))
 
@@ -380,7 +379,6 @@ class _Amid(Target):
         return projection.project(both, self.scene, window.view, window.part)
 
     def colors(self, hit: NDArray[np.int64], view: View) -> Singles:
-        """Colours that a view sees of Gaussians, ascending, (3, u)."""
         count = len(self.gaussians)
         mine = int(np.searchsorted(hit, count))
         parts = [super().colors(hit[:mine], view), self.every.colors(hit[mine:] - count, view)]
@@ -403,10 +401,7 @@ class _Both(Gaussians):
 
 
 def _windows(splats, total, scene, views):
-    """Windows of the views that show a region, weighted by how much of it they show.
-
-    Their rays are as dense as if all of the `total` kept splats were refitted together.
-    """
+    """Windows of the views that show a region, weighted by how much of it they show."""
     sample = splats.take(slice(None, None, max(len(splats) // _SAMPLE, 1)))
     only = [view for view, _ in views]
     gaussians, _, _ = projection.prepare(sample, ViewSet(tuple(only)), scene, threads=1)

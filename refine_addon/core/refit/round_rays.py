@@ -93,9 +93,9 @@ class Window:
         return replace(self, view=replace(self.view, center=center))
 
     def pixels(self, hits: float, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Columns and rows of the rays of a round (0 for validation), for `hits` a ray.
+        """Columns and rows of the rays of a round (0: validation), for about `hits` a ray.
 
-        Rounds follow an estimate's rays in the R2 sequence (`cast.pixels`), so pixels differ.
+        Rounds continue an estimate's R2 sequence (`cast.pixels`), so their pixels differ.
         """
         count = min(self.rays, self.hits / max(hits, 1.0), cast.MAX_RAYS_OF_VIEW)
         columns, rows = cast.pixels(self.part, self.number + 1 + number, count)
@@ -227,7 +227,6 @@ class RoundRays:
         return self._made(splats, prepared[0], scene)
 
     def _each(self, work, windows, splats, told):
-        """Iterator of the results of `work` on the rays of each window."""
         numbers = range(len(windows))
         cost = seconds("refit", len(self.original.splats) + len(splats), len(windows))
         return run(work, numbers, cost=cost, progress=told, what="refitting", threads=self._threads)
@@ -254,10 +253,7 @@ def steps_of(views: Sequence[View], scene: Scene) -> list[float]:
 def cast_truth(
     target: Target, windows: Sequence[Window], number: int, shown: float | None, place: int
 ) -> Truth:
-    """The rays of the view at a `place` in a round (0: validation), cast into the unpruned splats.
-
-    `shown` is that of the validation rays, see `Truth`; None before these are cast.
-    """
+    """Rays of the view at a `place` in a round (0: validation), cast into unpruned splats."""
     window = windows[place]
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
@@ -275,7 +271,6 @@ def cast_truth(
 
 
 def _psnr(target, windows, truths, place):
-    """PSNR of the colours that the rays of a view see, dB."""
     window, truth = windows[place], truths[place]
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
@@ -298,9 +293,9 @@ def _linearized(truth_of, windows, target, shapes, place):
 
 
 class LinearRays:
-    """The colours of the rays of all views, as a linear function of what M Gaussians change.
+    """The colours of all rays, as a linear function of changes of M Gaussians.
 
-    `seen` yields each view with its part of the residual J'r and of the diagonal of J'J, (22, u).
+    `seen` yields each view with its part of J'r and of the diagonal of J'J, (22, u).
     """
 
     def __init__(self, shapes: Shapes, seen: Iterable[tuple[LinearView, Singles, Singles]]) -> None:
@@ -336,10 +331,7 @@ def _add(total, hit, values):
 
 
 class Stored:
-    """A list of objects, most of them in a temporary file.
-
-    The first `HELD` bytes, and what the file has no room for, stay in memory.
-    """
+    """A list of objects, in a temporary file after the first `HELD` bytes, if it has room."""
 
     def __init__(self) -> None:
         self._held, self._lock = 0, threading.Lock()

@@ -52,14 +52,7 @@ _TRIES = 3  # times that workers are checked if all of them get lost
 
 @contextlib.contextmanager
 def cluster(workers: int | str) -> Iterator[Cluster]:
-    """Start workers in processes of their own, or use those of a scheduler.
-
-    Parameters
-    ----------
-    workers : int or str
-        Number of processes to start, of one thread each; or a scheduler's address, such as
-        ``tcp://10.0.0.1:8786``.
-    """
+    """Start `workers` processes of one thread each, or use the scheduler at that address."""
     try:
         import dask
         import distributed
@@ -90,10 +83,7 @@ def cluster(workers: int | str) -> Iterator[Cluster]:
 
 
 def _uninterrupted(make: Callable[[], Any]) -> Any:
-    """Run `make` on a thread, out of reach of Ctrl-C, which is raised afterwards.
-
-    A cluster that is interrupted while it starts cannot close what it has started.
-    """
+    """Run `make` without Ctrl-C, raised later: a half-started cluster could not be closed."""
     with ThreadPoolExecutor(1, initializer=_block_ctrl_c) as pool:
         future = pool.submit(make)
         try:
@@ -118,11 +108,7 @@ class Cluster:
         self._client = client
 
     def check(self, job: Path, tiles: Sequence[Tile]) -> None:
-        """Ask every worker whether it sees the files of a job and has this version.
-
-        `RefineError` names a worker that does not, or says that there is none; `Interrupted` if all
-        workers were lost.
-        """
+        """Refuse workers that miss files or differ in version; `Interrupted` if all were lost."""
         for _ in range(_TRIES):
             try:
                 self._client.wait_for_workers(1, timeout=_CONNECT)
@@ -148,10 +134,7 @@ class Cluster:
     def run(
         self, packed: bytes, items: Sequence[Any], progress: Progress, what: str
     ) -> Iterator[Any]:
-        """Yield the results of pickled work with each item, in order.
-
-        `Interrupted` if workers were lost again and again.
-        """
+        """Yield results of pickled work on items, in order; `Interrupted` if all workers go."""
         from distributed import CancelledError, KilledWorker
         from distributed.comm import CommClosedError
 
@@ -196,7 +179,6 @@ _unpacked = functools.lru_cache(maxsize=2)(pickle.loads)
 
 
 async def _answer(version: str, job: Path, tiles: Sequence[Tile]) -> str:
-    """Sentence that says what is wrong with this worker, or ""."""
     if version != VERSION:
         return f"it has refine {VERSION}, this is {version}"
     # Not on the worker's own thread: requests for many tiles would make it look dead.

@@ -54,8 +54,8 @@ def prune_tiles(
     """Prune files of splats as one scene, by one budget over all of them; none is held in memory.
 
     The kept splats are those of one file with all rows in the given order. All files are written,
-    or none. The job's folder lies beside the outputs until the end; the same call goes on after an
-    interruption, behind the last finished stage.
+    or none. The job's folder lies beside the outputs until the end; after an interruption the same
+    call goes on.
 
     Parameters
     ----------
@@ -79,13 +79,12 @@ def prune_tiles(
     RefineError, Cancelled
         As in `prune`, or if two files have one name; nothing is written or kept.
     Interrupted
-        If a disk, a storage or all workers fail, or a file takes an output's place; the same
-        call goes on.
+        If a disk, a storage or all workers fail, or a file takes an output's place.
 
     Notes
     -----
-    Memory: about 150 bytes a splat, and the hits of scoring rays, see `occlusion.score`. A worker
-    needs for each view about 160 bytes for each splat shown. Disk: the tiles, 60 bytes a splat.
+    Memory: about 150 bytes a splat, and the hits of scoring rays; in a worker 160 for each splat
+    that a view shows. Disk: the tiles, and 60 bytes a splat.
     """
     clock, tiles = Clock(), tiles_at(sources, model)
     output = None if folder is None or dry_run else located(folder)
@@ -166,7 +165,6 @@ def _decided(job, tiles, views, budget, method, clock, reading, deciding, thread
 
 
 def _stored(job: Path, result: Result) -> Kept:
-    """Kept splats, in files of the job."""
     rows, became = np.empty(0, np.int64), None
     if result.merged is not None:
         changed = np.flatnonzero(result.merged.changed)
@@ -210,7 +208,6 @@ def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
 
 
 def _lock(job: Path, lock: Any) -> None:
-    """Lock the folder of a job, or raise `RefineError`."""
     if fcntl is None:
         return
     try:

@@ -58,11 +58,7 @@ class Tile(NamedTuple):
 
 
 def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
-    """Look at the files of a scene; `model` overrides those that they state.
-
-    `RefineError` also if a file is given twice (its splats would count twice), if models differ, or
-    if no file has a splat.
-    """
+    """Look at the files of a scene; refuses doubles, which would count twice, and mixed models."""
     tiles: list[Tile] = []
     given: dict[Hashable, Tile] = {}
     for path in paths:
@@ -109,10 +105,7 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
 
 
 def rows_of(tile: Tile, start: int, stop: int) -> NDArray[Any]:
-    """Rows of a tile, read rather than mapped: mapped pages stay in memory.
-
-    `RefineError` if the tile cannot be read or has changed.
-    """
+    """Rows of a tile, read, since mapped pages stay in memory; refuses changed files."""
     return _read(tile, tile.dtype, stop - start, tile.begin + start * tile.dtype.itemsize)
 
 
@@ -135,10 +128,7 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
 
 
 def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
-    """All splats of some tiles, in files of a new folder, with the widest type and degree of all.
-
-    Coefficients that a tile lacks are 0. At least one tile has a splat.
-    """
+    """All splats of some tiles, in files of a new folder: widest types, missing harmonics 0."""
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
     kinds = [splats_from_columns(np.empty(0, each)) for each in dtypes] if len(dtypes) > 1 else []
     pieces = [(tile, part.start, part.stop) for tile in tiles for part in chunks(tile.splats, ROWS)]

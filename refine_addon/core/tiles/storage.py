@@ -78,10 +78,7 @@ def state(path: Path | Url) -> tuple[int, int | str]:
 
 
 def beginning(path: Path | Url, size: int, whole: int) -> bytes:
-    """First `size` bytes of a file of `whole` bytes, or all.
-
-    Refuses a URL without random access: `array` would download all of it.
-    """
+    """First bytes of a file of `whole` bytes; refuses URLs that `array` would download entirely."""
     if not isinstance(path, Url):
         with _explained(path, "cannot be read"), path.open("rb") as stream:
             return stream.read(size)
@@ -112,8 +109,7 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
 def new_folder(folder: Path | Url) -> Iterator[None]:
     """Make a folder if it is missing; remove it if it is empty at the end.
 
-    Behind a URL an empty file is written, moved and removed, to find missing rights before long
-    work.
+    Behind a URL an empty file is written, moved and removed first, since long work follows.
     """
     if not isinstance(folder, Url):
         with whole_file.new_folder(folder):
@@ -185,7 +181,6 @@ def _opened(url: Url, problem: str) -> Iterator[tuple[Any, str]]:
 
 
 def _split(url: Url) -> tuple[Any, str]:
-    """File system of a URL, and the path there."""
     try:
         from fsspec.core import url_to_fs
     except ImportError as error:

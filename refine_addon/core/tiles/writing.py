@@ -59,10 +59,7 @@ def header_of(tile: Tile, kept: int) -> bytes:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Places of a job's tiles in an existing `folder`, each under its own name.
-
-    `RefineError` if two tiles have one name, or a file could not be made or may not be replaced.
-    """
+    """Places of a job's tiles in an existing `folder`, each under its own name; refuses doubles."""
 
     job: Path
     tiles: Sequence[Tile]
@@ -115,10 +112,7 @@ class Outputs:
         return [sizes[number] for number in range(len(self.tiles))]
 
     def publish(self) -> None:
-        """Rename all tiles not yet in place; none if another file is in the way from the start.
-
-        `Interrupted` if one cannot be renamed.
-        """
+        """Rename all tiles not yet in place; none if another file is in the way from the start."""
         there, before = self.in_place(), noted(self.job, RENAMED)[1]
         try:
             self._refuse_existing(there)
