@@ -44,8 +44,7 @@ def view_from_camera(
     obj: bpy.types.Object, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
 ) -> View:
     """View of a camera object as Blender renders it, at the scene's size; named after the object.
-    An imported camera keeps its file's image size and, until moved or changed, the file's
-    numbers."""
+    Imported ones keep their file's image size and, until moved or changed, its numbers."""
     if obj.type != "CAMERA":
         raise RefineError(f"object '{obj.name}': is of type {obj.type}, expected a camera")
     evaluated = obj.evaluated_get(depsgraph)
@@ -84,8 +83,7 @@ def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
 
 def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArray[np.float64]:
     """An object's matrix to the world, (4, 4), quarter turns exact: float32 leaves 4e-8 at zeros.
-    `RefineError` if animation or constraints move it, and it is not evaluated (disabled,
-    excluded)."""
+    `RefineError` if it is not evaluated (disabled, excluded), and animated or constrained."""
     evaluated = obj.evaluated_get(depsgraph)
     if evaluated.is_evaluated:
         return snapped(np.array(evaluated.matrix_world, np.float64))

@@ -153,8 +153,7 @@ def holds_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
 
 def check(obj: bpy.types.Object) -> SplatObject:
     """The object with its layout: the one of its import, or the standard one.
-    `RefineError` in edit mode, with four vertices a splat, or for a missing or mistyped
-    attribute."""
+    `RefineError` in edit mode, with four vertices a splat, or for a missing or wrong attribute."""
     label = f"object '{obj.name}'"
     if obj.type not in _TYPES:
         raise RefineError(

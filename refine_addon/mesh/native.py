@@ -58,8 +58,7 @@ def harmonics(cloud: bpy.types.PointCloud) -> int:
 
 def places(count: int) -> dict[str, Place]:
     """Places of a splat's properties in a point cloud with `count` harmonics.
-    ``sh_10`` follows ``sh_9``; each holds red, green and blue, where a file has all of red
-    first."""
+    ``sh_10`` follows ``sh_9``; each holds RGB, where a file has all of red first."""
     by_name = {f"f_dc_{channel}": Place(BASE, channel, FOUR_FLOATS) for channel in range(3)}
     for channel in range(3):
         for index in range(count):

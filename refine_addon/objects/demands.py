@@ -37,8 +37,7 @@ _masks: dict[bytes, NDArray[np.bool_]] = {}  # Points in each volume, by a diges
 @dataclass(frozen=True, eq=False)
 class Demands:
     """Protected splats and those removed by the user; `zones`: volumes in the world.
-    `names`: protecting vertex groups and attributes; `PROTECT` and `MUST_GO` (`mesh.edit`) always
-    count."""
+    `names`: protecting vertex groups and attributes, besides `PROTECT` of `mesh.edit`."""
 
     names: tuple[str, ...] = ()
     zones: tuple[Zone, ...] = ()

@@ -1,7 +1,6 @@
 """Operations of panel and command on splat objects: score, apply, export.
-Several objects are one scene: scored together, under one budget. `mesh.layout.check` makes the
-`SplatObject` of each. Each function does all it says, or raises `RefineError` and changes
-nothing."""
+Several objects are one scene: scored together, under one budget. `mesh.layout.check` checks each.
+A function does all it says, or raises `RefineError` and changes nothing."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def read_to_move(
     harmonics: int = 0,
 ) -> tuple[set[str], Callable[[], tuple[dict[str, NDArray[Any]], int]]]:
     """Read an object to move its splats by `matrix`, (4, 4) in its frame, first repaired if `mend`.
-    The properties that change (none if nothing does), and a thread-safe callable for their values,
+    Gives the properties that change (maybe none), and a thread-safe callable for their values,
     (N,), and the number mended. `harmonics`: least number beyond the constant, zeros added."""
     matrix = np.eye(4) if matrix is None else matrix
     check_affine(matrix)

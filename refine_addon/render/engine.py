@@ -133,7 +133,7 @@ def _place(depsgraph, camera, size):
 def _cropped(view: View, render: bpy.types.RenderSettings) -> View:
     if not render.use_border:
         return view
-    # In the precision of Blender: .7 of 240 columns are 168, and 167 with more digits.
+    # In the precision of Blender: 0.7 of 240 columns are 168, and 167 with more digits.
     across = np.array([render.border_min_x, render.border_max_x], np.float32)
     left, right = (across * np.float32(view.width)).astype(int).tolist()
     up = np.array([render.border_max_y, render.border_min_y], np.float32)

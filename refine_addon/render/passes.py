@@ -71,8 +71,7 @@ def _read(path: Path) -> Pass:
 
 def _known(depths, alphas, far):
     """Depth of each pixel, (H, W), 0 where empty.
-    Engines trace one ray, which may miss: edges take the nearest depth beside, others are in
-    front."""
+    Engines trace one ray, which may miss: edges take the nearest depth, others are in front."""
     known = np.where(depths >= far, np.float32(np.inf), depths)
     for _ in range(_ROUNDS):
         padded = np.pad(known, 1, constant_values=np.inf)

@@ -223,7 +223,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     rest = np.ones(count, np.bool_) if removed is None else ~removed
     left, way = int(np.count_nonzero(rest)), WAYS.get(settings.method, "delete")
     about = budget.psnr is not None and way != "delete"
-    if about:  # what merging reaches is foretold
+    if about:  # what merging reaches is predicted
         stays = 0 if protected is None else int(np.count_nonzero(protected & rest))
         gone = math.floor(quality_of(scores).share(budget.psnr, way) * left)
         arguments["budget"] = Budget(keep=max(left - min(gone, left - stays), 1))

@@ -33,7 +33,6 @@ _ENDS_UNSEEN = bpy.app.version < (5, 0, 0)
 
 _SETTLED = 0.5  # Seconds after a render until windows have drawn; see `_draw_whole`
 
-
 NOTICE = "Splats are not in this render: use Render > Render with Splats"
 
 IN_BACKGROUND = "refine: splats are not in this render; use --command refine render"

@@ -32,7 +32,6 @@ REST = 0.2  # Seconds without a change after which a view rests
 
 TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55  # Tint of splats that the budget removes, and its share
 
-
 BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)  # Splats drawn while moving, at most; pixels each
 
 
