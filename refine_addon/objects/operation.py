@@ -52,7 +52,7 @@ def prune_object(
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Prune an object of the open scene, export the result, save the .blend (`save`); the report.
-    See `core.operations.prune_file`. If it fails, an exported file stays, the object is unchanged."""
+    See `core.operations.prune_file`. On an error an exported file and the object stay."""
     checked = check(find(name))
     save = save and not dry_run
     method = possible([checked], method)
