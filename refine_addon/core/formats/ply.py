@@ -76,6 +76,7 @@ class SplatFile:
     path: Path
     rows: NDArray[Any]  # (N,) structured, one field a property; read-only and mapped if binary
     header: bytes  # with ``end_header`` and its line end
+    # Bytes of the body before and after the rows.
     before: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     after: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     indexing: tuple[str, ...] = ()  # other elements whose rows hold indices of splats
@@ -215,12 +216,12 @@ class SplatFile:
 
 
 def read_ply(path: Path | str) -> SplatFile:
-    """Open a 3DGS PLY file: binary of either byte order, or ASCII; it may have no splats.
+    """Open a 3DGS PLY file: binary of either byte order, or ASCII; it may have 0 splats.
 
     Raises
     ------
     RefineError
-        If the file is missing, damaged or holds no splats; with the place in the file.
+        If the file is missing, damaged or no file of splats; with the place in the file.
     """
     path = expanded(path)
     return read_plain(path, file_bytes(path))

@@ -2,7 +2,7 @@
 
 ``lod-meta.json`` holds a tree over space. Each leaf, a chunk, names for each level its rows of a
 SOG folder. As in splat-transform, consecutive chunks share a folder of up to `UNIT` splats. Viewers
-choose a chunk's level by its size, so it is no wider than cameras were away.
+choose a level by a chunk's size in the image, so none is wider than the cameras' distance.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ NAME, VERSION = "streamed SOG", 1
 INDEX = "lod-meta.json"
 
 UNIT = 1 << 19
-"""Splats after which a folder is closed; most of a finest chunk. splat-transform's default."""
+"""A folder is closed beyond this; most splats of a chunk in the finest level. As
+splat-transform."""
 
 LEAST = 1 << 13
 """Smaller chunks are not split for width, as in splat-transform: each costs viewers the same."""
