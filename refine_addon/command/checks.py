@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import argparse
 import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from ..core import RefineError
+from ..core.errors import reason_of
 from ..core.formats.registry import SUFFIXES, format_named, names_file, without_suffix
 from ..core.lod import is_streamed, level_paths
-from ..core.whole_file import Url, refuse_url
-from .options import BLENDER
-from .report import is_report
-from .zones import ROLES
+from ..core.whole_file import Url, refuse_existing, refuse_url
+from .options import BLENDER, ROLES
 
 
 def check(options: argparse.Namespace) -> None:
@@ -35,7 +35,20 @@ def check(options: argparse.Namespace) -> None:
         names = [without_suffix(path.name) for path in inputs]
         _refuse_doubles(inputs, [options.pictures / f"{n}-CAMERA-after.png" for n in names])
     if options.report:
-        _check_report(options, made)
+        _refuse_report(options, made)
+
+
+def check_report(path: Path, *, overwrite: bool) -> None:
+    """Refuse a report that could not be written, before the work."""
+    refuse_existing(path, overwrite=overwrite)
+    try:
+        # A link stays one: what it points to is written.
+        with tempfile.TemporaryFile(dir=os.path.dirname(os.path.realpath(path))):
+            pass
+    except OSError as error:
+        raise RefineError(
+            f"{path}: cannot be written ({reason_of(error)}); nothing was changed"
+        ) from error
 
 
 def _rules(options: argparse.Namespace) -> dict[str, object]:
@@ -95,7 +108,7 @@ def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
     return [output / path.name for path in options.inputs]
 
 
-def _check_report(options: argparse.Namespace, made: Sequence[Path | Url]) -> None:
+def _refuse_report(options: argparse.Namespace, made: Sequence[Path | Url]) -> None:
     """Refuse a report that would replace an input or output, even with --overwrite."""
     report, pictures = options.report, options.pictures
     others = [*options.inputs, *made, options.output, options.cameras, options.blend]
@@ -108,7 +121,8 @@ def _check_report(options: argparse.Namespace, made: Sequence[Path | Url]) -> No
         raise RefineError(f"--report {report} may be one of the pictures; choose another name")
     if options.overwrite and os.path.isfile(report):
         with report.open("rb") as stream:
-            if not is_report(stream.read(64)):
+            words = stream.read(64).split()
+            if words and not b"".join(words).startswith(b'{"refine":'):  # not a report, nor empty
                 raise RefineError(f"{report} exists and is no report: write to another name")
 
 

@@ -16,7 +16,7 @@ from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.lod import SHARES
 from ..core.splats import MODELS
-from ..core.volumes import Volume, parse
+from ..core.volumes import Role, Volume, parse
 from ..core.whole_file import Url, expanded, is_url
 from ..version import VERSION
 
@@ -121,6 +121,9 @@ render: render the open scene with splats, by its output settings
   {BLENDER} render --source frames:1:250:10
 """
 """For each subcommand its purpose, inputs, options, and examples."""
+
+ROLES: dict[str, Role] = {"protect": "protect", "remove_inside": "remove", "keep_inside": "keep"}
+"""Options -> role of their volumes."""
 
 LAST_FRAME = 1_048_574  # Blender's last frame; negative, its first
 

@@ -1,23 +1,64 @@
-"""The part common to all subcommands: go from input to input, print and record each result."""
+"""The part common to all subcommands: go from input to input, print and record each result.
+Output cannot harm a terminal; the report says what was done, as JSON, for programs."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TextIO
+
+import numpy as np
 
 from ..core import RefineError, ViewSet, read_cameras
-from ..core.errors import printable
+from ..core.errors import printable, reason_of
 from ..core.execute import Progress, TimeLeft, in_time
 from ..core.formats.registry import names_file
 from ..core.report import MANY_UNSEEN
-from ..core.whole_file import new_folder
-from . import report, zones
-from .terminal import Terminal, complain, described
+from ..core.whole_file import new_folder, whole_file
+from ..version import VERSION
+
+_CLEAR = "\r\x1b[K"
+
+
+def described(error: Exception) -> str:
+    """An error's message; for those of the system with the file."""
+    file = getattr(error, "filename", None)
+    return f"{file}: {error.strerror}" if file else reason_of(error)
+
+
+def complain(text: str) -> None:
+    """Print an error in place of the progress."""
+    start = _CLEAR if _is_terminal(sys.stderr) else ""
+    _write("stderr", f"{start}refine: error: {printable(text)}\n")
+
+
+def flush() -> None:
+    """Flush argparse's help; its reader may be gone."""
+    _write("stdout", "")
+
+
+class Terminal:
+    """Output of a run; `quiet`: errors only."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._draws = not quiet and _is_terminal(sys.stderr)
+
+    def say(self, *lines: str) -> None:
+        """Print lines, unless quiet."""
+        if not self._quiet:
+            _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
+
+    def draw(self, text: str) -> None:
+        """Show a line until the next replaces it; on terminals only."""
+        if self._draws:
+            _write("stderr", f"{_CLEAR}{printable(text)}")
 
 
 class Run:
@@ -63,7 +104,7 @@ class Run:
         What decided: the scene's cameras (the user named a file's), protected and removed splats,
         and the number of scored splats that no view holds."""
         splats, words, output = done["splats"], self._cameras.get("words"), done["files"]["output"]
-        lines = [f"cameras: {words}" if words else "", zones.words(done)]
+        lines = [f"cameras: {words}" if words else "", _demands(done)]
         if unseen := splats.get("unseen"):
             cleaned = done["cleaned"].values() if "budget" in done and "cleaned" in done else ()
             scored = splats["before"] - splats["removed_by_user"]
@@ -71,7 +112,7 @@ class Run:
             lines.append(f"{unseen:,} of {scored:,} splats lie in no view")
             if (gone := splats.get("unseen_removed")) and unseen >= MANY_UNSEEN * scored:
                 lines.append(f"{gone / unseen:.0%} of these go: add views if others can see them")
-        self.terminal.clear()
+        self.terminal.draw("")
         first = f"{self._named(label)}: {line}{f' -> {output}' if output else ''}"
         rest = filter(None, [*lines, *more, *(f"note: {note}" for note in done["notes"])])
         self.terminal.say(first, *(f"  {text}" for text in rest))
@@ -112,9 +153,60 @@ class Run:
         if options.report is not None:
             made = [entry for entry in done if options.save or entry.get("files", {}).get("output")]
             splats = bool(made) and not options.dry_run
-            report.write(options.report, self.entries, seconds, options.overwrite, splats)
+            _write_report(options.report, self.entries, seconds, options.overwrite, splats)
         return len(done) < len(self.entries)
 
     def _named(self, name: str) -> str:
         count = len(self._sizes)
         return name if count == 1 else f"file {len(self.entries) + 1} of {count}, {name}"
+
+
+def _demands(done):
+    """The report's demands in one line, "" without."""
+    counts = {"protected": "protected", "removed_by_user": "removed by you"}
+    splats = done["splats"]
+    parts = [f"{splats[key]:,} {what}" for key, what in counts.items() if splats.get(key)]
+    volumes = "; ".join(
+        f"{volume['role']} {volume['name'].removeprefix('object ')}: {volume['splats']:,}"
+        for volume in done.get("volumes", ())
+    )
+    return " ".join([", ".join(parts), f"({volumes})" if volumes else ""]).strip()
+
+
+def _write_report(path, results, seconds, overwrite, splats):
+    """Write the report of all results; an error says whether `splats` were written."""
+    content = {
+        "refine": VERSION,  # first: by this a report is known, see `checks`
+        "python": sys.version.split()[0],
+        "numpy": np.__version__,
+        "seconds": seconds,
+        "results": results,
+    }
+    try:
+        with whole_file(path, overwrite=overwrite) as stream:
+            stream.write(json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
+    except RefineError as error:
+        # What `whole_file` says of "nothing" holds for its own file alone.
+        cause = error.__cause__
+        why = reason_of(cause if isinstance(cause, OSError) else error).removeprefix(f"{path}: ")
+        done = "; the splats were" if splats else ""
+        raise RefineError(f"{path}: the report was not written ({why}){done}") from error
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    return stream is not None and stream.isatty()
+
+
+def _write(name: Literal["stdout", "stderr"], text: str) -> None:
+    stream: TextIO | None = getattr(sys, name)
+    if stream is None:  # closed before Python began
+        return
+    try:
+        stream.write(text)
+        stream.flush()
+    except UnicodeEncodeError:  # a name that this terminal's encoding cannot show
+        _write(name, text.encode("ascii", "backslashreplace").decode())
+    except OSError:
+        # Whoever read this has gone, or its disk is full: the work goes on. Python would try once
+        # more as it exits, and make that the exit code.
+        setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115

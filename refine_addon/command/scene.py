@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import bpy
@@ -15,7 +15,6 @@ from ..core.execute import Cancelled
 from ..objects import splat_group
 from ..render import frames
 from ..render.engine import Shared
-from .terminal import Terminal
 
 
 def opened(words: Sequence[str] | None = None) -> str:
@@ -59,8 +58,8 @@ def views(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
     return found, facts | {"words": f"{words[choice.source]}, {why}"}
 
 
-def render(options: argparse.Namespace, terminal: Terminal) -> None:
-    """Render frames of the open scene to its output path."""
+def render(options: argparse.Namespace, say: Callable[..., None]) -> None:
+    """Render frames of the open scene to its output path; `say` prints lines."""
     scene, shared = bpy.context.scene, Shared()
     chosen: Any = range(scene.frame_current, scene.frame_current + 1)
     if options.source:
@@ -73,7 +72,7 @@ def render(options: argparse.Namespace, terminal: Terminal) -> None:
         raise RefineError("a render was stopped") from None
     except RuntimeError as error:  # what Blender reports
         raise RefineError(str(error).strip()) from error
-    drawn, say = set(shared.frames), terminal.say
+    drawn = set(shared.frames)
     for frame in chosen:
         path = scene.render.frame_path(frame=frame)
         there = f"  note: {path}: exists and stays; the scene's Overwrite is off"

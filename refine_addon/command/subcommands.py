@@ -1,15 +1,18 @@
-"""The subcommands: work and messages for a splat file, an object, tiles, several files."""
+"""From the arguments to the exit code.
+The subcommands: work and messages for a splat file, an object, tiles, several files."""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import core
+from ..core import RefineError, Zone
 from ..core.execute import in_time
 from ..core.formats.ply_columns import other_properties
 from ..core.formats.registry import without_suffix
@@ -19,18 +22,48 @@ from ..core.report import size_in_words, sizes_in_words
 from ..core.splats import drawable
 from ..core.tiles.cluster import cluster
 from ..core.tiles.storage import located
-from . import zones
-from .run import Run
+from ..core.volumes import Role, Volume
+from .checks import check, check_report
+from .options import ROLES, complete, make_parser
+from .run import Run, complain, described, flush
 
 
-def run_subcommand(run: Run) -> None:
+def run(arguments: Sequence[str], *, scene: bool) -> int:
+    """Parse, check and run; exit code as of `refine_addon.command.main`."""
+    parser = make_parser()
+    try:
+        given = parser.parse_args(list(arguments))
+        given.scene, given.blend = scene, ""
+        if scene:
+            from .scene import opened
+
+            given.blend = opened()
+        try:
+            complete(given)
+            check(given)
+        except RefineError as error:
+            parser.error(str(error))
+        if given.report is not None:
+            check_report(given.report, overwrite=given.overwrite)
+        work = Run(given)
+        _run(work)
+        return int(work.finish())
+    except SystemExit as leaving:  # argparse leaves the process; Blender wants a number
+        flush()
+        return int(leaving.code or 0)
+    except (RefineError, OSError, MemoryError) as error:
+        complain(described(error))
+    return 1
+
+
+def _run(run: Run) -> None:
     """Run the options' subcommand, input by input; the run records errors."""
     options = run.options
     work = {"prune": _prune, "score": _score, "clean": _clean, "lod": _lod, "info": _info}
     if options.command == "render":
         from .scene import render
 
-        render(options, run.terminal)
+        render(options, run.terminal.say)
     elif options.command == "convert":
         run.attempt(_convert, str(options.inputs[0]))
     elif options.together:
@@ -44,8 +77,9 @@ def _how(run: Run, name: str) -> dict[str, Any]:
     options = run.options
     how = {"overwrite": options.overwrite, "progress": run.progress(name)}
     if options.object:
-        return how | {"demands": zones.of_object(options)}
-    return how | {"zones": zones.of_files(options), "model": options.model}
+        return how | {"demands": _of_object(options)}
+    zones = tuple(_zone(*named) for named in _named(options))
+    return how | {"zones": zones, "model": options.model}
 
 
 def _prune(run: Run, source: Path | str, output: Path | None) -> dict[str, Any]:
@@ -235,3 +269,45 @@ def _by_method(predicted: Mapping[str, Any], without: str = "") -> str:
         and without != (name := "occlusion" if way == "delete" else way)
         and not (way == "delete" and without == "closed-form")
     )
+
+
+def _of_object(options: argparse.Namespace) -> Any:
+    """The demands on the splats of --object, from the options and the scene."""
+    import bpy
+
+    from ..objects import demands, splat_group
+
+    obj = splat_group.find(options.object)
+    marks = {*obj.vertex_groups.keys(), *getattr(obj.data, "attributes", {}).keys()}
+    names, zones = [], []
+    for role, text, volume in _named(options):
+        if role == "protect" and volume is None and text in marks:
+            names.append(text)
+        else:
+            also = f", nor has '{obj.name}' a group or an attribute" if role == "protect" else ""
+            zones.append(_zone(role, text, volume, also))
+    scene = demands.Demands.of_scene(bpy.context.scene)
+    return scene + demands.Demands(tuple(names), tuple(zones))
+
+
+def _named(options: argparse.Namespace) -> Iterator[tuple[Role, str, Volume | None]]:
+    for option, role in ROLES.items():
+        for text, volume in getattr(options, option) or ():
+            yield role, text, volume
+
+
+def _zone(role: Role, text: str, volume: Volume | None, also: str = "") -> Zone:
+    if volume is not None:
+        return Zone(role, f"'{text}'", volume)
+    import bpy
+
+    from ..objects import demands
+
+    obj = bpy.context.scene.objects.get(text)
+    if obj is None:
+        fit = [o.name for o in bpy.context.scene.objects if demands.can_be_volume(o)]
+        there = ", ".join(fit[:8]) or "none"
+        raise RefineError(
+            f"no object '{text}' in the open .blend{also} (objects that are volumes: {there})"
+        )
+    return demands.zone(role, obj)

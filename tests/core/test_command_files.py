@@ -169,7 +169,7 @@ def test_a_report_that_fails_in_the_end_does_not_speak_of_splats_that_were_not_w
 ):
     """Made by somebody else while the work went on; it is left alone."""
     monkeypatch.setattr(
-        "refine_addon.command.terminal.Terminal.say",
+        "refine_addon.command.run.Terminal.say",
         lambda *_: (folder / "report.json").write_text("theirs"),
     )
 

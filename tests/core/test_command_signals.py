@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from refine_addon import command
-from refine_addon.command import flow
+from refine_addon.command import subcommands
 from refine_addon.core import read_ply
 
 ROOT = Path(__file__).parents[2]
@@ -369,7 +369,7 @@ def test_whoever_listened_before_listens_afterwards(monkeypatch, outcome):
             raise outcome
         return outcome
 
-    monkeypatch.setattr(flow, "run", run)
+    monkeypatch.setattr(subcommands, "run", run)
 
     if isinstance(outcome, ValueError):
         with pytest.raises(ValueError, match="a fault of ours"):

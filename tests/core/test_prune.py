@@ -297,7 +297,7 @@ def test_core_imports_where_there_is_no_blender():
     code = (
         "import sys\n"
         "for name in ('bpy', 'bmesh', 'mathutils', 'gpu'): sys.modules[name] = None\n"
-        "import refine_addon.core, refine_addon.command.flow\n"
+        "import refine_addon.core, refine_addon.command.subcommands\n"
     )
 
     subprocess.run([sys.executable, "-c", code], check=True)
