@@ -1,7 +1,8 @@
-"""What the recipes tell to run in Blender is understood by the command."""
+"""What the recipes tell to run in Blender is understood; docs/command.md has every option."""
 
 from __future__ import annotations
 
+import argparse
 import shlex
 import shutil
 from pathlib import Path
@@ -40,3 +41,27 @@ def test_a_recipe_for_blender_is_understood_and_refused_by_no_check(line, tmp_pa
 def test_there_are_recipes_for_blender():
     """In both documents."""
     assert {name for name, _ in LINES} == {"README.md", "recipes.md"}
+
+
+def option_rows():
+    """Yield the rows of the table of options, from the parser: each option once, with its users."""
+    (commands,) = (a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    users = {}
+    for name, command in commands.choices.items():
+        for action in command._actions:
+            words = [*action.option_strings[-1:], *([] if action.nargs == 0 else [action.metavar])]
+            if action.dest != "help":
+                users.setdefault((" ".join(words), action.help), []).append(name)
+    for (words, text), names in users.items():
+        yield f"| `{words}` | {', '.join(names)} | {text} |".replace("N|A", r"N\|A")
+
+
+def test_the_table_of_options_is_that_of_the_parser():
+    """Where it fails: the rows that it expects are those of docs/command.md."""
+    lines = (ROOT / "docs/command.md").read_text(encoding="utf-8").splitlines()
+    start = lines.index("| option | of | says |") + 2
+
+    rows = list(option_rows())
+
+    assert lines[start : start + len(rows)] == rows
+    assert not lines[start + len(rows)].startswith("|")
