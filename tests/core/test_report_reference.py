@@ -34,11 +34,11 @@ RUNS = {
 }
 
 
-def documented(title):
-    """Return the keys in the table of a section, each with what stands in its second column."""
-    section = next(text for text in SECTIONS if text.startswith(title))
-    rows = re.findall(r"^\| (`.*?) \| (.*?) \|", section, re.MULTILINE)
-    return [(key, text) for keys, text in rows for key in re.findall(r"`([^`]+)`", keys)]
+def documented(command):
+    """Return the keys in the lists of all sections whose headings name a command, or "The file"."""
+    sections = [text for text in SECTIONS if command in text.partition("\n")[0].split(", ")]
+    rows = re.findall(r"^- (`.+?`)(?=: )", "\n".join(sections), re.MULTILINE)
+    return [key for keys in rows for key in re.findall(r"`([^`]+)`", keys)]
 
 
 def written(value, name=""):
@@ -75,13 +75,11 @@ def test_every_key_of_a_report_is_in_the_reference(files, monkeypatch, command):
     Without a curve `quality` itself is null.
     """
     monkeypatch.chdir(files)
-    keys = [key for key, of in documented("An entry") if command in of.split(", ")]
-    if command == "lod":
-        keys += [key for key, _ in documented("Levels of detail")]
+    keys = documented(command)
 
     found = set()
     for report in reports(command):
-        assert set(report) == {key for key, _ in documented("The file")}
+        assert set(report) == set(documented("The file"))
         found |= set(written(report["results"][0]))
     found.discard("quality")
     keys = [key for key in keys if key not in ("levels", "quality")]
