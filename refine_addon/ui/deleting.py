@@ -11,7 +11,7 @@ from ..mesh import layout as mesh_layout
 from ..objects import splat_group
 from ..objects.demands import Demands
 from . import plans
-from .operator_bases import Answer, AtOnce, OnSplats
+from .operator_bases import Answer, AtOnce, OnSplats, tooltips
 
 WHAT = (
     ("SELECTED", "Selected", "Delete the selected splats, but for those that must stay"),
@@ -34,11 +34,7 @@ class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     what: EnumProperty(name="What", description="Which splats go", items=WHAT)
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
-        """A button's tooltip."""
-        return next(text for name, _, text in WHAT if name == properties.what)
+    description = tooltips("what", WHAT)
 
     def act(self, context: bpy.types.Context) -> Answer:
         """Delete them, except protected ones, and report their number."""

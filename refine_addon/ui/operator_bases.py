@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import bpy
@@ -61,6 +61,15 @@ def out_of_edit_mode(context: bpy.types.Context) -> str:
 def scored(context: bpy.types.Context) -> str:
     """A need: the active object has scores."""
     return "" if mesh_scores.record(context.object.data) else "Score the splats first"
+
+
+def tooltips(name: str, items: Sequence[Sequence[Any]]) -> Any:
+    """The `description` of an operator whose buttons differ by an enum, of these items."""
+
+    def described(_cls: type, _context: bpy.types.Context, properties: Any) -> str:
+        return next(text for value, _, text, *_ in items if value == getattr(properties, name))
+
+    return classmethod(described)
 
 
 class Needing:

@@ -32,7 +32,7 @@ from . import (
 )
 from .panel_cache import cached
 from .properties import HINTS, METHODS
-from .select_panel import REFINE_PT_select
+from .select_operators import REFINE_PT_select
 from .view_operators import MODES
 from .volumes import ROLES
 from .wrapped import counted

@@ -29,7 +29,7 @@ from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING
 from . import plans
-from .select_panel import SelectSettings
+from .select_operators import SelectSettings
 from .volumes import RefineVolume
 
 METHODS = (

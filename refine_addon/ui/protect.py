@@ -11,7 +11,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import selection
 from . import plans
-from .operator_bases import Answer, AtOnce, Needing, idle, on_splats
+from .operator_bases import Answer, AtOnce, Needing, idle, on_splats, tooltips
 
 _MARKS = {"STAY": mesh_edit.PROTECT, "GO": mesh_edit.MUST_GO}
 
@@ -31,11 +31,7 @@ class REFINE_OT_protect(AtOnce, Needing, bpy.types.Operator):
     needs = (idle, on_splats)
 
     mark: EnumProperty(name="Mark", description="What becomes of them", items=_ITEMS)
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
-        """A button's tooltip."""
-        return next(text for name, _, text in _ITEMS if name == properties.mark)
+    description = tooltips("mark", _ITEMS)
 
     def act(self, context: bpy.types.Context) -> Answer:
         """Write the marks; a splat has one of the two."""

@@ -1,4 +1,4 @@
-"""Operators on the selection of splats: what changes it at once, and its uses."""
+"""The box *Select* of the panel: its settings, what changes the selection at once, its uses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import bpy
 import numpy as np
-from bpy.props import BoolProperty, EnumProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty
 from bpy.types import Context
 from numpy.typing import NDArray
 
@@ -21,17 +21,17 @@ from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
-from . import plans
-from .operator_bases import Answer, AtOnce, Job, OnSplats
-from .select_tools import MODES
+from . import plans, wrapped
+from .operator_bases import Answer, AtOnce, Job, OnSplats, tooltips
+from .select_tools import MODES, SHAPES, selected_count
 
 ACTIONS = (
-    ("ALL", "All", "Select all splats that are not hidden"),
-    ("NONE", "None", "Select no splat"),
-    ("INVERT", "Invert", "Select what is not selected"),
-    ("HIDE", "Hide", "Hide the selected splats in the 3D views"),
-    ("ISOLATE", "Isolate", "Hide the splats that are not selected"),
-    ("REVEAL", "Reveal", "Show the hidden splats again, selected"),
+    ("ALL", "All", "Select all splats that are not hidden", "CHECKBOX_HLT", 0),
+    ("NONE", "None", "Select no splat", "CHECKBOX_DEHLT", 1),
+    ("INVERT", "Invert", "Select what is not selected", "SELECT_DIFFERENCE", 2),
+    ("HIDE", "Hide", "Hide the selected splats in the 3D views", "HIDE_ON", 3),
+    ("ISOLATE", "Isolate", "Hide the splats that are not selected", "PIVOT_CURSOR", 4),
+    ("REVEAL", "Reveal", "Show the hidden splats again, selected", "HIDE_OFF", 5),
 )
 
 SETS = (
@@ -52,11 +52,7 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     action: EnumProperty(name="Action", description="What is done", items=ACTIONS)
-
-    @classmethod
-    def description(cls, _context: Context, properties: bpy.types.AnyType) -> str:
-        """A button's tooltip."""
-        return next(text for name, _, text in ACTIONS if name == properties.action)
+    description = tooltips("action", ACTIONS)
 
     def act(self, context: Context) -> Answer:
         """Do it."""
@@ -85,11 +81,7 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
 
     what: EnumProperty(name="What", description="Which splats are taken", items=SETS)
     mode: EnumProperty(name="Mode", description="What becomes of those taken", items=MODES)
-
-    @classmethod
-    def description(cls, _context: Context, properties: bpy.types.AnyType) -> str:
-        """A button's tooltip."""
-        return next(text for name, _, text in SETS if name == properties.what)
+    description = tooltips("what", SETS)
 
     def act(self, context: Context) -> Answer:
         """Select them."""
@@ -188,6 +180,99 @@ def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]
     if not chosen.any():
         raise RefineError(f"object '{obj.name}': no splat is selected")
     return chosen
+
+
+class SelectSettings:
+    """Settings of the tools and the box *Select*; part of `RefineSettings`."""
+
+    select_radius: FloatProperty(
+        name="Radius",
+        description="Of the brush, in pixels",
+        subtype="PIXEL",
+        default=40.0,
+        min=1.0,
+        max=1000.0,
+    )
+    select_hidden: BoolProperty(
+        name="Through", description="Take splats that others hide, too: those behind surfaces"
+    )
+    select_tolerance: FloatProperty(
+        name="Tolerance",
+        description="How much red, green or blue may differ from the colour under the mouse",
+        subtype="FACTOR",
+        default=0.1,
+        min=0.0,
+        max=1.0,
+    )
+    select_connected: BoolProperty(
+        name="Connected", description="Take the colour only where it hangs together with the mouse"
+    )
+    select_mode: EnumProperty(
+        name="Mode", description="What becomes of the splats that a button takes", items=MODES
+    )
+    select_opacity: FloatProperty(
+        name="Opacity", description="Less opaque splats are taken", default=0.1, min=0.0, max=1.0
+    )
+    select_size: FloatProperty(
+        name="Size",
+        description="Splats with a longer standard deviation are taken, units of the object",
+        default=0.1,
+        min=1e-6,
+        precision=3,
+    )
+
+
+class REFINE_PT_select(bpy.types.Panel):
+    """The selection, its tools and its uses."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "REFINE"
+    bl_label = "Select"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Whether there are splats to select."""
+        return mesh_layout.looks_like_splats(context.object)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the count, the tools, other ways to select, and the uses."""
+        layout, settings, obj = self.layout, context.scene.refine, context.object
+        total = mesh_layout.splat_count(obj.data)
+        text = f"{selected_count(context):,} of {total:,} selected"
+        layout.label(text=text, icon="RESTRICT_SELECT_OFF")
+        grid = layout.grid_flow(columns=3, even_columns=True, align=True)
+        for shape, text, _ in SHAPES:
+            grid.operator("wm.tool_set_by_id", text=text).name = f"refine.select_{shape.lower()}"
+        row = layout.row()
+        row.prop(settings, "select_hidden")
+        row.prop(settings, "select_connected")
+        if obj.mode == "EDIT":
+            wrapped.label(layout, context, "More in object mode", icon="INFO")
+            return
+        grid = layout.grid_flow(columns=3, even_columns=True, align=True)
+        for action, text, _, icon, _ in ACTIONS:
+            grid.operator("refine.select", text=text, icon=icon).action = action
+        row = layout.row(align=True)
+        row.operator("refine.grow_selection", text="Grow", icon="ADD").shrink = False
+        row.operator("refine.grow_selection", text="Shrink", icon="REMOVE").shrink = True
+        layout.row(align=True).prop(settings, "select_mode", expand=True, icon_only=True)
+        menu = layout.operator_menu_enum("refine.select_by", "what", text="Select By")
+        menu.mode = settings.select_mode
+        row = layout.row(align=True)
+        row.prop(settings, "select_opacity")
+        row.prop(settings, "select_size")
+        _draw_uses(layout)
+
+
+def _draw_uses(layout: bpy.types.UILayout) -> None:
+    row = layout.row(align=True)
+    for mark, text, icon in (("STAY", "Stay", "LOCKED"), ("GO", "Go", "TRASH"), ("NONE", "", "X")):
+        row.operator("refine.protect", text=text, icon=icon).mark = mark
+    column = layout.column(align=True)
+    column.operator("refine.separate_selected", text="Separate", icon="MOD_EXPLODE")
+    column.operator("refine.delete", text="Delete", icon="X").what = "SELECTED"
 
 
 CLASSES = (

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 from bpy.props import EnumProperty
 
 from ..viewport import draw
-from .operator_bases import Answer
+from .operator_bases import Answer, tooltips
 
 MODES = (
     ("OFF", "Off", "Show the plain points of the mesh again"),
@@ -27,16 +25,12 @@ class REFINE_OT_view(bpy.types.Operator):
     bl_options = {"INTERNAL"}
 
     mode: EnumProperty(name="Show", description="What is drawn", items=MODES)
+    description = tooltips("mode", MODES)
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         """Whether there is a window to draw in."""
         return not bpy.app.background
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: Any) -> str:
-        """A button's tooltip."""
-        return next(text for mode, _, text in MODES if mode == properties.mode)
 
     def execute(self, _context: bpy.types.Context) -> Answer:
         """Draw, or stop."""

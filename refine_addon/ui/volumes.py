@@ -10,7 +10,7 @@ from ..core.errors import RefineError
 from ..mesh import layout as mesh_layout
 from ..objects import demands
 from . import plans
-from .operator_bases import Answer, AtOnce, Needing, idle, on_splats
+from .operator_bases import Answer, AtOnce, Needing, idle, on_splats, tooltips
 
 ROLES = (
     ("PROTECT", "Protect Inside", "Splats in it stay, whatever else is said", "LOCKED", 0),
@@ -74,11 +74,7 @@ class REFINE_OT_add_volume(AtOnce, Needing, bpy.types.Operator):
 
     role: EnumProperty(name="Role", description="What becomes of the splats in it", items=ROLES)
     shape: EnumProperty(name="Shape", description="What is added", items=SHAPES)
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
-        """A button's tooltip."""
-        return next(role[2] for role in ROLES if role[0] == properties.role)
+    description = tooltips("role", ROLES)
 
     def act(self, context: bpy.types.Context) -> Answer:
         """Add it, selected to be moved; the splats stay active."""

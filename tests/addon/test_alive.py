@@ -381,7 +381,7 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
 
 def served(addon, function):
     """Return what a thread gets that asks the main thread to call a function."""
-    worker = addon.ui.worker.Worker(lambda _progress: addon.main_thread.call(function))
+    worker = addon.ui.running.Worker(lambda _progress: addon.main_thread.call(function))
     while worker.running():
         addon.main_thread.serve()
     return worker.result()
@@ -408,7 +408,7 @@ def test_an_answer_just_after_the_time_out_is_no_time_out(addon, monkeypatch):
                 raise
 
     monkeypatch.setattr(addon.main_thread, "Future", Late)
-    worker = addon.ui.worker.Worker(lambda _progress: addon.main_thread.call(lambda: 7))
+    worker = addon.ui.running.Worker(lambda _progress: addon.main_thread.call(lambda: 7))
     timed_out.wait(0.5)  # longer than a wait for an answer
     addon.main_thread.serve()
     answered.set()
@@ -425,7 +425,7 @@ def test_a_time_out_of_the_function_itself_is_raised(addon):
 def test_a_thread_that_is_cancelled_waits_for_no_answer(addon):
     """And what it asked for is not done."""
     main_thread, calls = addon.main_thread, []
-    worker = addon.ui.worker.Worker(lambda _progress: main_thread.call(lambda: calls.append(1)))
+    worker = addon.ui.running.Worker(lambda _progress: main_thread.call(lambda: calls.append(1)))
     while not main_thread._asked.qsize():
         time.sleep(0.01)
     worker.end()
