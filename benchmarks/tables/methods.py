@@ -88,11 +88,11 @@ def everything() -> list[Method]:
 ABOUT = {
     "random": "uniformly at random",
     "opacity": "lowest opacity first",
-    "lightgaussian": "LightGaussian: sum of opacity T over pixels x (V / V90)^0.1",
-    "mesongs": "MesonGS: sum of alpha T over pixels x (V / V90)^0.1",
-    "radsplat": "RadSplat: largest alpha T of any pixel",
-    "pup-3dgs": "PUP 3D-GS: log det of the Fisher matrix of mean and scale, by rendered gradients",
-    "removal-error": "squared error of the pictures without this one splat, exactly",
+    "lightgaussian": "sum of opacity T over pixels x (V / V90)^0.1",
+    "mesongs": "sum of alpha T over pixels x (V / V90)^0.1",
+    "radsplat": "largest alpha T of any pixel",
+    "pup-3dgs": "log det of the Fisher matrix of mean and scale, by rendered gradients",
+    "removal-error": "squared error of the pictures without this one splat",
 }
 
 
@@ -126,13 +126,13 @@ def rap_network(weights: Path) -> Method:
         del statistics
         return as_scores(rap.score(task.splats, weights), len(task.views))
 
-    return Method("rap", LITERATURE, "RAP: a trained network, which sees no cameras", score=score)
+    return Method("rap", LITERATURE, "a trained network, which sees no cameras", score=score)
 
 
 def _merging() -> list[Method]:
     """Return GHAP's mixture reduction in both dresses."""
     about = {
-        "nearest": "GHAP's clusters by blocks; of each the splat nearest to its centre stays",
+        "nearest": "GHAP's clusters by blocks; of each the splat nearest its centre stays",
         "moments": "GHAP's clusters by blocks; each becomes one splat by matching moments",
     }
     methods = []
@@ -183,10 +183,10 @@ def _published() -> list[Method]:
 
 
 CORE_ABOUT = {
-    "closed-form": "closed form with frustum test, free of units: the instant answer",
-    "occlusion": "froxels: transmittance and contrast without rendering, in rounds",
-    "merge": "what goes is merged into what stays, by what the views see of each",
-    "refit": "then what stays is fitted, on rays, to what the unpruned splats look like",
+    "closed-form": "REFINE with frustum test, free of units",
+    "occlusion": "transmittance and contrast without rendering, in rounds",
+    "merge": "what goes is merged into what stays",
+    "refit": "then what stays is fitted, on rays, to the unpruned splats",
 }
 
 

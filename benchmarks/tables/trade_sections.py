@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
-import numpy as np
-
 from . import finetune, flops, million, refits
 from .cost import Cost
 from .results import Measured
@@ -48,8 +46,8 @@ def _sizes_table(scene: Measured) -> list[str]:
         body.append([line.name, *map(_seconds, costs), f"{growth:.2f}"])
     heads = ["seconds (of the processor)", *sizes, "last over the one before it"]
     return ["", f"### {scene.name}: seconds by the size of the pictures", "",
-            ("Half removed. The same splats and cameras, only with pictures of another size; the "
-            "first is that of the files. The last column compares processor time."), "",
+            ("Half removed. The first size is that of the files; the last column compares "
+            "processor time."), "",
             *table(heads, body)]  # fmt: skip
 
 
@@ -60,14 +58,14 @@ def _estimate_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
     for row in scene.estimate:
         by_way[row.way].append(row)
     body = [
-        [way, *(f"{row.estimate:.1f} / {row.truth:.1f} ({_signed(row.off)})" for row in rows)]
+        [way, *(f"{row.estimate:.1f}/{row.truth:.1f} ({_signed(row.off)})" for row in rows)]
         for way, rows in by_way.items()
     ]
     errors = [abs(row.off) for row in scene.estimate]
     return ["", f"### {scene.name}: the estimated quality beside the truth", "",
-            ("`estimated_psnr` of the report / mean PSNR of renders of all scoring views against "
-            "those of the unpruned splats (difference), dB; ranked by occlusion."), "",
-            *table(["estimate / truth", *(f"{ratio:.0%}" for ratio in ratios)], body), "",
+            ("`estimated_psnr` of the report/mean PSNR of renders of all scoring views "
+            "(difference), dB; ranked by occlusion."), "",
+            *table(["estimate/truth", *(f"{ratio:.0%}" for ratio in ratios)], body), "",
             (f"Mean error {sum(errors) / len(errors):.2f} dB, largest {max(errors):.2f} dB.")
             ]  # fmt: skip
 
@@ -92,13 +90,13 @@ def _refit_tables(scene: Measured, ratios: Sequence[float]) -> list[str]:
             label = "as it is" if name == "merged" else name
             ways.append([label, *(f"{curve.rounds[-1][1]:.1f} ({curve.rounds[-1][0]:.1f})"
                                   for curve in curves)])  # fmt: skip
-    how = ("PSNR on held-out views against renders of the unpruned splats, dB. Seconds are the "
-           "processor's with one thread, what comparing takes left out")  # fmt: skip
+    how = ("PSNR on held-out views against renders, dB. Seconds are the processor's with one "
+           "thread, without comparing,")  # fmt: skip
     return ["", f"### {scene.name}: refitting, round after round", "",
-            f"{how}, and count from the scores. The first number is before any round.", "",
+            f"{how} and count from the scores. The first number is before any round.", "",
             *table(["refitted", *heads], rounds), "",
             f"### {scene.name}: refitting made cheaper", "",
-            f"After merging. {how}, and of refitting alone.", "",
+            f"After merging. {how} of refitting alone.", "",
             *table(["refitting", *heads], ways)]  # fmt: skip
 
 
@@ -117,11 +115,10 @@ def _finetune_table(scene: Measured) -> list[str]:
     known = "" if unpruned is None else f" Unpruned: {unpruned:.2f} dB."
     return ["", f"### {scene.name}: after training on the photos", "",
             ("PSNR on held-out views against their photos, dB, before and after "
-            f"{scene.iterations} iterations on the photos of the scoring views.{known} Trained are "
-            "means, scales, rotations, opacities and all harmonics, by Adam at the learning rates "
-            "of the reference implementation (of means: those of its last iterations) and its loss "
-            "(0.8 L1, 0.2 SSIM), with exact gradients of the reference renderer; splats are "
-            "neither added nor removed (`benchmarks/tables/finetune.py`)."), "",
+            f"{scene.iterations} iterations on the photos of the scoring views.{known} All "
+            "parameters are trained by Adam at the reference implementation's learning rates (of "
+            "means: its last) and loss (0.8 L1, 0.2 SSIM); splats are neither added nor removed "
+            "(`benchmarks/tables/finetune.py`)."), "",
             *table(["removed", *(f"{ratio:.0%}" for ratio in finetune.RATIOS), "seconds"], body)
             ]  # fmt: skip
 
@@ -136,14 +133,12 @@ def _million_table(scene: Measured) -> list[str]:
         for one in found.commands
     ]  # fmt: skip
     return ["", f"### {scene.name}: {found.splats:,} splats", "",
-            (f"Made of the {found.source:,}: the largest are split in two along their longest axis "
-            f"({million.ASIDE:g} standard deviations to either side, together of the same mean, "
-            "covariance and thickness, one a little brighter and the other darker) until there "
-            f"are enough. Renders of the scene before and after agree to {found.likeness:.1f} dB. "
-            "Commands are whole processes, file to file, half removed, by all scoring views with "
-            f"pictures {million.WIDTH} px wide; PSNR on {found.compared} held-out views against "
-            f"renders of the {found.splats:,}; MB of each process's own. Neighbours that were one "
-            "splat are alike, which flatters everything that merges."), "",
+            (f"Made of the {found.source:,} by splitting the largest in two along their longest "
+            f"axis ({million.ASIDE:g} standard deviations to either side, one a little brighter); "
+            f"renders before and after agree to {found.likeness:.1f} dB. Whole processes, file to "
+            f"file, all scoring views, pictures {million.WIDTH} px wide; PSNR on {found.compared} "
+            f"held-out views against renders of the {found.splats:,}. Halves of one splat are "
+            "alike, which flatters everything that merges."), "",
             *table(["half removed", "PSNR", "seconds", "of the processor", "MB"], body)
             ]  # fmt: skip
 
@@ -156,8 +151,8 @@ def _cheaper_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
         for line in scene.cheaper
     ]
     return ["", f"### {scene.name}: speed for accuracy within occlusion", "",
-            ("PSNR on held-out views against renders of the unpruned splats. Views are `--views`; "
-            "cells, density and rounds are arguments of `core/scoring/occlusion.py`."), "",
+            ("PSNR on held-out views against renders. Views are `--views`; cells, density and "
+            "rounds are arguments of `core/scoring/occlusion.py`."), "",
             *table(["occlusion", *(f"{r:.0%}" for r in ratios), "seconds"], body)]  # fmt: skip
 
 
@@ -166,8 +161,8 @@ def _ablation_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
         return []
     body = [[line.name, *(f"{value:.1f}" for value in line.psnr)] for line in scene.ablation]
     return ["", f"### {scene.name}: the closed form without its parts", "",
-            ("PSNR on held-out views against renders of the unpruned splats. Visibility is alpha, "
-            "projection 1 / (d^2 + eta), equal weights lambda = 1/3."), "",
+            ("PSNR on held-out views against renders. Visibility is alpha, projection "
+            "1 / (d^2 + eta), equal weights lambda = 1/3."), "",
             *table(["closed form", *(f"{ratio:.0%}" for ratio in ratios)], body)]  # fmt: skip
 
 
@@ -175,9 +170,6 @@ def _flops_table(scene: Measured) -> list[str]:
     counts = scene.flops
     if counts is None:
         return []
-    rows = [[term, *map(str, numbers)] for term, numbers in flops.ANALYTIC.items()]
-    total = np.sum(list(flops.ANALYTIC.values()), axis=0)
-    rows.append(["sum, by hand", *map(str, total)])
     everything = counts.splats * counts.views / 1e9
     body = [
         [one.method, f"{one.per_splat:.0f}", f"{one.per_splat_view:.1f}",
@@ -189,12 +181,11 @@ def _flops_table(scene: Measured) -> list[str]:
                  f"{rendered * everything:.2f}"])  # fmt: skip
     failed = [f"- {name} could not be counted: {why}" for name, why in counts.failed.items()]
     return ["", f"### {scene.name}: floating-point operations", "",
-            "The closed form, a splat and a view, by hand (a test counts them):", "",
-            *table(["operations", *flops.READINGS], rows), "",
-            ("Counted by running the code with arrays that count (`tables/flops.py`); the last "
-            f"column is for all {counts.splats:,} splats and {counts.views} views. Rendering pays "
-            f"for pixels: a splat is drawn in {counts.hits_per_splat_view:.1f} pixels of a view on "
-            f"average, {flops.PER_HIT} operations each, projection and pixels missed left out."),
+            ("Counted by running the code with arrays that count (`tables/flops.py`, where "
+            "`ANALYTIC` is the closed form's count by hand, which a test compares); the last "
+            f"column is for all {counts.splats:,} splats and {counts.views} views. Rendering "
+            f"draws a splat in {counts.hits_per_splat_view:.1f} pixels of a view on average, "
+            f"{flops.PER_HIT} operations each."),
             "", *table(["method", "a splat", "a splat and view", "all, 1e9"], body),
             *(["", *failed] if failed else [])]  # fmt: skip
 
@@ -213,7 +204,7 @@ def _hessian_table(scene: Measured) -> list[str]:
     rows[-1][-1] = ""
     return ["", f"### {scene.name}: how independent splats and attributes are", "",
             ("Diagonal energy ratio of the Gauss-Newton Hessian of the pictures, 1 is independent; "
-            f"the mean over {found.groups} random splats with their {found.neighbours} nearest "
-            f"neighbours, {found.views} views, exact Jacobians (`tables/hessian.py`). Unitless:"
-            " every parameter in the unit that makes its own diagonal entry 1."), "",
+            f"mean over {found.groups} random splats with {found.neighbours} nearest neighbours, "
+            f"{found.views} views (`tables/hessian.py`). Unitless: every parameter's own diagonal "
+            "entry is 1."), "",
             *table(["diagonal blocks", "as it is", "unitless"], rows)]  # fmt: skip
