@@ -14,11 +14,9 @@ from .ui.properties import RefineSettings
 from .webp import BlenderImages
 
 _NAMES = """
-    ui.volumes ui.properties ui.preferences ui.panel_cache
-    ui.chart ui.plans ui.running ui.transforms ui.import_operators
-    ui.camera_import ui.floaters ui.deleting ui.protect ui.instances ui.select_tools
-    ui.select_operators ui.operators ui.compare ui.view_operators ui.render_operators
-    ui.export_operators ui.remedies ui.panel viewport.draw
+    ui.marks ui.properties ui.images ui.plans ui.running ui.transforms ui.import_operators
+    ui.select_tools ui.select_operators ui.operators ui.render_operators ui.export_operators
+    ui.camera_operators ui.panel viewport.draw
 """
 MODULES = [importlib.import_module(f".{name}", __package__) for name in _NAMES.split()]
 CLASSES = tuple(cls for module in MODULES for cls in getattr(module, "CLASSES", ()))

@@ -44,7 +44,7 @@ def store(
 ) -> None:
     """Write scores and their record to an object's mesh. `cameras`: name and splats of each view;
     `protected`: (N,) bool, protected in the curve; `together`, if scored with other objects: its
-    name, splats of all, and ranks among all, (N,); `origin`: see `staleness.origin`."""
+    name, splats of all, and ranks among all, (N,); `origin`: see `plans.origin`."""
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
     if len(checked) != len(scores.values):

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import bpy
+from bpy.props import EnumProperty
+from mathutils import Matrix
 
 from ..cameras.sets import CameraChoice, known_turn
 from ..core.errors import RefineError
@@ -16,26 +18,103 @@ from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.layout import looks_like_splats, splat_count
 from ..objects import demands, level_objects, splat_group
 from ..viewport import draw as viewport_draw
+from ..viewport.placing import placings
 from . import (
-    camera_list,
-    chart,
-    compare,
-    instances,
+    camera_operators,
+    images,
+    operators,
     plans,
     render_operators,
     running,
-    staleness,
     transforms,
     wrapped,
 )
-from .panel_cache import cached
+from .marks import ROLES
+from .operator_bases import Answer, AtOnce, Needing, idle, in_object_mode, tooltips
+from .plans import cached
 from .properties import HINTS, METHODS
 from .select_operators import REFINE_PT_select
-from .view_operators import MODES
-from .volumes import ROLES
 from .wrapped import counted
+
+MODES = (
+    ("OFF", "Off", "Show the plain points of the mesh again"),
+    ("SCENE", "Scene", "Show the splats as they are"),
+    ("HEAT", "Heat", "Colour each splat by its rank: dark goes first, yellow goes last"),
+    ("STAYS", "What Stays", "Show what Apply would leave"),
+    ("GOES", "What Goes", "Show what Apply would remove, in orange"),
+)
+
+
+class REFINE_OT_view(bpy.types.Operator):
+    """Draw the splats in the 3D views; nothing in the scene is changed"""
+
+    bl_idname = "refine.view"
+    bl_label = "Show Splats"
+    bl_options = {"INTERNAL"}
+
+    mode: EnumProperty(name="Show", description="What is drawn", items=MODES)
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Whether there is a window to draw in."""
+        return not bpy.app.background
+
+    description = tooltips("mode", MODES)
+
+    def execute(self, _context: bpy.types.Context) -> Answer:
+        """Draw, or stop."""
+        viewport_draw.show(self.mode)
+        return {"FINISHED"}
+
+
+def _instances(context: bpy.types.Context) -> str:
+    obj = context.object
+    if obj is not None and not looks_like_splats(obj) and any(placings([obj])):
+        return ""
+    return "Select an empty that instances a collection with splats"
+
+
+class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):
+    """Make objects of the scene of the splats that the active object instances, to be scored"""
+
+    bl_idname = "refine.make_real"
+    bl_label = "Make Splats Real"
+    bl_options = {"REGISTER", "UNDO"}
+    needs = (idle, in_object_mode, _instances)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Copy them with their data to where they are seen, and hide the instance."""
+        empty, real = context.object, []
+        for place in list(placings([empty])):
+            copy = place.obj.copy()
+            copy.data = place.obj.data.copy()
+            copy.animation_data_clear()
+            copy.constraints.clear()
+            copy.parent = None
+            copy.matrix_world = Matrix(place.matrix)
+            for collection in empty.users_collection:
+                collection.objects.link(copy)
+            real.append(copy)
+        empty.instance_type = "NONE"
+        empty.select_set(False)
+        for copy in real:
+            copy.select_set(True)
+        context.view_layer.objects.active = real[0]
+        return {"FINISHED"}
+
+
+def _draw_instances(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
+    """Draw the active object's instances and the button; whether it instances splats."""
+    if _instances(context):
+        return False
+    count = sum(splat_count(place.obj.data) for place in placings([context.object]))
+    text = f"{count:,} splats of collection '{context.object.instance_collection.name}'"
+    wrapped.label(layout, context, text, icon="OUTLINER_OB_GROUP_INSTANCE")
+    layout.operator("refine.make_real")
+    return True
 
 
 class _InSidebar:
@@ -65,7 +144,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         elif obj is not None and native.lost_base(obj):
             text = "Colours were lost: open it in Blender 5.2"
             wrapped.label(layout, context, text, icon="ERROR")
-        elif not instances.draw(layout, context):
+        elif not _draw_instances(layout, context):
             text = "Select an object that holds splats"
             wrapped.label(layout, context, text, icon="INFO")
         _draw_modes(layout, obj if mesh_layout.looks_like_splats(obj) else None)
@@ -108,7 +187,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
             button.quarter = str(alignment.turn)
         if record:
             plan = plans.shown(obj, settings) or {}
-            camera_list.draw(self.layout, record, plan.get("views", {}))
+            camera_operators.draw(self.layout, record, plan.get("views", {}))
 
 
 class REFINE_PT_prune(_InSidebar, bpy.types.Panel):
@@ -137,10 +216,10 @@ class REFINE_PT_prune(_InSidebar, bpy.types.Panel):
         apply.operator("refine.apply", icon="TRASH")
         _draw_plan(layout, context, record, plan)
         layout.operator("refine.compare", icon="IMAGE_DATA")
-        if record and (text := compare.measured(obj, settings)):
+        if record and (text := operators.measured(obj, settings)):
             wrapped.label(layout, context, text, icon="CHECKMARK")
         if plan and plan.get("quality"):
-            chart.draw(layout, plan["quality"])
+            images.draw_chart(layout, plan["quality"])
         _draw_progress(layout, context, "refine.score", "refine.apply", "refine.compare")
 
 
@@ -308,10 +387,12 @@ def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
 def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
     objects = splat_group.chosen(context.view_layer, obj)
     question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
-    return cached(question, context, lambda: staleness.changes(context, *objects))
+    return cached(question, context, lambda: plans.stale(context, *objects))
 
 
 CLASSES = (
+    REFINE_OT_view,
+    REFINE_OT_make_real,
     REFINE_PT_splats,
     REFINE_PT_cameras,
     REFINE_PT_prune,

@@ -1,17 +1,20 @@
 """Plans: the budget's effect, computed when the slider rests, not when drawn.
-Protected and removed splats likewise: marked anew after a volume or a mark has changed."""
+Protected and removed splats likewise: marked anew after a volume or a mark has changed.
+Also what changed since scoring, and values that panels keep until the scene changes."""
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, TypeVar
 
 import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
+from ..cameras.objects import SOURCE, WEIGHT, render_size
+from ..cameras.sets import CameraChoice
 from ..core.errors import RefineError
 from ..core.execute import in_time
 from ..core.methods import ClosedForm, Occlusion
@@ -20,11 +23,16 @@ from ..core.quality.alignment import Alignment
 from ..core.quality.curve import Quality, Way, expected_seconds, in_words, out_of_reach, parted
 from ..core.report import MANY_UNSEEN, little_seen, sizes_in_words
 from ..core.selection import Budget, quality_of
+from ..mesh import attributes as mesh_attributes
+from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
 from ..objects.splat_group import Outcome
-from . import camera_list, chart, running
+from . import images, running
+from .wrapped import counted
+
+Answer = TypeVar("Answer")
 
 REST = 0.2  # Seconds without a change after which a slider rests
 
@@ -37,6 +45,19 @@ _waiting: list[tuple[str, str]] = []
 """Scene and objects, by name, to be marked when the slider rests."""
 
 _edited: set[str] = set()  # Objects in edit mode, by name, with changed marks, to be counted later
+
+_answers: dict[Hashable, Any] = {}  # What `cached` keeps
+
+_NOISE = 1e-6  # Relative to the largest number beside it: difference that another machine may make
+
+_FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
+
+_WORDS = {
+    "matrix": "object moved",
+    "cameras": "cameras changed",
+    "must_go": "what must go changed",
+    "settings": "settings changed",
+}
 
 
 def changed(context: bpy.types.Context) -> None:
@@ -132,7 +153,9 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
         between = curve.at_between(share, way)
         if parted(curve.at(share, way), between):
             texts.append(f"views between these lose more: {in_words(between)}")
-    texts += [camera_list.warning(record), alignment.distant()]
+    if none := sum(seen == 0 for _, seen in record.get("cameras") or ()):
+        texts.append(f"no splat lies in the view of {counted(none, 'camera')}")
+    texts.append(alignment.distant())
     unseen = plan["unseen"]
     if unseen >= MANY_UNSEEN * plan["splats"]:
         go = f"{plan['unseen_gone'] / unseen:.0%} of these go"
@@ -171,7 +194,7 @@ def _key(obj: bpy.types.Object, settings: Any) -> Any:
         for item in demands.listed(settings.id_data)
     ]
     budget = (settings.budget, getattr(settings, settings.budget), settings.method)
-    return scorings, budget, settings.protect, volumes, chart.look(bpy.context.preferences)
+    return scorings, budget, settings.protect, volumes, images.look(bpy.context.preferences)
 
 
 def _wait(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: float) -> None:
@@ -242,7 +265,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
         if closed:
             remark = "Score by another method, or with Quality as the budget, to see dB"
     else:
-        chart.show(curve, share)
+        images.show_chart(curve, share)
         views = curve.of_views(share, becomes if curve.foretold else "delete")
         if budget.psnr is not None:
             remark = _sentence(out_of_reach(budget.psnr, gone, left, curve.at(share, becomes)))
@@ -256,9 +279,108 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
+    """An object's transform, the panel's cameras, and the settings that decide: JSON."""
+    method = context.scene.refine.to_method()
+    return {
+        "matrix": np.array(obj.matrix_world).tolist(),
+        "frame": context.scene.frame_current,
+        "cameras": _cameras(context),
+        "must_go": _marked(obj, 2),
+        # All methods but the closed form score by occlusion.
+        "settings": [method.name == "closed-form", method.views],
+    }
+
+
+def stale(context: bpy.types.Context, *objects: bpy.types.Object) -> list[str]:
+    """Changes since any object was scored, in few words; none without an origin."""
+    found: dict[str, None] = {}
+    for obj in objects:
+        record = mesh_scores.record(obj.data) or {}
+        now = origin(context, obj)
+        try:
+            then = {name: record["origin"][name] for name in now}
+            source, others = then["cameras"][0], now["cameras"]
+        except (IndexError, KeyError, TypeError):  # whoever wrote there, it was not `origin`
+            continue
+        if source == "FRAMES" and then["frame"] != now["frame"]:
+            then["matrix"] = now["matrix"]  # the views of a shot follow the object, which moves
+        if source == "SELECTED" and others[:2] == ["SELECTED", 0]:
+            then["cameras"] = others  # selecting the splats deselected them
+        found |= {_WORDS[name]: None for name in _WORDS if not _same(then[name], now[name])}
+        if record.get("quality") and record.get("protected") != _marked(obj, 1):
+            found["what is protected changed"] = None
+    return list(found)
+
+
+def _same(one: Any, other: Any, scale: float = 0.0) -> bool:
+    """Whether JSON values are equal up to noise in lists of numbers."""
+    if isinstance(one, list) and isinstance(other, list):
+        scale = max((abs(each) for each in one if isinstance(each, float)), default=0.0)
+        pairs = zip(one, other, strict=False)
+        return len(one) == len(other) and all(_same(*pair, scale) for pair in pairs)
+    if isinstance(one, float) and isinstance(other, float):
+        return abs(one - other) <= _NOISE * scale
+    return bool(one == other)
+
+
+def _marked(obj: bpy.types.Object, kind: int) -> list[int]:
+    if mesh_edit.FORCE not in obj.data.attributes:
+        return mesh_scores.digest(None)
+    return mesh_scores.digest(mesh_attributes.read_attribute(obj.data, mesh_edit.FORCE) == kind)
+
+
+def _cameras(context: bpy.types.Context) -> list[Any]:
+    scene, settings = context.scene, context.scene.refine
+    if settings.source == "FRAMES":
+        frames = settings.to_frames(scene)
+        name = scene.camera.name if scene.camera else ""
+        return ["FRAMES", frames.start, frames.stop, frames.step, name]
+    cameras = CameraChoice(settings.source, settings.collection).cameras(context)
+    chosen = ["SELECTED" if settings.source == "SELECTED" else "OTHERS", len(cameras)]
+    if not cameras:
+        return chosen
+    (width, height), aspect = render_size(scene)
+    numbers = np.array([_numbers(camera, (width, height, aspect)) for camera in cameras])
+    # In any order, and short however many there are: (2, C).
+    means = np.array([numbers.mean(axis=0), np.sqrt((numbers**2).mean(axis=0))])
+    axes, place, rest = np.split(means, (9, 12), axis=1)
+    return [*chosen, axes.ravel().tolist(), place.ravel().tolist(), *rest.T.tolist()]
+
+
+def _numbers(camera: bpy.types.Object, frame: tuple[int, int, float]) -> tuple[float, ...]:
+    matrix, data = np.array(camera.matrix_world), camera.data
+    weight = camera.get(WEIGHT, 1.0)
+    return (
+        *(*matrix[:3, :3].ravel(), *matrix[:3, 3]),
+        *(data.lens, data.sensor_width, data.sensor_height, data.shift_x, data.shift_y),
+        *(data.clip_start, data.clip_end, _FITS.index(data.sensor_fit)),
+        *((0, 0, 0) if SOURCE in camera else frame),  # imported ones keep the size of their file
+        weight if isinstance(weight, (int, float)) else -1.0,
+    )
+
+
+def cached(what: Hashable, context: bpy.types.Context, compute: Callable[[], Answer]) -> Answer:
+    """Value of `compute` (of the scene, active object, settings), kept until anything changes.
+    A script's silent changes, such as custom properties, show after the next change."""
+    obj, settings = context.object, context.scene.refine
+    names = set(settings.bl_rna.properties.keys()) - {"rna_type", "name"}
+    values = repr([getattr(settings, name) for name in sorted(names)])
+    key = (what, context.scene.session_uid, obj and obj.session_uid, values)
+    if key not in _answers:
+        _answers[key] = compute()
+    return _answers[key]
+
+
+@persistent
+def _forget(*_arguments: object) -> None:
+    _answers.clear()
+
+
 @persistent
 def _undone(*_: object) -> None:
     """After undo or redo, mark again what may differ, and draw the right chart."""
+    _forget()
     _made.clear()
     if not bpy.app.background:
         (mark_again if bpy.context.scene.refine.volumes else changed)(bpy.context)
@@ -267,6 +389,7 @@ def _undone(*_: object) -> None:
 @persistent
 def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Watch moving volumes, splats moving under them, and the end of edit mode."""
+    _forget()
     if depsgraph is None or bpy.app.background:
         return
     edited = {bpy.data.objects.get(name) for name in _edited} - {None}
@@ -285,7 +408,7 @@ def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
 
 _EVENTS = {
     "undo_post": _undone, "redo_post": _undone, "load_post": _undone,
-    "depsgraph_update_post": _updated,
+    "depsgraph_update_post": _updated, "frame_change_post": _forget,
 }  # fmt: skip
 
 
@@ -301,5 +424,5 @@ def unregister() -> None:
         getattr(bpy.app.handlers, event).remove(heard)
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
-    for kept in (_made, _waiting, _edited):
+    for kept in (_made, _waiting, _edited, _answers):
         kept.clear()

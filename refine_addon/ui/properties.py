@@ -1,4 +1,4 @@
-"""The panel's settings, and their conversion to those of core."""
+"""The panel's settings, their conversion to those of core, and their defaults (preferences)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 import numpy as np
 from bpy.props import (
+    BoolProperty,
     CollectionProperty,
     EnumProperty,
     FloatProperty,
@@ -29,8 +30,8 @@ from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING
 from . import plans
+from .marks import RefineVolume
 from .select_operators import SelectSettings
-from .volumes import RefineVolume
 
 METHODS = (
     (
@@ -293,4 +294,59 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         return _REASONS[self.strength]
 
 
-CLASSES = (RefineSettings,)
+PACKAGE = __package__.rpartition(".")[0]  # Such as ``bl_ext.user_default.refine_addon``
+
+DEFAULTS = ("method", "views")  # Preferences that are scene settings of the same name
+
+
+class RefinePreferences(bpy.types.AddonPreferences):
+    """Defaults, in Blender's preferences beside the extension."""
+
+    bl_idname = PACKAGE
+
+    method: EnumProperty(**METHOD)
+    views: IntProperty(**VIEWS)
+    upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        """Draw them."""
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.label(text="Defaults for scenes into which splats are imported")
+        for name in (*DEFAULTS, "upright"):
+            layout.prop(self, name)
+
+
+def give_defaults(context: bpy.types.Context) -> None:
+    """Fill a scene's unset settings; in a window only, as scripts say what they want."""
+    chosen = _chosen(context)
+    if chosen is not None and not bpy.app.background:
+        fill(context.scene.refine, chosen)
+
+
+def fill(settings: RefineSettings, chosen: RefinePreferences) -> None:
+    """Set preferred values that these settings do not set yet."""
+    for name in DEFAULTS:
+        if chosen.is_property_set(name) and not settings.is_property_set(name):
+            setattr(settings, name, getattr(chosen, name))
+
+
+def suggest(operator: Any, context: bpy.types.Context, name: str) -> None:
+    """Give an operator that asks for its options the default of one not given."""
+    chosen = _chosen(context)
+    if chosen is not None and not operator.properties.is_property_set(name):
+        setattr(operator, name, getattr(chosen, name))
+
+
+def _chosen(context: bpy.types.Context) -> RefinePreferences | None:
+    addon = context.preferences.addons.get(PACKAGE)
+    if addon is None:
+        return None
+    return addon.preferences
+
+
+CLASSES = (
+    RefineSettings,
+    RefinePreferences,
+)

@@ -31,7 +31,7 @@ from ..mesh.edit_mode import readable
 from ..mesh.layout import SplatObject
 from ..viewport import draw as viewport_draw
 from .operator_bases import FAILURES, Answer, Needing, fail, idle, on_splats
-from .panel_cache import cached
+from .plans import cached
 from .running import Worker
 
 _TOOLS = (

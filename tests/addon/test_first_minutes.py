@@ -98,8 +98,8 @@ def test_what_lies_beside_the_splats_is_found_by_its_name(addon, tmp_path, made,
     place = tmp_path / "a" / "b" / "c"
     place.mkdir(parents=True)
 
-    assert addon.ui.camera_import.cameras_beside(place) == (found and tmp_path / found)
-    assert addon.ui.camera_import.cameras_beside(place / "d") is None
+    assert addon.ui.import_operators.cameras_beside(place) == (found and tmp_path / found)
+    assert addon.ui.import_operators.cameras_beside(place / "d") is None
 
 
 class _Layout:
@@ -135,7 +135,7 @@ def test_the_dialogue_names_the_cameras_before_they_are_taken(addon, capture, br
 
 def test_camera_files_have_a_handler(addon):
     """So that they can be dropped on the view: every kind that the file browser shows."""
-    module = addon.ui.camera_import
+    module = addon.ui.import_operators
     operator = bpy.ops.refine.import_cameras.get_rna_type()
     shown = operator.properties["filter_glob"].default
 
@@ -146,7 +146,7 @@ def test_camera_files_have_a_handler(addon):
 
 def test_several_files_of_cameras_are_refused_but_those_of_one_model(addon, tmp_path):
     """Of a COLMAP model any files can be dropped together; of others all but one would be lost."""
-    gather = addon.ui.camera_import.REFINE_OT_import_cameras.gather
+    gather = addon.ui.import_operators.REFINE_OT_import_cameras.gather
     several = [None, None]
     model, other = (str(tmp_path / name) for name in ("images.bin", "a.json"))
 
@@ -161,7 +161,7 @@ def test_the_dialogue_of_the_cameras_follows_the_splats(addon, capture, upright)
     bpy.ops.refine.import_ply(filepath=str(capture), upright=upright)
     bpy.context.view_layer.update()
     bpy.context.view_layer.objects.active = None
-    module = addon.ui.camera_import
+    module = addon.ui.import_operators
 
     assert module._is_upright(module._imported_splats(bpy.context)) is upright
 
@@ -185,7 +185,7 @@ def test_the_render_size_is_set_where_nobody_chose_one(addon, change, untouched)
     is_set = SimpleNamespace(is_property_set=lambda _name: False)
     operator = SimpleNamespace(properties=is_set, set_resolution=None)
 
-    addon.ui.camera_import.suggest_resolution(operator, bpy.context)
+    addon.ui.import_operators.suggest_resolution(operator, bpy.context)
 
     assert operator.set_resolution is untouched
 
@@ -221,7 +221,7 @@ def test_what_compare_measured_stays_in_the_panel_while_the_plan_is_the_same(
 ):
     """Another share, or other scores, and it is no longer shown."""
     scene = bpy.context.scene
-    scene.camera, measured = room_cameras.objects[24], addon.ui.compare.measured
+    scene.camera, measured = room_cameras.objects[24], addon.ui.operators.measured
     bpy.ops.refine.score()
     before = measured(quarter, scene.refine)
     bpy.ops.refine.compare()

@@ -100,9 +100,9 @@ def test_a_level_of_a_streamed_sog_is_imported():
 @pytest.mark.parametrize("name", ["a/lod-meta.json", "META.JSON", "a/transforms.json"])
 def test_a_json_file_that_is_dropped_is_one_of_splats_by_its_name(addon, monkeypatch, name):
     """The handler of .json is that of cameras, which hands over an index of splats."""
-    cls, called = addon.ui.camera_import.REFINE_OT_import_cameras, []
+    cls, called = addon.ui.import_operators.REFINE_OT_import_cameras, []
     operators = SimpleNamespace(import_ply=lambda *given, **named: called.append((given, named)))
-    monkeypatch.setattr(addon.ui.camera_import.bpy.ops, "refine", operators, raising=False)
+    monkeypatch.setattr(addon.ui.import_operators.bpy.ops, "refine", operators, raising=False)
     properties = SimpleNamespace(filepath=name, is_property_set=lambda _: True)
     operator = SimpleNamespace(
         properties=properties, invoke_popup=lambda _: {"ASKED"}, upright=False

@@ -17,7 +17,7 @@ def preferred(addon):
     """Return the extension's preferences; unset again afterwards."""
     preferences = bpy.context.preferences.addons[addon.__name__].preferences
     yield preferences
-    for name in (*addon.ui.preferences.DEFAULTS, "upright"):
+    for name in (*addon.ui.properties.DEFAULTS, "upright"):
         preferences.property_unset(name)
 
 
@@ -27,7 +27,7 @@ def test_preferences_are_the_defaults_of_what_a_scene_has_not_set(addon, preferr
     preferred.method, preferred.views = "closed-form", 16
     settings.views = 32
 
-    addon.ui.preferences.fill(settings, preferred)
+    addon.ui.properties.fill(settings, preferred)
 
     assert (settings.method, settings.views) == ("closed-form", 32)
 
@@ -50,7 +50,7 @@ def test_a_dialogue_starts_from_the_preferences(addon, preferred):
             upright=False, properties=SimpleNamespace(is_property_set=lambda _name, g=given: g)
         )
 
-        addon.ui.preferences.suggest(operator, bpy.context, "upright")
+        addon.ui.properties.suggest(operator, bpy.context, "upright")
 
         assert operator.upright is expected
 
@@ -71,7 +71,7 @@ def test_cameras_are_looked_for_where_the_splats_came_from(addon, tmp_path, came
     shutil.copy(ROOM / "point_cloud.ply", place)
     (tmp_path / cameras).write_text("[]")
     bpy.ops.refine.import_ply(filepath=str(place / "point_cloud.ply"))
-    find = addon.ui.camera_import.capture_folder
+    find = addon.ui.import_operators.capture_folder
 
     assert find(bpy.context.object) == tmp_path / expected
     bpy.context.object["refine_folder"] = str(tmp_path / "gone")

@@ -535,7 +535,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
         ("ui.operators", "score", "score", {}),
         ("ui.operators", "prune", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
-        ("ui.camera_import", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
+        ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
         ("ui.export_operators", "write_splats", "export_ply", {"filepath": "out.ply"}),
     ],
 )

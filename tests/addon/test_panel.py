@@ -259,7 +259,7 @@ def test_nothing_is_asked_of_the_scene_twice_until_it_changes(
     bpy.ops.refine.score()
     panel = addon.ui.panel
     monkeypatch.setattr(panel, "_cameras", counting("cameras", panel._cameras))
-    for module, name in ((panel.staleness, "changes"), (panel.mesh_layout, "export_bytes")):
+    for module, name in ((panel.plans, "stale"), (panel.mesh_layout, "export_bytes")):
         monkeypatch.setattr(module, name, counting(name, getattr(module, name)))
     bpy.context.view_layer.update()
     draw()
@@ -273,7 +273,7 @@ def test_nothing_is_asked_of_the_scene_twice_until_it_changes(
     bpy.context.scene.refine.source = "VISIBLE"
     draw()
 
-    assert first == again == ["cameras", "changes", "export_bytes"]
+    assert first == again == ["cameras", "export_bytes", "stale"]
     assert lens == sorted(2 * first)
     assert sorted(asked) == sorted(3 * first)
 

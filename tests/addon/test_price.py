@@ -22,7 +22,7 @@ def curve(addon):
 @pytest.mark.parametrize("size", [212, 454])
 def test_the_curve_goes_where_the_estimate_is(addon, curve, size):
     """At 20, 50 and 79 % removed the pixels at 50, 40 and 30.3 dB have the colour of deleting."""
-    chart = addon.ui.chart
+    chart = addon.ui.images
     picture = chart.picture(curve, 0.95, size, INK)
     low, blue = chart.lowest(curve), np.array(chart._ON_DARK["delete"]) * 255.0
 
@@ -35,7 +35,7 @@ def test_the_curve_goes_where_the_estimate_is(addon, curve, size):
 
 def test_the_budget_is_a_line_with_a_dot_on_each_curve(addon, curve):
     """Of few splats, of which merging is not foretold, on one curve alone."""
-    chart = addon.ui.chart
+    chart = addon.ui.images
     few = replace(curve, foretold=False)
     low, dots = chart.lowest(curve), []
     for each in (curve, few):
@@ -95,7 +95,7 @@ def test_what_is_protected_is_read_again(addon, room, room_cameras):
 
 def test_the_chart_is_made_with_the_plan_and_is_no_data_of_the_file(addon, room, room_cameras):
     """An icon with as many pixels as its edge squared; the file holds no image."""
-    chart, settings = addon.ui.chart, bpy.context.scene.refine
+    chart, settings = addon.ui.images, bpy.context.scene.refine
     settings.method, settings.views = "occlusion", 8
     bpy.ops.refine.score()
     preview = chart._previews[0]["chart"]
@@ -110,7 +110,7 @@ def test_the_chart_is_made_with_the_plan_and_is_no_data_of_the_file(addon, room,
 
 def test_an_addon_that_is_off_keeps_no_picture(addon):
     """Its previews are freed, and made anew when it is on again."""
-    chart = addon.ui.chart
+    chart = addon.ui.images
     addon.unregister()
     gone = len(chart._previews), chart.icon("chart")
     addon.register()

@@ -56,7 +56,7 @@ def cameras(addon):
     """Return what the panel lists of each camera of the active object, by its name."""
     obj, ui = bpy.context.object, addon.ui
     plan = ui.plans.stored(obj, bpy.context.scene.refine)
-    listed = ui.camera_list.cameras(addon.mesh.scores.record(obj.data), plan["views"])
+    listed = ui.camera_operators.cameras(addon.mesh.scores.record(obj.data), plan["views"])
     return {camera.name: camera for camera in listed}
 
 

@@ -197,10 +197,10 @@ def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
     best = np.argsort(-scores, kind="stable")[:100]
     chosen(room, best)
     bpy.ops.refine.protect(mark="GO")
-    assert "what must go changed" in addon.ui.staleness.changes(bpy.context, room)
+    assert "what must go changed" in addon.ui.plans.stale(bpy.context, room)
     assert addon.objects.demands.facts(room.data)["removed_by_user"] == 100
     bpy.ops.refine.score()
-    assert addon.ui.staleness.changes(bpy.context, room) == []
+    assert addon.ui.plans.stale(bpy.context, room) == []
     going = addon.mesh.attributes.read_attribute(room.data, "refine_remove")
     assert going[best].all()
     assert going.sum() == 19_877

@@ -11,7 +11,7 @@ from .conftest import keep_mask
 def hints(addon, obj):
     """Return what the panel would say of an object's scores."""
     bpy.context.view_layer.update()
-    return addon.ui.staleness.changes(bpy.context, obj)
+    return addon.ui.plans.stale(bpy.context, obj)
 
 
 def _move(room, _camera):

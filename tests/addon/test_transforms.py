@@ -171,7 +171,7 @@ def test_scores_hold_when_a_transform_is_baked(addon, imported, room_cameras):
     bpy.ops.refine.bake_transform()
 
     bpy.context.view_layer.update()
-    assert addon.ui.staleness.changes(bpy.context, imported) == []
+    assert addon.ui.plans.stale(bpy.context, imported) == []
 
 
 @pytest.mark.parametrize("what", ["shared", "animated", "shape keys"])

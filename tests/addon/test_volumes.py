@@ -335,18 +335,18 @@ def test_native_point_clouds_go_by_volumes_and_marks_as_meshes_do(addon, room, c
 def test_a_volume_that_moved_asks_for_new_scores(addon, room, crop):
     """The panel says so; what had to go then and need not now has no score, and is not guessed."""
     bpy.ops.refine.score()
-    before = addon.ui.staleness.changes(bpy.context, room)
+    before = addon.ui.plans.stale(bpy.context, room)
     bpy.data.objects["Inner"].location.x += 0.5
     bpy.context.view_layer.update()
     addon.ui.plans.refresh(bpy.context)
 
     assert before == []
-    assert addon.ui.staleness.changes(bpy.context, room) == ["what must go changed"]
+    assert addon.ui.plans.stale(bpy.context, room) == ["what must go changed"]
     assert "score it again" in addon.ui.plans.stored(room, bpy.context.scene.refine)["error"]
     with pytest.raises(RuntimeError, match="score it again"):
         bpy.ops.refine.apply()
     bpy.ops.refine.score()
-    assert addon.ui.staleness.changes(bpy.context, room) == []
+    assert addon.ui.plans.stale(bpy.context, room) == []
     assert bpy.ops.refine.apply() == {"FINISHED"}
 
 
@@ -382,11 +382,11 @@ def test_a_volume_that_protects_alone_changes_no_score(addon, room, room_cameras
     addon.ui.plans.refresh(bpy.context)
     stays = mask(addon, room, "refine_force") == 1
 
-    assert addon.ui.staleness.changes(bpy.context, room) == []
+    assert addon.ui.plans.stale(bpy.context, room) == []
     assert stays.sum() == (np.abs(means(addon, room) - center) < upper - center).all(axis=1).sum()
     assert not mask(addon, room, "refine_remove")[stays].any()
     item.role = "REMOVE"
-    assert addon.ui.staleness.changes(bpy.context, room) == ["what must go changed"]
+    assert addon.ui.plans.stale(bpy.context, room) == ["what must go changed"]
 
 
 @pytest.fixture
@@ -420,12 +420,12 @@ def test_a_quality_keeps_in_the_panel_what_the_command_keeps(addon, core, room, 
 def test_what_is_protected_otherwise_asks_for_new_scores(addon, room, guarded):
     """The estimate is of other kept sets then: after a move, not after it is undone."""
     bpy.ops.refine.score()
-    found = [addon.ui.staleness.changes(bpy.context, room)]
+    found = [addon.ui.plans.stale(bpy.context, room)]
     for x in (0.3, -0.3):
         guarded.location.x += x
         bpy.context.view_layer.update()
         addon.ui.plans.refresh(bpy.context)
-        found.append(addon.ui.staleness.changes(bpy.context, room))
+        found.append(addon.ui.plans.stale(bpy.context, room))
 
     assert found == [[], ["what is protected changed"], []]
 
@@ -449,7 +449,7 @@ def test_a_mesh_of_another_shape_is_another_volume(addon, room, room_cameras):
     box = cube(middle(addon, room)[0], (0.5, 0.5, 0.5))
     volume(box, "REMOVE")
     bpy.ops.refine.score()
-    before = addon.ui.staleness.changes(bpy.context, room)
+    before = addon.ui.plans.stale(bpy.context, room)
     size = box.dimensions[:]
     box.data.vertices[7].co *= 0.2
     bpy.context.view_layer.update()
@@ -457,7 +457,7 @@ def test_a_mesh_of_another_shape_is_another_volume(addon, room, room_cameras):
 
     assert before == []
     assert box.dimensions[:] == size
-    assert addon.ui.staleness.changes(bpy.context, room) == ["what must go changed"]
+    assert addon.ui.plans.stale(bpy.context, room) == ["what must go changed"]
 
 
 def test_a_volume_that_moves_marks_all_splats_anew(addon, room, room_cameras):

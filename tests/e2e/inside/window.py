@@ -95,7 +95,7 @@ def price(name: str) -> dict[str, Any]:
         "sentence": ui.plans.sentence(plan) if plan else "",
         "rested": bool(plan),
         "marked": sum(mark.value for mark in marks),
-        "chart": ui.chart.icon("chart") > 0,
+        "chart": ui.images.icon("chart") > 0,
         "images": len([image for image in bpy.data.images if image.users]),
     }
 

@@ -1,9 +1,10 @@
-"""Operators on deciding cameras: a ring of them around the splats, and a turn of all."""
+"""Deciding cameras: what each sees, a ring of them around the splats, a turn of all."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import bpy
 import mathutils
@@ -13,12 +14,55 @@ from bpy.props import EnumProperty, IntProperty
 from ..cameras.objects import UPRIGHT
 from ..cameras.sets import CameraChoice
 from ..core.errors import RefineError
+from ..core.quality.curve import in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
 from .operator_bases import Answer, AtOnce, OnSplats
 from .wrapped import counted
+
+_MOST = 8  # Cameras shown
+
+
+class Camera(NamedTuple):
+    """View's name, splats in it, estimated dB or None, whether it is far away."""
+
+    name: str
+    seen: int
+    psnr: float | None
+    far: bool
+
+
+def cameras(record: dict[str, Any], psnr: Mapping[str, float]) -> list[Camera]:
+    """Cameras of a record: useless ones first, then by change; `psnr`: known dB by view."""
+    far = set((record.get("alignment") or {}).get("far", ()))
+    each = (
+        Camera(name, seen, psnr.get(name), name in far)
+        for name, seen in record.get("cameras") or ()
+    )
+    return sorted(
+        each, key=lambda c: (c.seen > 0, not c.far, math.inf if c.psnr is None else c.psnr, c.seen)
+    )
+
+
+def draw(layout: bpy.types.UILayout, record: dict[str, Any], psnr: Mapping[str, float]) -> None:
+    """Draw the first of `cameras`; folded at first."""
+    header, body = layout.panel("REFINE_cameras", default_closed=True)
+    header.label(text="What Each Sees")
+    if not body:
+        return
+    column = body.column(align=True)
+    every = cameras(record, psnr)
+    for camera in every[:_MOST]:
+        text = "far away" if camera.far else f"{camera.seen:,}" if camera.seen else "nothing"
+        if camera.psnr is not None:
+            text += f", {in_words(camera.psnr)}"
+        useless = camera.far or not camera.seen
+        column.label(text=f"{camera.name}: {text}", icon="ERROR" if useless else "CAMERA_DATA")
+    if len(every) > _MOST:
+        column.label(text=f"and {len(every) - _MOST} that change less")
+
 
 _INNER = (5.0, 95.0)  # Percentiles of positions that a ring frames: far floaters do not count
 
@@ -179,4 +223,7 @@ def _join(context: bpy.types.Context, ring: bpy.types.Collection) -> None:
     settings.collection, settings.source = ring, "COLLECTION"
 
 
-CLASSES = (REFINE_OT_turn_cameras, REFINE_OT_add_ring)
+CLASSES = (
+    REFINE_OT_turn_cameras,
+    REFINE_OT_add_ring,
+)

@@ -1,0 +1,303 @@
+"""What must stay and go in the panel: volumes, marks by hand, floaters; deleting at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import numpy as np
+from bpy.props import EnumProperty, IntProperty, PointerProperty
+from bpy.types import Context
+
+from ..core.cleaning.clean import Cleaned, Cleaning, clean
+from ..core.errors import RefineError
+from ..core.execute import Progress
+from ..mesh import attributes as mesh_attributes
+from ..mesh import edit as mesh_edit
+from ..mesh import floaters, selection
+from ..mesh import layout as mesh_layout
+from ..mesh.layout import SplatObject
+from ..objects import demands, splat_group
+from ..objects.demands import Demands
+from . import plans
+from .operator_bases import Answer, AtOnce, Job, Needing, OnSplats, idle, on_splats, tooltips
+from .operators import chosen_views
+
+ROLES = (
+    ("PROTECT", "Protect Inside", "Splats in it stay, whatever else is said", "LOCKED", 0),
+    ("REMOVE", "Remove Inside", "Splats in it go before all others", "TRASH", 1),
+    (
+        "KEEP",
+        "Keep Inside",
+        "All splats go that are in no volume of this kind",
+        "FULLSCREEN_EXIT",
+        2,
+    ),
+)
+"""Roles of volumes, by core's names, in small letters there."""
+
+_OUTSIDE, _OUTSIDE_KEPT = 0.25, 0.02
+"""Share of splats beyond each face of a new volume; the latter where it keeps what is inside."""
+
+_LEAST_HALF = 1e-3  # Half width, world units, at least: flat splats make no flat volume
+
+SHAPES = (
+    ("BOX", "Box", "A new box around the middle of the splats"),
+    ("SPHERE", "Sphere", "A new sphere around the middle of the splats"),
+    (
+        "SELECTED",
+        "Selected Objects",
+        "Closed meshes, and empties shown as cubes or spheres, that are selected too",
+    ),
+)
+
+
+def _changed(_volume: RefineVolume, context: bpy.types.Context) -> None:
+    plans.mark_again(context)
+
+
+def _fits(_volume: RefineVolume, obj: bpy.types.Object) -> bool:
+    return demands.can_be_volume(obj)
+
+
+class RefineVolume(bpy.types.PropertyGroup):
+    """A volume of the list, at ``scene.refine.volumes``."""
+
+    object: PointerProperty(
+        name="Volume",
+        description="A closed mesh, or an empty that is shown as a cube or a sphere",
+        type=bpy.types.Object,
+        poll=_fits,
+        update=_changed,
+    )
+    role: EnumProperty(
+        name="Role", description="What becomes of the splats in it", items=ROLES, update=_changed
+    )
+
+
+class REFINE_OT_add_volume(AtOnce, Needing, bpy.types.Operator):
+    """Add a volume to the list"""
+
+    bl_idname = "refine.add_volume"
+    bl_label = "Add Volume"
+    bl_options = {"REGISTER", "UNDO"}
+    needs = (idle, on_splats)
+
+    role: EnumProperty(name="Role", description="What becomes of the splats in it", items=ROLES)
+    shape: EnumProperty(name="Shape", description="What is added", items=SHAPES)
+    description = tooltips("role", ROLES)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Add it, selected to be moved; the splats stay active."""
+        checked = mesh_layout.check(context.object)
+        if self.shape == "SELECTED":
+            objects = _selected_volumes(context)
+        else:
+            objects = [_new_empty(context, checked, self.shape, self.role)]
+        for obj in objects:
+            item = context.scene.refine.volumes.add()
+            item.role = self.role
+            item.object = obj
+        return {"FINISHED"}
+
+
+def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Selected objects not listed yet; raises `RefineError` if none fits."""
+    listed = {item.object for item in context.scene.refine.volumes}
+    objects = [o for o in context.selected_objects if not mesh_layout.looks_like_splats(o)]
+    objects = [obj for obj in objects if obj not in listed]
+    if not objects:
+        raise RefineError("no volume: select closed meshes or empties, and the splats last")
+    for obj in objects:
+        demands.zone("remove", obj)
+    return objects
+
+
+def _new_empty(
+    context: bpy.types.Context, checked: mesh_layout.SplatObject, shape: str, role: str
+) -> bpy.types.Object:
+    """A new empty around the middle half of the splats, or nearly all if they are kept."""
+    means = demands.world_means(checked)
+    means = means[np.isfinite(means).all(axis=1)]
+    if not len(means):
+        raise RefineError(f"object '{checked.obj.name}': no splat has a finite centre")
+    share = _OUTSIDE_KEPT if role == "KEEP" else _OUTSIDE
+    low, high = np.quantile(means, (share, 1.0 - share), axis=0)
+    half = np.maximum((high - low) / 2.0, _LEAST_HALF)
+    obj = bpy.data.objects.new(f"{checked.obj.name} {role.lower()}", None)
+    obj.empty_display_type = "CUBE" if shape == "BOX" else "SPHERE"
+    obj.location = (low + high) / 2.0
+    obj.scale = half
+    if shape == "SPHERE":
+        away = np.linalg.norm(means - (low + high) / 2.0, axis=1)
+        obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), _LEAST_HALF),) * 3
+    obj.show_in_front = True
+    context.collection.objects.link(obj)
+    for other in context.selected_objects:
+        other.select_set(False)
+    obj.select_set(True)
+    context.view_layer.update()
+    return obj
+
+
+class REFINE_OT_drop_volume(Needing, bpy.types.Operator):
+    """Take the volume off the list; the object stays"""
+
+    bl_idname = "refine.drop_volume"
+    bl_label = "Remove from List"
+    bl_options = {"REGISTER", "UNDO"}
+
+    index: IntProperty(name="Index", description="Place in the list", min=0)
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Take it off."""
+        context.scene.refine.volumes.remove(self.index)
+        plans.mark_again(context)
+        return {"FINISHED"}
+
+
+_MARKS = {"STAY": mesh_edit.PROTECT, "GO": mesh_edit.MUST_GO}
+
+_ITEMS = (
+    ("STAY", "Stay", "Mark the selected splats: they stay, whatever the budget"),
+    ("GO", "Go", "Mark the selected splats: they go before all others"),
+    ("NONE", "Unmark", "Take both marks off the selected splats"),
+)
+
+
+class REFINE_OT_protect(AtOnce, Needing, bpy.types.Operator):
+    """Mark the selected splats to stay, or to go"""
+
+    bl_idname = "refine.protect"
+    bl_label = "Mark Splats"
+    bl_options = {"REGISTER", "UNDO"}
+    needs = (idle, on_splats)
+
+    mark: EnumProperty(name="Mark", description="What becomes of them", items=_ITEMS)
+    description = tooltips("mark", _ITEMS)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Write the marks; a splat has one of the two."""
+        obj = context.object
+        mesh_edit.check_writable(obj)
+        editing = obj.mode == "EDIT" and obj.type == "MESH"
+        chosen = obj.data.total_vert_sel if editing else selection.selected(obj)
+        if not np.any(chosen):
+            raise RefineError(f"object '{obj.name}': no splat is selected; select some first")
+        for mark, name in _MARKS.items():
+            value = mark == self.mark
+            if not value and name not in obj.data.attributes:
+                continue
+            if editing:
+                _mark_in_edit_mode(obj, name, value)
+                continue
+            marked = mesh_edit.marks(obj, name)
+            marked = np.zeros_like(chosen) if marked is None else marked
+            mesh_edit.mark_by_hand(obj, np.where(chosen, value, marked), name)
+        if editing:
+            plans.mark_after_edit_mode(obj)
+        plans.mark_again(context)
+        return {"FINISHED"}
+
+
+def _mark_in_edit_mode(obj: bpy.types.Object, name: str, value: bool) -> None:
+    """Change marks of selected vertices, which only Blender can write there."""
+    mesh = obj.data
+    marks = mesh.attributes.get(name)
+    if marks and (marks.data_type, marks.domain) != ("BOOLEAN", "POINT"):
+        mesh_attributes.remove_attribute(mesh, name)
+        marks = None
+    before = mesh.attributes.active.name if mesh.attributes.active else ""
+    mesh.attributes.active = marks or mesh.attributes.new(name, "BOOLEAN", "POINT")
+    try:
+        bpy.ops.mesh.attribute_set(value_bool=value)
+    except RuntimeError as error:
+        raise RefineError(
+            f"object '{obj.name}': Blender could not mark the splats ({str(error).strip()})"
+        ) from error
+    finally:
+        if before in mesh.attributes:
+            mesh.attributes.active = mesh.attributes[before]
+
+
+class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
+    """Find splats that float where the cameras see empty space; nothing is deleted (Esc cancels)"""
+
+    bl_idname = "refine.find_floaters"
+    bl_label = "Find Floaters"
+    bl_options = {"REGISTER", "UNDO"}
+    doing = "Looking for floaters"
+
+    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
+        """The arguments of `clean`, in the world."""
+        checked, settings = mesh_layout.check(context.object), context.scene.refine
+        mesh_edit.check_writable(checked.obj)
+        cleaning = Cleaning(settings.to_reasons(), settings.views)
+        forced = splat_group.forced(context.scene, [checked])
+        masks = {"protected": forced.protected, "removed": forced.removed}
+        return [checked], ((splat_group.gather([checked]), chosen_views(context), cleaning), masks)
+
+    @staticmethod
+    def compute(job: Any, progress: Progress) -> Cleaned:
+        """The floaters."""
+        arguments, masks = job
+        return clean(*arguments, **masks, progress=progress)
+
+    def put(self, context: Context, group: list[SplatObject], _job: Any, cleaned: Any) -> None:
+        """Store the floaters, mark them as removed, report them."""
+        floaters.store(group[0], cleaned)
+        floaters.mark(group[0], context.scene.refine.to_reasons())
+        self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")
+
+
+WHAT = (
+    ("SELECTED", "Selected", "Delete the selected splats, but for those that must stay"),
+    ("FLOATERS", "Floaters", "Delete what floats, as much as the strength says"),
+    ("VOLUMES", "By Volumes", "Delete what volumes and marks say must go, and nothing else"),
+)
+
+_NONE = {
+    "SELECTED": "no splat is selected that need not stay",
+    "FLOATERS": "no splat floats that need not stay",
+    "VOLUMES": "no volume says of any splat that it must go",
+}
+
+
+class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
+    """Delete splats now, without scores"""
+
+    bl_idname = "refine.delete"
+    bl_label = "Delete Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    what: EnumProperty(name="What", description="Which splats go", items=WHAT)
+    description = tooltips("what", WHAT)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Delete them, except protected ones, and report their number."""
+        checked, settings = mesh_layout.check(context.object), context.scene.refine
+        forced = Demands.of_scene(context.scene).forced(checked)
+        if self.what == "SELECTED":
+            going = selection.selected(checked.obj)
+        elif self.what == "FLOATERS":
+            going = floaters.mask(checked, settings.to_reasons())
+        else:
+            going = forced.removed
+        if going is not None and forced.protected is not None:
+            going = going & ~forced.protected
+        if going is None or not going.any():
+            raise RefineError(f"object '{checked.obj.name}': {_NONE[self.what]}")
+        outcome = splat_group.delete_splats(checked, ~going)
+        plans.refresh(context)
+        self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")
+        return {"FINISHED"}
+
+
+CLASSES = (
+    RefineVolume,
+    REFINE_OT_add_volume,
+    REFINE_OT_drop_volume,
+    REFINE_OT_protect,
+    REFINE_OT_find_floaters,
+    REFINE_OT_delete,
+)
