@@ -110,6 +110,15 @@ def world_means(checked: SplatObject) -> NDArray[np.float64]:
     return moved(mesh_attributes.read_attribute(checked.mesh, "position"), matrix)
 
 
+def finite_means(checked: SplatObject) -> NDArray[np.float64]:
+    """`world_means` that are finite; `RefineError` if none is."""
+    means = world_means(checked)
+    means = means[np.isfinite(means).all(axis=1)]
+    if not len(means):
+        raise RefineError(f"object '{checked.obj.name}': has no splat at a finite place")
+    return means
+
+
 def can_be_volume(obj: bpy.types.Object) -> bool:
     """Whether an object may be a volume, at first sight; splat objects have no faces."""
     if obj.type == "MESH":

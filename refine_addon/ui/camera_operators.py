@@ -128,14 +128,28 @@ class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> Answer:
         """Add them."""
-        middle, radius = _ball(mesh_layout.check(context.object))
+        means = demands.finite_means(mesh_layout.check(context.object))
+        low, high = np.percentile(means, _INNER, axis=0)
+        # Of one point, and of what is flat, a ball of some size.
+        radius = float(np.linalg.norm(high - low)) / 2.0 or 1.0
+        data, render = bpy.data.cameras.new("Ring"), context.scene.render
+        width = render.resolution_x * render.pixel_aspect_x
+        height = render.resolution_y * render.pixel_aspect_y
+        # The sensor lies along the longer side of the picture.
+        half = data.sensor_width / 2.0 / data.lens * min(width, height) / max(width, height)
+        distance = _MARGIN * radius / math.sin(math.atan(half))
+        data.clip_start, data.clip_end = 1e-3 * distance, 1e2 * distance
+        data.display_size = 0.1 * radius
         ring = bpy.data.collections.new("Ring of Cameras")
         for number in range(self.count):
             around = 2.0 * math.pi * number / self.count
             up = math.radians(_ELEVATIONS[number % len(_ELEVATIONS)])
             x, y = math.cos(around) * math.cos(up), math.sin(around) * math.cos(up)
             away = mathutils.Vector((x, y, math.sin(up)))
-            ring.objects.link(_camera(context.scene, middle, away, radius))
+            camera = bpy.data.objects.new("Ring", data)
+            camera.location = mathutils.Vector((low + high) / 2.0) + distance * away
+            camera.rotation_euler = away.to_track_quat("Z", "Y").to_euler()
+            ring.objects.link(camera)
         _join(context, ring)
         self.report({"INFO"}, f"Added {self.count} cameras in '{ring.name}'; score again")
         return {"FINISHED"}
@@ -155,72 +169,35 @@ def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> list[bpy.types.Object]:
     """Objects to turn so that cameras turn without the splats; else `RefineError`."""
-    ancestors = [splats]  # of the splats, with themselves
-    while ancestors[-1].parent:
-        ancestors.append(ancestors[-1].parent)
     roots = {}
     for camera in cameras:
-        root = camera
-        while root.parent and root.parent not in ancestors:
-            root = root.parent
-        if root.parent:
-            raise RefineError(
-                f"camera '{camera.name}' turns with the splats, being parented to them or theirs"
-            )
+        root = _root(camera)
+        if root == _root(splats):
+            raise RefineError(f"camera '{camera.name}' turns with the splats; unparent it")
         if root.constraints:
-            raise RefineError(
-                f"'{root.name}': has constraints, which decide where it is; turn it by hand"
-            )
+            raise RefineError(f"'{root.name}': has constraints; turn it by hand")
         if root.library:
-            raise RefineError(
-                f"'{root.name}': is linked from {root.library.filepath}; make it local first"
-            )
+            raise RefineError(f"'{root.name}': is linked, make it local first")
         roots[root] = None
     return list(roots)
 
 
-def _ball(checked: mesh_layout.SplatObject) -> tuple[mathutils.Vector, float]:
-    means = demands.world_means(checked)
-    means = means[np.isfinite(means).all(axis=1)]
-    if not len(means):
-        raise RefineError(f"object '{checked.obj.name}': has no splat at a finite place")
-    low, high = np.percentile(means, _INNER, axis=0)
-    # Of one point, and of what is flat, a ball of some size.
-    return mathutils.Vector((low + high) / 2.0), float(np.linalg.norm(high - low)) / 2.0 or 1.0
-
-
-def _camera(
-    scene: bpy.types.Scene, middle: mathutils.Vector, away: mathutils.Vector, radius: float
-) -> bpy.types.Object:
-    data, render = bpy.data.cameras.new("Ring"), scene.render
-    width = render.resolution_x * render.pixel_aspect_x
-    height = render.resolution_y * render.pixel_aspect_y
-    # The sensor lies along the longer side of the picture.
-    half = data.sensor_width / 2.0 / data.lens * min(width, height) / max(width, height)
-    distance = _MARGIN * radius / math.sin(math.atan(half))
-    data.clip_start, data.clip_end = 1e-3 * distance, 1e2 * distance
-    data.display_size = 0.1 * radius
-    camera = bpy.data.objects.new("Ring", data)
-    camera.location = middle + distance * away
-    camera.rotation_euler = away.to_track_quat("Z", "Y").to_euler()
-    return camera
+def _root(obj: bpy.types.Object) -> bpy.types.Object:
+    while obj.parent:
+        obj = obj.parent
+    return obj
 
 
 def _join(context: bpy.types.Context, ring: bpy.types.Collection) -> None:
     scene, settings = context.scene, context.scene.refine
-    parent = settings.collection if settings.source == "COLLECTION" else None
-    if parent and not parent.library:
-        parent.children.link(ring)
+    if settings.source == "COLLECTION" and (others := settings.collection) and not others.library:
+        others.children.link(ring)
         return
     scene.collection.children.link(ring)
-    if settings.source == "VISIBLE":
-        return
-    if parent:
-        ring.children.link(parent)
-    else:
-        for camera in CameraChoice(settings.source).cameras(context):
+    if settings.source != "VISIBLE":
+        for camera in CameraChoice.of_scene(scene).cameras(context):
             ring.objects.link(camera)
-    settings.collection, settings.source = ring, "COLLECTION"
+        settings.collection, settings.source = ring, "COLLECTION"
 
 
 CLASSES = (

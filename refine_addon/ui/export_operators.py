@@ -88,7 +88,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         items=_FORMATS,
         options={"SKIP_SAVE"},
     )
-    settled: StringProperty(default=_FORMATS[0][0], options={"HIDDEN", "SKIP_SAVE"})
+    settled = _FORMATS[0][0]  # What `check` saw last
 
     @staticmethod
     def new_name(obj: bpy.types.Object) -> str:

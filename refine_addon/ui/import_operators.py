@@ -35,14 +35,6 @@ from .wrapped import counted
 
 FOLDER = "refine_folder"  # Custom property of an imported object: its file's folder
 
-SET_RESOLUTION: dict[str, Any] = {
-    "name": "Set Render Size",
-    "description": "Give the scene the image size of the first camera, and make that the active "
-    "one, so that renders show what the camera saw",
-    "options": {"SKIP_SAVE"},
-}
-"""Property of the operators that import cameras."""
-
 _ABOVE = 3  # folders above the splats in which their cameras are looked for
 
 _DEFAULT_SIZE = (1920, 1080, 100)  # of Blender's factory settings, with the percentage
@@ -52,7 +44,58 @@ _OF_MODELS = {".bin", ".txt"}  # several files of one folder are a COLMAP model
 _USUAL_NAMES = {"cameras", "images", "transforms", "transforms_train"}  # of any capture
 
 
-class REFINE_OT_import_cameras(Job, Needing, bpy.types.Operator, ImportHelper):
+class _Importing(Job, Needing, ImportHelper):
+    """An operator that imports cameras, alone or with splats."""
+
+    bl_options = {"REGISTER", "UNDO", "PRESET"}
+    needs = (idle, in_object_mode)
+
+    files: CollectionProperty(  # without them Blender cannot ask about files that are dropped
+        type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
+    )
+    directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
+    upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
+    set_resolution: BoolProperty(
+        name="Set Render Size",
+        description="Give the scene the image size of the first camera, and make that the active "
+        "one, so that renders show what the camera saw",
+        options={"SKIP_SAVE"},
+    )
+
+    def add_cameras(self, context: Context, views: ViewSet, path: Path) -> bpy.types.Collection:
+        """Camera objects in a new collection named after `path`, which decides from now on."""
+        scene = context.scene
+        name = "Cameras" if path.is_dir() or path.stem in _USUAL_NAMES else f"Cameras {path.stem}"
+        collection = bpy.data.collections.new(name)
+        target_collection(context).children.link(collection)
+        cameras = create_cameras(views, collection, upright=self.upright)
+        scene.refine.collection = collection
+        scene.refine.source = "COLLECTION"
+        if self.set_resolution:
+            scene.render.resolution_x = views[0].width
+            scene.render.resolution_y = views[0].height
+            scene.render.resolution_percentage = 100
+        if self.set_resolution or scene.camera is None:
+            scene.camera = cameras[0]
+        if views.note:
+            self.report({"WARNING"}, views.note)
+        return collection
+
+    def warn_of_turn(self, context: Context, splats: bpy.types.Object) -> None:
+        """Report if only one of splats and deciding cameras was imported upright."""
+        context.view_layer.update()  # or what was just made stands at the origin
+        if turn := known_turn(context, splats):
+            self.report({"WARNING"}, Alignment(turn, known=True).turned())
+
+
+class _Dropped:
+    @classmethod
+    def poll_drop(cls, context: Context) -> bool:
+        """Whether files can be dropped here."""
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
     """Import cameras as objects: Inria cameras.json, nerfstudio transforms.json or COLMAP"""
 
     # On a thread not for its time alone. What the file browser calls is put down as the last
@@ -60,22 +103,10 @@ class REFINE_OT_import_cameras(Job, Needing, bpy.types.Operator, ImportHelper):
     # that of the splats before, and adjusting them would undo these cameras.
     bl_idname = "refine.import_cameras"
     bl_label = "Import Cameras"
-    bl_options = {"REGISTER", "UNDO", "PRESET"}
-    needs = (idle, in_object_mode)
+    doing = "Reading cameras"
 
     filename_ext = ".json"
     filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
-    files: CollectionProperty(  # without them Blender cannot ask about files that are dropped
-        type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
-    )
-    directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
-    upright: BoolProperty(
-        name="Upright",
-        description=UPRIGHT_TEXT + ". Choose what you chose for the splats",
-    )
-    set_resolution: BoolProperty(**SET_RESOLUTION)
-
-    doing = "Reading cameras"
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Ask for the file; upright by default where the splats are.
@@ -111,13 +142,13 @@ class REFINE_OT_import_cameras(Job, Needing, bpy.types.Operator, ImportHelper):
 
     def put(self, context: Context, _group: list[SplatObject], path: Path, views: ViewSet) -> None:
         """Make camera objects."""
-        collection = add_cameras(self, context, views, path)
+        collection = self.add_cameras(context, views, path)
         if (splats := _imported_splats(context)) is not None:
-            warn_of_turn(self, context, splats)
+            self.warn_of_turn(context, splats)
         self.report({"INFO"}, f"Imported {counted(len(views), 'camera')} into '{collection.name}'")
 
 
-class REFINE_FH_cameras(bpy.types.FileHandler):
+class REFINE_FH_cameras(_Dropped, bpy.types.FileHandler):
     """Camera files dropped on the 3D view."""
 
     bl_idname = "REFINE_FH_cameras"
@@ -125,49 +156,11 @@ class REFINE_FH_cameras(bpy.types.FileHandler):
     bl_import_operator = "refine.import_cameras"
     bl_file_extensions = ".json;.bin;.txt"
 
-    @classmethod
-    def poll_drop(cls, context: Context) -> bool:
-        """Whether files can be dropped here."""
-        return context.area is not None and context.area.type == "VIEW_3D"
-
-
-def add_cameras(
-    operator: Any,
-    context: Context,
-    views: ViewSet,
-    path: Path,
-) -> bpy.types.Collection:
-    """Make camera objects in a new collection named after `path`, which decides from now on.
-    The operator has the properties ``upright`` and ``set_resolution``."""
-    scene = context.scene
-    name = "Cameras" if path.is_dir() or path.stem in _USUAL_NAMES else f"Cameras {path.stem}"
-    collection = bpy.data.collections.new(name)
-    target_collection(context).children.link(collection)
-    cameras = create_cameras(views, collection, upright=operator.upright)
-    scene.refine.collection = collection
-    scene.refine.source = "COLLECTION"
-    if operator.set_resolution:
-        scene.render.resolution_x = views[0].width
-        scene.render.resolution_y = views[0].height
-        scene.render.resolution_percentage = 100
-    if operator.set_resolution or scene.camera is None:
-        scene.camera = cameras[0]
-    if views.note:
-        operator.report({"WARNING"}, views.note)
-    return collection
-
 
 def suggest_resolution(operator: Any, context: Context) -> None:
     """Default of ``set_resolution``: true where nobody has chosen size or camera."""
     if not operator.properties.is_property_set("set_resolution"):
         operator.set_resolution = _is_untouched(context.scene)
-
-
-def warn_of_turn(operator: bpy.types.Operator, context: Context, splats: bpy.types.Object) -> None:
-    """Report if only one of splats and deciding cameras was imported upright."""
-    context.view_layer.update()  # or what was just made stands at the origin
-    if turn := known_turn(context, splats):
-        operator.report({"WARNING"}, Alignment(turn, known=True).turned())
 
 
 def target_collection(context: Context) -> bpy.types.Collection:
@@ -219,35 +212,26 @@ _ROWS = 1 << 16  # Rows read between two checks for cancelling
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)  # File browser's filter
 
 
-class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
+class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
     """Import files of splats, of any format: a vertex a splat, a point attribute a property"""
 
     bl_idname = "refine.import_ply"
     bl_label = "Import Splats"
-    bl_options = {"REGISTER", "UNDO", "PRESET"}
-    needs = (idle, in_object_mode)
+    doing = "Reading splats"
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
-    files: CollectionProperty(
-        type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
-    )
-    directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
-    upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
     cameras: BoolProperty(
         name="With Cameras",
         description="Import the cameras that lie beside the file, or up to three folders above it",
         options={"SKIP_SAVE"},
     )
-    set_resolution: BoolProperty(**SET_RESOLUTION)
     level: IntProperty(
         name="Level",
         description="Of a streamed SOG (lod-meta.json): 0 is the finest level",
         min=0,
         options={"SKIP_SAVE"},
     )
-
-    doing = "Reading splats"
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Ask for files, or only for options where files were dropped."""
@@ -324,10 +308,10 @@ class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
         count = sum(len(obj.data.vertices) for obj in imported)
         told = f"Imported {count:,} splats from {counted(len(imported), 'file')}"
         if views is not None:
-            add_cameras(self, context, views, cameras)
+            self.add_cameras(context, views, cameras)
             beside = os.path.relpath(cameras, paths[0].parent)
             told += f", and {counted(len(views), 'camera')} from {beside}"
-        warn_of_turn(self, context, imported[-1])
+        self.warn_of_turn(context, imported[-1])
         self.report({"INFO"}, told)
 
     def _paths(self) -> list[Path]:
@@ -349,7 +333,7 @@ class REFINE_OT_import_ply(Job, Needing, bpy.types.Operator, ImportHelper):
         return obj
 
 
-class REFINE_FH_ply(bpy.types.FileHandler):
+class REFINE_FH_ply(_Dropped, bpy.types.FileHandler):
     """Splat files dropped on the 3D view."""
 
     bl_idname = "REFINE_FH_ply"
@@ -359,11 +343,6 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     bl_file_extensions = ";".join(
         dict.fromkeys("." + end.split(".")[-1] for end in READ_SUFFIXES if end not in INDEX_NAMES)
     )
-
-    @classmethod
-    def poll_drop(cls, context: Context) -> bool:
-        """Whether files can be dropped here."""
-        return context.area is not None and context.area.type == "VIEW_3D"
 
 
 def _read(path: Path, level: int, progress: Progress) -> SplatFile:

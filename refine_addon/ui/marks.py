@@ -117,10 +117,7 @@ def _new_empty(
     context: bpy.types.Context, checked: mesh_layout.SplatObject, shape: str, role: str
 ) -> bpy.types.Object:
     """A new empty around the middle half of the splats, or nearly all if they are kept."""
-    means = demands.world_means(checked)
-    means = means[np.isfinite(means).all(axis=1)]
-    if not len(means):
-        raise RefineError(f"object '{checked.obj.name}': no splat has a finite centre")
+    means = demands.finite_means(checked)
     share = _OUTSIDE_KEPT if role == "KEEP" else _OUTSIDE
     low, high = np.quantile(means, (share, 1.0 - share), axis=0)
     half = np.maximum((high - low) / 2.0, _LEAST_HALF)

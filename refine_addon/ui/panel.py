@@ -18,7 +18,6 @@ from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import looks_like_splats, splat_count
 from ..objects import demands, level_objects, splat_group
 from ..viewport import draw as viewport_draw
 from ..viewport.placing import placings
@@ -72,7 +71,7 @@ class REFINE_OT_view(bpy.types.Operator):
 
 def _instances(context: bpy.types.Context) -> str:
     obj = context.object
-    if obj is not None and not looks_like_splats(obj) and any(placings([obj])):
+    if obj is not None and not mesh_layout.looks_like_splats(obj) and any(placings([obj])):
         return ""
     return "Select an empty that instances a collection with splats"
 
@@ -110,7 +109,7 @@ def _draw_instances(layout: bpy.types.UILayout, context: bpy.types.Context) -> b
     """Draw the active object's instances and the button; whether it instances splats."""
     if _instances(context):
         return False
-    count = sum(splat_count(place.obj.data) for place in placings([context.object]))
+    count = sum(mesh_layout.splat_count(place.obj.data) for place in placings([context.object]))
     text = f"{count:,} splats of collection '{context.object.instance_collection.name}'"
     wrapped.label(layout, context, text, icon="OUTLINER_OB_GROUP_INSTANCE")
     layout.operator("refine.make_real")

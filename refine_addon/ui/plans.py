@@ -406,22 +406,15 @@ def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
         mark_again(bpy.context)
 
 
-_EVENTS = {
-    "undo_post": _undone, "redo_post": _undone, "load_post": _undone,
-    "depsgraph_update_post": _updated, "frame_change_post": _forget,
-}  # fmt: skip
-
-
-def register() -> None:
-    """Add the handlers."""
-    for event, heard in _EVENTS.items():
-        getattr(bpy.app.handlers, event).append(heard)
+HANDLERS = {
+    _undone: ("undo_post", "redo_post", "load_post"),
+    _updated: ("depsgraph_update_post",),
+    _forget: ("frame_change_post",),
+}
 
 
 def unregister() -> None:
-    """Remove the handlers, and plan no more."""
-    for event, heard in _EVENTS.items():
-        getattr(bpy.app.handlers, event).remove(heard)
+    """Plan no more."""
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
     for kept in (_made, _waiting, _edited, _answers):

@@ -97,21 +97,15 @@ def stop() -> None:
 
 
 def register() -> None:
-    """Add draw callbacks and handlers."""
+    """Add draw callbacks."""
     add = bpy.types.SpaceView3D.draw_handler_add
     for work, kind in ((_draw, "POST_VIEW"), (_draw_legend, "POST_PIXEL")):
         _state.handles.append(add(partial(_guarded, work), (), "WINDOW", kind))
-    for handler, names in _LISTENERS.items():
-        for name in names:
-            getattr(bpy.app.handlers, name).append(handler)
 
 
 def unregister() -> None:
     """Stop drawing and undo `register`."""
     stop()
-    for handler, names in _LISTENERS.items():
-        for name in names:
-            getattr(bpy.app.handlers, name).remove(handler)
     while _state.handles:
         bpy.types.SpaceView3D.draw_handler_remove(_state.handles.pop(), "WINDOW")
 
@@ -254,7 +248,7 @@ def _undone(*_: object) -> None:
         _hide_points()
 
 
-_LISTENERS: dict[Callable[..., None], tuple[str, ...]] = {
+HANDLERS: dict[Callable[..., None], tuple[str, ...]] = {
     _updated: ("depsgraph_update_post", "frame_change_post"),
     _undone: ("undo_post", "redo_post"),
     _forget: ("load_pre",),
