@@ -117,7 +117,7 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
             return bpy.ops.refine.import_ply("INVOKE_DEFAULT", filepath=path)
         obj = _imported_splats(context)
         if obj is None:
-            properties.suggest(self, context, "upright")
+            properties.fill(self.properties, context, "upright")
         elif not self.properties.is_property_set("upright"):
             self.upright = _is_upright(obj)
         suggest_resolution(self, context)
@@ -236,7 +236,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Ask for files, or only for options where files were dropped."""
         self.by_hand = True
-        properties.suggest(self, context, "upright")
+        properties.fill(self.properties, context, "upright")
         if not self.properties.is_property_set("cameras"):
             self.cameras = not any(SOURCE in obj for obj in context.scene.objects)
         suggest_resolution(self, context)
@@ -302,8 +302,8 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         for obj in imported:
             obj.select_set(True)
         context.view_layer.objects.active = imported[-1]
-        properties.give_defaults(context)
-        if not bpy.app.background:
+        if not bpy.app.background:  # scripts say what they want
+            properties.fill(context.scene.refine, context, *properties.DEFAULTS)
             draw.show("SCENE")
         count = sum(len(obj.data.vertices) for obj in imported)
         told = f"Imported {count:,} splats from {counted(len(imported), 'file')}"

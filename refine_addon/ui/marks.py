@@ -26,13 +26,7 @@ from .operators import chosen_views
 ROLES = (
     ("PROTECT", "Protect Inside", "Splats in it stay, whatever else is said", "LOCKED", 0),
     ("REMOVE", "Remove Inside", "Splats in it go before all others", "TRASH", 1),
-    (
-        "KEEP",
-        "Keep Inside",
-        "All splats go that are in no volume of this kind",
-        "FULLSCREEN_EXIT",
-        2,
-    ),
+    ("KEEP", "Keep Inside", "Splats in no volume of this kind go", "FULLSCREEN_EXIT", 2),
 )
 """Roles of volumes, by core's names, in small letters there."""
 
@@ -44,11 +38,7 @@ _LEAST_HALF = 1e-3  # Half width, world units, at least: flat splats make no fla
 SHAPES = (
     ("BOX", "Box", "A new box around the middle of the splats"),
     ("SPHERE", "Sphere", "A new sphere around the middle of the splats"),
-    (
-        "SELECTED",
-        "Selected Objects",
-        "Closed meshes, and empties shown as cubes or spheres, that are selected too",
-    ),
+    ("SELECTED", "Selected Objects", "Closed meshes, cube and sphere empties that are selected"),
 )
 
 

@@ -180,15 +180,9 @@ def _is_ours(obj: bpy.types.Object) -> bool:
 
 
 def _key(obj: bpy.types.Object, settings: Any) -> Any:
-    objects = splat_group.chosen(bpy.context.view_layer, obj)
-    scorings = [
-        (
-            each.data.session_uid,
-            mesh_layout.splat_count(each.data),
-            each.data.get(mesh_scores.RECORD),
-        )
-        for each in objects
-    ]
+    meshes = [each.data for each in splat_group.chosen(bpy.context.view_layer, obj)]
+    counts = [mesh_layout.splat_count(mesh) for mesh in meshes]
+    scorings = [(mesh.session_uid, mesh.get(mesh_scores.RECORD)) for mesh in meshes], counts
     volumes = [
         (item.role, item.object.session_uid, *map(tuple, item.object.matrix_world))
         for item in demands.listed(settings.id_data)

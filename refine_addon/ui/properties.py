@@ -34,23 +34,10 @@ from .marks import RefineVolume
 from .select_operators import SelectSettings
 
 METHODS = (
-    (
-        "closed-form",
-        "Closed Form",
-        "REFINE's formula; takes nothing as hidden. Rows stay as they were",
-    ),
+    ("closed-form", "Closed Form", "REFINE's formula: nothing is hidden. Rows stay as they were"),
     ("occlusion", "Occlusion", "Knows what hides what; deletes. Rows stay as they were"),
-    (
-        "merge",
-        "Merge",
-        "What goes is merged into what stays, by what the cameras see of it; deletes where that is "
-        "as good",
-    ),
-    (
-        "refit",
-        "Refit",
-        "Merges, then fits what stays to what all splats looked like: closest, and slowest",
-    ),
+    ("merge", "Merge", "What goes is merged into what stays; deletes where that is as good"),
+    ("refit", "Refit", "Merges, then fits what stays to how all splats looked: closest, slowest"),
 )
 """The dial, from instant to best, by core's names."""
 
@@ -75,27 +62,9 @@ UPRIGHT_TEXT = (
     "z-up world of Blender"
 )
 
-VIEWS: dict[str, Any] = {
-    "name": "Views",
-    "description": "Use at most this many views, spread out evenly; 0 uses all",
-    "default": Merge.views,
-    "min": 0,
-}
-
-METHOD: dict[str, Any] = {
-    "name": "Method",
-    "description": "How splats are pruned, from instant to best",
-    "items": METHODS,
-    "default": Merge.name,
-}
-
 DRAWN = (
     ("default", "Default", "As ordinary 3D Gaussian splats"),
-    (
-        "antialiased",
-        "Antialiased",
-        "Trained with antialiasing (Mip-Splatting, gsplat, Brush, Postshot)",
-    ),
+    ("antialiased", "Antialiased", "Trained so in Mip-Splatting, gsplat, Brush or Postshot"),
     ("2dgs", "2DGS", "Flat discs without a third scale"),
 )
 """Drawing models, by the names of `rendering.MODELS` and in their order."""
@@ -175,10 +144,25 @@ def decimal(value: float) -> float:
     return float(str(np.float32(value)))
 
 
-class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
+class _Preferred:
+    method: EnumProperty(
+        name="Method",
+        description="How splats are pruned, from instant to best",
+        items=METHODS,
+        default=Merge.name,
+        update=_plan_again,
+    )
+    views: IntProperty(
+        name="Views",
+        description="Use at most this many views, spread out evenly; 0 uses all",
+        default=Merge.views,
+        min=0,
+    )
+
+
+class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
-    method: EnumProperty(**METHOD, update=_plan_again)
     model: EnumProperty(
         name="Drawn As",
         description="How the splats of the active object are drawn, in all of the panel and in the "
@@ -187,7 +171,6 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         get=_model,
         set=_set_model,
     )
-    views: IntProperty(**VIEWS)
     source: EnumProperty(name="Cameras", description="Which cameras decide", items=SOURCES)
     collection: PointerProperty(
         name="Collection", description="The collection of the cameras", type=bpy.types.Collection
@@ -299,13 +282,11 @@ PACKAGE = __package__.rpartition(".")[0]  # Such as ``bl_ext.user_default.refine
 DEFAULTS = ("method", "views")  # Preferences that are scene settings of the same name
 
 
-class RefinePreferences(bpy.types.AddonPreferences):
+class RefinePreferences(_Preferred, bpy.types.AddonPreferences):
     """Defaults, in Blender's preferences beside the extension."""
 
     bl_idname = PACKAGE
 
-    method: EnumProperty(**METHOD)
-    views: IntProperty(**VIEWS)
     upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -318,32 +299,12 @@ class RefinePreferences(bpy.types.AddonPreferences):
             layout.prop(self, name)
 
 
-def give_defaults(context: bpy.types.Context) -> None:
-    """Fill a scene's unset settings; in a window only, as scripts say what they want."""
-    chosen = _chosen(context)
-    if chosen is not None and not bpy.app.background:
-        fill(context.scene.refine, chosen)
-
-
-def fill(settings: RefineSettings, chosen: RefinePreferences) -> None:
-    """Set preferred values that these settings do not set yet."""
-    for name in DEFAULTS:
-        if chosen.is_property_set(name) and not settings.is_property_set(name):
-            setattr(settings, name, getattr(chosen, name))
-
-
-def suggest(operator: Any, context: bpy.types.Context, name: str) -> None:
-    """Give an operator that asks for its options the default of one not given."""
-    chosen = _chosen(context)
-    if chosen is not None and not operator.properties.is_property_set(name):
-        setattr(operator, name, getattr(chosen, name))
-
-
-def _chosen(context: bpy.types.Context) -> RefinePreferences | None:
+def fill(values: Any, context: bpy.types.Context, *names: str) -> None:
+    """Set preferred values that settings or an operator's properties do not set yet."""
     addon = context.preferences.addons.get(PACKAGE)
-    if addon is None:
-        return None
-    return addon.preferences
+    for name in names if addon else ():
+        if addon.preferences.is_property_set(name) and not values.is_property_set(name):
+            setattr(values, name, getattr(addon.preferences, name))
 
 
 CLASSES = (

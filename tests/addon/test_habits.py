@@ -27,7 +27,7 @@ def test_preferences_are_the_defaults_of_what_a_scene_has_not_set(addon, preferr
     preferred.method, preferred.views = "closed-form", 16
     settings.views = 32
 
-    addon.ui.properties.fill(settings, preferred)
+    addon.ui.properties.fill(settings, bpy.context, *addon.ui.properties.DEFAULTS)
 
     assert (settings.method, settings.views) == ("closed-form", 32)
 
@@ -46,13 +46,11 @@ def test_a_dialogue_starts_from_the_preferences(addon, preferred):
     """Upright is preferred; where it was given, it stays."""
     preferred.upright = True
     for given, expected in ((False, True), (True, False)):
-        operator = SimpleNamespace(
-            upright=False, properties=SimpleNamespace(is_property_set=lambda _name, g=given: g)
-        )
+        options = SimpleNamespace(upright=False, is_property_set=lambda _name, g=given: g)
 
-        addon.ui.properties.suggest(operator, bpy.context, "upright")
+        addon.ui.properties.fill(options, bpy.context, "upright")
 
-        assert operator.upright is expected
+        assert options.upright is expected
 
 
 @pytest.mark.parametrize(
