@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import bpy
 import mathutils
 import numpy as np
-from bpy.props import EnumProperty, IntProperty
+from bpy.props import BoolProperty, IntProperty
 
 from ..cameras.objects import UPRIGHT
 from ..cameras.sets import CameraChoice
@@ -78,13 +78,8 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
     bl_label = "Turn the Cameras"
     bl_options = {"REGISTER", "UNDO"}
 
-    quarter: EnumProperty(
-        name="Turn",
-        description="About the world's X axis",
-        items=(
-            ("1", "As Upright", "From y down to z up, as Upright turns what is imported"),
-            ("-1", "Back", "From z up to y down"),
-        ),
+    back: BoolProperty(
+        name="Back", description="From z up to y down, instead of to z up as Upright turns"
     )
 
     def act(self, context: bpy.types.Context) -> Answer:
@@ -98,7 +93,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
         for checked in group:
             mesh_edit.check_writable(checked.obj)
         turn = mathutils.Matrix(UPRIGHT.tolist())
-        turn = turn.inverted() if self.quarter == "-1" else turn
+        turn = turn.inverted() if self.back else turn
         parent = None
         for root in roots:
             if root.animation_data:

@@ -231,10 +231,6 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
             self.report({"WARNING"}, note)
 
 
-NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
-"""Image names of the pictures, replaced by each comparison."""
-
-
 class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
     """Draw what the active camera sees before and after Apply, and say how close both are in dB"""
 
@@ -268,7 +264,8 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
         plan = plans.stored(context.object, context.scene.refine)
         if plan is not None:
             plan["measured"] = comparison
-        images = [put(NAMES[kind], getattr(comparison, kind) / np.float32(255.0)) for kind in KINDS]
+        pixels = {kind: getattr(comparison, kind) / np.float32(255.0) for kind in KINDS}
+        images = [put(f"Compare: {kind}", picture) for kind, picture in pixels.items()]
         if not bpy.app.background and context.window is not None:
             _show(context, images)
         about = "" if estimated is None else f"; {in_words(estimated)} estimated in all views"

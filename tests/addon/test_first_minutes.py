@@ -206,7 +206,7 @@ def test_turning_the_cameras_drops_their_scores(addon, imported):
     bpy.ops.refine.score()
     assert addon.ui.plans.stored(obj, bpy.context.scene.refine) is not None
 
-    bpy.ops.refine.turn_cameras(quarter="1")
+    bpy.ops.refine.turn_cameras()
 
     assert addon.mesh.scores.record(obj.data) is None
     assert addon.ui.plans.stored(obj, bpy.context.scene.refine) is None

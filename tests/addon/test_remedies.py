@@ -103,17 +103,17 @@ def test_nothing_is_told_of_pictures_without_an_estimate(addon, room, room_camer
 
 
 @pytest.mark.parametrize(
-    ("splats", "cameras", "quarter"), [(True, False, "1"), (False, True, "-1")]
+    ("splats", "cameras", "turn_back"), [(True, False, False), (False, True, True)]
 )
 def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
-    addon, imported, warned, splats, cameras, quarter
+    addon, imported, warned, splats, cameras, turn_back
 ):
     """Known from the imports; after the turn the scores are those of imports that are alike."""
     obj = imported(splats=splats, cameras=cameras)
     first = warned()
     wrong = read(addon, obj, "refine_score")
     turned = turn(addon)
-    bpy.ops.refine.turn_cameras(quarter=quarter)
+    bpy.ops.refine.turn_cameras(back=turn_back)
     second = warned()
     right = read(addon, obj, "refine_score")
     matrix = bpy.context.scene.refine.collection.objects[0].matrix_world.copy()
@@ -121,7 +121,7 @@ def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
     alike = imported(splats=splats, cameras=splats)
     bpy.ops.refine.score()
 
-    assert turned == int(quarter)
+    assert turned == (-1 if turn_back else 1)
     assert told(first, "imported upright")
     assert not told(second, "up axis")
     assert np.allclose(right, read(addon, alike, "refine_score"), rtol=2e-3)
@@ -177,7 +177,7 @@ def test_animated_cameras_are_turned_with_their_motion(room, room_cameras):
         places[frame] = mathutils.Vector((x, 2.0, -1.0))
     scene = bpy.context.scene
     scene.camera, scene.refine.source = camera, "FRAMES"
-    bpy.ops.refine.turn_cameras(quarter="1")
+    bpy.ops.refine.turn_cameras()
 
     for frame, place in places.items():
         scene.frame_set(frame)
@@ -192,18 +192,18 @@ def test_cameras_that_cannot_turn_are_named_and_none_is_turned(room, room_camera
     bpy.context.view_layer.update()
     unchanged.start()
     with pytest.raises(RuntimeError, match=f"'{second.name}' turns with the splats"):
-        bpy.ops.refine.turn_cameras(quarter="1")
+        bpy.ops.refine.turn_cameras()
     unchanged()
     second.parent = None
     first.constraints.new("TRACK_TO")
     bpy.context.view_layer.update()
     unchanged.start()
     with pytest.raises(RuntimeError, match=f"'{first.name}': has constraints"):
-        bpy.ops.refine.turn_cameras(quarter="1")
+        bpy.ops.refine.turn_cameras()
     unchanged()
     bpy.context.scene.refine.collection = None
     with pytest.raises(RuntimeError, match="no cameras"):
-        bpy.ops.refine.turn_cameras(quarter="1")
+        bpy.ops.refine.turn_cameras()
 
 
 def ring():
@@ -349,7 +349,7 @@ def test_each_remedy_goes_with_one_undo(room, room_cameras):
     matrix = np.array(room_cameras.objects[0].matrix_world)
     bpy.ops.refine.score()
     bpy.ops.ed.undo_push(message="before")
-    bpy.ops.refine.turn_cameras(quarter="1")
+    bpy.ops.refine.turn_cameras()
     bpy.ops.refine.add_ring()
     bpy.ops.ed.undo_push(message="after")
     bpy.ops.ed.undo()
