@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -42,19 +41,14 @@ _LINGERS = 10.0  # Seconds that it stays after the render
 _until: list[float] = []
 
 
-@dataclass
-class _Watch:
-    escaped: bool = False
-    over: bool = False
+_watched: list[Shared] = []  # What Esc stops; each `_watch_anew` makes another list
 
 
-_watch = _Watch(over=True)
-
-
-def _watch_anew() -> None:
+def _watch_anew(shared: Shared) -> None:
     """Watch for Esc ahead of other handlers, in all windows: one may show the render."""
-    global _watch
-    _watch.over, _watch = True, _Watch()
+    global _watched
+    _watched.clear()
+    _watched = [shared]
     for window in bpy.context.window_manager.windows:
         with bpy.context.temp_override(window=window):
             bpy.ops.refine.watch_render("INVOKE_DEFAULT")
@@ -66,7 +60,7 @@ def no_render(_context: bpy.types.Context) -> str:
 
 
 class REFINE_OT_watch_render(bpy.types.Operator):
-    """Notes Esc, and leaves it to Blender's render"""
+    """Stops a render at Esc, and leaves that to Blender, too"""
 
     # Of operators that wait, the last is told of an event first. Blender's render keeps Esc for
     # itself, also where it has just ended by itself and so is not ended by that.
@@ -76,15 +70,15 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Begin to watch."""
-        self._watch = _watch
+        self._watched = _watched
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, _context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Note Esc; end at the first event after the render."""
-        if self._watch.over:
+        """Heed Esc; end at the first event after the render."""
+        if not self._watched:
             return {"FINISHED", "PASS_THROUGH"}
-        self._watch.escaped |= event.type == "ESC" and event.value == "PRESS"
+        self._watched[0].stopped |= event.type == "ESC" and event.value == "PRESS"
         return {"PASS_THROUGH"}
 
 
@@ -135,13 +129,12 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             worker = SimpleNamespace(fraction=0.0, what="", cancel=stop, end=stop)
             self._running = Running(self, context, [], None, worker)
             context.window_manager.modal_handler_add(self)
-            _watch_anew()
+            _watch_anew(self._shared)
         return answer
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Start the next render when one is over."""
         if event.type == "TIMER":
-            self._shared.stopped |= _watch.escaped
             main_thread.serve()
             if not bpy.app.is_job_running("RENDER"):
                 return self._go_on(context)
@@ -209,7 +202,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         if shows and not self._opened:
             _draw_whole()
         self._opened = True
-        _watch_anew()
+        _watch_anew(self._shared)
 
     def _show(self) -> None:
         picture, self._shared.picture = self._shared.picture, None
@@ -243,7 +236,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         return {"CANCELLED"}
 
     def _over(self, context: bpy.types.Context) -> None:
-        _watch.over = True
+        _watched.clear()
         if self._steps is not None:
             self._steps.close()
             self._steps = None

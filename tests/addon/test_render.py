@@ -440,11 +440,11 @@ def test_an_esc_that_blender_forgets_ends_the_drawing_of_splats(addon, shot, mon
     assert settings(shot) == before
 
 
-def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon, monkeypatch):
+def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon):
     """Blender's renders forget it when they begin, and would run on to their end."""
     operators, begun = addon.ui.render_operators, []
-    watch = operators._Watch()
-    monkeypatch.setattr(operators, "_watch", watch)
+    watch = operators.REFINE_OT_watch_render
+    escape = SimpleNamespace(type="ESC", value="PRESS")
     step = addon.render.copies.Step(bpy.context.scene.name, animation=False, what="meshes")
     waiting = SimpleNamespace(
         _steps=iter([step, step]),
@@ -462,7 +462,8 @@ def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon,
 
     assert [event(), event(), len(begun)] == [{"RUNNING_MODAL"}, {"RUNNING_MODAL"}, 1]
     assert event() == {"RUNNING_MODAL"}
-    watch.escaped = True
+    watched = SimpleNamespace(_watched=[waiting._shared])
+    assert watch.modal(watched, bpy.context, escape) == {"PASS_THROUGH"}
     assert event() == {"CANCELLED"}
     assert len(begun) == 1
 

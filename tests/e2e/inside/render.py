@@ -105,13 +105,15 @@ def escape(found: dict[str, Any], *, animation: bool) -> Generator[float, None, 
     operators = importlib.import_module(f"{extension.MODULE}.ui.render_operators")
     heard: list[float] = []
 
-    class Watch(operators._Watch):
-        def __setattr__(self, name: str, value: bool) -> None:
-            super().__setattr__(name, value)
-            if name == "escaped" and value:
-                heard.append(processor() - time.thread_time())
+    watch = operators.REFINE_OT_watch_render
+    real = watch.modal
 
-    operators._Watch, real = Watch, operators._Watch
+    def modal(self, context, event):
+        if event.type == "ESC" and event.value == "PRESS":
+            heard.append(processor() - time.thread_time())
+        return real(self, context, event)
+
+    watch.modal = modal
     invoke(animation=animation)
     yield 1.0
     found["began"] = rendering()
@@ -120,7 +122,7 @@ def escape(found: dict[str, Any], *, animation: bool) -> Generator[float, None, 
     yield from until(lambda: not rendering(), "it has stopped")
     yield 1.0  # the scene is drawn
     found["busy"].append(processor() - heard[0] - pressed)
-    operators._Watch = real
+    watch.modal = real
 
 
 def processor() -> float:
