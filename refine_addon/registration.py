@@ -15,7 +15,7 @@ from .ui.properties import RefineSettings
 from .webp import BlenderImages
 
 _NAMES = """
-    ui.marks ui.properties ui.images ui.plans ui.running ui.transforms ui.import_operators
+    ui.marks ui.properties ui.images ui.plans ui.operator_bases ui.transforms ui.import_operators
     ui.select_tools ui.select_operators ui.operators ui.render_operators ui.export_operators
     ui.camera_operators ui.panel viewport.draw
 """

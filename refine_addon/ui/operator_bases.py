@@ -1,20 +1,30 @@
-"""Common parts of operators: needs, threads, error messages."""
+"""Common parts of operators: needs, threads, error messages.
+One operation at most is on a thread, as panels, polls and menus see it. The thread gets arrays
+only: Blender's data is not safe to touch from there."""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from concurrent.futures import Future
+from functools import partial
+from typing import Any, NamedTuple
 
 import bpy
+from bpy.app.handlers import persistent
 
 from .. import main_thread
 from ..core.errors import RefineError
-from ..core.execute import Cancelled, Progress, silent
+from ..core.execute import Cancelled, Progress, TimeLeft, checked_by, in_time, silent
+from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
-from . import running
-from .running import Running
+
+_STEP = 0.05  # Seconds between two looks at the thread
+
+PATIENCE = 0.7  # Seconds that a cancelled thread has to end before it is left alone
 
 Answer = set[str]  # FINISHED, CANCELLED, RUNNING_MODAL or PASS_THROUGH
 
@@ -36,9 +46,214 @@ def described(error: Exception) -> str:
     return str(error)
 
 
+class Worker:
+    """``work(progress)`` on a thread; `fraction` done, 0 to 1, of `what`, a word or two."""
+
+    def __init__(self, work: Callable[[Progress], Any]) -> None:
+        self.fraction, self.what = 0.0, ""
+        self._cancelled: float | None = None  # when
+        self._outcome: Future[Any] = Future()
+        self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
+        self._thread.start()
+
+    def running(self) -> bool:
+        """Whether there is still something to wait for: not `PATIENCE` after cancelling.
+        Such work, like packing a file, ends at its next checkpoint, and its result is dropped."""
+        late = self.cancelled and time.monotonic() - self._cancelled > PATIENCE
+        return not late and self._thread.is_alive()
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether it was asked to stop."""
+        return self._cancelled is not None
+
+    def cancel(self) -> None:
+        """Ask it to stop; `result` raises `Cancelled` then, unless the work offers one."""
+        if not self.cancelled:
+            self._cancelled = time.monotonic()
+
+    def end(self) -> None:
+        """Ask it to stop, and wait until it has or `PATIENCE` is over."""
+        self.cancel()
+        self._thread.join(PATIENCE)
+
+    def result(self) -> Any:
+        """The work's result or error; keeps neither."""
+        if self.cancelled and self._thread.is_alive():
+            raise Cancelled
+        self._thread.join()
+        outcome, self._outcome = self._outcome, Future()
+        return outcome.result()
+
+    def _run(self, work: Callable[[Progress], Any]) -> None:
+        try:
+            with checked_by(self._check):
+                result = work(self._progress)
+            if getattr(result, "stopped", None) is None:  # see `Result.stopped`
+                self._check()  # nobody may be left to ask for the result
+            self._outcome.set_result(result)
+        except BaseException as error:
+            # Whoever cancels asks for no reason, and a traceback would keep what was worked on.
+            self._outcome.set_exception(Cancelled() if self.cancelled else error)
+
+    def _check(self) -> None:
+        if self.cancelled:
+            raise Cancelled
+
+    def _progress(self, fraction: float, what: str) -> bool:
+        self.fraction, self.what = fraction, what
+        return not self.cancelled
+
+
+class Target(NamedTuple):
+    """An object as read, known by its number in this session, which an undo keeps."""
+
+    name: str
+    uid: int
+    mode: str
+    splats: tuple[int, ...]
+
+    @classmethod
+    def of(cls, checked: SplatObject) -> Target:
+        """An object's present state."""
+        obj, mesh = checked.obj, checked.mesh
+        splats = mesh.session_uid, len(checked), mesh_attributes.digest(checked)
+        return cls(obj.name, obj.session_uid, obj.mode, splats)
+
+
+class Running:
+    """A running operation; dropped at its end, as Blender's history must not keep splats.
+    `operator`: its name; `job`: data from the scene; `worker`: or a render's stand-in; `waits`:
+    what must happen before the result is written, "" if nothing."""
+
+    def __init__(
+        self,
+        operator: Any,
+        context: bpy.types.Context,
+        group: list[SplatObject],
+        job: Any,
+        worker: Any = None,
+    ) -> None:
+        self.operator, self.doing = type(operator).bl_idname, operator.doing
+        self.job, self.waits = job, ""
+        self._offers, self._targets = operator.offers, [Target.of(each) for each in group]
+        self._left, self._told = TimeLeft(), ""
+        self.worker = worker or Worker(partial(operator.compute, job))
+        self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
+        _now[:] = [self]
+        self.tell(context)
+
+    def objects(self) -> list[bpy.types.Object]:
+        """Objects to write to; raises `RefineError` once one was deleted."""
+        there = {obj.session_uid: obj for obj in bpy.data.objects}
+        found = [there.get(target.uid) for target in self._targets]
+        for obj, target in zip(found, self._targets, strict=True):
+            if obj is None or not obj.users_scene:
+                raise RefineError(
+                    f"object '{target.name}': was deleted; {self.doing.lower()} has ended"
+                )
+        return found
+
+    def done(self) -> bool:
+        """Whether the thread ended and its result can be written; see `waits`."""
+        pairs = zip(self.objects(), self._targets, strict=True)
+        if self.worker.running():
+            return False
+        modes = (target.mode for obj, target in pairs if obj.mode != target.mode)
+        mode = next(modes, "").replace("_", " ").lower()
+        self.waits = f"go back to {mode} mode for the result" if mode else ""
+        if self.waits and self.worker.cancelled:
+            raise Cancelled
+        return not self.waits
+
+    def unchanged(self) -> list[SplatObject]:
+        """The objects; `RefineError` if their splats changed since."""
+        group = [mesh_layout.check(obj) for obj in self.objects()]
+        for checked, target in zip(group, self._targets, strict=True):
+            if Target.of(checked).splats != target.splats:
+                raise RefineError(
+                    f"object '{target.name}': its splats were changed meanwhile; start again"
+                )
+        return group
+
+    @property
+    def at_escape(self) -> str:
+        """What Esc does now."""
+        keeps = self._offers and self.worker.what == self._offers and not self.waits
+        return "keeps what that has reached" if keeps else "cancels"
+
+    @property
+    def factor(self) -> float:
+        """Share done, 0 to 1."""
+        return self.worker.fraction
+
+    @property
+    def share(self) -> str:
+        """Share done and time left, short enough for a bar."""
+        if self.waits:
+            return "done"
+        left = self._left.seconds(self.factor)
+        return f"{self.factor:.0%}" + ("" if left is None else f", about {in_time(left)} left")
+
+    @property
+    def sentence(self) -> str:
+        """The current work, and what Esc does."""
+        if self.waits:
+            return f"{self.doing}: {self.waits} (Esc {self.at_escape})"
+        what = f" ({self.worker.what})" if self.worker.what else ""
+        return f"{self.doing}{what}; Esc {self.at_escape}"
+
+    def tell(self, context: bpy.types.Context) -> None:
+        """Show news of the progress in status bar and panels."""
+        text = f"{self.sentence}: {self.share}"
+        if text != self._told:
+            self._told = text
+            context.workspace.status_text_set(text)
+            redraw_panels(context)
+
+    def over(self, context: bpy.types.Context) -> None:
+        """Stop workers and clear the bars."""
+        self.worker.cancel()
+        if self in _now:
+            _now.clear()
+        context.window_manager.event_timer_remove(self._timer)
+        if not bpy.app.background:
+            # Not at once: a window that is being closed ends Blender where it is drawn.
+            bpy.app.timers.register(_clear_bars, first_interval=0.0)
+        redraw_panels(context)
+
+
+_now: list[Running] = []
+
+
+def now() -> Running | None:
+    """The running operation, if any."""
+    return _now[0] if _now else None
+
+
 def idle(_context: bpy.types.Context) -> str:
     """A need: no other operation may run on a thread."""
-    return running.refusal()
+    if (running := now()) is None:
+        return ""
+    return f"{running.doing}: wait until it is over, or press Esc, which {running.at_escape}"
+
+
+def _clear_bars() -> None:
+    for window in bpy.context.window_manager.windows if now() is None else ():
+        for workspace in bpy.data.workspaces:
+            with bpy.context.temp_override(window=window, workspace=workspace):
+                workspace.status_text_set(None)
+
+
+def redraw_panels(context: bpy.types.Context) -> None:
+    """Redraw the sidebars of the 3D views, and not the views themselves."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type != "VIEW_3D":
+                continue
+            for region in area.regions:
+                if region.type == "UI":
+                    region.tag_redraw()
 
 
 def in_object_mode(context: bpy.types.Context) -> str:
@@ -205,3 +420,24 @@ class Job:
         if self._running is not None:
             self._running = None
             now.over(context)
+
+
+def register() -> None:
+    """End the work when another file is loaded."""
+    bpy.app.handlers.load_pre.append(_end)
+
+
+def unregister() -> None:
+    """Undo `register`, and end the work: Blender drops the operator silently."""
+    running = now()
+    if running is not None:
+        _end()
+        running.over(bpy.context)
+    bpy.app.handlers.load_pre.remove(_end)
+
+
+@persistent
+def _end(*_arguments: object) -> None:
+    if (running := now()) is not None:
+        _now.clear()
+        running.worker.end()

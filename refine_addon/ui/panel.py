@@ -24,10 +24,10 @@ from ..viewport.placing import placings
 from . import (
     camera_operators,
     images,
+    operator_bases,
     operators,
     plans,
     render_operators,
-    running,
     transforms,
     wrapped,
 )
@@ -302,7 +302,7 @@ class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):
 def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
     """Draw the running operator's progress, last of all:
     in a panel, Blender 4.3 replaces a bar by a label drawn later."""
-    now = running.now()
+    now = operator_bases.now()
     if now is not None and now.operator in names:
         layout.progress(factor=now.factor, text=now.share)
         wrapped.label(layout, context, now.sentence)

@@ -29,7 +29,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
 from ..objects.splat_group import Outcome
-from . import images, running
+from . import images, operator_bases
 from .wrapped import counted
 
 Answer = TypeVar("Answer")
@@ -206,7 +206,7 @@ def _rested() -> None:
     if objects:
         _refresh(pairs[0][0] or bpy.context.scene, objects)
     _waiting.clear()
-    running.redraw_panels(bpy.context)
+    operator_bases.redraw_panels(bpy.context)
 
 
 def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> None:

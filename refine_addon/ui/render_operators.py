@@ -20,8 +20,7 @@ from ..render import card, copies, frames
 from ..render.engine import Shared
 from ..render.meshes import drawn_by_us, restore
 from .images import put
-from .operator_bases import FAILURES, Answer, Needing, fail, idle
-from .running import Running, now
+from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle, now
 from .wrapped import counted
 
 IMAGE = "Render with Splats"  # Name of the image with the last frame

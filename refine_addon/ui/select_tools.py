@@ -30,9 +30,8 @@ from ..mesh import selection
 from ..mesh.edit_mode import readable
 from ..mesh.layout import SplatObject
 from ..viewport import draw as viewport_draw
-from .operator_bases import FAILURES, Answer, Needing, fail, idle, on_splats
+from .operator_bases import FAILURES, Answer, Needing, Worker, fail, idle, on_splats
 from .plans import cached
-from .running import Worker
 
 _TOOLS = (
     ("BRUSH", "Brush", "that a round brush covers", "generic.select_circle"),

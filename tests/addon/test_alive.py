@@ -30,7 +30,7 @@ def start(addon, few):
         return started_in_a_window(addon, cls or addon.ui.operators.REFINE_OT_score, **properties)
 
     yield start
-    addon.ui.running._end()
+    addon.ui.operator_bases._end()
 
 
 @pytest.fixture
@@ -203,7 +203,7 @@ def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, few, ch
     assert answer == {"CANCELLED"}
     assert noted(addon, few) is None
     assert context.timers == 0
-    assert addon.ui.running.now() is None
+    assert addon.ui.operator_bases.now() is None
 
 
 @pytest.mark.parametrize("how", ["removed", "out of the scene"])
@@ -218,7 +218,7 @@ def test_an_object_that_is_deleted_ends_the_work_at_once(start, gate, addon, few
     assert operator.modal(context, event("TIMER")) == {"CANCELLED"}
     assert said == ["object 'room': was deleted; scoring splats has ended"]
     assert context.timers == 0
-    assert addon.ui.running.now() is None
+    assert addon.ui.operator_bases.now() is None
     assert bpy.ops.refine.import_ply.poll()
 
 
@@ -255,8 +255,8 @@ def test_a_result_waits_until_edit_mode_is_left(start, gate, addon, few):
     operator, context, _ = start()
     bpy.ops.object.mode_set(mode="EDIT")
     gate.open.set()
-    until(operator, context, lambda: addon.ui.running.now().waits)
-    waits = addon.ui.running.now().sentence
+    until(operator, context, lambda: addon.ui.operator_bases.now().waits)
+    waits = addon.ui.operator_bases.now().sentence
     bpy.ops.object.mode_set(mode="OBJECT")
 
     assert waits == "Scoring splats: go back to object mode for the result (Esc cancels)"
@@ -302,11 +302,11 @@ def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):
         operator.cancel(context)  # as Blender does, after load_pre
         assert context.timers == 0
     else:
-        addon.ui.running.unregister()
-        addon.ui.running.register()
+        addon.ui.operator_bases.unregister()
+        addon.ui.operator_bases.register()
 
     assert threads() == []
-    assert addon.ui.running.now() is None
+    assert addon.ui.operator_bases.now() is None
     assert bpy.ops.refine.import_ply.poll()
 
 
@@ -381,7 +381,7 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
 
 def served(addon, function):
     """Return what a thread gets that asks the main thread to call a function."""
-    worker = addon.ui.running.Worker(lambda _progress: addon.main_thread.call(function))
+    worker = addon.ui.operator_bases.Worker(lambda _progress: addon.main_thread.call(function))
     while worker.running():
         addon.main_thread.serve()
     return worker.result()
@@ -408,7 +408,7 @@ def test_an_answer_just_after_the_time_out_is_no_time_out(addon, monkeypatch):
                 raise
 
     monkeypatch.setattr(addon.main_thread, "Future", Late)
-    worker = addon.ui.running.Worker(lambda _progress: addon.main_thread.call(lambda: 7))
+    worker = addon.ui.operator_bases.Worker(lambda _progress: addon.main_thread.call(lambda: 7))
     timed_out.wait(0.5)  # longer than a wait for an answer
     addon.main_thread.serve()
     answered.set()
@@ -425,7 +425,9 @@ def test_a_time_out_of_the_function_itself_is_raised(addon):
 def test_a_thread_that_is_cancelled_waits_for_no_answer(addon):
     """And what it asked for is not done."""
     main_thread, calls = addon.main_thread, []
-    worker = addon.ui.running.Worker(lambda _progress: main_thread.call(lambda: calls.append(1)))
+    worker = addon.ui.operator_bases.Worker(
+        lambda _progress: main_thread.call(lambda: calls.append(1))
+    )
     while not main_thread._asked.qsize():
         time.sleep(0.01)
     worker.end()

@@ -214,15 +214,15 @@ def test_esc_while_refitting_keeps_what_that_has_reached(addon, few, monkeypatch
     def count_rounds(rays, *arguments):
         psnr = measured(rays, *arguments)
         done.append(psnr)
-        while len(done) > rounds and not addon.ui.running.now().worker.cancelled:
+        while len(done) > rounds and not addon.ui.operator_bases.now().worker.cancelled:
             time.sleep(0.01)
         return psnr
 
     monkeypatch.setattr(addon.core.refit.round_rays.RoundRays, "psnr", count_rounds)
     operator, context, said = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
-    first = addon.ui.running.now().at_escape
+    first = addon.ui.operator_bases.now().at_escape
     until(operator, context, lambda: len(done) > rounds)
-    sentence = addon.ui.running.now().sentence
+    sentence = addon.ui.operator_bases.now().sentence
     operator.modal(context, event("ESC"))
     answer = until_over(operator, context)
 
@@ -242,7 +242,7 @@ def test_esc_while_the_result_of_refitting_waits_changes_nothing(addon, few):
     count = len(room.data.vertices)
     operator, context, said = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
     bpy.ops.object.mode_set(mode="EDIT")
-    until(operator, context, lambda: addon.ui.running.now().waits)
+    until(operator, context, lambda: addon.ui.operator_bases.now().waits)
     operator.modal(context, event("ESC"))
     answer = until_over(operator, context)
     bpy.ops.object.mode_set(mode="OBJECT")

@@ -315,7 +315,7 @@ def test_one_is_not_counted_as_many(draw, room, room_cameras):
 @pytest.fixture
 def at_work(addon):
     """Return a function that lets the panel believe that an operator works."""
-    running = addon.ui.running
+    running = addon.ui.operator_bases
 
     def at_work(operator, doing):
         worker = SimpleNamespace(fraction=0.43, what="looking")

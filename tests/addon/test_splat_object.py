@@ -199,7 +199,7 @@ def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, quart
     """The thread of the window: same scores; after `cancel` its result raises `Cancelled`."""
     core = addon.core
     splats = addon.objects.splat_group.gather([addon.mesh.layout.check(quarter)])
-    worker = addon.ui.running.Worker(
+    worker = addon.ui.operator_bases.Worker(
         lambda progress: core.score(splats, room_views, progress=progress)
     )
     scores = worker.result()
@@ -209,7 +209,7 @@ def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, quart
         begun.set()
         return core.score(splats, room_views, progress=progress)
 
-    cancelled = addon.ui.running.Worker(slow)
+    cancelled = addon.ui.operator_bases.Worker(slow)
     begun.wait(60.0)
     cancelled.cancel()
 

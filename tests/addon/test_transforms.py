@@ -325,7 +325,7 @@ def held_join(addon, imported, monkeypatch):
 
     monkeypatch.setattr(addon.objects.transforms, "read_to_join", held)
     yield second, lambda: started_in_a_window(addon, addon.ui.transforms.REFINE_OT_join), go
-    addon.ui.running._end()
+    addon.ui.operator_bases._end()
 
 
 def test_a_join_that_is_cancelled_leaves_the_scene_as_it_was(held_join, imported, unchanged):

@@ -241,7 +241,7 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(
         monkeypatch.setattr(addon.mesh.scores, "store", refuse)
         monkeypatch.setattr(addon.objects.splat_group, "apply", refuse)
     operator, context, said = started(name)
-    assert addon.ui.running.now().operator == f"refine.{name}"
+    assert addon.ui.operator_bases.now().operator == f"refine.{name}"
     if how == "escape":
         operator.modal(context, event("ESC"))
     if how == "cancelled":
@@ -255,7 +255,7 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(
 
     assert noted
     assert left(noted) == []
-    assert addon.ui.running.now() is None
+    assert addon.ui.operator_bases.now() is None
     assert [text for text in said if "failed" in text] == ["failed"] * ("fail" in how)
     assert ("nothing was changed" in "".join(said)) == (how == "escape")
     assert len(few.data.vertices) == (

@@ -193,7 +193,7 @@ class Gate:
     """Holds back scoring until it is opened."""
 
     def __init__(self) -> None:
-        self.running = importlib.import_module(f"{extension.MODULE}.ui.running")
+        self.running = importlib.import_module(f"{extension.MODULE}.ui.operator_bases")
         scoring = importlib.import_module(f"{extension.MODULE}.ui.operators")
         work = importlib.import_module(f"{extension.MODULE}.core.execute")
         self.opened, score = threading.Event(), scoring.score

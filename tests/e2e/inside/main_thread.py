@@ -147,7 +147,7 @@ def changing(clock: Clock, scored: Scored, path: str) -> None:
 def on_a_thread(clock: Clock) -> Callable[..., set[str]]:
     """Return what runs an operator as `Job` does in a window, and waits for its thread."""
     main_thread = importlib.import_module(f"{extension.MODULE}.main_thread")
-    running = importlib.import_module(f"{extension.MODULE}.ui.running")
+    running = importlib.import_module(f"{extension.MODULE}.ui.operator_bases")
 
     def waited(work: Callable[..., Any]) -> Any:
         clock.cut()

@@ -43,12 +43,12 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
 
     invoke()
     yield 2.0
-    running = importlib.import_module(f"{extension.MODULE}.ui.running")
-    found["refusal"], found["can export"] = running.refusal(), bpy.ops.refine.export_ply.poll()
+    running = importlib.import_module(f"{extension.MODULE}.ui.operator_bases")
+    found["refusal"], found["can export"] = running.idle(None), bpy.ops.refine.export_ply.poll()
     found["scenes"] = [scene.name for scene in bpy.data.scenes if scene.name[0] != "."]
     yield from picture(pictures, "during")
     yield from until(lambda: IMAGE in bpy.data.images and not rendering(), "it is rendered")
-    found["refusal"] = [found["refusal"], running.refusal()]
+    found["refusal"] = [found["refusal"], running.idle(None)]
     yield from picture(pictures, "render")
     found["size"] = list(bpy.data.images[IMAGE].size)
     found["alike"] = [settings(scene) == before]

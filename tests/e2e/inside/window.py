@@ -80,7 +80,7 @@ def state(name: str) -> dict[str, Any]:
 
 def at_work() -> bool:
     """Tell whether an operator works on a thread."""
-    return importlib.import_module(f"{extension.MODULE}.ui.running").now() is not None
+    return importlib.import_module(f"{extension.MODULE}.ui.operator_bases").now() is not None
 
 
 def price(name: str) -> dict[str, Any]:
