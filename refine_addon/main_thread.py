@@ -1,17 +1,27 @@
-"""Calls that other threads leave to Blender's main thread: only there its data may be touched."""
+"""Calls that other threads leave to Blender's main thread: only there its data may be touched.
+Core's formats have WebP images read and written so, by Blender's library."""
 
 from __future__ import annotations
 
 import contextlib
 import queue
+import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
+from functools import partial
+from pathlib import Path
 from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
 
 from .core.execute import Cancelled, checkpoint
 
 _STEP = 0.1  # Seconds between two checks of waiting work for cancelling
+
+_LOSSLESS = 100  # Quality at which Blender compresses WebP without loss
 
 _asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
 
@@ -43,3 +53,73 @@ def serve() -> None:
                 answer.set_result(function())
             except BaseException as error:
                 answer.set_exception(error)
+
+
+class BlenderImages:
+    """A codec (`refine_addon.core.images.Codec`) on Blender's main thread."""
+
+    def size(self, data: bytes) -> tuple[int, int]:
+        """Width and height from the file's first bytes, a RIFF container.
+        Its first chunk is ``VP8X`` (24 bits each, less 1), ``VP8L`` (14 bits, less 1, behind a
+        byte) or ``VP8 `` (14 bits, behind 6 bytes)."""
+        kind, start = data[12:16], data[20:30]
+        if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(start) < 10:
+            raise ValueError("no WebP image")
+        # Blender shows a black image where the data of one cannot be unpacked.
+        if int.from_bytes(data[4:8], "little") + 8 > len(data):
+            raise ValueError("truncated")
+        if kind == b"VP8X":
+            sides = [int.from_bytes(start[at : at + 3], "little") + 1 for at in (4, 7)]
+        elif kind == b"VP8L":
+            packed = int.from_bytes(start[1:5], "little")
+            sides = [(packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1]
+        else:
+            sides = [int.from_bytes(start[at : at + 2], "little") & 0x3FFF for at in (6, 8)]
+        return sides[0], sides[1]
+
+    def decode(self, data: bytes) -> NDArray[np.uint8]:
+        """Pixels, (height, width, 4), top row first."""
+        return call(partial(self._decode, data))
+
+    def encode(self, pixels: NDArray[np.uint8]) -> bytes:
+        """A WebP image of pixels, (height, width, 4); colours of alpha 0 may be lost."""
+        return call(partial(self._encode, pixels))
+
+    def _decode(self, data: bytes) -> NDArray[np.uint8]:
+        with _file() as path:
+            path.write_bytes(data)
+            try:
+                image = bpy.data.images.load(str(path))
+            except RuntimeError as error:
+                raise ValueError(str(error).strip()) from error
+            try:
+                image.colorspace_settings.name = "Non-Color"
+                image.alpha_mode = "CHANNEL_PACKED"
+                width, height = image.size
+                if (width, height) != self.size(data):
+                    raise ValueError("damaged")
+                values = np.empty(width * height * 4, np.float32)
+                image.pixels.foreach_get(values)
+            finally:
+                bpy.data.images.remove(image)
+        pixels = np.rint(values * 255.0).astype(np.uint8)
+        return pixels.reshape(height, width, 4)[::-1]  # Blender's first row is the lowest
+
+    def _encode(self, pixels: NDArray[np.uint8]) -> bytes:
+        height, width = pixels.shape[:2]
+        image = bpy.data.images.new("refine", width, height, alpha=True, is_data=True)
+        try:
+            image.alpha_mode = "CHANNEL_PACKED"
+            image.pixels.foreach_set((pixels[::-1] / np.float32(255.0)).astype(np.float32).ravel())
+            image.file_format = "WEBP"
+            with _file() as path:
+                image.save(filepath=str(path), quality=_LOSSLESS)
+                return path.read_bytes()
+        finally:
+            bpy.data.images.remove(image)
+
+
+@contextlib.contextmanager
+def _file() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder) / "image.webp"

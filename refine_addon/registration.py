@@ -11,8 +11,8 @@ from bpy.props import PointerProperty
 
 from . import command
 from .core import images
+from .main_thread import BlenderImages
 from .ui.properties import RefineSettings
-from .webp import BlenderImages
 
 _NAMES = """
     ui.marks ui.properties ui.images ui.plans ui.operator_bases ui.transforms ui.import_operators

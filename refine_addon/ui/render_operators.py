@@ -23,6 +23,8 @@ from .images import put
 from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle, now
 from .wrapped import counted
 
+_ENDS = (Cancelled, *FAILURES, RuntimeError)  # Exceptions that end a render and are no bugs
+
 IMAGE = "Render with Splats"  # Name of the image with the last frame
 
 _ENDS_UNSEEN = bpy.app.version < (5, 0, 0)
@@ -111,9 +113,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         try:
             for step in filter(None, self._steps or ()):
                 bpy.ops.render.render(scene=step.scene, animation=step.animation)
-        except Cancelled:
-            return self._stopped(context)
-        except (*FAILURES, RuntimeError) as error:
+        except _ENDS as error:
             return self._stopped(context, error)
         return self._finished(context)
 
@@ -158,21 +158,18 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         """Take the last render's result, or start the next one at the next event:
         an Esc may wait behind this one, and renders forget it as they begin."""
         try:
-            if self._shared.stopped or self._steps is None:
-                return self._stopped(context)
             step, self._next = self._next, None
+            undone = step is not None and step.scene not in bpy.data.scenes
+            if self._shared.stopped or self._steps is None or undone:
+                raise Cancelled
             if step is None:
                 self._next = next(self._steps)
                 self._show()
-            elif step.scene in bpy.data.scenes:
+            else:
                 self._render(context, step)
-            else:  # undone
-                return self._stopped(context)
         except StopIteration:
             return self._finished(context)
-        except Cancelled:
-            return self._stopped(context)
-        except (*FAILURES, RuntimeError) as error:
+        except _ENDS as error:
             return self._stopped(context, error)
         except Exception:  # a fault of the program, which Blender prints
             self._over(context)
@@ -227,9 +224,9 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             self.report({"WARNING"}, sentence)
         return {"FINISHED"}
 
-    def _stopped(self, context: bpy.types.Context, error: Exception | None = None) -> Answer:
+    def _stopped(self, context: bpy.types.Context, error: BaseException) -> Answer:
         self._over(context)
-        if error is not None:
+        if not isinstance(error, Cancelled):
             return fail(self, error)
         self.report({"INFO"}, "Render cancelled")
         return {"CANCELLED"}

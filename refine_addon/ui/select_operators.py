@@ -263,16 +263,13 @@ class REFINE_PT_select(bpy.types.Panel):
         row = layout.row(align=True)
         row.prop(settings, "select_opacity")
         row.prop(settings, "select_size")
-        _draw_uses(layout)
-
-
-def _draw_uses(layout: bpy.types.UILayout) -> None:
-    row = layout.row(align=True)
-    for mark, text, icon in (("STAY", "Stay", "LOCKED"), ("GO", "Go", "TRASH"), ("NONE", "", "X")):
-        row.operator("refine.protect", text=text, icon=icon).mark = mark
-    column = layout.column(align=True)
-    column.operator("refine.separate_selected", text="Separate", icon="MOD_EXPLODE")
-    column.operator("refine.delete", text="Delete", icon="X").what = "SELECTED"
+        row = layout.row(align=True)
+        marks = ("STAY", "Stay", "LOCKED"), ("GO", "Go", "TRASH"), ("NONE", "", "X")
+        for mark, text, icon in marks:
+            row.operator("refine.protect", text=text, icon=icon).mark = mark
+        column = layout.column(align=True)
+        column.operator("refine.separate_selected", text="Separate", icon="MOD_EXPLODE")
+        column.operator("refine.delete", text="Delete", icon="X").what = "SELECTED"
 
 
 CLASSES = (

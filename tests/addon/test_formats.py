@@ -134,7 +134,7 @@ def test_the_images_of_blender_are_those_of_pillow(addon):
     random = np.random.default_rng(0)
     pixels = random.integers(0, 256, (12, 20, 4), np.uint8)
     pixels[..., 3] |= 1
-    pillow, blender = addon.core.images._Pillow(), addon.webp.BlenderImages()
+    pillow, blender = addon.core.images._Pillow(), addon.main_thread.BlenderImages()
     before = len(bpy.data.images)
 
     for writer in (pillow, blender):

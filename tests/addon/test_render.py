@@ -452,7 +452,7 @@ def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon)
         _shared=SimpleNamespace(stopped=False),
         _show=lambda: None,
         _render=lambda _context, step: begun.append(step),
-        _stopped=lambda _context: {"CANCELLED"},
+        _stopped=lambda _context, _error: {"CANCELLED"},
         _go_on=lambda context: operators.REFINE_OT_render._go_on(waiting, context),
     )
     timer = SimpleNamespace(type="TIMER")
