@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection
+from typing import Any
 
 import bpy
 import numpy as np
@@ -13,8 +14,7 @@ from ..core.cleaning.clean import REASONS, Cleaned
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
-from .layout import SplatObject, splat_count
-from .records import parsed
+from .layout import SplatObject, recorded, splat_count
 
 REASON = "refine_floats"  # Integer point attribute: 0, or the splat's place in `REASONS`, from 1
 
@@ -41,22 +41,21 @@ def store(checked: SplatObject, cleaned: Cleaned) -> None:
 
 def counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None:
     """Floaters for each reason; None without a search since the last change."""
-    try:
-        noted = parsed(mesh[FOUND])
-        counted = {name: int(noted["counts"][name]) for name in REASONS}
+
+    def read(noted: Any) -> dict[str, int] | None:
         current = noted["splats"] == splat_count(mesh) and REASON in mesh.attributes
-    except (KeyError, TypeError, ValueError):
-        return None
-    return counted if current else None
+        return {name: int(noted["counts"][name]) for name in REASONS} if current else None
+
+    return recorded(mesh, FOUND, read)
 
 
 def surety(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, float]:
     """Share of further views that see past the splats of each reason, 0..1, where known."""
-    try:
-        noted = parsed(mesh[FOUND])["sure"].items()
-        return {name: float(share) for name, share in noted if share is not None}
-    except (AttributeError, KeyError, TypeError, ValueError):
-        return {}
+
+    def read(noted: Any) -> dict[str, float]:
+        return {name: float(sure) for name, sure in noted["sure"].items() if sure is not None}
+
+    return recorded(mesh, FOUND, read) or {}
 
 
 def mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:

@@ -7,8 +7,9 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import bpy
@@ -133,6 +134,20 @@ class SplatObject:
         return splat_count(self.obj.data)
 
 
+def recorded(mesh: bpy.types.ID, name: str, read: Callable[[Any], Any]) -> Any:
+    """What `read` makes of a JSON record, read-only, in a custom property; None if it cannot.
+    Another program may have written there."""
+    try:
+        return read(_parsed(mesh[name]))
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return None
+
+
+@lru_cache(maxsize=16)  # for panels
+def _parsed(text: str) -> Any:
+    return json.loads(text)
+
+
 def splat_count(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> int:
     """Splats of a mesh or a point cloud."""
     return len(mesh.points if hasattr(mesh, "points") else mesh.vertices)
@@ -207,9 +222,9 @@ def rest_count(mesh: bpy.types.Mesh) -> int:
 
 def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
     """Layout noted by the import, None if there is none or it cannot be read."""
-    try:
-        noted = json.loads(mesh[LAYOUT])
-        places = _native_places(mesh)
+    places = _native_places(mesh)
+
+    def read(noted: Any) -> Layout | None:
         columns = tuple(
             Column(name, dtype, places.get(name) or _plain(dtype, attribute, component))
             for name, dtype, attribute, component in noted["columns"]
@@ -224,11 +239,9 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         if rest:
             more = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in rest]
             layout = _with(layout, splat_count(mesh), more)
-        described = layout.row_dtype.itemsize > 0
-    except (AttributeError, KeyError, TypeError, ValueError):
-        # Another program may have written there: what does not describe a file is no layout.
-        return None
-    return layout if described else None
+        return layout if layout.row_dtype.itemsize > 0 else None
+
+    return recorded(mesh, LAYOUT, read)
 
 
 def merged(layouts: Sequence[Layout]) -> Layout:

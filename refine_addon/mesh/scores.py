@@ -18,8 +18,7 @@ from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
-from .layout import SplatObject
-from .records import parsed
+from .layout import SplatObject, recorded
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: score, rank from 0 (removed first) to 1, number of views that hold it."""
@@ -100,23 +99,19 @@ def digest(mask: NDArray[np.bool_] | None) -> list[int]:
 
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     """Record of a mesh's scoring, None without."""
-    try:
-        recorded: dict[str, Any] = parsed(mesh[RECORD])
-        complete = recorded.keys() >= {"splats", "settings", "views_given", "views_used"}
-    except (KeyError, TypeError, ValueError, AttributeError):
-        return None
-    return recorded if complete else None
+    needed = {"splats", "settings", "views_given", "views_used"}
+    return recorded(mesh, RECORD, lambda found: found if found.keys() >= needed else None)
 
 
 def move_origin(
     mesh: bpy.types.Mesh, before: NDArray[np.float64], after: NDArray[np.float64]
 ) -> None:
     """Keep scores valid for an object whose (4, 4) matrix changed while its splats stayed."""
-    recorded = record(mesh) or {}
-    origin = recorded.get("origin")
+    scoring = record(mesh) or {}
+    origin = scoring.get("origin")
     if origin and np.allclose(origin.get("matrix", np.nan), before, rtol=0.0, atol=1e-6):
         origin = {**origin, "matrix": np.asarray(after).tolist()}
-        mesh[RECORD] = json.dumps({**recorded, "origin": origin})
+        mesh[RECORD] = json.dumps({**scoring, "origin": origin})
 
 
 def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | None = None) -> Scores:
@@ -125,18 +120,18 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
     records, columns, start = [], [], 0
     removed = np.zeros(sum(map(len, group)), np.bool_) if removed is None else removed
     for checked in group:
-        recorded, label = record(checked.mesh), f"object '{checked.obj.name}'"
-        if recorded is None or not _has_scores(checked.mesh):
+        scoring, label = record(checked.mesh), f"object '{checked.obj.name}'"
+        if scoring is None or not _has_scores(checked.mesh):
             raise RefineError(f"{label}: has no scores; score it first")
         own = [mesh_attributes.read_attribute(checked.mesh, n) for n in (SCORE, SEEN, SCORED)]
         count = len(own[0])
         unscored = int(np.count_nonzero(~own[2] & ~removed[start : start + count]))
-        if count > recorded["splats"] or unscored:
+        if count > scoring["splats"] or unscored:
             raise RefineError(
-                f"{label}: scored with {recorded['splats']} splats, has {count} now, "
+                f"{label}: scored with {scoring['splats']} splats, has {count} now, "
                 f"{unscored} of them without a score; score it again"
             )
-        records.append(recorded)
+        records.append(scoring)
         columns.append(own)
         start += count
     values, seen, scored = (np.concatenate(parts) for parts in zip(*columns, strict=True))

@@ -4,6 +4,8 @@ Meshes use ``.select_vert`` and ``.hide_vert``, in edit mode the vertices there;
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from operator import attrgetter
 
 import bmesh
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 
 from . import attributes as mesh_attributes
 from .edit import check_writable
-from .layout import splat_count
+from .layout import SplatObject, check, splat_count
 
 HIDDEN = ".hide_vert"
 
@@ -54,6 +56,22 @@ def count(obj: bpy.types.Object) -> int:
     if _in_edit_mode(obj):
         return int(obj.data.total_vert_sel)
     return int(np.count_nonzero(_chosen(obj)))
+
+
+@contextmanager
+def readable(obj: bpy.types.Object) -> Iterator[SplatObject]:
+    """The object, or in edit mode a copy of its present state, in no scene, untransformed."""
+    if obj.mode != "EDIT" or obj.type != "MESH":
+        yield check(obj)
+        return
+    obj.update_from_editmode()
+    mesh = obj.data.copy()
+    copy = bpy.data.objects.new(obj.name, mesh)
+    try:
+        yield check(copy)
+    finally:
+        bpy.data.objects.remove(copy)
+        bpy.data.meshes.remove(mesh)
 
 
 def _store(

@@ -22,8 +22,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject, splat_count
-from ..mesh.records import parsed
+from ..mesh.layout import SplatObject, recorded, splat_count
 
 FACTS = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
 
@@ -187,16 +186,16 @@ def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced
 def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
     """``protected``, ``removed_by_user``, ``volumes`` (splats by label), or ``error``, as marked.
     Empty if splats came or went since."""
-    try:
-        recorded = parsed(mesh[FACTS])
-        if recorded["splats"] != splat_count(mesh):
+
+    def read(noted: Any) -> dict[str, Any]:
+        if noted["splats"] != splat_count(mesh):
             return {}
-        if "error" in recorded:
-            return {"error": str(recorded["error"])}
-        counts = {name: int(recorded[name]) for name in ("protected", "removed_by_user")}
-        return {**counts, "volumes": dict(recorded["volumes"])}
-    except (KeyError, TypeError, ValueError):
-        return {}
+        if "error" in noted:
+            return {"error": str(noted["error"])}
+        counts = {name: int(noted[name]) for name in ("protected", "removed_by_user")}
+        return {**counts, "volumes": dict(noted["volumes"])}
+
+    return recorded(mesh, FACTS, read) or {}
 
 
 def _record(mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:

@@ -12,9 +12,8 @@ import bpy
 
 from ..core.errors import RefineError
 from ..core.execute import Cancelled
-from . import copies
+from . import meshes
 from .engine import REFINE_engine, Shared
-from .meshes import Meshes, drawn_by_us
 
 
 def refuse(scene: bpy.types.Scene) -> None:
@@ -24,7 +23,7 @@ def refuse(scene: bpy.types.Scene) -> None:
         raise RefineError(f"{label}: has no camera; add one, or make one the active camera")
     instanced = {obj.instance_collection for obj in bpy.data.objects} - {None}
     members = [member for collection in instanced for member in collection.all_objects]
-    if not any(drawn_by_us(obj) for obj in (*scene.objects, *members)):
+    if not any(meshes.drawn_by_us(obj) for obj in (*scene.objects, *members)):
         raise RefineError(f"{label}: has no splats to draw; import some, or use Render Image")
     if scene.render.use_multiview:
         raise RefineError(f"{label}: splats are not drawn in stereo; switch off Stereoscopy")
@@ -47,41 +46,41 @@ def left_out(scene: bpy.types.Scene) -> list[str]:
 
 def steps(
     scene: bpy.types.Scene, frames: Sequence[int], shared: Shared, *, write: bool
-) -> Generator[copies.Step | None, None, None]:
+) -> Generator[meshes.Step | None, None, None]:
     """Yield Blender's renders for some frames; the caller renders each before the next.
     At None Blender may do other things. Cleans up at the end or when closed. `write`: pictures go
     to the scene's output. `RefineError` if a step failed, `Cancelled` if one was stopped."""
     refuse(scene)
     with _made(shared) as folder:
-        meshes, whole = Meshes(scene, folder), _whole(scene, "whole")
-        shared.engine, shared.renders = meshes.engine, meshes.renders + 1
+        others, whole = meshes.Meshes(scene, folder), _whole(scene, "whole")
+        shared.engine, shared.renders = others.engine, others.renders + 1
         shared.transparent = scene.render.film_transparent
         movie = write and scene.render.is_movie_format
         kept = not scene.render.use_overwrite, scene.render.use_placeholder
         if movie:  # it is written as one, when all frames are drawn
             written = _whole(scene, "movie")
-            copies.write_exr(copies.existing(whole), folder / "whole_######")
+            meshes.write_exr(meshes.existing(whole), folder / "whole_######")
         for frame in frames:
             if write and not movie and _is_there(whole, frame, *kept):
                 continue
-            shared.layers = yield from meshes.layers(frame)
-            copies.set_frames(whole, [frame])
-            yield copies.Step(whole, animation=write, what="splats")
+            shared.layers = yield from others.layers(frame)
+            meshes.set_frames(whole, [frame])
+            yield meshes.Step(whole, animation=write, what="splats")
             _check(shared, frame)
             if movie:
                 shared.save(folder, frame)
         if movie:
             shared.finished = folder
-            copies.set_frames(written, frames)
-            yield copies.Step(written, animation=True, what="movie")
+            meshes.set_frames(written, frames)
+            yield meshes.Step(written, animation=True, what="movie")
             _check(shared, frames[-1])
 
 
 def _whole(scene: bpy.types.Scene, what: str) -> str:
-    copy = copies.copied(scene, what)
+    copy = meshes.copied(scene, what)
     copy.render.engine = REFINE_engine.bl_idname
     copy.render.use_overwrite, copy.render.use_placeholder = True, False  # see `_is_there`
-    copies.show_as_stored(copy)
+    meshes.show_as_stored(copy)
     return str(copy.name)
 
 
@@ -92,7 +91,7 @@ def _check(shared: Shared, frame: int) -> None:
 
 def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
     """Whether a frame's file exists and stays; else make a placeholder if wanted."""
-    path = Path(bpy.path.abspath(copies.existing(name).render.frame_path(frame=frame)))
+    path = Path(bpy.path.abspath(meshes.existing(name).render.frame_path(frame=frame)))
     there = path.exists()
     if placeholder and not there:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,13 +103,13 @@ def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
 def _made(shared: Shared) -> Iterator[Path]:
     """Yield a folder; afterwards remove it, and all else that a render made."""
     folder = Path(tempfile.mkdtemp(prefix="refine-"))
-    copies.remove_all()
+    meshes.remove_all()
     bpy.utils.register_class(REFINE_engine)
     REFINE_engine.shared = shared
     try:
         yield folder
     finally:
         REFINE_engine.shared = None
-        copies.remove_all()
+        meshes.remove_all()
         bpy.utils.unregister_class(REFINE_engine)
         shutil.rmtree(folder, ignore_errors=True)

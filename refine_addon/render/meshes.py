@@ -1,29 +1,38 @@
-"""Everything but splats: rendered by the scene's own engine, with depths."""
+"""Everything but splats: rendered by the scene's own engine, with depths, in copies of the scene,
+so that its settings stay untouched; and the rendered passes, from files to layers.
+Layers blend as splats do, in shown colours; so Blender's view transform comes before them."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.execute import Cancelled
-from ..core.pictures import Layers
+from ..core.images import read_exr
+from ..core.pictures import Layers, in_order
 from ..mesh import native
 from ..mesh.layout import looks_like_splats
-from . import copies, passes
+
+COPY_OF = "refine_render"  # Custom property of a copy: its original scene
 
 _RENDERED = {
     *("MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES", "POINTCLOUD", "GREASEPENCIL"),
     *("GPENCIL", "EMPTY"),  # an empty may stand for a collection
 }
 
-_MARK = "refine_out_of_sight"  # Custom property of a hidden object: the property that was changed
+_HIDDEN_BY = (
+    "refine_out_of_sight"  # Custom property of a hidden object: the property that was changed
+)
 
 _BY_RAYS = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES"}
 """Types that can be hidden from cameras; EEVEE ignores that for instances."""
@@ -38,10 +47,20 @@ _INFINITE = 1e9  # Depth beyond which there is nothing: Cycles reports 1e10
 
 _PIXELS = 1 << 18  # Pixels per call of the view transform
 
+_ROUNDS = 2  # Pixels that known depths spread into edges without one
+
 _MOMENT = 0.01  # Seconds that Blender may stand still
 
 
-Steps = Generator[copies.Step | None, None, Callable[[], Layers] | None]
+class Step(NamedTuple):
+    """A render for Blender: its scene's name, whether an animation (writes files), a label."""
+
+    scene: str
+    animation: bool
+    what: str
+
+
+Steps = Generator[Step | None, None, Callable[[], Layers] | None]
 
 
 def drawn_by_us(obj: bpy.types.Object) -> bool:
@@ -102,9 +121,9 @@ class Meshes:
                 opaque = yield from self._rendered(self._meshes, frame, "opaque")
             files.append((opaque, opaque))
         world = (yield from self._rendered(self._world, frame, "world")) if self._world else None
-        far = min(_FARTHEST * copies.existing(self._any).camera.data.clip_end, _INFINITE)
+        far = min(_FARTHEST * existing(self._any).camera.data.clip_end, _INFINITE)
         with ThreadPoolExecutor(1, "refine-render") as pool:
-            future = pool.submit(passes.read, files, world, far)
+            future = pool.submit(_layers_of, files, world, far)
             while not wait([future], _MOMENT).done:
                 yield None
         pictures, blended = future.result()
@@ -113,8 +132,8 @@ class Meshes:
     def _rendered(self, name, frame, label):
         """Render a frame of a copy; the renamed file.
         Blender handles Esc itself, and writes no unfinished file."""
-        copies.set_frames(name, [frame])
-        yield copies.Step(name, animation=True, what="meshes")
+        set_frames(name, [frame])
+        yield Step(name, animation=True, what="meshes")
         try:
             written = Path(bpy.data.scenes[name].render.frame_path(frame=frame))
             return written.replace(self._folder / f"{label}.exr")
@@ -123,8 +142,8 @@ class Meshes:
 
     def _copy(self, scene, what, *, cycles=False, samples=0):
         """Make a copy: by Cycles if needed or asked for, with few rays if asked for."""
-        copy = copies.copied(scene, what)
-        copies.write_exr(copy, self._folder / f"{what}_######")
+        copy = copied(scene, what)
+        write_exr(copy, self._folder / f"{what}_######")
         copy.render.film_transparent = True
         for layer in copy.view_layers:
             layer.use_pass_combined = layer.use_pass_z = True
@@ -159,14 +178,14 @@ class Meshes:
         return np.split(np.concatenate(bands, axis=1), len(pictures), axis=1)
 
     def _band_shown(self, band):
-        scene, path = copies.existing(self._any), str(self._folder / "shown.png")
+        scene, path = existing(self._any), str(self._folder / "shown.png")
         height, width = band.shape[1:]
         pixels = np.ones((height, width, 4), np.float32)
         pixels[..., :3] = np.moveaxis(band, 0, -1)
         images = [bpy.data.images.new("REFINE", width, height, float_buffer=True)]
         try:
             images[0].pixels.foreach_set(pixels.ravel())
-            copies.write_png(scene)
+            write_png(scene)
             images[0].save_render(path, scene=scene)
             images.append(bpy.data.images.load(path))
             images[1].colorspace_settings.name = "Non-Color"
@@ -174,7 +193,7 @@ class Meshes:
             images[1].pixels.foreach_get(pixels.ravel())
         finally:
             bpy.data.batch_remove(images)
-            copies.write_exr(scene, Path(scene.render.filepath))
+            write_exr(scene, Path(scene.render.filepath))
         return np.moveaxis(pixels[..., :3], -1, 0)
 
 
@@ -220,7 +239,7 @@ def out_of_sight(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
         seen_by_rays = obj.type in _BY_RAYS and obj.instance_type == "NONE"
         name = "visible_camera" if seen_by_rays else "hide_render"
         if getattr(obj, name) == seen_by_rays:  # else the scene leaves it out already
-            obj[_MARK] = name
+            obj[_HIDDEN_BY] = name
             setattr(obj, name, not seen_by_rays)
     try:
         yield
@@ -231,8 +250,153 @@ def out_of_sight(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
 def restore() -> None:
     """Show all hidden objects again."""
     for obj in bpy.data.objects:
-        name = obj.get(_MARK)
+        name = obj.get(_HIDDEN_BY)
         if name is not None:
             setattr(obj, name, name == "visible_camera")
             with suppress(KeyError):
-                del obj[_MARK]
+                del obj[_HIDDEN_BY]
+
+
+def copied(scene: bpy.types.Scene, what: str) -> bpy.types.Scene:
+    """A copy that renders what the scene does, without compositor and sequencer, one view layer.
+    Its name begins with a dot, so menus leave it out."""
+    copy = scene.copy()
+    copy.name = f".REFINE {what}"
+    copy[COPY_OF] = scene
+    render = copy.render
+    render.use_compositing = render.use_sequencer = render.use_multiview = False
+    rendered = next((layer for layer in copy.view_layers if layer.use), copy.view_layers[0])
+    for layer in copy.view_layers:
+        layer.use = layer == rendered
+    return copy
+
+
+def existing(name: str) -> bpy.types.Scene:
+    """A copy by its name; raises `Cancelled` if an undo has removed it."""
+    scene = bpy.data.scenes.get(name)
+    if scene is None:
+        raise Cancelled
+    return scene
+
+
+def set_frames(name: str, frames: Sequence[int]) -> bpy.types.Scene:
+    """Make a copy render evenly spaced frames, and go to the first."""
+    scene = existing(name)
+    scene.frame_start, scene.frame_end = frames[0], frames[-1]
+    scene.frame_step = frames[1] - frames[0] if frames[1:] else 1
+    if scene.frame_current != frames[0]:
+        scene.frame_set(frames[0])
+    return scene
+
+
+def remove_all() -> None:
+    """Remove all copies; windows that show one show its scene again."""
+    for window in bpy.context.window_manager.windows:
+        if COPY_OF in window.scene:
+            window.scene = window.scene[COPY_OF]
+    found = [scene for scene in bpy.data.scenes if COPY_OF in scene]
+    if bpy.context.window is None:  # as in a command: `remove` of 4.3 crashes without a window
+        bpy.data.batch_remove(found)
+        found = []
+    for scene in found:
+        bpy.data.scenes.remove(scene)
+
+
+def write_exr(scene: bpy.types.Scene, path: Path) -> None:
+    """Make a copy write images with all passes for `core.images`."""
+    render, settings = scene.render, scene.render.image_settings
+    _set_format(settings, "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER")
+    settings.color_depth, settings.exr_codec = "32", "NONE"
+    if hasattr(settings, "use_exr_interleave"):  # since 5.0
+        settings.use_exr_interleave = True
+    render.filepath = str(path)
+    render.use_file_extension = render.use_overwrite = True
+    render.use_placeholder = render.use_stamp = False
+    render.use_crop_to_border = True
+
+
+def write_png(scene: bpy.types.Scene) -> None:
+    """Make a copy save 16-bit PNG, as fast as possible."""
+    settings = scene.render.image_settings
+    _set_format(settings, "IMAGE", "PNG")
+    settings.color_mode, settings.color_depth, settings.compression = "RGB", "16", 0
+
+
+def show_as_stored(scene: bpy.types.Scene) -> None:
+    """Give a copy the view transform that shows sRGB colours as they are."""
+    view = scene.view_settings
+    view.view_transform, view.look = "Standard", "None"
+    view.exposure, view.gamma, view.use_curve_mapping = 0.0, 1.0, False
+    if hasattr(view, "use_white_balance"):  # since 4.3
+        view.use_white_balance = False
+    scene.render.image_settings.color_management = "FOLLOW_SCENE"
+
+
+def _set_format(settings: bpy.types.ImageFormatSettings, media_type: str, file_format: str) -> None:
+    if hasattr(settings, "media_type"):  # since 5.0
+        settings.media_type = media_type
+    settings.file_format = file_format
+    settings.color_management = "FOLLOW_SCENE"
+
+
+class Pass(NamedTuple):
+    """Rendered together: colours times alpha, (3, H, W), alphas and depths, (H, W)."""
+
+    colors: NDArray[np.float32]
+    alphas: NDArray[np.float32]
+    depths: NDArray[np.float32]
+
+
+Blended = tuple[list[NDArray[np.float32]], Callable[[Sequence[NDArray[np.float32]]], Layers]]
+
+
+def _layers_of(files: Sequence[tuple[Path, Path]], world: Path | None, far: float) -> Blended:
+    """Read and remove files, (colours, depths) of each pass and of the world behind.
+    The pictures, (3, H, W) float32, for the view transform, and a callable that makes layers of the
+    transformed ones. Depths from `far` on hold nothing."""
+    passes = []
+    for colors, depths in files:
+        one = _read(colors)
+        away = one.depths if depths == colors else _read(depths).depths
+        passes.append(one._replace(depths=_known(away, one.alphas, far)))
+    return _blended(passes, _read(world).colors if world else None)
+
+
+def _blended(passes: Sequence[Pass], world: NDArray[np.float32] | None) -> Blended:
+    """Each pass as if opaque, and all blended without splats; see `_layers_of`."""
+    nothing = np.zeros_like(passes[0].colors if passes else world)
+    seen = [each for each in passes if each.alphas.any()]
+    passes = seen or [Pass(nothing, nothing[0], nothing[0])]
+    stacked = in_order(passes)
+    over, left = stacked.over_nothing(), stacked.left()[-1]
+    share = np.ones_like(left) if world is not None else 1.0 - left
+    over = over / np.maximum(share, 1e-6) if world is None else over + left * world
+
+    def layers(shown: Sequence[NDArray[np.float32]]) -> Layers:
+        """Layers that look like Blender's without splats: the background corrects the blending."""
+        pairs = zip(seen, shown, strict=False)
+        opaque = [each._replace(colors=each.alphas * colors) for each, colors in pairs]
+        layers = in_order(opaque or passes)
+        return replace(layers, background=share * shown[-1] - layers.over_nothing())
+
+    straight = [each.colors / np.maximum(each.alphas, 1e-6) for each in seen]
+    return [*straight, over.astype(np.float32)], layers
+
+
+def _read(path: Path) -> Pass:
+    channels = {name.split(".", 1)[-1]: values for name, values in read_exr(path).items()}
+    path.unlink()
+    colors = np.stack([channels[f"Combined.{letter}"] for letter in "RGB"])
+    depths = channels["Depth.Z"] if "Depth.Z" in channels else channels["Depth.V"]
+    return Pass(colors, channels["Combined.A"].clip(0.0, 1.0), depths)
+
+
+def _known(depths, alphas, far):
+    """Depth of each pixel, (H, W), 0 where empty.
+    Engines trace one ray, which may miss: edges take the nearest depth, others are in front."""
+    known = np.where(depths >= far, np.float32(np.inf), depths)
+    for _ in range(_ROUNDS):
+        padded = np.pad(known, 1, constant_values=np.inf)
+        around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).min(axis=(2, 3))
+        known = np.where(np.isinf(known), around, known)
+    return np.where(np.isinf(known) | (alphas <= 0.0), np.float32(0.0), known)

@@ -20,7 +20,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, level_objects, splat_group
 from ..viewport import draw as viewport_draw
-from ..viewport.placing import placings
+from ..viewport.content import placings
 from . import (
     camera_operators,
     images,

@@ -16,9 +16,8 @@ from bpy.props import BoolProperty
 
 from .. import main_thread
 from ..core.execute import Cancelled
-from ..render import card, copies, frames
+from ..render import card, frames, meshes
 from ..render.engine import Shared
-from ..render.meshes import drawn_by_us, restore
 from .images import put
 from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle, now
 from .wrapped import counted
@@ -152,7 +151,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         self._shared, self._frames = Shared(card=card.available()), chosen
         self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
         self._started, self._opened, self._done = time.monotonic(), False, 0
-        self._next: copies.Step | None = None
+        self._next: meshes.Step | None = None
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
         """Take the last render's result, or start the next one at the next event:
@@ -176,7 +175,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             raise
         return {"RUNNING_MODAL"}
 
-    def _render(self, context: bpy.types.Context, step: copies.Step) -> None:
+    def _render(self, context: bpy.types.Context, step: meshes.Step) -> None:
         """Make Blender render; the first time it opens its render view, as F12 does."""
         number, total = len(self._shared.frames) + 1, len(self._frames)
         worker = self._running.worker
@@ -289,10 +288,10 @@ def _handlers():
 @persistent
 def _began(scene: bpy.types.Scene, *_: object) -> None:
     """Check whether a render leaves splats out; runs on the rendering thread."""
-    if copies.MARK in scene:
+    if meshes.COPY_OF in scene:
         return
     shown = (layer.objects for layer in scene.view_layers if layer.use)
-    if not any(drawn_by_us(obj) and not obj.hide_render for group in shown for obj in group):
+    if not any(meshes.drawn_by_us(obj) and not obj.hide_render for group in shown for obj in group):
         return
     if bpy.app.background:
         sys.stderr.write(f"{IN_BACKGROUND}\n")
@@ -316,8 +315,8 @@ def _say() -> float | None:
 def _returned(*_: object) -> None:
     """Remove leftovers of a finished render that an undo or a file brought back."""
     if not bpy.app.is_job_running("RENDER"):
-        copies.remove_all()
-        restore()
+        meshes.remove_all()
+        meshes.restore()
 
 
 CLASSES = (REFINE_OT_render, REFINE_OT_watch_render)

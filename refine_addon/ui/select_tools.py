@@ -27,7 +27,6 @@ from ..core.views import pinhole
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import selection
-from ..mesh.edit_mode import readable
 from ..mesh.layout import SplatObject
 from ..viewport import draw as viewport_draw
 from .operator_bases import FAILURES, Answer, Needing, Worker, fail, idle, on_splats
@@ -84,7 +83,7 @@ class Stroke:
             np.array(eye.window_matrix, np.float64),
             (region.width, region.height),
         )
-        with readable(obj) as checked:
+        with selection.readable(obj) as checked:
             away, self.before = _not_drawn(checked), selection.selected(checked.obj)
             digest = mesh_attributes.digest(checked)
             splats = (obj.data.session_uid, digest, matrix.tobytes(), away.tobytes())

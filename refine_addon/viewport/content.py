@@ -1,8 +1,11 @@
-"""The drawn data: splats of meshes, packed once, and their textures."""
+"""The drawn data: splats of meshes, packed once, and their textures; and places of splats in a
+view: objects of the view layer, and instances of collections.
+Blender draws a mesh without faces as points, and has no switch for that. So its evaluated copy,
+which no file, undo step or script sees, is shown as its bounding box; the object is untouched."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -10,6 +13,7 @@ from typing import Any, NamedTuple
 import bpy
 import gpu
 import numpy as np
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..core.errors import RefineError
@@ -18,11 +22,11 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh import selection as mesh_selection
-from ..mesh.edit_mode import readable
-from ..mesh.layout import SplatObject, check, sh_degree
+from ..mesh.layout import SplatObject, check, looks_like_splats, sh_degree, splat_count
 from . import shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
-from .placing import Placing, is_edited
+
+_DEEPEST = 8  # Deepest nesting of instances; Blender draws no more
 
 
 class Marks(NamedTuple):
@@ -167,7 +171,7 @@ class Content:
     def read_edited(self, obj: bpy.types.Object) -> None:
         """Read an object in edit mode; not while Blender draws, as it updates the mesh."""
         self._stale.discard(obj.data.session_uid)
-        with readable(obj) as checked:
+        with mesh_selection.readable(obj) as checked:
             self._read(checked, obj.data.session_uid)
 
     def _read(self, checked: SplatObject, uid: int) -> None:
@@ -250,3 +254,77 @@ def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | Non
     if not attribute or (attribute.data_type, attribute.domain) != (kind, "POINT"):
         return None
     return mesh_attributes.read_attribute(mesh, name)
+
+
+class Placing(NamedTuple):
+    """An object with splats and its (4, 4) matrix to the world.
+    `key`: identity of the object and its instancers in one number, and of the mesh."""
+
+    key: tuple[int, int]
+    obj: bpy.types.Object
+    matrix: NDArray[np.float64]
+
+
+def placings(objects: list[bpy.types.Object]) -> Iterator[Placing]:
+    """Splats among some objects of a scene, and among their instances."""
+    for obj in objects:
+        yield from _placed(obj, obj.matrix_world, 0, 0)
+
+
+def instanced(objects: list[bpy.types.Object]) -> set[bpy.types.Object]:
+    """Splat objects that some objects instance."""
+    return {place.obj for place in placings(objects)} - set(objects)
+
+
+def every() -> set[tuple[int, int]]:
+    """Keys of all splats of the file."""
+    return {placing.key for placing in placings(list(bpy.data.objects))}
+
+
+def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> Iterator[Placing]:
+    """An object's own splats, or those of its instances, given its matrix to the world."""
+    chain = (chain << 32) + obj.session_uid
+    if looks_like_splats(obj):
+        if splat_count(obj.data):
+            yield Placing((chain, obj.data.session_uid), obj, np.array(matrix, np.float64))
+        return
+    collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+    if collection is None or depth == _DEEPEST:
+        return
+    base = matrix @ Matrix.Translation(-collection.instance_offset)
+    for member in collection.all_objects:
+        if not member.hide_viewport:
+            yield from _placed(member, base @ member.matrix_world, chain, depth + 1)
+
+
+def hide_points(depsgraph: bpy.types.Depsgraph, refused: Container[int] | None) -> None:
+    """Show a view layer's splats as bounding boxes, but for refused meshes; None: as points."""
+    for obj, evaluated in _copies(depsgraph):
+        hidden = refused is not None and obj.data.session_uid not in refused
+        wanted = "BOUNDS" if hidden and not is_edited(obj) else obj.display_type
+        if evaluated.display_type != wanted:
+            evaluated.display_type = wanted
+
+
+def is_edited(obj: bpy.types.Object) -> bool:
+    """Whether splats are in edit mode, in this object or another with the same data."""
+    return obj.mode == "EDIT" or getattr(obj.data, "is_editmode", False)
+
+
+def graphs() -> Iterator[bpy.types.Depsgraph]:
+    """Dependency graphs of all windows."""
+    for window in bpy.context.window_manager.windows:
+        yield window.view_layer.depsgraph
+
+
+def _copies(
+    depsgraph: bpy.types.Depsgraph | None,
+) -> Iterator[tuple[bpy.types.Object, bpy.types.Object]]:
+    if depsgraph is None or depsgraph.mode != "VIEWPORT":
+        return
+    objects = [obj.original for obj in depsgraph.scene.objects]
+    for original in {*objects, *instanced(objects)}:
+        if looks_like_splats(original):
+            evaluated = original.evaluated_get(depsgraph)
+            if evaluated.is_evaluated:
+                yield original, evaluated

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
-from . import overlays, placing, shader
-from .content import Content
+from . import overlays, shader
+from .content import Content, every, graphs, hide_points, is_edited, placings
 from .view import Camera, View
 
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
@@ -133,7 +133,7 @@ def _draw() -> None:
     region, region_3d, space = context.region, context.region_data, context.space_data
     visible = [obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)]
     refused = len(_state.content.refused)
-    placed = _state.content.update(placing.placings(visible), placing.every)
+    placed = _state.content.update(placings(visible), every)
     if len(_state.content.refused) > refused:  # Blender shows these as it did before
         bpy.app.timers.register(_hide_points, first_interval=0.0)
     key = region.as_pointer()
@@ -177,7 +177,7 @@ def _read_edited() -> float | None:
     layers = [window.view_layer for window in bpy.context.window_manager.windows]
     _state.reads = True  # which counts as a change of its own
     for obj in {obj for layer in layers for obj in layer.objects}:
-        if placing.is_edited(obj) and looks_like_splats(obj) and splat_count(obj.data):
+        if is_edited(obj) and looks_like_splats(obj) and splat_count(obj.data):
             with contextlib.suppress(RefineError):
                 _state.content.read_edited(obj)
     for layer in layers:
@@ -194,8 +194,8 @@ def _redraw() -> None:
 
 def _hide_points() -> None:
     """Hide the plain points of drawn splats in all windows, or show them."""
-    for depsgraph in placing.graphs():
-        placing.hide_points(depsgraph, None if _state.mode == "OFF" else _state.content.refused)
+    for depsgraph in graphs():
+        hide_points(depsgraph, None if _state.mode == "OFF" else _state.content.refused)
 
 
 def _areas() -> list[bpy.types.Area]:
@@ -238,7 +238,7 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
                     _state.edited_at = time.monotonic()
                     if not bpy.app.timers.is_registered(_read_edited):
                         bpy.app.timers.register(_read_edited, first_interval=_EDIT_REST)
-    placing.hide_points(depsgraph, _state.content.refused)
+    hide_points(depsgraph, _state.content.refused)
 
 
 @persistent

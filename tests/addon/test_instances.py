@@ -27,12 +27,12 @@ def instance(room, empty_scene):
 
 def test_an_instance_stands_where_its_empty_puts_it(addon, room, instance):
     """Twice as large: the room's origin, at z = 5 less the offset of x = 1, is at (-2, 0, 10)."""
-    (place,) = addon.viewport.placing.placings([instance])
+    (place,) = addon.viewport.content.placings([instance])
 
     assert place.obj == room
     np.testing.assert_allclose(place.matrix[:3, 3], [-2.0, 0.0, 10.0])
     np.testing.assert_allclose(place.matrix[:3, :3], 2.0 * np.eye(3))
-    assert addon.viewport.placing.instanced([instance]) == {room}
+    assert addon.viewport.content.instanced([instance]) == {room}
 
 
 def test_instances_within_instances_and_beside_each_other_have_keys_of_their_own(
@@ -49,7 +49,7 @@ def test_instances_within_instances_and_beside_each_other_have_keys_of_their_own
         empty.instance_type, empty.instance_collection = "COLLECTION", both
         empty_scene.collection.objects.link(empty)
         outer.append(empty)
-    places = list(addon.viewport.placing.placings(outer))
+    places = list(addon.viewport.content.placings(outer))
 
     assert len({place.key for place in places}) == 4
     assert {place.key[1] for place in places} == {room.data.session_uid}
@@ -65,7 +65,7 @@ def test_instances_are_followed_as_deep_as_blender_draws_them(addon, instance):
         empty.instance_type, empty.instance_collection = "COLLECTION", collection
         empties.append(empty)
 
-    found = [len(list(addon.viewport.placing.placings([empty]))) for empty in empties]
+    found = [len(list(addon.viewport.content.placings([empty]))) for empty in empties]
     assert found == [1] * 8 + [0]
 
 
@@ -84,7 +84,7 @@ def test_an_instance_is_made_real_and_scored(addon, room, instance):
     np.testing.assert_allclose(np.array(real.matrix_world), np.eye(4))
     assert "refine_score" in real.data.attributes
     assert "refine_score" not in room.data.attributes
-    assert not list(addon.viewport.placing.placings([instance]))
+    assert not list(addon.viewport.content.placings([instance]))
     assert not bpy.ops.refine.make_real.poll()
 
 

@@ -381,7 +381,7 @@ def test_the_processor_renders_small_tiles_between_which_esc_is_heard(
     copy = bpy.data.scenes[".REFINE meshes"].cycles
     assert (copy.use_auto_tile, copy.tile_size) == (True, used)
     assert (cycles.device, cycles.use_auto_tile, cycles.tile_size) == asked
-    addon.render.copies.remove_all()
+    addon.render.meshes.remove_all()
 
 
 @pytest.mark.parametrize(
@@ -445,7 +445,7 @@ def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon)
     operators, begun = addon.ui.render_operators, []
     watch = operators.REFINE_OT_watch_render
     escape = SimpleNamespace(type="ESC", value="PRESS")
-    step = addon.render.copies.Step(bpy.context.scene.name, animation=False, what="meshes")
+    step = addon.render.meshes.Step(bpy.context.scene.name, animation=False, what="meshes")
     waiting = SimpleNamespace(
         _steps=iter([step, step]),
         _next=None,
@@ -496,7 +496,7 @@ def test_splats_that_blender_draws_are_left_to_it(
         bpy.ops.refine.render()
     shot.collection.objects.link(other)
     meshes = addon.render.meshes.Meshes(shot, tmp_path)
-    addon.render.copies.remove_all()
+    addon.render.meshes.remove_all()
 
     assert addon.ui.render_operators.IN_BACKGROUND not in said
     assert meshes.engine == "CYCLES"

@@ -46,7 +46,7 @@ def drawn(addon, content, obj):
     """Return what is drawn of an object, looked at again."""
     content.has_changed()
     key = (obj.session_uid, obj.data.session_uid)
-    found = content.update(addon.viewport.placing.placings([obj]), lambda: {key})
+    found = content.update(addon.viewport.content.placings([obj]), lambda: {key})
     return content.atlas.slots[key] if found else None
 
 
