@@ -1,16 +1,17 @@
-"""Scores on a mesh: point attributes, and a record of the scoring."""
+"""Scores and floaters on a mesh: point attributes, and records of how they were found."""
 
 from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.cleaning.clean import REASONS, Cleaned
 from ..core.errors import RefineError
 from ..core.methods import Method
 from ..core.quality.curve import Quality
@@ -18,7 +19,7 @@ from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
-from .layout import SplatObject, recorded
+from .layout import SplatObject, recorded, splat_count
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: score, rank from 0 (removed first) to 1, number of views that hold it."""
@@ -28,6 +29,10 @@ SCORED = "refine_scored"
 added later."""
 
 RECORD = "refine_scores"  # Custom property of the mesh: record of its scoring, JSON
+
+REASON = "refine_floats"  # Integer point attribute: 0, or the splat's place in `REASONS`, from 1
+
+FOUND = "refine_floaters"  # Custom property of the mesh: floaters by reason, and how sure, JSON
 
 
 def store(
@@ -163,3 +168,59 @@ def _has_scores(mesh: bpy.types.Mesh) -> bool:
     kinds = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
     attributes = ((mesh.attributes.get(name), kind) for name, kind in kinds.items())
     return all(attribute and attribute.data_type == kind for attribute, kind in attributes)
+
+
+def store_floaters(checked: SplatObject, cleaned: Cleaned) -> None:
+    """Write the cleaning result to an object's mesh."""
+    mesh_edit.check_writable(checked.obj)
+    if len(checked) != len(cleaned.keep):
+        raise RefineError(
+            f"object '{checked.obj.name}': has {len(checked)} splats, floaters were looked for "
+            f"among {len(cleaned.keep)}; look again"
+        )
+    reasons = np.zeros(len(cleaned.keep), np.int32)
+    for number, name in enumerate(REASONS, start=1):
+        reasons[cleaned.by_reason[name]] = number
+    mesh_attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
+    counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.by_reason.items()}
+    noted = {"splats": len(reasons), "counts": counts, "sure": cleaned.surety()}
+    checked.mesh[FOUND] = json.dumps(noted)
+    mesh_attributes.updated(checked.mesh)
+
+
+def floater_counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None:
+    """Floaters for each reason; None without a search since the last change."""
+
+    def read(noted: Any) -> dict[str, int] | None:
+        current = noted["splats"] == splat_count(mesh) and REASON in mesh.attributes
+        return {name: int(noted["counts"][name]) for name in REASONS} if current else None
+
+    return recorded(mesh, FOUND, read)
+
+
+def floater_surety(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, float]:
+    """Share of further views that see past the splats of each reason, 0..1, where known."""
+
+    def read(noted: Any) -> dict[str, float]:
+        return {name: float(sure) for name, sure in noted["sure"].items() if sure is not None}
+
+    return recorded(mesh, FOUND, read) or {}
+
+
+def floater_mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
+    """Floaters of these reasons, (N,); `RefineError` without a search since the splats changed."""
+    if floater_counts(checked.mesh) is None:
+        raise RefineError(f"object '{checked.obj.name}': look for floaters first")
+    numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
+    return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)
+
+
+def mark_floaters(checked: SplatObject, reasons: Collection[str]) -> None:
+    """Mark the floaters of these reasons as removed, for the preview."""
+    mesh_edit.mark_removed(checked.obj, floater_mask(checked, reasons))
+
+
+def forget_floaters(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+    """Remove the cleaning result."""
+    mesh_attributes.remove_attribute(mesh, REASON)
+    mesh.pop(FOUND, None)

@@ -20,7 +20,6 @@ from ..core.errors import RefineError
 from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Volume, Zone
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
-from ..mesh import floaters as mesh_floaters
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject, recorded, splat_count
 
@@ -161,7 +160,7 @@ def mark(checked: SplatObject, forced: Forced) -> None:
     if removed is not None:
         if not scored:
             mesh_edit.mark_removed(checked.obj, removed)
-    elif not scored and not mesh_floaters.counts(mesh):
+    elif not scored and not mesh_scores.floater_counts(mesh):
         mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
     if forced.facts or forced.protected is not None or removed is not None:
         volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]

@@ -1,12 +1,12 @@
-"""Operations of panel and command on splat objects: score, apply, export.
+"""Operations of panel and command on splat objects: score, apply, export, levels of detail.
 Several objects are one scene: scored together, under one budget. `mesh.layout.check` checks each.
 A function does all it says, or raises `RefineError` and changes nothing."""
 
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import astuple, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
+from ..core.lod import Level
 from ..core.methods import Merge, Method, Occlusion
 from ..core.result import Result
 from ..core.scores import Scores
@@ -29,13 +30,16 @@ from ..core.volumes import Forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
-from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 from . import demands
 from .demands import Demands
 from .transforms import read_to_move, uneven_notes
+
+LEVEL_FACTS = "refine_lod"  # Custom property of a level object: its stats, as in files' reports
+
+LEVEL_OF = "refine_level_of"  # Custom property of a level object: its original
 
 Members = list["SplatObject"]  # Objects by name; one at least
 
@@ -303,7 +307,7 @@ def reduce_object(checked: SplatObject, change: Change) -> None:
     mesh_attributes.write_rows(checked, change.rows, change.columns)
     if change.columns:
         mesh_drift.renew(checked.mesh)
-    mesh_floaters.forget(checked.mesh)
+    mesh_scores.forget_floaters(checked.mesh)
     checked.mesh.pop(mesh_scores.RECORD, None)
 
 
@@ -344,3 +348,60 @@ def find(name: str) -> bpy.types.Object:
             f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {listed})"
         )
     return obj
+
+
+def add_levels(
+    checked: SplatObject, levels: Sequence[Level], distance: float
+) -> bpy.types.Collection:
+    """Copy the original as an object for each level, ``_lod1`` and so on, in a new collection.
+    Hidden, as all stand in one place; nothing is left on an error. `distance`: views to scene."""
+    name = checked.obj.name
+    collection = bpy.data.collections.new(f"{name} levels")
+    with _nothing_left(collection):
+        bpy.context.scene.collection.children.link(collection)
+        for level in levels:
+            copy = checked.obj.copy()
+            collection.objects.link(copy)
+            copy.data = checked.obj.data.copy()
+            copy.name = copy.data.name = f"{name}_lod{level.number}"
+            bpy.context.view_layer.update()  # its place in the world
+            group = [mesh_layout.check(copy)]
+            frames = frames_of(group)
+            apply(group, changes(frames, level.result))
+            facts = {**level.facts(), "distance": distance}
+            copy[LEVEL_OF] = checked.obj
+            copy[LEVEL_FACTS] = {key: value for key, value in facts.items() if value is not None}
+            copy.select_set(False)
+        for obj in collection.objects:  # all stand in one place
+            obj.hide_set(True)
+            obj.hide_render = True
+    return collection
+
+
+def has_levels(obj: bpy.types.Object | None) -> bool:
+    """Whether an object is a level, or has some."""
+    if obj is None:
+        return False
+    return LEVEL_OF in obj or any(each.get(LEVEL_OF) == obj for each in bpy.data.objects)
+
+
+def levels_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
+    """An object and its levels, finest first, from any of them; `RefineError` without levels."""
+    original = obj.get(LEVEL_OF) or obj
+    levels = [each for each in bpy.data.objects if each.get(LEVEL_OF) == original]
+    if not levels:
+        raise RefineError(f"object '{obj.name}': has no levels; make them first")
+    return [original, *sorted(levels, key=lambda each: each[LEVEL_FACTS]["level"])]
+
+
+@contextmanager
+def _nothing_left(collection: bpy.types.Collection) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        data = [obj.data for obj in collection.objects]
+        for obj in list(collection.objects):
+            bpy.data.objects.remove(obj)
+        bpy.data.batch_remove(data)
+        bpy.data.collections.remove(collection)
+        raise

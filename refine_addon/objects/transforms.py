@@ -22,7 +22,6 @@ from ..core.splats import Splats, above_constant, refuse_mixed
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
-from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
@@ -288,7 +287,7 @@ def _copied(member: SplatObject, bench: bpy.types.Collection, rest: int) -> bpy.
     obj = bpy.data.objects.new("REFINE join", member.mesh.copy())
     bench.objects.link(obj)
     mesh_scores.forget(mesh_layout.check(obj))
-    mesh_floaters.forget(obj.data)
+    mesh_scores.forget_floaters(obj.data)
     mesh_attributes.remove_attribute(obj.data, mesh_edit.FORCE)
     obj.data.pop(demands.FACTS, None)
     for index in range(mesh_layout.rest_count(obj.data), rest):

@@ -29,7 +29,7 @@ from ..core.whole_file import expanded, refuse_existing
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
-from ..objects import level_objects, splat_group
+from ..objects import splat_group
 from .operator_bases import Answer, Job, OnSplats
 
 _FORMATS = (
@@ -152,18 +152,18 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
     @staticmethod
     def new_name(obj: bpy.types.Object) -> str:
         """Name of a folder, which is made."""
-        return f"{level_objects.levels_of(obj)[0].name}_levels"
+        return f"{splat_group.levels_of(obj)[0].name}_levels"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
         """Levels, finest first, path and notes."""
-        objects = level_objects.levels_of(mesh_layout.check(context.object).obj)
+        objects = splat_group.levels_of(mesh_layout.check(context.object).obj)
         moved = self.apply_transform
         each = [mesh_layout.check(obj) for obj in objects]
         files = [splat_group.read_for_export(one, apply_transform=moved) for one in each]
         notes = [
             note for one in each for note in splat_group.export_notes(one, apply_transform=moved)
         ]
-        width = objects[1][level_objects.FACTS].get("distance", np.inf)
+        width = objects[1][splat_group.LEVEL_FACTS].get("distance", np.inf)
         if not moved:  # as long in the object's own unit
             width /= np.cbrt(abs(objects[0].matrix_world.to_3x3().determinant())) or 1.0
         path = expanded(bpy.path.abspath(self.filepath))

@@ -14,8 +14,9 @@ from ..core.errors import RefineError
 from ..core.execute import Progress
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
-from ..mesh import floaters, selection
 from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
+from ..mesh import selection
 from ..mesh.layout import SplatObject
 from ..objects import demands, splat_group
 from ..objects.demands import Demands
@@ -232,8 +233,8 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, cleaned: Any) -> None:
         """Store the floaters, mark them as removed, report them."""
-        floaters.store(group[0], cleaned)
-        floaters.mark(group[0], context.scene.refine.to_reasons())
+        mesh_scores.store_floaters(group[0], cleaned)
+        mesh_scores.mark_floaters(group[0], context.scene.refine.to_reasons())
         self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")
 
 
@@ -267,7 +268,7 @@ class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
         if self.what == "SELECTED":
             going = selection.selected(checked.obj)
         elif self.what == "FLOATERS":
-            going = floaters.mask(checked, settings.to_reasons())
+            going = mesh_scores.floater_mask(checked, settings.to_reasons())
         else:
             going = forced.removed
         if going is not None and forced.protected is not None:

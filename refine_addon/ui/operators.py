@@ -27,7 +27,7 @@ from ..core.visibility import frustum
 from ..core.volumes import Forced
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
-from ..objects import level_objects, splat_group
+from ..objects import splat_group
 from ..objects.splat_group import Change, Members
 from . import plans
 from .images import put
@@ -220,7 +220,7 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
     def put(self, _context: Context, group: Members, job: Any, made: Any) -> None:
         """Make the objects and report each level's cost."""
         (splats, views, levels, _), _ = job
-        collection = level_objects.add_levels(group[0], made, viewing_distance(splats, views))
+        collection = splat_group.add_levels(group[0], made, viewing_distance(splats, views))
         counts = [
             f"{level.facts()['splats']:,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
             for level in made

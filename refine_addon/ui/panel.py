@@ -15,10 +15,10 @@ from ..core.formats.ply import stated_model
 from ..core.quality.alignment import Alignment
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
-from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
+from ..mesh import native
 from ..mesh import scores as mesh_scores
-from ..objects import demands, level_objects, splat_group
+from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
 from ..viewport.content import placings
 from . import (
@@ -233,9 +233,9 @@ class REFINE_PT_clean(_InSidebar, bpy.types.Panel):
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.row(align=True).prop(settings, "strength", expand=True)
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
-        counts = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
-        if counts is not None:
-            reasons, sure = settings.to_reasons(), floaters.surety(obj.data)
+        counts = mesh_layout.looks_like_splats(obj) and mesh_scores.floater_counts(obj.data)
+        if counts:
+            reasons, sure = settings.to_reasons(), mesh_scores.floater_surety(obj.data)
             total = sum(counts[name] for name in reasons)
             text = f"{total:,} of {mesh_layout.splat_count(obj.data):,} float"
             known = sum(counts[name] * sure.get(name, 0.0) for name in reasons)
@@ -293,7 +293,7 @@ class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):
         column = _named_column(layout)
         column.prop(settings, "levels")
         column.operator("refine.levels", icon="MOD_DECIM")
-        if level_objects.has_levels(obj):
+        if splat_group.has_levels(obj):
             column.operator("refine.export_levels", icon="EXPORT")
         names = ("refine.export_ply", "refine.levels", "refine.export_levels")
         _draw_progress(layout, context, *names)

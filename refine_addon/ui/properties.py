@@ -26,8 +26,8 @@ from ..core.methods import METHODS as CORE_METHODS
 from ..core.methods import Merge, Method
 from ..core.selection import Budget
 from ..core.splats import MODELS
-from ..mesh import floaters
 from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
 from ..mesh.edit import MARKING
 from . import plans
 from .marks import RefineVolume
@@ -114,12 +114,12 @@ def _set_model(_settings: RefineSettings, value: int) -> None:
 
 def _mark_floaters(settings: RefineSettings, context: bpy.types.Context) -> None:
     obj = getattr(context, "object", None)  # not in every editor
-    if not mesh_layout.looks_like_splats(obj) or floaters.counts(obj.data) is None:
+    if not mesh_layout.looks_like_splats(obj) or mesh_scores.floater_counts(obj.data) is None:
         return
     if obj.mode == "EDIT":
         return
     with contextlib.suppress(RefineError):  # *Delete Floaters* says what is wrong
-        floaters.mark(mesh_layout.check(obj), settings.to_reasons())
+        mesh_scores.mark_floaters(mesh_layout.check(obj), settings.to_reasons())
 
 
 def _protectable(

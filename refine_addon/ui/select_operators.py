@@ -16,8 +16,9 @@ from ..core.execute import Progress
 from ..core.splats import opacity
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
-from ..mesh import floaters, selection
 from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
+from ..mesh import selection
 from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
@@ -101,7 +102,7 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
             scales = [columns[name] for name in names if name.startswith("scale_")]
             return np.max(scales, axis=0) > np.log(settings.select_size)
         if self.what == "FLOATERS":
-            return floaters.mask(checked, settings.to_reasons())
+            return mesh_scores.floater_mask(checked, settings.to_reasons())
         if self.what == "GOING":
             if mesh_edit.REMOVE not in checked.mesh.attributes:
                 raise RefineError(

@@ -50,7 +50,7 @@ def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
 
     assert (~expected.keep)[moved].mean() > 0.8
     np.testing.assert_array_equal(marked(addon, room), ~expected.keep)
-    found = addon.mesh.floaters.counts(room.data)
+    found = addon.mesh.scores.floater_counts(room.data)
     assert {name: found[name] for name in expected.settings.reasons} == expected.counts()
     assert len(room.data.vertices) == count
 
@@ -76,7 +76,7 @@ def test_marks_follow_the_strength(addon, polluted):
     """Nothing is looked for again: each strength goes for reasons of its own."""
     room, _ = polluted
     bpy.ops.refine.find_floaters()
-    found, counts = addon.mesh.floaters.counts(room.data), {}
+    found, counts = addon.mesh.scores.floater_counts(room.data), {}
     for strength in ("CAREFUL", "USUAL", "STRONG"):
         bpy.context.scene.refine.strength = strength
         counts[strength] = np.count_nonzero(marked(addon, room))
@@ -99,7 +99,7 @@ def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     left = addon.mesh.attributes.read_attribute(room.data, "opacity")
     np.testing.assert_array_equal(left, opacities[~goes])
     assert addon.mesh.scores.record(room.data) is None
-    assert addon.mesh.floaters.counts(room.data) is None
+    assert addon.mesh.scores.floater_counts(room.data) is None
     with pytest.raises(RuntimeError, match="look for floaters first"):
         bpy.ops.refine.delete(what="FLOATERS")
 
@@ -144,7 +144,7 @@ def test_with_no_floaters_to_delete_scores_and_findings_stay(addon, polluted):
 
     assert len(room.data.vertices) == 9_939
     assert addon.mesh.scores.record(room.data) is not None
-    assert addon.mesh.floaters.counts(room.data) is not None
+    assert addon.mesh.scores.floater_counts(room.data) is not None
 
 
 def test_what_was_found_is_of_no_use_once_splats_were_added(addon, polluted):
@@ -153,14 +153,14 @@ def test_what_was_found_is_of_no_use_once_splats_were_added(addon, polluted):
     bpy.ops.refine.find_floaters()
     room.data.vertices.add(1)
 
-    assert addon.mesh.floaters.counts(room.data) is None
+    assert addon.mesh.scores.floater_counts(room.data) is None
     with pytest.raises(addon.core.RefineError, match="look for floaters first"):
-        addon.mesh.floaters.mask(addon.mesh.layout.check(room), ("front",))
+        addon.mesh.scores.floater_mask(addon.mesh.layout.check(room), ("front",))
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", json.dumps({"splats": 39755})])
 def test_a_damaged_note_counts_as_none(addon, room, text):
     """A .blend may come from anywhere."""
-    room.data[addon.mesh.floaters.FOUND] = text
+    room.data[addon.mesh.scores.FOUND] = text
 
-    assert addon.mesh.floaters.counts(room.data) is None
+    assert addon.mesh.scores.floater_counts(room.data) is None

@@ -167,7 +167,7 @@ def test_levels_are_exported_as_a_streamed_sog(addon, few, tmp_path):
 
 def test_the_button_stands_where_there_are_levels(addon, few):
     """On the object and on each level; on another there is none."""
-    has = addon.objects.level_objects.has_levels
+    has = addon.objects.splat_group.has_levels
     assert not has(few)
     assert not has(None)
 

@@ -520,7 +520,7 @@ def test_levels_and_floaters_leave_out_what_must_go(addon, core, room, quarter, 
     bpy.ops.refine.levels()
 
     assert not found[removed | protected].any()
-    counts = addon.mesh.floaters.counts(room.data)
+    counts = addon.mesh.scores.floater_counts(room.data)
     assert {name: counts[name] for name in expected.settings.reasons} == expected.counts()
     level = bpy.data.objects["room_lod1"]
     assert len(level.data.vertices) == 1988  # .2 of 9939, rounded up
