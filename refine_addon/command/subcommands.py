@@ -92,7 +92,7 @@ def _prune(run: Run, source: Path | str, output: Path | None) -> dict[str, Any]:
     if options.pictures:
         how["pictures"] = PictureFiles(options.pictures, without_suffix(name), options.overwrite)
     if options.object:
-        from ..objects.operation import prune_object
+        from ..objects.splat_group import prune_object
 
         return _say_pruned(run, name, prune_object(source, views, save=options.save, **how))
     done = core.prune_file(source, views=views, cleaning=options.cleaning, **how)
@@ -166,7 +166,7 @@ def _clean(run: Run, source: Path, output: Path | None) -> dict[str, Any]:
 def _score(run: Run, source: Path | str, output: Path) -> dict[str, Any]:
     method, views = run.options.how, run.views()
     if run.options.object:
-        from ..objects.operation import score_object
+        from ..objects.splat_group import score_object
 
         done = score_object(source, views, method, output=output, **_how(run, source))
     else:

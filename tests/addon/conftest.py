@@ -47,7 +47,6 @@ def addon(extension):
     for path in (ROOT / "refine_addon").glob("*.py"):
         if not path.stem.startswith("__"):
             importlib.import_module(f"{MODULE}.{path.stem}")
-    importlib.import_module(f"{MODULE}.objects.operation")  # which the command alone loads
     return extension
 
 

@@ -119,7 +119,7 @@ def test_an_object_is_pruned_to_a_size_in_another_format(addon, small, tmp_path)
     """3,200 bytes hold 100 splats of a .splat; the size of a .spz does not follow from them."""
     bpy.ops.refine.import_ply(filepath=str(small))
     core, views = addon.core, addon.core.read_cameras(ROOM / "cameras.json")
-    prune, name = addon.objects.operation.prune_object, bpy.context.object.name
+    prune, name = addon.objects.splat_group.prune_object, bpy.context.object.name
 
     report = prune(name, views, core.Budget(max_mb=0.0032), output=tmp_path / "a.splat")
 

@@ -111,7 +111,7 @@ def test_the_command_on_an_object_writes_the_same_splats(addon, few, room_views,
     count = len(room.data.vertices)
     out = tmp_path / "out.ply"
 
-    report = addon.objects.operation.prune_object(
+    report = addon.objects.splat_group.prune_object(
         room.name, room_views, budget, addon.core.METHODS[method](), output=out
     )
 
@@ -129,7 +129,7 @@ def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tm
     expected = merged_in_core(addon, room, room_views, budget).merged
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
 
-    addon.objects.operation.prune_object(room.name, room_views, budget, save=True)
+    addon.objects.splat_group.prune_object(room.name, room_views, budget, save=True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
 
     obj = bpy.data.objects["room"]
@@ -155,13 +155,13 @@ def test_nothing_is_saved_over_where_refitting_was_stopped(
     asked = room.name, room_views, budget, addon.core.ClosedForm()
 
     with pytest.raises(addon.core.Cancelled):
-        addon.objects.operation.prune_object(*asked, output=out, save=True)
+        addon.objects.splat_group.prune_object(*asked, output=out, save=True)
 
     assert not out.exists()
     assert (tmp_path / "scene.blend").read_bytes() == before
     assert len(room.data.vertices) == count
     with pytest.raises(addon.core.Cancelled):
-        addon.objects.operation.prune_object(*asked, output=out)
+        addon.objects.splat_group.prune_object(*asked, output=out)
     assert out.exists()
 
 
@@ -189,7 +189,7 @@ def test_splats_are_merged_unless_the_scale_is_uneven(addon, few, room_views, sc
     room.scale = (1.0, scale, 1.0)
     bpy.context.view_layer.update()
 
-    report = addon.objects.operation.prune_object(room.name, room_views, budget, dry_run=True)
+    report = addon.objects.splat_group.prune_object(room.name, room_views, budget, dry_run=True)
     bpy.ops.refine.score()
     before = len(room.data.vertices)
     bpy.ops.refine.apply()

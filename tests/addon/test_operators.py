@@ -524,7 +524,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
     core = addon.core
     views = core.read_cameras(ROOM / "cameras.json")
     with pytest.raises(core.RefineError, match=r"^~nouser/x\.ply: cannot be found"):
-        addon.objects.operation.prune_object(
+        addon.objects.splat_group.prune_object(
             "room", views, core.Budget(ratio=0.5), output=Path("~nouser/x.ply")
         )
 

@@ -54,7 +54,7 @@ def test_save_prunes_the_object_in_the_blend(addon, scene_file):
 def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):
     """Nor does it write."""
     unchanged.start()
-    report = addon.objects.operation.prune_object(
+    report = addon.objects.splat_group.prune_object(
         "room",
         addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context),
         addon.core.Budget(keep=1000),
@@ -74,7 +74,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
     """The message lists the splat objects of the scene."""
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
-        addon.objects.operation.prune_object(
+        addon.objects.splat_group.prune_object(
             "rooom", views, addon.core.Budget(ratio=0.5), **options
         )
 
@@ -83,7 +83,9 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
     """There is no file to save to."""
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
-        addon.objects.operation.prune_object("room", views, addon.core.Budget(ratio=0.5), save=True)
+        addon.objects.splat_group.prune_object(
+            "room", views, addon.core.Budget(ratio=0.5), save=True
+        )
     assert len(room.data.vertices) == 39755
 
 

@@ -574,7 +574,7 @@ def test_score_apply_and_export_say_what_was_done(
         said = capfd.readouterr()
         assert "splats were transformed without" in said.out + said.err
     core = addon.core
-    report = addon.objects.operation.prune_object(
+    report = addon.objects.splat_group.prune_object(
         imported.name, room_views, core.Budget(ratio=0.5), core.ClosedForm(), dry_run=True
     )
 

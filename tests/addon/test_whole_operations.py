@@ -84,7 +84,7 @@ def test_an_apply_that_fails_leaves_the_mesh_as_it_was(few, fail_at, stage):
 
 def pruned(addon, room_views, tmp_path, method="merge"):
     """Prune the object as the command does, to a file and in the .blend."""
-    return addon.objects.operation.prune_object(
+    return addon.objects.splat_group.prune_object(
         "room",
         room_views,
         addon.core.Budget(ratio=0.6),

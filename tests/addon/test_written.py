@@ -20,7 +20,7 @@ def test_the_file_of_a_moved_object_is_compared_where_the_object_stands(
     bpy.context.view_layer.update()
     views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context).take(range(0, 72, 6))
 
-    report = addon.objects.operation.prune_object(
+    report = addon.objects.splat_group.prune_object(
         "room", views, core.Budget(ratio=0.3), core.Occlusion(), output=tmp_path / "a.glb"
     )
 
@@ -36,7 +36,7 @@ def test_the_report_of_an_object_counts_what_the_file_holds(
     for vertex in room.data.vertices[:3]:
         vertex.co.x = np.nan
 
-    report = addon.objects.operation.prune_object(
+    report = addon.objects.splat_group.prune_object(
         "room",
         room_views.take(range(4)),
         core.Budget(ratio=0.0),
