@@ -13,8 +13,7 @@ from ..cameras.sets import CameraChoice
 from ..core import RefineError, ViewSet
 from ..core.execute import Cancelled
 from ..objects import splat_group
-from ..render import frames
-from ..render.engine import Shared
+from ..render import engine
 
 
 def opened(words: Sequence[str] | None = None) -> str:
@@ -60,13 +59,13 @@ def views(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
 
 def render(options: argparse.Namespace, say: Callable[..., None]) -> None:
     """Render frames of the open scene to its output path; `say` prints lines."""
-    scene, shared = bpy.context.scene, Shared()
+    scene, shared = bpy.context.scene, engine.Shared()
     chosen: Any = range(scene.frame_current, scene.frame_current + 1)
     if options.source:
         every = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         chosen = options.source[1] or every
     try:
-        for step in filter(None, frames.steps(scene, chosen, shared, write=True)):
+        for step in filter(None, engine.steps(scene, chosen, shared, write=True)):
             bpy.ops.render.render(scene=step.scene, animation=step.animation)
     except Cancelled:
         raise RefineError("a render was stopped") from None
@@ -80,7 +79,7 @@ def render(options: argparse.Namespace, say: Callable[..., None]) -> None:
     if drawn:
         among = f" among what {shared.engine} rendered" if shared.engine else ""
         say(f"  {shared.splats:,} splats{among}")
-        say(*(f"  note: {note}" for note in frames.left_out(scene)))
+        say(*(f"  note: {note}" for note in engine.left_out(scene)))
     if shared.engine and shared.engine != scene.render.engine:
         engines = f"all but splats is by {shared.engine}, not {scene.render.engine}"
         say(f"  note: {engines}: there is no graphics card, or only the world to render")

@@ -16,8 +16,7 @@ from bpy.props import BoolProperty
 
 from .. import main_thread
 from ..core.execute import Cancelled
-from ..render import card, frames, meshes
-from ..render.engine import Shared
+from ..render import card, engine, meshes
 from .images import put
 from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle, now
 from .wrapped import counted
@@ -41,10 +40,10 @@ _LINGERS = 10.0  # Seconds that it stays after the render
 _until: list[float] = []
 
 
-_watched: list[Shared] = []  # What Esc stops; each `_watch_anew` makes another list
+_watched: list[engine.Shared] = []  # What Esc stops; each `_watch_anew` makes another list
 
 
-def _watch_anew(shared: Shared) -> None:
+def _watch_anew(shared: engine.Shared) -> None:
     """Watch for Esc ahead of other handlers, in all windows: one may show the render."""
     global _watched
     _watched.clear()
@@ -148,8 +147,8 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         chosen = [scene.frame_current]
         if self.animation:
             chosen = [*range(scene.frame_start, scene.frame_end + 1, scene.frame_step)]
-        self._shared, self._frames = Shared(card=card.available()), chosen
-        self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
+        self._shared, self._frames = engine.Shared(card=card.available()), chosen
+        self._steps = engine.steps(scene, chosen, self._shared, write=self.animation)
         self._started, self._opened, self._done = time.monotonic(), False, 0
         self._next: meshes.Step | None = None
 
@@ -219,7 +218,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         what = counted(len(shared.frames), "frame") if self.animation else "Rendered"
         among = f" among what {shared.engine} rendered" if shared.engine else ""
         self.report({"INFO"}, f"{what}: {shared.splats:,} splats{among}, {seconds:.1f} s")
-        for sentence in frames.left_out(context.scene):
+        for sentence in engine.left_out(context.scene):
             self.report({"WARNING"}, sentence)
         return {"FINISHED"}
 

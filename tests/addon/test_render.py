@@ -523,7 +523,7 @@ def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys)
 def test_what_splats_are_rendered_without_is_said(addon, shot, tmp_path, capsys):
     """A camera with depth of field, a scene with motion blur and compositing nodes."""
     shot.render.filepath = str(tmp_path / "f_##")
-    quiet = addon.render.frames.left_out(shot)
+    quiet = addon.render.engine.left_out(shot)
     shot.camera.data.dof.use_dof = shot.render.use_motion_blur = True
     if not hasattr(shot, "compositing_node_group"):
         shot.use_nodes = True
