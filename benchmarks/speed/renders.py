@@ -28,7 +28,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 import refine_addon
-from refine_addon.cameras.objects import SOURCE, view_from_camera
+from refine_addon.cameras import SOURCE, view_from_camera
 from refine_addon.core import read_ply
 
 from ..renderer.rasterizer import render

@@ -9,7 +9,7 @@ from typing import Any
 
 import bpy
 
-from ..cameras.sets import CameraChoice
+from ..cameras import CameraChoice
 from ..core import RefineError, ViewSet
 from ..core.execute import Cancelled
 from ..objects import splat_group

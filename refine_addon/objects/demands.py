@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.objects import world_matrix
+from ..cameras import world_matrix
 from ..core import volumes as core_volumes
 from ..core.affine import moved
 from ..core.errors import RefineError

@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.objects import world_matrix
+from ..cameras import world_matrix
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.formats.format import Format

@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.objects import snapped, world_matrix
+from ..cameras import snapped, world_matrix
 from ..core.affine import Move, baked, check_affine, is_flat, is_uniform, moved
 from ..core.errors import RefineError
 from ..core.execute import Progress, chunks, run_all, silent

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import main_thread
-from ..cameras.objects import pose
+from ..cameras import pose
 from ..core.affine import is_flat, transformed
 from ..core.errors import RefineError
 from ..core.execute import Cancelled, checked_by, checkpoint, report

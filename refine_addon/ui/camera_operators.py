@@ -11,8 +11,7 @@ import mathutils
 import numpy as np
 from bpy.props import BoolProperty, IntProperty
 
-from ..cameras.objects import UPRIGHT
-from ..cameras.sets import CameraChoice
+from ..cameras import UPRIGHT, CameraChoice
 from ..core.errors import RefineError
 from ..core.quality.curve import in_words
 from ..mesh import edit as mesh_edit

@@ -13,8 +13,7 @@ from bpy.props import BoolProperty, CollectionProperty, IntProperty, StringPrope
 from bpy.types import Context
 from bpy_extras.io_utils import ImportHelper
 
-from ..cameras.objects import SHEAR, SOURCE, UPRIGHT
-from ..cameras.sets import create_cameras, known_turn
+from ..cameras import SHEAR, SOURCE, UPRIGHT, create_cameras, known_turn
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError
 from ..core.execute import Progress, part, report

@@ -13,7 +13,7 @@ import numpy as np
 from bpy.types import Context
 from numpy.typing import NDArray
 
-from ..cameras.sets import CameraChoice
+from ..cameras import CameraChoice
 from ..core.execute import Progress, part
 from ..core.lod import Level, lod, viewing_distance
 from ..core.pictures import AMPLIFIED, KINDS, Comparison, compare

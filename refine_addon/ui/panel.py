@@ -9,7 +9,7 @@ import bpy
 from bpy.props import EnumProperty
 from mathutils import Matrix
 
-from ..cameras.sets import CameraChoice, known_turn
+from ..cameras import CameraChoice, known_turn
 from ..core.errors import RefineError
 from ..core.formats.ply import stated_model
 from ..core.quality.alignment import Alignment

@@ -13,8 +13,7 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ..cameras.objects import SOURCE, WEIGHT, render_size
-from ..cameras.sets import CameraChoice
+from ..cameras import SOURCE, WEIGHT, CameraChoice, render_size
 from ..core.errors import RefineError
 from ..core.execute import in_time
 from ..core.methods import ClosedForm, Occlusion

@@ -17,7 +17,7 @@ from bpy.types import Context
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-from ..cameras.objects import world_matrix
+from ..cameras import world_matrix
 from ..core import picking
 from ..core.affine import transformed
 from ..core.execute import Progress

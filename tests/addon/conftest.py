@@ -132,7 +132,7 @@ def room_cameras(addon, empty_scene, room_views):
     """Import the room's cameras as objects, in a collection; score by the fastest method."""
     collection = bpy.data.collections.new("cameras")
     empty_scene.collection.children.link(collection)
-    addon.cameras.sets.create_cameras(room_views, collection)
+    addon.cameras.create_cameras(room_views, collection)
     empty_scene.refine.collection = collection
     empty_scene.refine.source = "COLLECTION"
     empty_scene.refine.method = "closed-form"

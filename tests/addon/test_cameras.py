@@ -27,7 +27,7 @@ def _set(target, values):
 
 
 def _view(addon, obj):
-    return addon.cameras.objects.view_from_camera(
+    return addon.cameras.view_from_camera(
         obj, bpy.context.scene, bpy.context.evaluated_depsgraph_get()
     )
 
@@ -218,7 +218,7 @@ def test_a_disabled_camera_is_read_if_it_can_be(addon):
 
 
 def _names(addon, source, **options):
-    views = addon.cameras.sets.CameraChoice(source, **options).views(bpy.context)
+    views = addon.cameras.CameraChoice(source, **options).views(bpy.context)
     return [view.name for view in views]
 
 
@@ -240,7 +240,7 @@ def test_each_source_gives_its_cameras(addon):
     assert _names(addon, "SELECTED") == ["second"]
     assert sorted(_names(addon, "VISIBLE")) == ["first", "second"]
     assert sorted(_names(addon, "COLLECTION", collection=outer)) == ["second", "third"]
-    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
+    views = addon.cameras.CameraChoice("VISIBLE").views(bpy.context)
     assert views.views[0].name in ("first", "second")
 
 
@@ -260,7 +260,7 @@ def test_a_shot_is_a_view_set_and_the_frame_is_put_back(addon):
     _animate(scene.camera, "location", {1: 1.0, 5: 5.0}, index=0)
     _animate(scene.camera.data, "lens", {1: 50.0, 5: 100.0})
     scene.frame_set(4, subframe=0.25)
-    views = addon.cameras.sets.views_from_frames(bpy.context, range(1, 6, 2))
+    views = addon.cameras.views_from_frames(bpy.context, range(1, 6, 2))
 
     assert [round(view.center[0], 5) for view in views] == [1.0, 3.0, 5.0]
     assert math.isclose(views[2].fx, 2 * views[0].fx)
@@ -275,7 +275,7 @@ def test_cameras_bound_to_markers_take_over(addon):
     for frame, camera in ((1, first), (3, second)):
         scene.timeline_markers.new(camera.name, frame=frame).camera = camera
     scene.camera = other
-    views = addon.cameras.sets.views_from_frames(bpy.context, range(1, 5))
+    views = addon.cameras.views_from_frames(bpy.context, range(1, 5))
 
     assert [view.name.split(",")[0] for view in views] == ["first", "first", "second", "second"]
     assert scene.camera is other
@@ -292,7 +292,7 @@ def test_an_error_in_the_midst_of_a_shot_puts_the_frame_back(addon):
     scene.frame_set(2)
 
     with pytest.raises(addon.core.RefineError, match="'flat' is orthographic"):
-        addon.cameras.sets.views_from_frames(bpy.context, range(1, 5))
+        addon.cameras.views_from_frames(bpy.context, range(1, 5))
     assert scene.frame_current == 2
     assert scene.camera is first
 
@@ -300,7 +300,7 @@ def test_an_error_in_the_midst_of_a_shot_puts_the_frame_back(addon):
 def test_an_empty_range_of_frames_is_refused(addon):
     """From 5 to 4."""
     with pytest.raises(addon.core.RefineError, match="starts at 5 and ends at 4"):
-        addon.cameras.sets.views_from_frames(bpy.context, range(5, 5))
+        addon.cameras.views_from_frames(bpy.context, range(5, 5))
 
 
 def test_a_turntable_is_seen_from_all_sides(addon, room):
@@ -313,7 +313,7 @@ def test_a_turntable_is_seen_from_all_sides(addon, room):
     scene.camera = _camera(location=(4.0, 0.0, 0.0))
     _animate(room, "rotation_euler", {1: 0.0, 2: math.pi / 2}, index=2)
     scene.frame_set(1)
-    views = addon.cameras.sets.views_from_frames(bpy.context, range(1, 3), room)
+    views = addon.cameras.views_from_frames(bpy.context, range(1, 3), room)
 
     assert np.allclose(views[0].center, [4, 0, 0])
     assert np.allclose(views[1].center, [0, -4, 0], atol=1e-6)
@@ -328,7 +328,7 @@ def test_an_animated_scale_of_the_splats_is_refused(addon, room):
     _animate(room, "scale", {1: 1.0, 2: 2.0}, index=2)
 
     with pytest.raises(addon.core.RefineError, match="scale is animated"):
-        addon.cameras.sets.views_from_frames(bpy.context, range(1, 3), room)
+        addon.cameras.views_from_frames(bpy.context, range(1, 3), room)
 
 
 def _close(got, expected):
@@ -341,7 +341,7 @@ def _close(got, expected):
 def test_imported_cameras_give_back_the_views_of_their_file(addon, room_cameras, room_views):
     """To the last digit, though Blender's matrices are float32 and the render size is another."""
     bpy.context.scene.render.resolution_x = 999
-    views = addon.cameras.sets.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
+    views = addon.cameras.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
 
     assert len(views) == 72
     for got, expected in zip(views, room_views, strict=True):
@@ -352,7 +352,7 @@ def test_blender_shows_what_the_imported_camera_saw(addon, room_cameras, room_vi
     """Without the note: at the file's resolution pose and frame agree to float32."""
     for camera in room_cameras.objects:
         del camera["refine_view"]
-    views = addon.cameras.sets.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
+    views = addon.cameras.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
 
     for got, expected in zip(views, room_views, strict=True):
         assert np.allclose(got.rotation, expected.rotation, atol=1e-6)
@@ -374,7 +374,7 @@ def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, 
     ).keep
     for camera in room_cameras.objects:
         del camera["refine_view"]
-    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
+    views = addon.cameras.CameraChoice("VISIBLE").views(bpy.context)
     got = core.prune(
         addon.objects.splat_group.gather([addon.mesh.layout.check(room)]),
         views,
@@ -422,7 +422,7 @@ def test_any_view_becomes_a_camera_that_blender_frames_alike(
         rotation = rotation * np.array([-1.0, 1.0, 1.0])
     cx, cy = middle[0] * 240, middle[1] * 160
     expected = core.View(rotation, np.array(center), focal, focal, cx, cy, 240, 160)
-    camera = addon.cameras.objects.camera_from_view(expected)
+    camera = addon.cameras.camera_from_view(expected)
     bpy.context.scene.collection.objects.link(camera)
     del camera["refine_view"]
     got = _view(addon, camera)

@@ -34,7 +34,7 @@ def test_the_pictures_are_those_of_what_apply_leaves(addon, quarter, room_camera
     bpy.ops.refine.apply()
     after = gather([check(quarter)], whole=True)
     assert len(after) == 9_939 - 6_957  # floor(.7 * 9939)
-    views = addon.cameras.sets.CameraChoice("ACTIVE").views(bpy.context, quarter)
+    views = addon.cameras.CameraChoice("ACTIVE").views(bpy.context, quarter)
     (expected,) = addon.core.pictures.compare(before, after, views)
     assert (expected.view.width, expected.view.height) == (240, 160)
     for name, wanted in zip(NAMES, ("before", "after", "difference"), strict=True):

@@ -61,7 +61,7 @@ def test_one_import_brings_the_cameras_that_lie_above(addon, capture, upright):
     assert (scene.render.resolution_x, scene.render.resolution_y) == (240, 160)
     assert scene.camera.name == "000"
     assert bpy.context.object.name == "point_cloud"
-    assert addon.cameras.sets.known_turn(bpy.context, bpy.context.object) == 0
+    assert addon.cameras.known_turn(bpy.context, bpy.context.object) == 0
 
 
 def test_scripts_get_no_cameras_unasked(capture):
@@ -196,7 +196,7 @@ def test_a_mismatch_of_the_up_axis_is_told_at_import(addon, imported, capfd, spl
     obj = imported(splats=splats, cameras=not splats)
 
     assert "do not share an up axis" in capfd.readouterr().out
-    assert addon.cameras.sets.known_turn(bpy.context, obj) == turn
+    assert addon.cameras.known_turn(bpy.context, obj) == turn
     assert addon.mesh.scores.record(obj.data) is None
 
 
@@ -213,7 +213,7 @@ def test_turning_the_cameras_drops_their_scores(addon, imported):
     left = {"refine_score", "refine_rank", "refine_remove", "refine_scored"}
     assert not left & set(obj.data.attributes.keys())
     assert not bpy.ops.refine.apply.poll()
-    assert addon.cameras.sets.known_turn(bpy.context, obj) == 0
+    assert addon.cameras.known_turn(bpy.context, obj) == 0
 
 
 def test_what_compare_measured_stays_in_the_panel_while_the_plan_is_the_same(

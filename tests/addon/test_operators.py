@@ -474,7 +474,7 @@ def test_edit_mode_greys_the_buttons(room, room_cameras):
 @pytest.mark.parametrize("how", ["hide_set", "hide_viewport", "exclude"])
 def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_cameras, score, how):
     """By the eye, by the monitor icon, by excluding the collection; the command reaches all."""
-    views = addon.cameras.sets.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
+    views = addon.cameras.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
     expected = addon.core.prune(
         addon.objects.splat_group.gather([addon.mesh.layout.check(room)]),
         views,

@@ -133,7 +133,7 @@ def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
 def test_the_command_notes_what_the_panel_warns_of(addon, imported):
     """On an object of the scene, by the cameras that the panel chooses."""
     obj = imported(splats=True, cameras=False)
-    views = addon.cameras.sets.CameraChoice.of_scene(bpy.context.scene).views(bpy.context, obj)
+    views = addon.cameras.CameraChoice.of_scene(bpy.context.scene).views(bpy.context, obj)
     report = addon.objects.splat_group.prune_object(
         obj.name, views, addon.core.Budget(ratio=0.5), addon.core.ClosedForm(), dry_run=True
     )

@@ -47,7 +47,7 @@ def rendered():
 
 def drawn(addon, scene, obj, **changes):
     """Return what core draws of an object in the scene's camera, alpha not multiplied."""
-    view = addon.cameras.objects.view_from_camera(
+    view = addon.cameras.view_from_camera(
         scene.camera, scene, bpy.context.evaluated_depsgraph_get()
     )
     splats = addon.objects.splat_group.gather([addon.mesh.layout.check(obj)], whole=True)
@@ -159,9 +159,7 @@ def test_splats_between_glass_and_a_wall_are_seen(addon, shot, quarter):
     shot.view_settings.view_transform = "Standard"
     shot.cycles.samples = 64
     depths = addon.objects.splat_group.gather([addon.mesh.layout.check(quarter)], whole=True).means
-    view = addon.cameras.objects.view_from_camera(
-        shot.camera, shot, bpy.context.evaluated_depsgraph_get()
-    )
+    view = addon.cameras.view_from_camera(shot.camera, shot, bpy.context.evaluated_depsgraph_get())
     depths = (depths - view.center) @ view.rotation[2]
     far = float(np.median(depths[depths > 0.2]))
     plane(shot, far, (0.0, 0.0, 0.0), width=90.0).name = "wall"
@@ -189,9 +187,7 @@ def test_splats_among_glass_and_walls_are_those_of_the_reference_renderer(addon,
     """
     shot.render.resolution_percentage, shot.cycles.samples = 100, 64
     shot.view_settings.view_transform = "Standard"
-    view = addon.cameras.objects.view_from_camera(
-        shot.camera, shot, bpy.context.evaluated_depsgraph_get()
-    )
+    view = addon.cameras.view_from_camera(shot.camera, shot, bpy.context.evaluated_depsgraph_get())
     splats = addon.objects.splat_group.gather([addon.mesh.layout.check(quarter)], whole=True)
     depths = (splats.means - view.center) @ view.rotation[2]
     expected, light = np.zeros((2, 80, 120, 3))

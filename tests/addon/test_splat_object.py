@@ -56,7 +56,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):
     unchanged.start()
     report = addon.objects.splat_group.prune_object(
         "room",
-        addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context),
+        addon.cameras.CameraChoice("VISIBLE").views(bpy.context),
         addon.core.Budget(keep=1000),
         addon.core.ClosedForm(),
         dry_run=True,
@@ -72,7 +72,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):
 @pytest.mark.parametrize("options", [{}, {"save": True}])
 def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_file, options):
     """The message lists the splat objects of the scene."""
-    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
+    views = addon.cameras.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
         addon.objects.splat_group.prune_object(
             "rooom", views, addon.core.Budget(ratio=0.5), **options
@@ -81,7 +81,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
 
 def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_cameras):
     """There is no file to save to."""
-    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
+    views = addon.cameras.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
         addon.objects.splat_group.prune_object(
             "room", views, addon.core.Budget(ratio=0.5), save=True
@@ -90,7 +90,7 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
 
 
 def _ranked(addon, obj, score):
-    score(obj, addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context))
+    score(obj, addon.cameras.CameraChoice("VISIBLE").views(bpy.context))
     return addon.mesh.attributes.read_attribute(obj.data, "refine_rank")
 
 
@@ -179,7 +179,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
 
 def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):
     """Someone deleted a vertex while the scoring ran."""
-    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
+    views = addon.cameras.CameraChoice("VISIBLE").views(bpy.context)
     scores = addon.core.score(
         addon.objects.splat_group.gather([addon.mesh.layout.check(room)]),
         views,

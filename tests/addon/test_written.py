@@ -18,7 +18,7 @@ def test_the_file_of_a_moved_object_is_compared_where_the_object_stands(
     for obj in (room, *(o for o in bpy.data.objects if o.type == "CAMERA")):
         obj.matrix_world = move @ obj.matrix_world
     bpy.context.view_layer.update()
-    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context).take(range(0, 72, 6))
+    views = addon.cameras.CameraChoice("VISIBLE").views(bpy.context).take(range(0, 72, 6))
 
     report = addon.objects.splat_group.prune_object(
         "room", views, core.Budget(ratio=0.3), core.Occlusion(), output=tmp_path / "a.glb"

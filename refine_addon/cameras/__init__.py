@@ -1,1 +1,0 @@
-"""Blender's cameras as views, and views as Blender's cameras."""
