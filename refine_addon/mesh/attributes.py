@@ -53,7 +53,8 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
     rows = source.rows
     mesh = bpy.data.meshes.new(scene_name(source.path))
     try:
-        add_vertices(mesh, len(rows))
+        mesh.vertices.add(len(rows))
+        remove_attribute(mesh, ".select_vert")  # Blender's default selects all
         columns = add_attributes(mesh, rows.dtype, source.header)
         _fill(mesh, rows, columns)
         mesh.update()
@@ -61,12 +62,6 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
         bpy.data.meshes.remove(mesh)
         raise
     return mesh
-
-
-def add_vertices(mesh: bpy.types.Mesh, count: int) -> None:
-    """Add vertices to an empty mesh, deselected, unlike Blender's default."""
-    mesh.vertices.add(count)
-    remove_attribute(mesh, ".select_vert")
 
 
 def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
@@ -215,12 +210,6 @@ def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
         mesh.update()
 
 
-def normals(checked: SplatObject) -> NDArray[np.float32]:
-    """Columns nx, ny, nz, (N, 3)."""
-    read = _Reader(checked)
-    return np.stack([read.stored(name) for name in ("nx", "ny", "nz")], axis=-1)
-
-
 def read_attribute(mesh: bpy.types.Mesh, name: str) -> NDArray[Any]:
     """A point attribute, (N,), or (N, width) for vectors and colours."""
     attribute = mesh.attributes[name]
@@ -266,27 +255,20 @@ class _Reader:
         self.columns = {column.name: column for column in checked.layout.columns}
         self.vectors: dict[str, NDArray[np.float32]] = {}
 
-    def stored(self, name: str) -> NDArray[Any]:
+    def __getitem__(self, name: str) -> NDArray[Any]:
         """A column as in the file, unsigned integers by their bits.
         Activated values come in float64, so that they can be written back unchanged."""
         column = self.columns[name]
         place = column.place
-        values = self._values(place.attribute)
+        values = self.vectors.get(place.attribute)
+        if values is None:
+            values = read_attribute(self.mesh, place.attribute)
         if values.ndim > 1:
+            self.vectors = {place.attribute: values}
             values = values[:, place.component]
         if place.coding:
             return place.coding.to_file(values)
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
-
-    def _values(self, attribute: str) -> NDArray[Any]:
-        if attribute in self.vectors:
-            return self.vectors[attribute]
-        values = read_attribute(self.mesh, attribute)
-        if values.ndim > 1:
-            self.vectors = {attribute: values}
-        return values
-
-    __getitem__ = stored
 
     def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
         values = np.empty((len(names), splat_count(self.mesh)), np.float32)
@@ -297,7 +279,7 @@ class _Reader:
             if KINDS[attribute.data_type].width == 1:
                 attribute.data.foreach_get("value", row)
             else:
-                row[:] = self.stored(name)
+                row[:] = self[name]
         return values
 
 

@@ -16,7 +16,7 @@ from ..core.affine import Move, affine_moves
 from ..core.formats.ply_columns import THIRD_SCALE
 from . import attributes as mesh_attributes
 from . import native
-from .layout import sh_degree
+from .layout import has, sh_degree
 
 HOME = "refine_home"  # Point vector: position when scales, rotation and harmonics were written
 
@@ -61,9 +61,7 @@ def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
 
 def is_stamped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
     """Whether a mesh has notes of its splats' positions."""
-    kinds = {HOME: "FLOAT_VECTOR", SHAPE: "INT"}
-    attributes = ((mesh.attributes.get(name), kind) for name, kind in kinds.items())
-    return all(a and (a.data_type, a.domain) == (kind, "POINT") for a, kind in attributes)
+    return has(mesh, HOME, "FLOAT_VECTOR") and has(mesh, SHAPE, "INT")
 
 
 def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:

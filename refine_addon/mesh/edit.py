@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from . import attributes as mesh_attributes
-from .layout import splat_count
+from .layout import has, splat_count
 
 REMOVE = "refine_remove"  # Boolean point attribute: splats that the budget removes
 
@@ -135,19 +135,6 @@ def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
     mark(obj, REMOVE, remove)
 
 
-def mark_forced(
-    obj: bpy.types.Object,
-    protected: NDArray[np.bool_] | None,
-    removed: NDArray[np.bool_] | None,
-) -> None:
-    """Mark protected splats and those removed by the user for the 3D views: (N,) each, or None."""
-    force = np.zeros(splat_count(obj.data), np.int32)
-    for number, mask in ((2, removed), (1, protected)):
-        if mask is not None:
-            force[mask] = number
-    mark(obj, FORCE, force, even_none=False)
-
-
 def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     """Splats protected by `PROTECT` or by the attribute or vertex group `name` ("" for none), (N,).
     Weights count above 0. None without a name and marks; `RefineError` if the name is missing."""
@@ -160,8 +147,8 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None
 
 def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     attribute = obj.data.attributes.get(name)
-    fits = attribute and attribute.data_type in MARKING and attribute.domain == "POINT"
-    if fits and name not in REQUIRED:  # what a splat is made of marks nothing
+    # What a splat is made of marks nothing.
+    if has(obj.data, name, *MARKING) and name not in REQUIRED:
         return mesh_attributes.read_attribute(obj.data, name) > 0
     if name in obj.vertex_groups:
         return group_weights(obj, name) > 0.0
@@ -175,10 +162,8 @@ def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
 
 def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     """Splats marked by hand with `PROTECT` or `MUST_GO`, (N,); None if none is."""
-    attribute = obj.data.attributes.get(name)
-    if attribute and (attribute.data_type, attribute.domain) == ("BOOLEAN", "POINT"):
-        return mesh_attributes.read_attribute(obj.data, name)
-    return None
+    marked = has(obj.data, name, "BOOLEAN")
+    return mesh_attributes.read_attribute(obj.data, name) if marked else None
 
 
 def mark_by_hand(obj: bpy.types.Object, marked: NDArray[np.bool_], name: str = PROTECT) -> None:

@@ -47,16 +47,8 @@ KINDS = {
 }
 """Attribute type -> field for `foreach_get`, element type, numbers in an element."""
 
-STORAGE = {
-    "i1": "INT8",
-    "u1": "INT",
-    "i2": "INT",
-    "u2": "INT",
-    "i4": "INT",
-    "u4": "INT",
-    "f4": "FLOAT",
-    "f8": "FLOAT",
-}
+STORAGE = dict.fromkeys(("u1", "i2", "u2", "i4", "u4"), "INT")
+STORAGE |= {"i1": "INT8", "f4": "FLOAT", "f8": "FLOAT"}
 """Type of a PLY property -> type of its attribute; u4 by its bits, f8 rounded."""
 
 PLACES = {name: Place("position", axis, ("FLOAT_VECTOR",)) for axis, name in enumerate("xyz")}
@@ -146,6 +138,12 @@ def recorded(mesh: bpy.types.ID, name: str, read: Callable[[Any], Any]) -> Any:
 @lru_cache(maxsize=16)  # for panels
 def _parsed(text: str) -> Any:
     return json.loads(text)
+
+
+def has(mesh: bpy.types.ID, name: str, *kinds: str) -> bool:
+    """Whether a mesh has a point attribute of one of these types."""
+    attribute = mesh.attributes.get(name)
+    return bool(attribute and attribute.data_type in kinds and attribute.domain == "POINT")
 
 
 def splat_count(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> int:
@@ -315,7 +313,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
         )
     normals: tuple[str, ...] = ("nx", "ny", "nz") if "nx" in attributes else ()
     places = PLACES | _native_places(obj.data)
-    if not normals and _is(attributes.get("normal"), ("FLOAT_VECTOR",)):
+    if not normals and has(obj.data, "normal", "FLOAT_VECTOR"):
         normals = tuple(NORMAL_PLACES)
         places.update(NORMAL_PLACES)
     names = [*PLACES, *normals, *REQUIRED[3:6], *rest, *REQUIRED[6:]]
@@ -357,16 +355,12 @@ def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
             f"(it has {', '.join(present[:_MOST_NAMES])}{more})"
         )
     for column in layout.columns:
-        attribute = attributes[column.attribute]
-        if not _is(attribute, column.place.kinds):
+        if not has(obj.data, column.attribute, *column.place.kinds):
+            attribute = attributes[column.attribute]
             raise RefineError(
                 f"object '{obj.name}': attribute '{attribute.name}' is {attribute.data_type} on "
                 f"{attribute.domain}, expected {' or '.join(column.place.kinds)} on POINT"
             )
-
-
-def _is(attribute: bpy.types.Attribute | None, kinds: tuple[str, ...]) -> bool:
-    return bool(attribute and attribute.data_type in kinds and attribute.domain == "POINT")
 
 
 def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> tuple[Column, ...]:

@@ -19,7 +19,7 @@ from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
-from .layout import SplatObject, recorded, splat_count
+from .layout import SplatObject, has, recorded, splat_count
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: score, rank from 0 (removed first) to 1, number of views that hold it."""
@@ -119,6 +119,9 @@ def move_origin(
         mesh[RECORD] = json.dumps({**scoring, "origin": origin})
 
 
+_KINDS = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
+
+
 def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | None = None) -> Scores:
     """Scores of several objects as of one; splats of `removed`, (N,) of all, need none.
     `RefineError` if others have none, or objects were not scored together."""
@@ -126,9 +129,9 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
     removed = np.zeros(sum(map(len, group)), np.bool_) if removed is None else removed
     for checked in group:
         scoring, label = record(checked.mesh), f"object '{checked.obj.name}'"
-        if scoring is None or not _has_scores(checked.mesh):
+        if scoring is None or not all(has(checked.mesh, *each) for each in _KINDS.items()):
             raise RefineError(f"{label}: has no scores; score it first")
-        own = [mesh_attributes.read_attribute(checked.mesh, n) for n in (SCORE, SEEN, SCORED)]
+        own = [mesh_attributes.read_attribute(checked.mesh, name) for name in _KINDS]
         count = len(own[0])
         unscored = int(np.count_nonzero(~own[2] & ~removed[start : start + count]))
         if count > scoring["splats"] or unscored:
@@ -162,12 +165,6 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
         quality=Quality.from_facts(first.get("quality")) if whole else None,
         scored=None if scored.all() else scored,
     )
-
-
-def _has_scores(mesh: bpy.types.Mesh) -> bool:
-    kinds = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
-    attributes = ((mesh.attributes.get(name), kind) for name, kind in kinds.items())
-    return all(attribute and attribute.data_type == kind for attribute, kind in attributes)
 
 
 def store_floaters(checked: SplatObject, cleaned: Cleaned) -> None:

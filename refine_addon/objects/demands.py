@@ -155,7 +155,11 @@ def mark(checked: SplatObject, forced: Forced) -> None:
     """Mark protected and removed splats for previews, and record their numbers.
     Removed ones also get `REMOVE`, unless scores or floaters set it."""
     mesh, removed = checked.mesh, forced.removed
-    mesh_edit.mark_forced(checked.obj, forced.protected, removed)
+    force = np.zeros(len(checked), np.int32)
+    for number, mask in ((2, removed), (1, forced.protected)):
+        if mask is not None:
+            force[mask] = number
+    mesh_edit.mark(checked.obj, mesh_edit.FORCE, force, even_none=False)
     scored = mesh_scores.record(mesh) is not None
     if removed is not None:
         if not scored:

@@ -59,7 +59,8 @@ def read_to_move(
         splats = replace(splats, sh_rest=np.pad(splats.sh_rest, ((0, 0), (0, more), (0, 0))))
     has_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
     names = {*values_by_name(splats), *(_NORMALS if has_normals else ())} - {"opacity"}
-    normals = mesh_attributes.normals(checked) if has_normals else None
+    stored = mesh_attributes.stored_columns(checked)
+    normals = np.stack([stored[name] for name in _NORMALS], axis=-1) if has_normals else None
     return names, partial(_moved, splats, normals, matrix, find)
 
 
@@ -151,37 +152,26 @@ def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:
     `RefineError` also if an object is animated or constrained."""
     notes, parts = [], []
     for checked in group:
-        mesh_edit.check_deletable(checked.obj)
-        _check_still(checked.obj)
-        matrix = _own_matrix(checked.obj, location=location)
+        obj, label = checked.obj, f"object '{checked.obj.name}'"
+        mesh_edit.check_deletable(obj)
+        animated = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
+        if animated or obj.constraints:
+            what = "animated" if animated else "constrained"
+            raise RefineError(
+                f"{label}: is {what}, which goes on to move it; remove that first, or export with "
+                "Apply Transform"
+            )
+        matrix = snapped(np.array(obj.matrix_basis, np.float64))
+        if not location:
+            matrix[:3, 3] = 0.0
+        if is_flat(matrix):
+            raise RefineError(f"{label}: is scaled to nothing along an axis, which nothing undoes")
         notes += uneven_notes(checked, matrix)
         parts.append((checked, read_to_move(checked, matrix, mend=True)[1]()[0]))
     write_moved(parts)
     for checked in group:  # nothing fails from here on
         _take_away(checked.obj, location=location)
     return notes
-
-
-def _check_still(obj: bpy.types.Object) -> None:
-    """Raise if animation or constraints would move the object back."""
-    animated = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
-    if animated or obj.constraints:
-        what = "animated" if animated else "constrained"
-        raise RefineError(
-            f"object '{obj.name}': is {what}, which goes on to move it; remove that first, or "
-            "export with Apply Transform"
-        )
-
-
-def _own_matrix(obj: bpy.types.Object, *, location: bool) -> NDArray[np.float64]:
-    matrix = snapped(np.array(obj.matrix_basis, np.float64))
-    if not location:
-        matrix[:3, 3] = 0.0
-    if is_flat(matrix):
-        raise RefineError(
-            f"object '{obj.name}': is scaled to nothing along an axis, which nothing undoes"
-        )
-    return matrix
 
 
 def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
@@ -216,10 +206,9 @@ def read_to_join(group: Sequence[SplatObject]) -> Callable[[Progress], Joined]:
         for member, matrix in zip(group, matrices, strict=True)
     ]
 
-    def work(progress: Progress) -> Joined:
-        return Joined(matrices, run_all(lambda p: p()[0], parts, progress=progress, threads=1))
-
-    return work
+    return lambda progress: Joined(
+        matrices, run_all(lambda part: part()[0], parts, progress=progress, threads=1)
+    )
 
 
 def join(group: Sequence[SplatObject], found: Joined | None = None) -> list[str]:
@@ -240,7 +229,11 @@ def join(group: Sequence[SplatObject], found: Joined | None = None) -> list[str]
         notes += _made_alike([mesh_layout.check(part) for part in parts], group)
         whole = _as_one(parts)
         mesh_drift.stamp(whole.data)
-        _give(group[0].obj, whole)
+        kept, old = group[0].obj, group[0].obj.data
+        name, kept.data = old.name, whole.data
+        if not old.users:
+            bpy.data.batch_remove([old])
+            kept.data.name = name
     for other in group[1:]:
         _replace(other.obj, group[0].obj)
     return notes
@@ -328,15 +321,6 @@ def _as_one(parts: Sequence[bpy.types.Object]) -> bpy.types.Object:
             f"{len(first.data.vertices)} splats were joined, expected {count}; report this"
         )
     return first
-
-
-def _give(obj: bpy.types.Object, source: bpy.types.Object) -> None:
-    old = obj.data
-    name = old.name
-    obj.data = source.data
-    if not old.users:
-        bpy.data.batch_remove([old])
-        obj.data.name = name
 
 
 def _replace(obj: bpy.types.Object, parent: bpy.types.Object) -> None:

@@ -22,7 +22,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh import selection as mesh_selection
-from ..mesh.layout import SplatObject, check, looks_like_splats, sh_degree, splat_count
+from ..mesh.layout import SplatObject, check, has, looks_like_splats, sh_degree, splat_count
 from . import shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
 
@@ -250,10 +250,7 @@ def _atlas(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> Atlas:
 
 
 def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | None:
-    attribute = mesh.attributes.get(name)
-    if not attribute or (attribute.data_type, attribute.domain) != (kind, "POINT"):
-        return None
-    return mesh_attributes.read_attribute(mesh, name)
+    return mesh_attributes.read_attribute(mesh, name) if has(mesh, name, kind) else None
 
 
 class Placing(NamedTuple):
@@ -297,12 +294,16 @@ def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> It
             yield from _placed(member, base @ member.matrix_world, chain, depth + 1)
 
 
-def hide_points(depsgraph: bpy.types.Depsgraph, refused: Container[int] | None) -> None:
+def hide_points(depsgraph: bpy.types.Depsgraph | None, refused: Container[int] | None) -> None:
     """Show a view layer's splats as bounding boxes, but for refused meshes; None: as points."""
-    for obj, evaluated in _copies(depsgraph):
+    if depsgraph is None or depsgraph.mode != "VIEWPORT":
+        return
+    objects = [obj.original for obj in depsgraph.scene.objects]
+    for obj in filter(looks_like_splats, {*objects, *instanced(objects)}):
         hidden = refused is not None and obj.data.session_uid not in refused
         wanted = "BOUNDS" if hidden and not is_edited(obj) else obj.display_type
-        if evaluated.display_type != wanted:
+        evaluated = obj.evaluated_get(depsgraph)
+        if evaluated.is_evaluated and evaluated.display_type != wanted:
             evaluated.display_type = wanted
 
 
@@ -315,16 +316,3 @@ def graphs() -> Iterator[bpy.types.Depsgraph]:
     """Dependency graphs of all windows."""
     for window in bpy.context.window_manager.windows:
         yield window.view_layer.depsgraph
-
-
-def _copies(
-    depsgraph: bpy.types.Depsgraph | None,
-) -> Iterator[tuple[bpy.types.Object, bpy.types.Object]]:
-    if depsgraph is None or depsgraph.mode != "VIEWPORT":
-        return
-    objects = [obj.original for obj in depsgraph.scene.objects]
-    for original in {*objects, *instanced(objects)}:
-        if looks_like_splats(original):
-            evaluated = original.evaluated_get(depsgraph)
-            if evaluated.is_evaluated:
-                yield original, evaluated
