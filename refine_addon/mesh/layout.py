@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import RefineError
-from ..core.formats.ply import new_header, stated_model, vertex_header, with_model
+from ..core.formats.ply import new_header, stated_model, vertex_header, with_count, with_model
 from ..core.formats.ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE
 from ..core.splats import MODELS, Model
 from . import native
@@ -58,8 +58,6 @@ NORMAL_PLACES = {
     f"n{axis}": Place("normal", index, ("FLOAT_VECTOR",)) for index, axis in enumerate("xyz")
 }
 """Where Blender's own PLY importer puts a file's normals."""
-
-_COUNT = rb"([\r\n]element[ \t]+vertex[ \t]+)[0-9]+"
 
 _LONGEST_NAME = 63  # Bytes of Blender's longest attribute name
 
@@ -131,7 +129,7 @@ def recorded(mesh: bpy.types.ID, name: str, read: Callable[[Any], Any]) -> Any:
     Another program may have written there."""
     try:
         return read(_parsed(mesh[name]))
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, StopIteration, TypeError, ValueError):
         return None
 
 
@@ -227,16 +225,12 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
             Column(name, dtype, places.get(name) or _plain(dtype, attribute, component))
             for name, dtype, attribute, component in noted["columns"]
         )
-        # Splats come and go; the count is the mesh's.
-        count = rb"\g<1>%d" % splat_count(mesh)
-        header = re.sub(_COUNT, count, noted["header"].encode("latin-1"), count=1)
-        layout = Layout(columns, header)
-        # Join adds harmonics of a higher degree.
-        names = layout.row_dtype.names or ()
+        # Splats come and go, and Join adds harmonics of a higher degree.
+        count, names = splat_count(mesh), [column.name for column in columns]
+        layout = Layout(columns, with_count(noted["header"].encode("latin-1"), count))
         rest = [n for i in range(rest_count(mesh)) if (n := f"f_rest_{i}") not in names]
         if rest:
-            more = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in rest]
-            layout = _with(layout, splat_count(mesh), more)
+            layout = _with(layout, count, _floats(rest, places))
         return layout if layout.row_dtype.itemsize > 0 else None
 
     return recorded(mesh, LAYOUT, read)
@@ -249,50 +243,47 @@ def merged(layouts: Sequence[Layout]) -> Layout:
     for column in (column for layout in layouts for column in layout.columns):
         known = columns.setdefault(column.name, column)
         if (known.place, known.dtype[1:]) != (column.place, column.dtype[1:]):
-            kinds = (np.dtype(each.dtype).newbyteorder("<") for each in (known, column))
-            widest = np.promote_types(*kinds).str
+            widest = np.promote_types(known.dtype, column.dtype).newbyteorder("<").str
             dtype = widest if widest[1:] in STORAGE else "<f8"
             place = _plain(dtype, known.attribute, known.place.component)
             columns[column.name] = Column(column.name, dtype, place)
     places = Counter(column.place[:2] for column in columns.values())
     if twice := [attribute for (attribute, _), count in places.items() if count > 1]:
         raise RefineError(f"attribute '{twice[0]}' holds different properties; rename one")
-    if tuple(columns.values()) == first.columns:
+    every, own = tuple(columns.values()), len(first.columns)
+    if every == first.columns:
         return first
-    more = [column for name, column in columns.items() if name not in first.row_dtype.names]
-    return _with(Layout(tuple(columns[c.name] for c in first.columns), first.header), 0, more)
+    return _with(Layout(every[:own], first.header), 0, every[own:])
 
 
 def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
     """A layout with further columns: harmonics after the others, the rest at the end."""
-    columns = list(layout.columns)
-    for column in more:
-        index = len(columns)
-        if column.name.startswith("f_rest_"):
-            before = [i for i, c in enumerate(columns) if c.name.startswith(("f_rest_", "f_dc_"))]
-            index = before[-1] + 1
-        columns.insert(index, column)
+    rest = [column for column in more if column.name.startswith("f_rest_")]
+    others = [column for column in more if column not in rest]
+    colors = [c.name.startswith(("f_dc_", "f_rest_")) for c in layout.columns]
+    end = len(colors) - colors[::-1].index(True)
+    columns = [*layout.columns[:end], *rest, *layout.columns[end:], *others]
     # Of one byte order, since the header names but one.
-    plain = [Column(c.name, c.dtype.replace(">", "<"), c.place) for c in columns]
+    plain = tuple(Column(c.name, c.dtype.replace(">", "<"), c.place) for c in columns)
     header = new_header(_row(plain), count)
     comments = re.findall(rb"^(?:comment|obj_info)\b[^\r\n]*", layout.header, re.MULTILINE)
     first = header.index(b"element")
     header = header[:first] + b"".join(line + b"\n" for line in comments) + header[first:]
-    return Layout(tuple(plain), header)
+    return Layout(plain, header)
 
 
 def note(mesh: bpy.types.Mesh | bpy.types.PointCloud, layout: Layout) -> None:
     """Note on a mesh the layout of its file."""
-    mesh[LAYOUT] = json.dumps(
-        {
-            "header": layout.header.decode("latin-1"),
-            "columns": [[c.name, c.dtype, c.attribute, c.place.component] for c in layout.columns],
-        }
-    )
+    columns = [[c.name, c.dtype, c.attribute, c.place.component] for c in layout.columns]
+    mesh[LAYOUT] = json.dumps({"header": layout.header.decode("latin-1"), "columns": columns})
 
 
 def _native_places(mesh: bpy.types.Mesh) -> dict[str, Place]:
     return native.places(native.harmonics(mesh)) if native.is_native(mesh) else {}
+
+
+def _floats(names: Sequence[str], places: Mapping[str, Place]) -> list[Column]:
+    return [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
 
 
 def _plain(dtype: str, attribute: str, component: int = 0) -> Place:
@@ -319,7 +310,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
     names = [*PLACES, *normals, *REQUIRED[3:6], *rest, *REQUIRED[6:]]
     if THIRD_SCALE not in attributes and THIRD_SCALE not in places and "scale_1" in attributes:
         names.remove(THIRD_SCALE)
-    columns = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
+    columns = _floats(names, places)
     columns += _further_columns(obj.data, {*names, *(column.attribute for column in columns)})
     header = new_header(_row(columns), splat_count(obj.data))
     return Layout(tuple(columns), header)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,8 +50,7 @@ LEVEL_OF = "refine_level_of"  # Custom property of a level object: its original
 Members = list["SplatObject"]  # Objects by name; one at least
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Effect of a budget: splats kept and removed, bytes of the exported files before and after."""
 
     kept: int
@@ -299,7 +298,7 @@ def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
         for checked, part in zip(group, parts, strict=True):
             reduce_object(checked, part)
-    return Outcome(*(sum(numbers) for numbers in zip(*map(astuple, outcomes), strict=True)))
+    return Outcome(*map(sum, zip(*outcomes, strict=True)))
 
 
 def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
@@ -451,7 +450,12 @@ def prune_object(
             assert result.scores is not None
             mesh_scores.store(checked, result.scores, method)
             reduce_object(checked, change)
-            _save(exported)
+            try:
+                bpy.ops.wm.save_mainfile()
+            except RuntimeError as error:
+                why = f"{bpy.data.filepath}: cannot be saved ({str(error).strip()})"
+                also = "" if exported is None else f", {exported} was written"
+                raise RefineError(f"{why}; nothing was removed{also}") from error
 
     return run(
         lambda form: _scene(checked, demands, harmonics, form),
@@ -495,13 +499,3 @@ def _scene(
         _matrix(checked),
         (*modifier_notes(checked.obj), *drift_notes(checked)),
     )
-
-
-def _save(exported: Path | None) -> None:
-    try:
-        bpy.ops.wm.save_mainfile()
-    except RuntimeError as error:
-        msg = f"{bpy.data.filepath}: cannot be saved ({str(error).strip()}); nothing was removed"
-        if exported is not None:
-            msg += f", {exported} was written"
-        raise RefineError(msg) from error

@@ -265,7 +265,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
         if record.get("seconds") and not closed:
             seconds = {**expected_seconds(record["seconds"], share, once=False), "delete": 0.0}
     return {
-        **vars(outcome), "splats": count, "about": about, "share": share, "becomes": becomes,
+        **outcome._asdict(), "splats": count, "about": about, "share": share, "becomes": becomes,
         "quality": curve, "closed": closed, "seconds": seconds, "remark": remark, "views": views,
         "unseen": int(np.count_nonzero(unseen)), "little_seen": little_seen(scores.seen[rest]),
         "unseen_gone": int(np.count_nonzero(unseen & ~keep)),
