@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from .core.affine import QUARTER, QUARTERS, quaternion
 from .core.errors import RefineError
 from .core.views import View, ViewSet
-from .mesh.layout import LAYOUT
-from .mesh.native import is_native
+from .mesh.layout import LAYOUT, is_native
 
 WEIGHT = "refine_weight"  # Custom property of a camera object: the weight of its view, 1 without it
 

@@ -72,11 +72,9 @@ class Layers:
 def in_order(layers: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]) -> Layers:
     """Layers (colours, alphas, depths) sorted by depth in each pixel; ties keep their order."""
     colors, alphas, depths = (np.stack(arrays) for arrays in zip(*layers, strict=True))
-    if len(layers) > 1:
-        order = np.argsort(depths, axis=0, kind="stable")
-        alphas, depths = (np.take_along_axis(of_each, order, 0) for of_each in (alphas, depths))
-        colors = np.take_along_axis(colors, order[:, None], 0)
-    return Layers(colors, alphas, depths)
+    order = np.argsort(depths, axis=0, kind="stable")
+    alphas, depths = (np.take_along_axis(of_each, order, 0) for of_each in (alphas, depths))
+    return Layers(np.take_along_axis(colors, order[:, None], 0), alphas, depths)
 
 
 def draw(

@@ -1,6 +1,6 @@
 """Splats as point attributes of a mesh, named as the PLY properties.
 Log scales, logit opacities and raw harmonics stay as in the file, as Blender's importer and KIRI's
-3DGS Render (`vert` form) store them; meshes of either can be read. Blender's own splats (`native`)
+3DGS Render (`vert` form) store them; meshes of either can be read. Blender's own splats
 are converted to and from such columns."""
 
 from __future__ import annotations

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ..core.affine import Move, affine_moves
 from ..core.formats.ply_columns import THIRD_SCALE
 from . import attributes as mesh_attributes
-from . import native
-from .layout import has, sh_degree
+from .layout import ROTATION, SCALE, has, is_native, sh_degree
 
 HOME = "refine_home"  # Point vector: position when scales, rotation and harmonics were written
 
@@ -130,7 +129,7 @@ class _Notes:
         )
         self.codes = codes.view(np.uint32)
         # Names of harmonics in Blender's own splats do not depend on the degree.
-        self.degree = None if native.is_native(mesh) else sh_degree(mesh)
+        self.degree = None if is_native(mesh) else sh_degree(mesh)
         origins = self.codes & _ORIGIN
         self.undisturbed = bool(
             np.array_equal(self.home.view(np.uint32), self.position.view(np.uint32))
@@ -176,8 +175,8 @@ def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.floa
     names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
     if THIRD_SCALE not in mesh.attributes:  # discs
         names.remove(THIRD_SCALE)
-    if native.is_native(mesh):
-        names = [native.SCALE, native.ROTATION]
+    if is_native(mesh):
+        names = [SCALE, ROTATION]
     return [mesh_attributes.read_attribute(mesh, name) for name in names]
 
 

@@ -1,6 +1,7 @@
 """The table of which attribute holds which property of a 3DGS PLY, checked here.
-"Mesh" means a mesh with a vertex for each splat, or a point cloud. Point clouds of Blender 5.3 hold
-activated values under other names: see `native`."""
+"Mesh" means a mesh with a vertex for each splat, or a point cloud. Blender 5.3 imports 3DGS files
+as point clouds of type ``GAUSSIAN_SPLAT`` with activated values under other names
+(docs/conventions.md). Attributes alone decide, so older versions and geometry nodes work too."""
 
 from __future__ import annotations
 
@@ -14,17 +15,47 @@ from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..core.formats.ply import new_header, stated_model, vertex_header, with_count, with_model
 from ..core.formats.ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE
-from ..core.splats import MODELS, Model
-from . import native
-from .native import Place
+from ..core.splats import MODELS, Model, opacity, scales, single_log_scales, single_logits
+
+BASE, SCALE, ROTATION, HARMONIC = "radiance:base", "scale", "rotation", "radiance:sh_"
+
+NATIVE = "GAUSSIAN_SPLAT"  # Type of point clouds that Blender draws as splats, since 5.3
+
+_NATIVE_NAMES = f"{BASE}, {SCALE}, {ROTATION}"
+
+_FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")  # Types of `BASE`: 5.3's, and that of 5.0 without it
+
+_MOST = 24  # Harmonics of degree 4, without the constant
 
 LAYOUT = "refine_layout"  # Custom property of the mesh: layout of its file, JSON
 
 MODEL = "refine_model"  # Custom property: one of `rendering.MODELS`, if the file named none
+
+
+class Coding(NamedTuple):
+    """Conversion of a file's values to those of an attribute and back, float64."""
+
+    to_file: Callable[[NDArray[Any]], NDArray[Any]]
+    to_attribute: Callable[[NDArray[Any]], NDArray[Any]]
+
+
+_LOG = Coding(single_log_scales, scales)
+_LOGIT = Coding(single_logits, opacity)
+
+
+class Place(NamedTuple):
+    """Attribute, vector component (0 for plain ones), allowed types (the first is made), and coding
+    (None where stored as in the file) of a property."""
+
+    attribute: str
+    component: int
+    kinds: tuple[str, ...]
+    coding: Coding | None = None
 
 
 class Kind(NamedTuple):
@@ -159,7 +190,46 @@ def looks_like_splats(obj: bpy.types.Object | None) -> bool:
 def holds_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
     """The same for an object's data."""
     attributes = data.attributes
-    return ("opacity" in attributes and "f_dc_0" in attributes) or native.is_native(data)
+    return ("opacity" in attributes and "f_dc_0" in attributes) or is_native(data)
+
+
+def is_native(data: bpy.types.ID) -> bool:
+    """Whether an object's data is a point cloud with the attributes of Blender's splats."""
+    attributes = getattr(data, "attributes", ())
+    return hasattr(data, "points") and BASE in attributes and SCALE in attributes
+
+
+def _harmonics(cloud: bpy.types.PointCloud) -> int:
+    """Attributes of a point cloud for harmonics, without the constant."""
+    return sum(f"{HARMONIC}{index}" in cloud.attributes for index in range(_MOST))
+
+
+def _native_places(data: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Place]:
+    """Places of a splat's properties in a point cloud of Blender's own splats, else none.
+    ``sh_10`` follows ``sh_9``; each holds RGB, where a file has all of red first."""
+    if not is_native(data):
+        return {}
+    count = _harmonics(data)
+    by_name = {f"f_dc_{channel}": Place(BASE, channel, _FOUR_FLOATS) for channel in range(3)}
+    for channel in range(3):
+        for index in range(count):
+            place = Place(f"{HARMONIC}{index}", channel, ("FLOAT_VECTOR",))
+            by_name[f"f_rest_{channel * count + index}"] = place
+    by_name["opacity"] = Place(BASE, 3, _FOUR_FLOATS, _LOGIT)
+    for axis in range(3):
+        by_name[f"scale_{axis}"] = Place(SCALE, axis, ("FLOAT_VECTOR",), _LOG)
+    for index in range(4):
+        by_name[f"rot_{index}"] = Place(ROTATION, index, ("QUATERNION",))
+    return by_name
+
+
+def lost_base(obj: bpy.types.Object) -> bool:
+    """Whether an object is what an older Blender leaves of 5.3's splats: all but `BASE`."""
+    if obj.type != "POINTCLOUD":
+        return False
+    attributes = obj.data.attributes
+    rest = SCALE in attributes and ROTATION in attributes and "f_dc_0" not in attributes
+    return rest and BASE not in attributes
 
 
 def check(obj: bpy.types.Object) -> SplatObject:
@@ -180,7 +250,11 @@ def check(obj: bpy.types.Object) -> SplatObject:
     if not splat_count(obj.data):
         points = "points" if obj.type == "POINTCLOUD" else "vertices"
         raise RefineError(f"{label}: has no {points}, expected one a splat")
-    native.refuse_lost_base(obj)
+    if lost_base(obj):
+        raise RefineError(
+            f"{label}: has no attribute {BASE}, which holds colour and opacity: Blender 5.0 and "
+            "older drop it where they open a file of 5.3; use 5.2 or later"
+        )
     layout = layout_of(obj)
     _check_attributes(obj, layout)
     return SplatObject(obj, layout)
@@ -211,8 +285,8 @@ def export_bytes(obj: bpy.types.Object) -> int | None:
 
 def rest_count(mesh: bpy.types.Mesh) -> int:
     """Number of ``f_rest_*`` properties that a mesh has attributes for."""
-    if native.is_native(mesh):
-        return 3 * native.harmonics(mesh)
+    if is_native(mesh):
+        return 3 * _harmonics(mesh)
     return sum(f"f_rest_{index}" in mesh.attributes for index in range(max(REST_COUNTS)))
 
 
@@ -243,7 +317,7 @@ def merged(layouts: Sequence[Layout]) -> Layout:
     for column in (column for layout in layouts for column in layout.columns):
         known = columns.setdefault(column.name, column)
         if (known.place, known.dtype[1:]) != (column.place, column.dtype[1:]):
-            widest = np.promote_types(known.dtype, column.dtype).newbyteorder("<").str
+            widest = np.promote_types(known.dtype, column.dtype).str
             dtype = widest if widest[1:] in STORAGE else "<f8"
             place = _plain(dtype, known.attribute, known.place.component)
             columns[column.name] = Column(column.name, dtype, place)
@@ -278,10 +352,6 @@ def note(mesh: bpy.types.Mesh | bpy.types.PointCloud, layout: Layout) -> None:
     mesh[LAYOUT] = json.dumps({"header": layout.header.decode("latin-1"), "columns": columns})
 
 
-def _native_places(mesh: bpy.types.Mesh) -> dict[str, Place]:
-    return native.places(native.harmonics(mesh)) if native.is_native(mesh) else {}
-
-
 def _floats(names: Sequence[str], places: Mapping[str, Place]) -> list[Column]:
     return [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
 
@@ -296,7 +366,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
     attributes = obj.data.attributes
     rest = [f"f_rest_{index}" for index in range(rest_count(obj.data))]
     if len(rest) not in REST_COUNTS:
-        name, width = (native.HARMONIC, 3) if native.is_native(obj.data) else ("f_rest_", 1)
+        name, width = (HARMONIC, 3) if is_native(obj.data) else ("f_rest_", 1)
         *counts, most = (each // width for each in REST_COUNTS)
         raise RefineError(
             f"object '{obj.name}': has {len(rest) // width} attributes {name}*, expected "
@@ -339,7 +409,7 @@ def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
     if absent:
         present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
         more = ", ..." if len(present) > _MOST_NAMES else ""
-        or_native = f" or Blender's own {native.NAMES}" if obj.type == "POINTCLOUD" else ""
+        or_native = f" or Blender's own {_NATIVE_NAMES}" if obj.type == "POINTCLOUD" else ""
         raise RefineError(
             f"object '{obj.name}': has no attribute {', '.join(dict.fromkeys(absent))}; expected "
             f"the properties of a 3DGS file{or_native} on its points "

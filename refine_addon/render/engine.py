@@ -53,10 +53,6 @@ class Shared:
     error: BaseException | None = None
     stopped: bool = False
 
-    def save(self, folder: Path, frame: int) -> None:
-        """Keep the last picture for a movie, in 16 bits."""
-        np.save(folder / f"{frame}.npy", np.rint(self.picture * 65535.0).astype(np.uint16))
-
 
 class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
     """Draws splats."""
@@ -229,7 +225,8 @@ def steps(
             yield meshes.Step(whole, animation=write, what="splats")
             _check(shared, frame)
             if movie:
-                shared.save(folder, frame)
+                picture = np.rint(shared.picture * 65535.0).astype(np.uint16)
+                np.save(folder / f"{frame}.npy", picture)
         if movie:
             shared.finished = folder
             meshes.set_frames(written, frames)

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from ..core.execute import Cancelled
 from ..core.images import read_exr
 from ..core.pictures import Layers, in_order
-from ..mesh import native
-from ..mesh.layout import looks_like_splats
+from ..mesh import layout as mesh_layout
 
 COPY_OF = "refine_render"  # Custom property of a copy: its original scene
 
@@ -65,8 +64,8 @@ Steps = Generator[Step | None, None, Callable[[], Layers] | None]
 
 def drawn_by_us(obj: bpy.types.Object) -> bool:
     """Whether an object holds splats that Blender does not draw itself."""
-    return looks_like_splats(obj) and not (
-        obj.type == "POINTCLOUD" and getattr(obj.data, "type", "") == native.TYPE
+    return mesh_layout.looks_like_splats(obj) and not (
+        obj.type == "POINTCLOUD" and getattr(obj.data, "type", "") == mesh_layout.NATIVE
     )
 
 

@@ -16,7 +16,6 @@ from ..core.quality.alignment import Alignment
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
-from ..mesh import native
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
@@ -140,7 +139,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         layout.operator("refine.import_ply", icon="IMPORT")
         if mesh_layout.looks_like_splats(obj):
             _draw_objects(layout, context, splat_group.chosen(context.view_layer, obj))
-        elif obj is not None and native.lost_base(obj):
+        elif obj is not None and mesh_layout.lost_base(obj):
             text = "Colours were lost: open it in Blender 5.2"
             wrapped.label(layout, context, text, icon="ERROR")
         elif not _draw_instances(layout, context):

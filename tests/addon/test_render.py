@@ -485,7 +485,7 @@ def test_splats_that_blender_draws_are_left_to_it(
     """
     other = bpy.data.objects.new("other", quarter.data.copy())
     cloud = as_cloud(addon, quarter)
-    monkeypatch.setattr(addon.mesh.native, "TYPE", getattr(cloud.data, "type", ""))
+    monkeypatch.setattr(addon.mesh.layout, "NATIVE", getattr(cloud.data, "type", ""))
     bpy.ops.render.render()
     said = capfd.readouterr().err
     with pytest.raises(RuntimeError, match="has no splats to draw; import some, or use Render Im"):
