@@ -75,7 +75,17 @@ def view_from_camera(
         weight=_weight(obj),
         name=obj.name,
     )
-    return _restored(view, source, matrix, data) if source else view
+    if not source:
+        return view
+    changes: dict[str, Any] = {}  # the file's own numbers wherever nothing was changed
+    if np.array_equal(matrix, np.array(source["matrix"])):
+        changes.update(rotation=np.array(source["rotation"]), center=np.array(source["center"]))
+    if _lens(data) == source["lens"]:
+        changes.update({name: source[name] for name in _SIZES[:4]})
+    if [data.clip_start, data.clip_end] == source["clip"]:
+        changes["near"] = source["near"]
+        changes["far"] = math.inf if source["far"] is None else source["far"]
+    return replace(view, **changes)
 
 
 def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
@@ -119,7 +129,14 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     data.clip_start = view.near or _DEFAULT_NEAR
     data.clip_end = min(view.far, max(_DEFAULT_FAR, 1e5 * view.near))
     obj = bpy.data.objects.new(name, data)
-    _place(obj, view)
+    axes = (FLIP[:, None] * view.rotation).T
+    mirrored = np.linalg.det(axes) < 0.0
+    if mirrored:
+        axes = axes * np.array([-1.0, 1.0, 1.0])
+        obj.scale = (-1.0, 1.0, 1.0)
+    obj.rotation_mode = "QUATERNION"
+    obj.rotation_quaternion = quaternion(axes)
+    obj.location = view.center
     if view.weight != 1.0:
         obj[WEIGHT] = view.weight
     # The view, and what Blender's float32 made of it, to tell if it is touched.
@@ -202,17 +219,6 @@ def snapped(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return snapped
 
 
-def _place(obj: bpy.types.Object, view: View) -> None:
-    axes = (FLIP[:, None] * view.rotation).T
-    mirrored = np.linalg.det(axes) < 0.0
-    if mirrored:
-        axes = axes * np.array([-1.0, 1.0, 1.0])
-        obj.scale = (-1.0, 1.0, 1.0)
-    obj.rotation_mode = "QUATERNION"
-    obj.rotation_quaternion = quaternion(axes)
-    obj.location = view.center
-
-
 def _lens(data: bpy.types.Camera) -> list[Any]:
     return [data.lens, data.sensor_fit, data.sensor_width, data.shift_x, data.shift_y]
 
@@ -228,24 +234,6 @@ def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
             f"camera '{obj.name}': custom property {SOURCE} is damaged; delete it, and the camera "
             "is used as Blender shows it"
         ) from None
-
-
-def _restored(
-    view: View,
-    source: dict[str, Any],
-    matrix: NDArray[np.float64],
-    data: bpy.types.Camera,
-) -> View:
-    """The view with the file's own numbers wherever nothing was changed."""
-    changes: dict[str, Any] = {}
-    if np.array_equal(matrix, np.array(source["matrix"])):
-        changes.update(rotation=np.array(source["rotation"]), center=np.array(source["center"]))
-    if _lens(data) == source["lens"]:
-        changes.update({name: source[name] for name in _SIZES[:4]})
-    if [data.clip_start, data.clip_end] == source["clip"]:
-        changes["near"] = source["near"]
-        changes["far"] = math.inf if source["far"] is None else source["far"]
-    return replace(view, **changes)
 
 
 @dataclass(frozen=True)

@@ -256,7 +256,28 @@ def check(obj: bpy.types.Object) -> SplatObject:
             "older drop it where they open a file of 5.3; use 5.2 or later"
         )
     layout = layout_of(obj)
-    _check_attributes(obj, layout)
+    attributes = obj.data.attributes
+    properties = {column.name for column in layout.columns}
+    absent = [name for name in REQUIRED if name not in properties]
+    if absent == [THIRD_SCALE]:  # discs
+        absent = []
+    absent += [column.attribute for column in layout.columns if column.attribute not in attributes]
+    if absent:
+        present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
+        more = ", ..." if len(present) > _MOST_NAMES else ""
+        or_native = f" or Blender's own {_NATIVE_NAMES}" if obj.type == "POINTCLOUD" else ""
+        raise RefineError(
+            f"{label}: has no attribute {', '.join(dict.fromkeys(absent))}; expected "
+            f"the properties of a 3DGS file{or_native} on its points "
+            f"(it has {', '.join(present[:_MOST_NAMES])}{more})"
+        )
+    for column in layout.columns:
+        if not has(obj.data, column.attribute, *column.place.kinds):
+            attribute = attributes[column.attribute]
+            raise RefineError(
+                f"{label}: attribute '{attribute.name}' is {attribute.data_type} on "
+                f"{attribute.domain}, expected {' or '.join(column.place.kinds)} on POINT"
+            )
     return SplatObject(obj, layout)
 
 
@@ -397,31 +418,6 @@ def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
         and attribute.name not in taken
         and re.fullmatch(r"(?!refine_|KIRI|\.)[!-~]+", attribute.name)
     ]
-
-
-def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
-    attributes = obj.data.attributes
-    properties = {column.name for column in layout.columns}
-    absent = [name for name in REQUIRED if name not in properties]
-    if absent == [THIRD_SCALE]:  # discs
-        absent = []
-    absent += [column.attribute for column in layout.columns if column.attribute not in attributes]
-    if absent:
-        present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
-        more = ", ..." if len(present) > _MOST_NAMES else ""
-        or_native = f" or Blender's own {_NATIVE_NAMES}" if obj.type == "POINTCLOUD" else ""
-        raise RefineError(
-            f"object '{obj.name}': has no attribute {', '.join(dict.fromkeys(absent))}; expected "
-            f"the properties of a 3DGS file{or_native} on its points "
-            f"(it has {', '.join(present[:_MOST_NAMES])}{more})"
-        )
-    for column in layout.columns:
-        if not has(obj.data, column.attribute, *column.place.kinds):
-            attribute = attributes[column.attribute]
-            raise RefineError(
-                f"object '{obj.name}': attribute '{attribute.name}' is {attribute.data_type} on "
-                f"{attribute.domain}, expected {' or '.join(column.place.kinds)} on POINT"
-            )
 
 
 def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> tuple[Column, ...]:

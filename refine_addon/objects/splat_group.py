@@ -5,8 +5,8 @@ A function does all it says, or raises `RefineError` and changes nothing."""
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -104,22 +104,17 @@ def check_forced(scene: bpy.types.Scene, group: Members, before: Forced) -> None
     """Raise `RefineError` if other splats are protected or removed than before."""
     now = forced(scene, group)
     pairs = ((before.protected, now.protected), (before.removed, now.removed))
-    if any(not np.array_equal(*map(_or_none, pair)) for pair in pairs):
+    if any(not np.array_equal(*(_filled(mask, group) for mask in pair)) for pair in pairs):
         raise RefineError(
             "what must stay or go has changed meanwhile; nothing was removed: apply again"
         )
-
-
-def _or_none(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-    return mask if mask is not None and mask.any() else None
 
 
 def _as_one(each: Sequence[Forced], group: Members) -> Forced:
     masks = []
     for name in ("protected", "removed"):
         parts = [getattr(one, name) for one in each]
-        none = [np.zeros(len(member), np.bool_) for member in group]
-        filled = [a if part is None else part for a, part in zip(none, parts, strict=True)]
+        filled = [_filled(part, [member]) for part, member in zip(parts, group, strict=True)]
         masks.append(None if all(part is None for part in parts) else np.concatenate(filled))
     return Forced(*masks)
 
@@ -132,8 +127,12 @@ def _rows(counts: Iterable[int]) -> list[slice]:
 
 def parts_of(mask: NDArray[np.bool_] | None, group: Members) -> list[NDArray[np.bool_]]:
     """Each object's part of a mask of all splats, (N,); None marks none."""
-    whole = np.zeros(sum(map(len, group)), np.bool_) if mask is None else mask
+    whole = _filled(mask, group)
     return [whole[rows] for rows in _rows(map(len, group))]
+
+
+def _filled(mask: NDArray[np.bool_] | None, group: Members) -> NDArray[np.bool_]:
+    return np.zeros(sum(map(len, group)), np.bool_) if mask is None else mask
 
 
 def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splats:
@@ -362,7 +361,7 @@ def add_levels(
     Hidden, as all stand in one place; nothing is left on an error. `distance`: views to scene."""
     name = checked.obj.name
     collection = bpy.data.collections.new(f"{name} levels")
-    with _nothing_left(collection):
+    try:
         bpy.context.scene.collection.children.link(collection)
         for level in levels:
             copy = checked.obj.copy()
@@ -380,6 +379,13 @@ def add_levels(
         for obj in collection.objects:  # all stand in one place
             obj.hide_set(True)
             obj.hide_render = True
+    except BaseException:
+        data = [obj.data for obj in collection.objects]
+        for obj in list(collection.objects):
+            bpy.data.objects.remove(obj)
+        bpy.data.batch_remove(data)
+        bpy.data.collections.remove(collection)
+        raise
     return collection
 
 
@@ -397,19 +403,6 @@ def levels_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
     if not levels:
         raise RefineError(f"object '{obj.name}': has no levels; make them first")
     return [original, *sorted(levels, key=lambda each: each[LEVEL_FACTS]["level"])]
-
-
-@contextmanager
-def _nothing_left(collection: bpy.types.Collection) -> Iterator[None]:
-    try:
-        yield
-    except BaseException:
-        data = [obj.data for obj in collection.objects]
-        for obj in list(collection.objects):
-            bpy.data.objects.remove(obj)
-        bpy.data.batch_remove(data)
-        bpy.data.collections.remove(collection)
-        raise
 
 
 def prune_object(

@@ -3,8 +3,8 @@ Each does all it says, or raises `RefineError` and changes nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -222,7 +222,9 @@ def join(group: Sequence[SplatObject], found: Joined | None = None) -> list[str]
     notes = [note for member, matrix in pairs for note in uneven_notes(member, matrix)]
     if found is None or not np.array_equal(found.matrices, matrices):
         found = read_to_join(group)(silent)
-    with _workbench() as bench:
+    bench = bpy.data.collections.new("REFINE join")  # removed afterwards with what it holds
+    bpy.context.scene.collection.children.link(bench)
+    try:
         parts = [_copied(member, bench, most) for member in group]
         for part, columns in zip(parts, found.columns, strict=True):
             mesh_attributes.write_columns(mesh_layout.check(part), columns)
@@ -234,8 +236,17 @@ def join(group: Sequence[SplatObject], found: Joined | None = None) -> list[str]
         if not old.users:
             bpy.data.batch_remove([old])
             kept.data.name = name
+    finally:
+        for obj in list(bench.objects):
+            _remove(obj)
+        bpy.data.collections.remove(bench)
     for other in group[1:]:
-        _replace(other.obj, group[0].obj)
+        back = kept.matrix_world.inverted() @ other.obj.matrix_world
+        for child in list(other.obj.children):
+            inverse = back @ child.matrix_parent_inverse
+            child.parent = kept
+            child.matrix_parent_inverse = inverse
+        _remove(other.obj)
     return notes
 
 
@@ -253,19 +264,6 @@ def _to_first(group: Sequence[SplatObject]) -> list[NDArray[np.float64]]:
         if is_flat(world):
             raise RefineError(f"object '{member.obj.name}': is scaled to nothing along an axis")
     return [np.eye(4), *(np.linalg.inv(worlds[0]) @ world for world in worlds[1:])]
-
-
-@contextmanager
-def _workbench() -> Iterator[bpy.types.Collection]:
-    """Temporary collection of the scene; its content is removed afterwards."""
-    bench = bpy.data.collections.new("REFINE join")
-    bpy.context.scene.collection.children.link(bench)
-    try:
-        yield bench
-    finally:
-        for obj in list(bench.objects):
-            _remove(obj)
-        bpy.data.collections.remove(bench)
 
 
 def _remove(obj: bpy.types.Object) -> None:
@@ -321,13 +319,3 @@ def _as_one(parts: Sequence[bpy.types.Object]) -> bpy.types.Object:
             f"{len(first.data.vertices)} splats were joined, expected {count}; report this"
         )
     return first
-
-
-def _replace(obj: bpy.types.Object, parent: bpy.types.Object) -> None:
-    """Remove an object; another becomes parent of its children, which stay in place."""
-    back = parent.matrix_world.inverted() @ obj.matrix_world
-    for child in list(obj.children):
-        inverse = back @ child.matrix_parent_inverse
-        child.parent = parent
-        child.matrix_parent_inverse = inverse
-    _remove(obj)
