@@ -422,18 +422,12 @@ class Job:
             now.over(context)
 
 
-def register() -> None:
-    """End the work when another file is loaded."""
-    bpy.app.handlers.load_pre.append(_end)
-
-
 def unregister() -> None:
-    """Undo `register`, and end the work: Blender drops the operator silently."""
+    """End the work: Blender drops the operator silently."""
     running = now()
     if running is not None:
         _end()
         running.over(bpy.context)
-    bpy.app.handlers.load_pre.remove(_end)
 
 
 @persistent
@@ -441,3 +435,6 @@ def _end(*_arguments: object) -> None:
     if (running := now()) is not None:
         _now.clear()
         running.worker.end()
+
+
+HANDLERS = {_end: ("load_pre",)}

@@ -266,24 +266,6 @@ def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
     layout.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
 
 
-def register() -> None:
-    """Add handlers: for F12 without splats, and to clean up after undo."""
-    for calls, handler in _handlers():
-        calls.append(handler)
-
-
-def unregister() -> None:
-    """Undo `register`."""
-    for calls, handler in _handlers():
-        calls.remove(handler)
-
-
-def _handlers():
-    of = bpy.app.handlers
-    returned = [(calls, _returned) for calls in (of.undo_post, of.redo_post, of.load_post)]
-    return [(of.render_init, _began), *returned]
-
-
 @persistent
 def _began(scene: bpy.types.Scene, *_: object) -> None:
     """Check whether a render leaves splats out; runs on the rendering thread."""
@@ -320,3 +302,4 @@ def _returned(*_: object) -> None:
 
 CLASSES = (REFINE_OT_render, REFINE_OT_watch_render)
 MENUS = {"TOPBAR_MT_render": draw_menu}
+HANDLERS = {_began: ("render_init",), _returned: ("undo_post", "redo_post", "load_post")}

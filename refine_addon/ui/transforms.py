@@ -209,22 +209,13 @@ def _note() -> None:
                 continue  # it only looks like splats
 
 
-_EVENTS = ("undo_post", "redo_post", "load_post")
-
-
 def register() -> None:
-    """Add the handlers."""
+    """Have the views warn of what moved."""
     viewport_draw.warned_by.append(_in_view)
-    bpy.app.handlers.depsgraph_update_post.append(_updated)
-    for event in _EVENTS:
-        getattr(bpy.app.handlers, event).append(_changed)
 
 
 def unregister() -> None:
     """Undo `register`."""
-    for event in _EVENTS:
-        getattr(bpy.app.handlers, event).remove(_changed)
-    bpy.app.handlers.depsgraph_update_post.remove(_updated)
     viewport_draw.warned_by.remove(_in_view)
     if bpy.app.timers.is_registered(_note):
         bpy.app.timers.unregister(_note)
@@ -233,3 +224,4 @@ def unregister() -> None:
 
 CLASSES = (REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend)
 MENUS = {"VIEW3D_MT_object_apply": _draw_apply, "VIEW3D_MT_object": _draw_object}
+HANDLERS = {_updated: ("depsgraph_update_post",), _changed: ("undo_post", "redo_post", "load_post")}

@@ -303,7 +303,6 @@ def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):
         assert context.timers == 0
     else:
         addon.ui.operator_bases.unregister()
-        addon.ui.operator_bases.register()
 
     assert threads() == []
     assert addon.ui.operator_bases.now() is None
