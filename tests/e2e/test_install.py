@@ -99,7 +99,8 @@ def test_enabling_and_disabling_twice_leaves_nothing_behind(blender: Blender):
 
     added = found["enabled"] - found["before"]
     assert {"operator refine.score", "property Scene.refine", "command refine"} <= added
-    assert [line for line in added if "refine" not in line.lower()] == []
+    own = ("refine", "select splats:")  # a key of our tools may call an operator of Blender's
+    assert [line for line in added if not any(name in line.lower() for name in own)] == []
     assert found["disabled"] ^ found["before"] == set()
     assert found["enabled again"] ^ found["enabled"] == set()
     assert found["disabled again"] ^ found["before"] == set()
