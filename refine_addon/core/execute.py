@@ -244,8 +244,6 @@ def run(
 ) -> Iterator[Outcome]:
     """Call ``work(item)`` for each item, and yield the results in order, as soon as they are there.
 
-    Parameters
-    ----------
     work : callable, whose results must not depend on where it runs
     progress, what
         Called in this thread between items and, on threads or if work calls `checkpoint`, ten times

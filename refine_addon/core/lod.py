@@ -62,8 +62,6 @@ class Levels:
     shares : tuple of float, each in (0, 1) and less than the one before
     psnr : tuple of float, instead; each less than the one before, dB, see `Budget`
 
-    Examples
-    --------
     >>> [budget.keep for budget in Levels((0.5, 0.25)).budgets(9)]
     [5, 3]
     """
@@ -123,18 +121,10 @@ class Levels:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level.
+    """One level, of all splats; the report of its result is that of the last step."""
 
-    Attributes
-    ----------
-    number : int, from 1; level 0 is the original
-    asked : float, the share or the PSNR
-    result : Result, of all splats; its report is that of the last step
-    scores : Scores, of all splats, the same for all levels
-    """
-
-    number: int
-    asked: float
+    number: int  # from 1; level 0 is the original
+    asked: float  # the share or the PSNR
     result: Result
     scores: Scores
 
@@ -261,8 +251,6 @@ def level_paths(source: Path, target: Path, count: int) -> list[Path]:
     >>> from pathlib import Path
     >>> [path.as_posix() for path in level_paths(Path("a/b.compressed.ply"), Path("out"), 2)]
     ['out/b.lod1.ply', 'out/b.lod2.ply']
-    >>> [path.as_posix() for path in level_paths(Path("a/b.ply"), Path("out/c.spz"), 1)]
-    ['out/c.lod1.spz']
     """
     folder, name, suffix = target, scene_name(source), ".ply"
     if registry.names_file(target):
@@ -383,8 +371,7 @@ def lod_file(
 
     Raises
     ------
-    RefineError, Cancelled
-        New files are deleted again then; a streamed SOG that was to be replaced is as it was.
+    RefineError, Cancelled : then new files are deleted, and a streamed SOG is as it was
     """
     clock, path, file = Clock(), expanded(target), expanded(source)
     output = (

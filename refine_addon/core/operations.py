@@ -86,8 +86,6 @@ def run(
 ) -> Result:
     """Read, decide, write and compare; the report of the result is complete afterwards.
 
-    Parameters
-    ----------
     read : ``read(form)`` returns the scene; `form` is the format of the output, None for plain PLY
     decide : ``decide(scene, clock, progress)`` returns the result
     output : its suffix names the format; None writes nothing
@@ -96,10 +94,7 @@ def run(
     views : those that decide; they tell what a lossy file costs, and are drawn
     save : ``save(result, written)`` does what is left once the file is written
 
-    Raises
-    ------
-    RefineError, Cancelled
-        Nothing is written then, unless comparing fails or a refit with partial result is cancelled.
+    Where it fails nothing is written, unless comparing fails or a partial refit is cancelled.
     """
     clock, written = Clock(), None if dry_run else output
     with contextlib.nullcontext() if pictures is None or views is None else pictures.opened(views):
@@ -244,12 +239,6 @@ def prune_file(
     pictures : PictureFiles, optional; where pictures before and after go
     model : Model, optional; where the file does not say how splats are drawn, or is wrong
     dry_run : bool, whether to decide as for the output and write no splats
-
-    Examples
-    --------
-    To keep half of the splats, with the others merged into them::
-
-        prune_file("in.ply", "out.ply", views, Budget(ratio=0.5))
     """
     if budget.max_mb is not None:
         refuse_unknown_size(None if output is None else expanded(output))
@@ -355,14 +344,7 @@ def score_file(
 
 @dataclass(frozen=True)
 class Move:
-    """A scale, then turns about x, y and z in this order, then a translation.
-
-    Attributes
-    ----------
-    translate : three float, in the unit of the file
-    rotate : three float, degrees about the axes of the file
-    scale : float, above 0
-    """
+    """A scale, then turns about x, y and z in this order, degrees, then a translation."""
 
     translate: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)

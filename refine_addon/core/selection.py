@@ -28,8 +28,6 @@ class Budget:
     min_seen : float, splats in fewer than this percentage of the views are removed
     psnr : float, least estimated PSNR of the views' pictures against the unpruned splats', dB
 
-    Examples
-    --------
     >>> Budget(ratio=0.29).removals(100)
     29
     """
@@ -119,9 +117,7 @@ def select(
 
     Raises
     ------
-    RefineError
-        If a PSNR is the budget and the scores have no estimate, if more would go than was scored
-        for (`Scores.settled`), or none would be kept.
+    RefineError : no estimate for a PSNR, more to go than `Scores.settled`, or none to keep
     """
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`

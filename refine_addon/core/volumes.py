@@ -39,11 +39,6 @@ class Box:
     Attributes
     ----------
     low, high : three float, two corners; may be infinite
-
-    Examples
-    --------
-    >>> Box((0, 0, 0), (1, 1, np.inf)).inside(np.array([[0.5, 0, 9], [0.5, 1, 9]])).tolist()
-    [True, False]
     """
 
     low: tuple[float, float, float]

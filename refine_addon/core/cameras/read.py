@@ -34,13 +34,11 @@ def read_cameras(path: Path | str) -> ViewSet:
 
     Returns
     -------
-    ViewSet
-        Its note names distortion, which is ignored, and other cameras in the folder.
+    ViewSet : its note names distortion, which is ignored, and other cameras in the folder
 
     Raises
     ------
-    RefineError
-        If the file is missing or wrong; with the place in the file.
+    RefineError : if the file is missing or wrong; with the place in the file
     """
     path = expanded(path)
     if is_folder(path):

@@ -126,8 +126,6 @@ class Cleaned:
     seen : (N,) int32, views that hold its centre; 0 of those removed by the user
     sure : (N,) float32, (p + 1) / (n + 2) where p of n views see past it (Laplace)
     undrawable : int, splats that cannot be drawn, which stay
-    views_given, views_used : int
-    settings : Cleaning
     """
 
     keep: NDArray[np.bool_]
@@ -199,8 +197,7 @@ def clean(
 
     Raises
     ------
-    RefineError
-        If no splat can be drawn, no view sees any, or nothing would be left.
+    RefineError : if no splat can be drawn, no view sees any, or nothing would be left
     """
     gone = must_go(removed, protected)
     rest = np.ones(len(splats), np.bool_) if gone is None else ~gone

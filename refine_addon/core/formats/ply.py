@@ -156,20 +156,15 @@ class SplatFile:
 
         Parameters
         ----------
-        path : path-like
-            Written completely or not at all. ``~`` is the home folder.
-        keep : (N,) bool, optional
-            All by default.
+        path : path-like, written completely or not at all; ``~`` is the home folder
+        keep : (N,) bool, optional; all by default
         columns : mapping of str to (N,), optional
-            Properties to set. Existing ones keep their place and type; new ones are appended with
-            the type of their array (float32 -> ``float``).
-        overwrite : bool
-            Whether an existing file may be replaced, even the one that was read.
+            Properties to set: existing ones in their place and type, new ones at the end.
+        overwrite : bool, whether a file may be replaced, even the one that was read
 
         Raises
         ------
-        RefineError
-            If the file exists, cannot be written, or `keep` or a column has a wrong shape or type.
+        RefineError : if the file exists or cannot be written, or a shape or type is wrong
         """
         path, columns = expanded(path), columns or {}
         if keep is not None and (keep.shape != self.rows.shape or keep.dtype != np.bool_):
@@ -220,8 +215,7 @@ def read_ply(path: Path | str) -> SplatFile:
 
     Raises
     ------
-    RefineError
-        If the file is missing, damaged or no file of splats; with the place in the file.
+    RefineError : if the file is missing, damaged or no file of splats; with the place in the file
     """
     path = expanded(path)
     return read_plain(path, file_bytes(path))

@@ -46,17 +46,13 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
 
     Parameters
     ----------
-    path : path-like
-        ``~`` is the home folder.
-    model : {"default", "antialiased", "2dgs"}, optional
-        Overrides the model that the file states.
-    level : int
-        Level of a streamed SOG, 0 being the finest; other files have only 0.
+    path : path-like, ``~`` is the home folder
+    model : {"default", "antialiased", "2dgs"}, optional; overrides what the file states
+    level : int, of a streamed SOG, 0 is the finest; other files have only 0
 
     Raises
     ------
-    RefineError
-        If the file is missing, damaged or of no known format; see also `SplatFile.drawn_as`.
+    RefineError : if the file is missing, damaged or of no known format
     """
     path = expanded(path)
     data = file_bytes(path)
@@ -97,8 +93,6 @@ def without_suffix(name: str) -> str:
 def scene_name(path: Path) -> str:
     """Name of the splats of a file: that of the file, or of the folder of an index.
 
-    Examples
-    --------
     >>> from pathlib import Path
     >>> [scene_name(Path(name)) for name in ("a/b.compressed.ply", "a/b", "a/lod-meta.json")]
     ['b', 'b', 'a']

@@ -259,11 +259,6 @@ def nearest(
     """Most of the nearest neighbours of points (N, 3): (N, min(count, N - 1)), ties by index.
 
     Points are in scene sizes; `count` is at most 16.
-
-    Examples
-    --------
-    >>> nearest(np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), 1).ravel().tolist()
-    [1, 0, 1]
     """
     total = len(points)
     count = min(count, total - 1)

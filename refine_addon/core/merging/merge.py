@@ -143,8 +143,6 @@ def merge(
 def stage_counts(count: int, goal: int, alone: float = ALONE) -> list[int]:
     """Splats left after each stage, `goal` after the last; one stage if it leaves `alone`.
 
-    Examples
-    --------
     >>> stage_counts(900, 500), stage_counts(900, 450), stage_counts(900, 900)
     ([500], [636, 450], [])
     """

@@ -3,8 +3,8 @@
     fineness = mean over pixels of the sum of  T_i alpha_i / (1 + (s_i / (FINE side))^2)
 
 s and side, px, are geometric means of a footprint's standard deviations and of the image's sides.
-No threshold holds for all scenes, but much finer pictures after a quarter turn about x mean that
-only one of the files was turned upright. From far away all is fine: see `SMALL`.
+Much finer pictures after a quarter turn about x mean that only one of the files was turned upright.
+From far away all is fine: see `SMALL`.
 """
 
 from __future__ import annotations

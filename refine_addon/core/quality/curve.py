@@ -271,8 +271,6 @@ def in_views(psnr: float, between: float | None) -> str:
 
     >>> in_views(50.2, 36.1), in_views(50.2, None)
     ('about 50 dB in these views, about 36 between them', 'about 50 dB in these views')
-    >>> in_views(72.0, 70.0)
-    'more than 60 dB in these views and between them'
     """
     here = f"{in_words(psnr)} in these views"
     if between is None:

@@ -59,27 +59,20 @@ def prune_tiles(
 
     Parameters
     ----------
-    sources : sequence of path-like
-        Plain binary PLY files in one frame and unit, or URLs that fsspec opens.
+    sources : sequence of path-like, plain binary PLY files in one frame, or URLs that fsspec opens
     folder : path-like or None
-        Where each goes under its own name; None writes nothing. For a URL the job's folder is in
-        the current directory.
-    views, budget, method, model, overwrite, dry_run, progress, threads
-        See `prune` and `prune_file`.
-    workers : Cluster, optional
-        Runs the large steps; by default this machine. See `cluster`.
+        Where each goes under its own name. For a URL the job's folder is in the current directory.
+    views, budget, method, model, overwrite, dry_run, progress, threads : see `prune_file`
+    workers : Cluster, optional, runs the large steps; by default this machine
 
     Returns
     -------
-    dict
-        The report, with ``tiles``: name, counts and bytes of each.
+    dict : the report, with ``tiles``: name, counts and bytes of each
 
     Raises
     ------
-    RefineError, Cancelled
-        As in `prune`, or if two files have one name; nothing is written or kept.
-    Interrupted
-        If a disk, a storage or all workers fail, or a file takes an output's place.
+    RefineError, Cancelled : as in `prune`, or if two files have one name; nothing is kept
+    Interrupted : if a disk, a storage or all workers fail, or a file takes an output's place
 
     Notes
     -----
