@@ -226,4 +226,4 @@ def test_rap_is_part_of_the_trade_where_its_weights_are_given(tmp_path: Path) ->
                        "--output", str(output)])  # fmt: skip
 
     assert code == 0
-    assert "- rap: RAP: a trained network" in output.read_text()
+    assert "- rap: a trained network" in output.read_text()
