@@ -300,7 +300,7 @@ class _Prune:
             given = None  # they were made for another budget
         gone = self.budget.removals(count, *self.sizes)
         left = count // 2 if gone is None else count - gone
-        expected = self._merging_seconds(left) + self._refitting_seconds(left)
+        expected = sum(self._expected_seconds(left))
         scoring, making = stages(
             progress, seconds("measure", count, views), expected * (2.2 if goal else 1.0)
         )
@@ -409,27 +409,21 @@ class _Prune:
         missed = made.reached < self.budget.psnr - CLOSE and made.reached < plain
         return missed or np.count_nonzero(keep) <= len(made.merged.splats)
 
-    def _merging_seconds(self, left: int) -> float:
-        """Expected seconds of merging to so many splats, estimate included."""
+    def _expected_seconds(self, left: int) -> tuple[float, float, float]:
+        """Of merging to so many splats, of the estimate then, and of refitting, if asked."""
         count, views = len(self.splats), len(self.used)
         counts = stage_counts(max(math.ceil((1.0 - FIRST) * count), left), left)
-        return sum(stage_seconds(count, counts, views)) + seconds("compare", left, views)
-
-    def _refitting_seconds(self, left: int) -> float:
-        if not isinstance(self.method, Refit):
-            return 0.0
-        rounds = expected_rounds(left, self.method.rounds)
-        return rounds * seconds("refit", len(self.splats) + left, len(self.used))
+        refit = 0.0
+        if isinstance(self.method, Refit):
+            rounds = expected_rounds(left, self.method.rounds)
+            refit = rounds * seconds("refit", count + left, views)
+        return sum(stage_seconds(count, counts, views)), seconds("compare", left, views), refit
 
     def _to_count(self, keep, scores: Scores, known: Measured, progress: Progress) -> Made:
         """Merge until as many are left as deletion keeps, (N,); refit if asked."""
         origin, used, left = self.origin, self.used, int(np.count_nonzero(keep))
         truth = scores.ray_sample if origin is None else origin.ray_sample
-        comparing_seconds = seconds("compare", left, len(used))
-        merging_progress, comparing, refitting = stages(
-            progress, self._merging_seconds(left) - comparing_seconds, comparing_seconds,
-            self._refitting_seconds(left),
-        )  # fmt: skip
+        merging_progress, comparing, refitting = stages(progress, *self._expected_seconds(left))
 
         def estimated(splats: Splats, told: Progress = silent) -> float | None:
             if truth is None:
