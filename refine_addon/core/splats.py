@@ -115,7 +115,11 @@ def joined(parts: Sequence[Splats]) -> Splats:
     """Splats of sets, in order, to the highest degree among them; missing harmonics are 0."""
     if len(parts) == 1:
         return parts[0]
-    refuse_mixed([part.model for part in parts])
+    models = dict.fromkeys(part.model for part in parts)
+    if len(models) > 1:
+        raise RefineError(
+            f"splats of different models ({', '.join(models)}), expected one: say how all are drawn"
+        )
     most = max(part.sh_rest.shape[1] for part in parts)
     columns: dict[str, Any] = {name: [getattr(part, name) for part in parts] for name in ARRAYS}
     columns["sh_rest"] = [
@@ -124,15 +128,6 @@ def joined(parts: Sequence[Splats]) -> Splats:
     with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
         columns = {name: np.concatenate(arrays) for name, arrays in columns.items()}
     return replace(parts[0], **columns)
-
-
-def refuse_mixed(models: Sequence[Model]) -> None:
-    """Raise `RefineError` if splats that become one scene are drawn in different ways."""
-    if len(set(models)) > 1:
-        listed = ", ".join(dict.fromkeys(models))
-        raise RefineError(
-            f"splats of different models ({listed}), expected one: say how all are drawn"
-        )
 
 
 def above_constant(degree: int) -> int:

@@ -188,20 +188,6 @@ def write_rows(
         write_columns(checked, whole)
 
 
-def move_columns(checked: SplatObject, layout: Layout) -> None:
-    """Move a mesh's columns to the places of `layout`, a superset; `checked` is outdated then."""
-    mesh, places = checked.mesh, {column.name: column.place for column in layout.columns}
-    stored = stored_columns(checked)
-    moving = [c for c in checked.layout.columns if c.place != places[c.name]]
-    values = {column.name: np.array(stored[column.name]) for column in moving}
-    for column in moving:
-        remove_attribute(mesh, column.attribute)
-    for name in values:
-        if (place := places[name]).attribute not in mesh.attributes:
-            mesh.attributes.new(place.attribute, place.kinds[0], "POINT")
-    write_columns(SplatObject(checked.obj, layout), values)
-
-
 def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     """Tell Blender that attributes changed."""
     if isinstance(mesh, bpy.types.PointCloud):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -325,39 +324,17 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         layout = Layout(columns, with_count(noted["header"].encode("latin-1"), count))
         rest = [n for i in range(rest_count(mesh)) if (n := f"f_rest_{i}") not in names]
         if rest:
-            layout = _with(layout, count, _floats(rest, places))
+            layout = _with_harmonics(layout, count, _floats(rest, places))
         return layout if layout.row_dtype.itemsize > 0 else None
 
     return recorded(mesh, LAYOUT, read)
 
 
-def merged(layouts: Sequence[Layout]) -> Layout:
-    """Layout of joined meshes: columns of all, the first's first, in types that hold all values.
-    The number of rows stands on the mesh."""
-    first, columns = layouts[0], dict[str, Column]()
-    for column in (column for layout in layouts for column in layout.columns):
-        known = columns.setdefault(column.name, column)
-        if (known.place, known.dtype[1:]) != (column.place, column.dtype[1:]):
-            widest = np.promote_types(known.dtype, column.dtype).str
-            dtype = widest if widest[1:] in STORAGE else "<f8"
-            place = _plain(dtype, known.attribute, known.place.component)
-            columns[column.name] = Column(column.name, dtype, place)
-    places = Counter(column.place[:2] for column in columns.values())
-    if twice := [attribute for (attribute, _), count in places.items() if count > 1]:
-        raise RefineError(f"attribute '{twice[0]}' holds different properties; rename one")
-    every, own = tuple(columns.values()), len(first.columns)
-    if every == first.columns:
-        return first
-    return _with(Layout(every[:own], first.header), 0, every[own:])
-
-
-def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
-    """A layout with further columns: harmonics after the others, the rest at the end."""
-    rest = [column for column in more if column.name.startswith("f_rest_")]
-    others = [column for column in more if column not in rest]
+def _with_harmonics(layout: Layout, count: int, rest: Sequence[Column]) -> Layout:
+    """A layout with further harmonics, after the others."""
     colors = [c.name.startswith(("f_dc_", "f_rest_")) for c in layout.columns]
     end = len(colors) - colors[::-1].index(True)
-    columns = [*layout.columns[:end], *rest, *layout.columns[end:], *others]
+    columns = [*layout.columns[:end], *rest, *layout.columns[end:]]
     # Of one byte order, since the header names but one.
     plain = tuple(Column(c.name, c.dtype.replace(">", "<"), c.place) for c in columns)
     header = new_header(_row(plain), count)

@@ -1,4 +1,4 @@
-"""Transforms of whole splat objects: bake, join, mend.
+"""Transforms of whole splat objects: bake, mend.
 Each does all it says, or raises `RefineError` and changes nothing."""
 
 from __future__ import annotations
@@ -7,25 +7,24 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import snapped, world_matrix
+from ..cameras import snapped
 from ..core.affine import Move, baked, check_affine, is_flat, is_uniform, moved
 from ..core.errors import RefineError
-from ..core.execute import Progress, chunks, run_all, silent
+from ..core.execute import chunks, run_all
 from ..core.formats.ply_columns import values_by_name
-from ..core.splats import Splats, above_constant, refuse_mixed
+from ..core.splats import Splats, above_constant
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
-from . import demands
 
 _NORMALS = ("nx", "ny", "nz")
 
@@ -43,20 +42,16 @@ def read_to_move(
     matrix: NDArray[np.float64] | None = None,
     *,
     mend: bool = False,
-    harmonics: int = 0,
 ) -> tuple[set[str], Callable[[], tuple[dict[str, NDArray[Any]], int]]]:
     """Read an object to move its splats by `matrix`, (4, 4) in its frame, first repaired if `mend`.
     Gives the properties that change (maybe none), and a thread-safe callable for their values,
-    (N,), and the number mended. `harmonics`: least number beyond the constant, zeros added."""
+    (N,), and the number mended."""
     matrix = np.eye(4) if matrix is None else matrix
     check_affine(matrix)
     find = mesh_drift.mending(checked.mesh) if mend else None
-    more = harmonics - mesh_layout.rest_count(checked.mesh) // 3
-    if find is None and more <= 0 and np.array_equal(matrix, np.eye(4)):
+    if find is None and np.array_equal(matrix, np.eye(4)):
         return set(), lambda: ({}, 0)
     splats = mesh_attributes.splats_from_object(checked)
-    if more > 0:
-        splats = replace(splats, sh_rest=np.pad(splats.sh_rest, ((0, 0), (0, more), (0, 0))))
     has_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
     names = {*values_by_name(splats), *(_NORMALS if has_normals else ())} - {"opacity"}
     stored = mesh_attributes.stored_columns(checked)
@@ -189,133 +184,3 @@ def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
         child.matrix_parent_inverse = back @ child.matrix_parent_inverse
     mesh_scores.move_origin(obj.data, np.array(before), np.array(obj.matrix_world))
     bpy.context.view_layer.update()
-
-
-class Joined(NamedTuple):
-    """Matrices to the first object's frame, and the splats' columns there."""
-
-    matrices: list[NDArray[np.float64]]
-    columns: list[dict[str, NDArray[Any]]]
-
-
-def read_to_join(group: Sequence[SplatObject]) -> Callable[[Progress], Joined]:
-    """Read objects; a thread-safe callable moves their splats into the first one's frame."""
-    matrices, most = _to_first(group), max(mesh_layout.rest_count(m.mesh) for m in group)
-    parts = [
-        read_to_move(member, matrix, mend=True, harmonics=most // 3)[1]
-        for member, matrix in zip(group, matrices, strict=True)
-    ]
-
-    return lambda progress: Joined(
-        matrices, run_all(lambda part: part()[0], parts, progress=progress, threads=1)
-    )
-
-
-def join(group: Sequence[SplatObject], found: Joined | None = None) -> list[str]:
-    """Put the splats of meshes into the first, looking the same; notes on what was filled in.
-    Marks, vertex groups and properties come along, 0 where missing, harmonics filled up with zeros;
-    scores do not. The others go, children parented to the first. `found`: void if an object moved
-    since `read_to_join`."""
-    matrices, most = _to_first(group), max(mesh_layout.rest_count(m.mesh) for m in group)
-    refuse_mixed([member.layout.model for member in group])
-    pairs = zip(group, matrices, strict=True)
-    notes = [note for member, matrix in pairs for note in uneven_notes(member, matrix)]
-    if found is None or not np.array_equal(found.matrices, matrices):
-        found = read_to_join(group)(silent)
-    bench = bpy.data.collections.new("REFINE join")  # removed afterwards with what it holds
-    bpy.context.scene.collection.children.link(bench)
-    try:
-        parts = [_copied(member, bench, most) for member in group]
-        for part, columns in zip(parts, found.columns, strict=True):
-            mesh_attributes.write_columns(mesh_layout.check(part), columns)
-        notes += _made_alike([mesh_layout.check(part) for part in parts], group)
-        whole = _as_one(parts)
-        mesh_drift.stamp(whole.data)
-        kept, old = group[0].obj, group[0].obj.data
-        name, kept.data = old.name, whole.data
-        if not old.users:
-            bpy.data.batch_remove([old])
-            kept.data.name = name
-    finally:
-        for obj in list(bench.objects):
-            _remove(obj)
-        bpy.data.collections.remove(bench)
-    for other in group[1:]:
-        back = kept.matrix_world.inverted() @ other.obj.matrix_world
-        for child in list(other.obj.children):
-            inverse = back @ child.matrix_parent_inverse
-            child.parent = kept
-            child.matrix_parent_inverse = inverse
-        _remove(other.obj)
-    return notes
-
-
-def _to_first(group: Sequence[SplatObject]) -> list[NDArray[np.float64]]:
-    for member in group:
-        mesh_edit.check_changeable(member.obj)
-        if member.obj.type != "MESH":
-            raise RefineError(
-                f"object '{member.obj.name}': is a point cloud, which Blender cannot join; export "
-                "it, and import the file as a mesh"
-            )
-    graph = bpy.context.evaluated_depsgraph_get()
-    worlds = [world_matrix(member.obj, graph) for member in group]
-    for member, world in zip(group, worlds, strict=True):
-        if is_flat(world):
-            raise RefineError(f"object '{member.obj.name}': is scaled to nothing along an axis")
-    return [np.eye(4), *(np.linalg.inv(worlds[0]) @ world for world in worlds[1:])]
-
-
-def _remove(obj: bpy.types.Object) -> None:
-    data = obj.data
-    bpy.data.objects.remove(obj)
-    if not data.users:
-        bpy.data.batch_remove([data])
-
-
-def _copied(member: SplatObject, bench: bpy.types.Collection, rest: int) -> bpy.types.Object:
-    """A mesh object with a copy of an object's splats, `rest` harmonics, and no scores."""
-    obj = bpy.data.objects.new("REFINE join", member.mesh.copy())
-    bench.objects.link(obj)
-    mesh_scores.forget(mesh_layout.check(obj))
-    mesh_scores.forget_floaters(obj.data)
-    mesh_attributes.remove_attribute(obj.data, mesh_edit.FORCE)
-    obj.data.pop(demands.FACTS, None)
-    for index in range(mesh_layout.rest_count(obj.data), rest):
-        obj.data.attributes.new(f"f_rest_{index}", "FLOAT", "POINT")
-    bpy.context.view_layer.update()
-    return obj
-
-
-def _made_alike(parts: Sequence[SplatObject], group: Sequence[SplatObject]) -> list[str]:
-    """Give objects the same columns in the same attributes; notes on what some lack."""
-    notes = []
-    layout = mesh_layout.merged([part.layout for part in parts])
-    for part, member in zip(parts, group, strict=True):
-        own = {column.name for column in part.layout.columns}
-        if missing := [c.name for c in layout.columns if c.name not in own]:
-            notes.append(
-                f"object '{member.obj.name}': has no {', '.join(missing)}, which became 0 for its "
-                f"{len(member):,} splats"
-            )
-        mesh_attributes.move_columns(part, layout)
-    mesh_layout.note(parts[0].mesh, layout)
-    return notes
-
-
-def _as_one(parts: Sequence[bpy.types.Object]) -> bpy.types.Object:
-    bpy.context.view_layer.update()
-    first, count = parts[0], sum(len(part.data.vertices) for part in parts)
-    others = [part.data for part in parts[1:]]
-    chosen = {"active_object": first, "object": first, "selected_editable_objects": parts}
-    try:
-        with bpy.context.temp_override(**chosen):
-            bpy.ops.object.join()
-    except RuntimeError as error:
-        raise RefineError(f"Blender could not join the splats ({str(error).strip()})") from error
-    bpy.data.batch_remove(others)
-    if len(first.data.vertices) != count:
-        raise RefineError(
-            f"{len(first.data.vertices)} splats were joined, expected {count}; report this"
-        )
-    return first

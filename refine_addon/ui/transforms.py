@@ -53,40 +53,6 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _several(context: Context) -> str:
-    chosen = splat_group.chosen(context.view_layer, context.object)
-    return "" if len(chosen) > 1 else "Select several objects that hold splats"
-
-
-class REFINE_OT_join(Job, OnSplats, bpy.types.Operator):
-    """Put the splats of the selected objects into the active one; they keep what they look like"""
-
-    bl_idname = "refine.join"
-    bl_label = "Join Splats"
-    bl_options = {"REGISTER", "UNDO"}
-    needs = (*OnSplats.needs, in_object_mode, _several)
-    doing = "Joining splats"
-
-    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """The selected objects, active first, and what moves their splats."""
-        group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
-        group.sort(key=lambda member: member.obj != context.object)
-        return group, transforms.read_to_join(group)
-
-    @staticmethod
-    def compute(move: Any, progress: Progress) -> transforms.Joined:
-        """Splats, sizes, rotations and harmonics in the active object's frame."""
-        return move(progress)
-
-    def put(self, context: Context, group: list[SplatObject], _job: Any, found: Any) -> None:
-        """Join them."""
-        for note in transforms.join(group, found):
-            self.report({"WARNING"}, note)
-        plans.refresh(context)
-        count = mesh_layout.splat_count(group[0].obj.data)
-        self.report({"INFO"}, f"Joined {len(group)} objects: {count:,} splats; score again")
-
-
 class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
     """Have sizes, rotations and colours follow what Blender's own tools did to the positions"""
 
@@ -149,9 +115,7 @@ def draw(layout: bpy.types.UILayout, context: Context, objects: Sequence[bpy.typ
         wrapped.label(layout, context, sentence, icon="ERROR")
     if any(drift.mendable for drift in drifts):
         layout.operator("refine.mend", icon="MODIFIER")
-    if len(objects) > 1:
-        layout.operator("refine.join", icon="SELECT_EXTEND")
-    elif objects[0].matrix_basis != mathutils.Matrix():
+    if len(objects) == 1 and objects[0].matrix_basis != mathutils.Matrix():
         layout.operator("refine.bake_transform", icon="OBJECT_ORIGIN")
 
 
@@ -159,12 +123,6 @@ def _draw_apply(menu: bpy.types.Menu, context: Context) -> None:
     if mesh_layout.looks_like_splats(context.object):
         menu.layout.separator()
         menu.layout.operator("refine.bake_transform", text="Bake Transform of Splats")
-
-
-def _draw_object(menu: bpy.types.Menu, context: Context) -> None:
-    if mesh_layout.looks_like_splats(context.object):
-        menu.layout.separator()
-        menu.layout.operator("refine.join")
 
 
 @persistent
@@ -222,6 +180,6 @@ def unregister() -> None:
     _known.clear()
 
 
-CLASSES = (REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend)
-MENUS = {"VIEW3D_MT_object_apply": _draw_apply, "VIEW3D_MT_object": _draw_object}
+CLASSES = (REFINE_OT_bake_transform, REFINE_OT_mend)
+MENUS = {"VIEW3D_MT_object_apply": _draw_apply}
 HANDLERS = {_updated: ("depsgraph_update_post",), _changed: ("undo_post", "redo_post", "load_post")}

@@ -96,15 +96,13 @@ def test_the_box_says_how_an_object_is_drawn_and_its_file_too(addon, make_splats
     assert addon.core.read_ply(tmp_path / "out.ply").model == "antialiased"
 
 
-def test_objects_of_different_models_are_no_scene_and_are_not_joined(
-    addon, make_splats, tmp_path, unchanged
-):
+def test_objects_of_different_models_are_no_scene(addon, make_splats, tmp_path, unchanged):
     one = imported(make_splats(20), tmp_path / "one.ply", "SplatRenderMode: mip")
     other = imported(make_splats(20), tmp_path / "other.ply")
     group = [addon.mesh.layout.check(obj) for obj in (one, other)]
     unchanged.start()
 
     with pytest.raises(addon.core.RefineError, match="different models"):
-        addon.objects.transforms.join(group)
+        addon.objects.splat_group.gather(group)
 
     unchanged()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 
 import bpy
@@ -13,9 +12,6 @@ import pytest
 from benchmarks.renderer.rasterizer import render
 from tests.e2e.inside.clouds import as_blender_imports
 from tests.strategies import ply_of
-from tests.windows import event, started_in_a_window, until_over
-
-from .conftest import export
 
 TURN = mathutils.Euler((0.4, -0.7, 1.1)).to_matrix().to_4x4()
 NOWHERE = mathutils.Matrix()
@@ -201,176 +197,12 @@ def parted(imported):
     return half
 
 
-def test_join_splats_keeps_what_is_seen_of_objects_that_stand_apart(addon, imported, seen):
-    """A turned one, a mirrored one and one that Ctrl+A ruined: 3 x 9,939 splats."""
-    second, third = (parted(imported) for _ in range(2))
-    imported.matrix_world = mathutils.Matrix.Translation((0.1, 0.0, 0.0))
-    second.matrix_world, third.matrix_world = SOMEWHERE, ELSEWHERE
-    group = second.vertex_groups.new(name="mine")
-    group.add([5, 7], 0.25, "REPLACE")
-    mark = np.arange(9939) % 3 == 0
-    addon.mesh.edit.mark_by_hand(third, mark)
-    child = bpy.data.objects.new("child", None)
-    bpy.context.scene.collection.objects.link(child)
-    child.parent = second
-    bpy.context.view_layer.update()
-    place, before = child.matrix_world.copy(), seen()
-    select(third)
-    bpy.ops.object.transform_apply(scale=False, location=False)
-    select(imported, second, third)
-
-    assert bpy.ops.refine.join() == {"FINISHED"}
-
-    assert [obj for obj in bpy.data.objects if obj.type == "MESH"] == [imported]
-    assert len(imported.data.vertices) == 3 * 9939
-    assert psnr(seen(), before) > 60.0
-    assert addon.mesh.drift.found(imported.data) is None
-    weights = addon.mesh.edit.group_weights(imported, "mine")
-    assert sorted(np.flatnonzero(weights) - 9939) == [5, 7]
-    np.testing.assert_array_equal(
-        addon.mesh.edit.protected_mask(imported, ""), np.append(np.zeros(2 * 9939, bool), mark)
-    )
-    assert child.parent == imported
-    np.testing.assert_allclose(child.matrix_world, place, atol=1e-5)
-    assert len(bpy.data.meshes) == 1
-    assert "REFINE join" not in bpy.data.collections
-
-
 def file_of(addon, make_splats, path, count, degree, **more):
     """Write random splats with further properties."""
     columns = make_splats(count, degree=degree, seed=count) | more
     path.write_bytes(ply_of(columns, comments=[f"of {path.name}"]))
     bpy.ops.refine.import_ply(filepath=str(path))
     return bpy.context.object, addon.core.read_ply(path)
-
-
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_files_of_several_degrees_and_properties_become_one(addon, make_splats, tmp_path, order):
-    """Degrees 1 and 3; a property that one lacks is 0 there; one of two types takes the wider."""
-    made = [
-        file_of(
-            addon, make_splats, tmp_path / "a.ply", 40, 1,
-            mine=np.arange(40, dtype=np.uint8), id=np.arange(40, dtype=np.int32),
-        ),
-        file_of(addon, make_splats, tmp_path / "b.ply", 30, 3, mine=np.full(30, 0.5, np.float32)),
-    ]  # fmt: skip
-    (first, one), (second, other) = (made[index] for index in order)
-    select(first, second)
-    notes = addon.objects.transforms.join([addon.mesh.layout.check(obj) for obj in (first, second)])
-
-    export(addon, addon.mesh.layout.check(first), tmp_path / "joined.ply")
-    got = addon.core.read_ply(tmp_path / "joined.ply")
-
-    assert len(got) == 70
-    assert [note.split(":")[1].split(",")[0] for note in notes] == [" has no id"]
-    expected = addon.core.splats.joined([file.splats() for file in (one, other)])
-    for field in addon.core.splats.ARRAYS:
-        np.testing.assert_array_equal(getattr(got.splats(), field), getattr(expected, field), field)
-    np.testing.assert_array_equal(
-        got.rows["mine"], np.concatenate([one.rows["mine"], other.rows["mine"]])
-    )
-    wide = dict.fromkeys(["a", "b"], np.zeros(30))
-    wide["a"] = np.arange(40)
-    ids = [wide["a"], wide["b"]]
-    np.testing.assert_array_equal(got.rows["id"], np.concatenate([ids[index] for index in order]))
-
-
-def test_point_clouds_are_not_joined(imported, quarter_file, addon, unchanged):
-    """Blender joins meshes alone; the sentence says what to do."""
-    cloud = as_blender_imports(addon.core.read_ply(quarter_file).rows)
-    select(imported, cloud)
-    unchanged.start()
-
-    with pytest.raises(RuntimeError, match=r"is a point cloud, .* import the file as a mesh"):
-        bpy.ops.refine.join()
-
-    unchanged()
-
-
-def test_a_join_that_fails_leaves_the_scene_as_it_was(addon, imported, monkeypatch, unchanged):
-    """Whatever was made by then is gone."""
-    second = parted(imported)
-    second.matrix_world = SOMEWHERE
-    select(imported, second)
-    bpy.context.view_layer.update()
-    unchanged.start()
-
-    def fail(*_):
-        raise MemoryError
-
-    monkeypatch.setattr(addon.objects.transforms, "_as_one", fail)
-    with pytest.raises(RuntimeError, match="not enough memory"):
-        bpy.ops.refine.join()
-
-    unchanged()
-
-
-@pytest.fixture
-def held_join(addon, imported, monkeypatch):
-    """Click *Join Splats* of a turned object and another; its thread waits until it is let go."""
-    second, go, joined = parted(imported), threading.Event(), addon.objects.transforms.read_to_join
-    second.matrix_world = SOMEWHERE
-    select(imported, second)
-    bpy.context.view_layer.update()
-
-    def held(group):
-        move = joined(group)
-
-        def work(progress):
-            while not go.wait(0.01):
-                addon.core.execute.report(progress, 0.0, "")
-            return move(progress)
-
-        return work
-
-    monkeypatch.setattr(addon.objects.transforms, "read_to_join", held)
-    yield second, lambda: started_in_a_window(addon, addon.ui.transforms.REFINE_OT_join), go
-    addon.ui.operator_bases._end()
-
-
-def test_a_join_that_is_cancelled_leaves_the_scene_as_it_was(held_join, imported, unchanged):
-    """Esc while the thread moves the splats; a second click joins them."""
-    _, start, go = held_join
-    unchanged.start()
-    operator, context, said = start()
-    operator.modal(context, event("ESC"))
-
-    assert until_over(operator, context) == {"CANCELLED"}
-    assert said == ["Joining splats cancelled; nothing was changed"]
-    unchanged()
-    go.set()
-    assert until_over(*start()[:2]) == {"FINISHED"}
-    assert len(imported.data.vertices) == 2 * 9939
-
-
-@pytest.mark.parametrize("moved", [False, True])
-def test_what_is_joined_stays_where_it_is_when_the_thread_is_done(held_join, imported, seen, moved):
-    """Also where somebody moves an object while the thread works."""
-    second, start, go = held_join
-    operator, context, said = start()
-    if moved:
-        second.location.x += 0.2
-    before = seen()
-    go.set()
-
-    assert until_over(operator, context) == {"FINISHED"}
-    assert said == ["Joined 2 objects: 19,878 splats; score again"]
-    assert len(imported.data.vertices) == 2 * 9939
-    assert psnr(seen(), before) > 60.0
-
-
-def test_a_join_of_splats_that_changed_since_is_refused(held_join, seen):
-    """A vertex of the second object is moved while the thread works."""
-    second, start, go = held_join
-    operator, context, said = start()
-    second.data.vertices[0].co.x += 1.0
-    second.data.update()
-    before = seen()
-    go.set()
-
-    assert until_over(operator, context) == {"CANCELLED"}
-    assert "its splats were changed meanwhile" in said[0]
-    assert psnr(seen(), before) == 99.0
 
 
 @pytest.mark.parametrize("degrees", [(3, 3), (1, 3), (3, 1)])

@@ -102,7 +102,7 @@ def main(
 
 
 def selecting(clock: Clock, scored: Scored) -> None:
-    """Select, hide and protect splats, part and join them, and crop them."""
+    """Select, hide and protect splats, part and move them, and crop them."""
     refine = bpy.ops.refine
     scored.again()
     clock.time("select by size", refine.select_by, what="LARGE")
@@ -115,8 +115,8 @@ def selecting(clock: Clock, scored: Scored) -> None:
     clock.time("protect", refine.protect)
     clock.time("separate", refine.separate_selected)
     bpy.context.view_layer.objects.active.location.x += 0.5
-    clock.time("join", refine.join)
-    clock.time("undo of join", bpy.ops.ed.undo)
+    clock.time("bake transform", refine.bake_transform)
+    clock.time("undo of bake transform", bpy.ops.ed.undo)
     scored.again()
     clock.time("add volume", refine.add_volume, role="REMOVE", shape="BOX")
     clock.time("select outside", refine.select_by, what="OUTSIDE")

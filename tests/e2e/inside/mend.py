@@ -1,4 +1,4 @@
-"""Apply and join objects of splats as Blender does, mend them, and join them ourselves."""
+"""Apply and join objects of splats as Blender does, and mend them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def main(cloud: str) -> dict[str, Any]:
     """
     found = {}
     for form in ("MESH", "POINTCLOUD"):
-        for step in (blenders_apply, *((blenders_join, ours) if form == "MESH" else ())):
+        for step in (blenders_apply, *((blenders_join,) if form == "MESH" else ())):
             bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
             extension.enable()
             objects = [imported(cloud, form, place) for place in PLACES]
@@ -60,15 +60,6 @@ def blenders_join(objects: list[bpy.types.Object]) -> list[str]:
     """Ctrl+J."""
     select(objects)
     bpy.ops.object.join()
-    return mended([bpy.context.object])
-
-
-def ours(objects: list[bpy.types.Object]) -> list[str]:
-    """*Bake Transform* of one, then *Join Splats*."""
-    select(objects[:1])
-    bpy.ops.refine.bake_transform()
-    select(objects)
-    bpy.ops.refine.join()
     return mended([bpy.context.object])
 
 

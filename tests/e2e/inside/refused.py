@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Doing = Generator[float, None, None]
 
 ON_SPLATS = (
-    *("score", "apply", "compare", "levels", "join", "mend", "find_floaters"),
+    *("score", "apply", "compare", "levels", "mend", "find_floaters"),
     "grow_selection",
 )
 """Operators that refuse splats which lack an attribute as soon as they are called."""

@@ -131,31 +131,27 @@ def arranged(steps: Steps, blend: str) -> Generator[float, None, None]:
 
 
 def joined(steps: Steps) -> Generator[float, None, None]:
-    """Part the splats, stand one half otherwise, and join: by Blender and mended, and by ours."""
-    for name in ("join mended", "join"):
-        whole = splats()
-        select_vertices(whole, np.arange(len(whole.data.vertices)) % 2 == 0)
-        steps.select(whole)
-        steps.do(bpy.ops.object.mode_set, mode="EDIT")
-        steps.do(bpy.ops.mesh.separate, type="SELECTED")
-        steps.do(bpy.ops.object.mode_set, mode="OBJECT")
-        half = splats(but=whole)
-        half.matrix_world = PLACE
-        half.data.transform(PLACE.inverted() @ whole.matrix_world)
-        half.data.update()
-        bpy.context.view_layer.update()
-        steps.select(half)
-        yield 0.5
-        steps.do(bpy.ops.refine.mend)
-        steps.select(whole, half)
-        yield from steps.look(f"parted for {name}")
-        if name == "join":
-            steps.do(bpy.ops.refine.join)
-        else:
-            steps.do(bpy.ops.object.join)
-            yield from steps.look("ruined by join")
-            steps.do(bpy.ops.refine.mend)
-        yield from steps.look(name)
+    """Part the splats, stand one half otherwise, join, and mend."""
+    whole = splats()
+    select_vertices(whole, np.arange(len(whole.data.vertices)) % 2 == 0)
+    steps.select(whole)
+    steps.do(bpy.ops.object.mode_set, mode="EDIT")
+    steps.do(bpy.ops.mesh.separate, type="SELECTED")
+    steps.do(bpy.ops.object.mode_set, mode="OBJECT")
+    half = splats(but=whole)
+    half.matrix_world = PLACE
+    half.data.transform(PLACE.inverted() @ whole.matrix_world)
+    half.data.update()
+    bpy.context.view_layer.update()
+    steps.select(half)
+    yield 0.5
+    steps.do(bpy.ops.refine.mend)
+    steps.select(whole, half)
+    yield from steps.look("parted for join")
+    steps.do(bpy.ops.object.join)
+    yield from steps.look("ruined by join")
+    steps.do(bpy.ops.refine.mend)
+    yield from steps.look("join mended")
 
 
 def edited(steps: Steps) -> Generator[float, None, None]:
