@@ -141,18 +141,20 @@ def draw_legend(
     marks: Collection[int] = (),
     warnings: Collection[str] = (),
 ) -> None:
-    """Draw the legend of a mode and of marks (`MARKED`) into a view, warnings above it."""
+    """Draw the legend of a mode and of marks (`MARKED`) into a view, warnings above it.
+    At the lower right, since Blender opens *Adjust Last Operation* at the lower left."""
     if mode not in WORDS and not marks and not warnings:
         return
     scale = context.preferences.system.ui_scale
-    x, y = _beside_tools(context) + _EDGE * scale, _EDGE * scale
     blf.size(0, _FONT * scale)
+    line, high, wide = _EDGE * scale, _HIGH * scale, _WIDE * scale
+    widest = max([wide, *(blf.dimensions(0, text)[0] for text in warnings)])
+    x = max(_right(context) - widest - _EDGE * scale, 0.0)
     blf.color(0, *_WHITE)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, *_BLACK)  # a blur of 0, 3 or 5
-    line, high, wide = y, _HIGH * scale, _WIDE * scale
     if mode == "HEAT":
-        _bar(x, y, wide, high, ramp()[::8])
+        _bar(x, line, wide, high, ramp()[::8])
         line += high + _GAP * scale
     if mode in WORDS:
         for index, text in enumerate(WORDS[mode]):  # the second ends where the bar does
@@ -175,9 +177,11 @@ def _write(text: str, x: float, y: float) -> None:
     blf.draw(0, text)
 
 
-def _beside_tools(context: bpy.types.Context) -> int:
-    regions = (region for region in context.area.regions if region.type == "TOOLS")
-    return sum(region.width for region in regions if region.x <= context.region.x)
+def _right(context: bpy.types.Context) -> int:
+    """Left edge of the sidebar, pixels of the view's region."""
+    left, region = context.region.x, context.region
+    sidebars = (each for each in context.area.regions if each.type == "UI" and each.width > 1)
+    return min([region.width, *(each.x - left for each in sidebars if each.x > left)])
 
 
 def _bar(x: float, y: float, wide: float, high: float, colors: Any) -> None:
