@@ -86,9 +86,7 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
     if mode and not stat.S_ISREG(mode):
         raise RefineError(f"{path}: is a device, expected the name of a file")
     if mode and not overwrite:
-        raise RefineError(
-            f"{path}: exists already; choose another name or overwrite it (--overwrite)"
-        )
+        raise RefineError(f"{path}: exists already; choose another name, or set overwrite")
     if not stat.S_ISDIR(folder):
         missing = behind if above else path.parent
         raise RefineError(f"{path}: cannot be written, there is no folder {missing}")

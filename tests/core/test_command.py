@@ -651,7 +651,7 @@ FAILS = {
     ),
     "a report that exists": (
         [*PRUNE, "-o", "out.ply", "--report", "mesh.ply"],
-        "mesh.ply: exists already; choose another name or overwrite it (--overwrite)",
+        "mesh.ply: exists already; choose another name, or set overwrite",
     ),
     "a report nowhere": (
         [*PRUNE, "-o", "out.ply", "--report", "none/report.json"],

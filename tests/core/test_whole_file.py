@@ -163,7 +163,7 @@ def test_an_output_that_cannot_be_is_refused_before_any_work(tmp_path):
     (tmp_path / "folder").mkdir()
     for name, overwrite, expected in [
         ("folder", True, "is a folder, expected a file name to write to"),
-        ("old", False, "exists already; choose another name or overwrite it (--overwrite)"),
+        ("old", False, "exists already; choose another name, or set overwrite"),
         ("none/out", False, f"cannot be written, there is no folder {tmp_path / 'none'}"),
         ("old/out", False, f"cannot be written, there is no folder {tmp_path / 'old'}"),
         ("n" * 300, False, "cannot be written (File name too long); nothing was changed"),

@@ -190,7 +190,7 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
     extra = other_properties(file.rows.dtype.names or ())
     lost = left_out(file, form, keep)
     held = f"{suffix} holds harmonics of degree {form.degree}, the file has degree {degree}"
-    stated = f"{suffix} does not say that splats are {model}: read it with --model {model}"
+    stated = f"{suffix} does not say that splats are {model}: say so when it is read (model)"
     undrawn = f"{lost} of the kept splats cannot be drawn and {suffix} cannot hold them: left out"
     said = {
         f"{suffix} {form.loss} (docs/conventions.md, Formats)": True,

@@ -134,9 +134,7 @@ def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
         if system.isdir(inner):
             raise RefineError(f"{path}: is a folder, expected a file name to write to")
         if not overwrite and system.exists(inner):
-            raise RefineError(
-                f"{path}: exists already; choose another name or overwrite it (--overwrite)"
-            )
+            raise RefineError(f"{path}: exists already; choose another name, or set overwrite")
 
 
 def upload(made: Path, url: Url) -> None:
