@@ -6,24 +6,11 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-PROMPT = ">>> "
-
 _BLOCK = re.compile(r"(<!-- not run: [^\n]+ -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 class Block(NamedTuple):
-    """A fenced block of a document.
-
-    Attributes
-    ----------
-    place : str
-        File and line.
-    language : str
-        What follows the fence, or "".
-    text : str
-    excused : bool
-        Whether ``<!-- not run: REASON -->`` stands on the line before.
-    """
+    """A fenced block; excused where ``<!-- not run: REASON -->`` stands on the line before."""
 
     place: str
     language: str
@@ -36,7 +23,7 @@ def modules_with_examples(package: Path, name: str) -> list[str]:
     return sorted(
         ".".join((name, *path.relative_to(package).with_suffix("").parts))
         for path in package.rglob("*.py")
-        if PROMPT in path.read_text(encoding="utf-8")
+        if ">>> " in path.read_text(encoding="utf-8")
     )
 
 

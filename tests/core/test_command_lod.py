@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ import pytest
 from refine_addon.command import main
 from refine_addon.core import read_splats
 
-from .test_command_clean import call, files  # noqa: F401 - a fixture
-from .test_levels import merges  # noqa: F401 - a fixture
+from .test_command import contents
+from .test_command_clean import call, files, told  # noqa: F401 - a fixture
 
 pytestmark = pytest.mark.slow
 
@@ -20,123 +19,125 @@ LOD = importlib.import_module("refine_addon.core.lod")
 QUICK = ["--method", "closed-form", "--views", "2"]
 
 
+@pytest.fixture
+def stops(monkeypatch):
+    """Return the levels before which Ctrl-C comes, none at first; 0: before any."""
+    made, levels = LOD.lod, set()
+
+    def lod(*given, **named):
+        if 0 in levels:
+            raise KeyboardInterrupt
+        for level in made(*given, **named):
+            if level.number in levels:
+                raise KeyboardInterrupt
+            yield level
+
+    monkeypatch.setattr(LOD, "lod", lod)
+    return levels
+
+
+def made(folder):
+    """Return the names of files of levels, and how many splats each holds."""
+    return {path.name: len(read_splats(path)) for path in sorted(folder.iterdir())}
+
+
 def test_lod_writes_levels_and_says_what_each_costs(files, capsys):
     """577 splats: .5 are 289 (288.5), .1 are 58 (57.7); a line for each, and the report."""
-    out, told = files / "out", files / "report.json"
+    options = ["--levels", ".5,.1", "-o", files / "out/room.splat"]
 
-    options = ["--levels", ".5,.1", "-o", str(out / "room.splat"), "--report", str(told)]
+    entry = told(files, "lod", *options, *QUICK)
 
-    code = call(files, "lod", *options, *QUICK)
-
-    assert code == 0
     said = capsys.readouterr().out
-    assert "2 levels of 577 splats" in said
+    assert ": 2 levels of 577 splats, by 2 of 6 views, " in said
     assert "room.lod1.splat: 289 splats" in said
-    assert len(read_splats(out / "room.lod2.splat")) == 58
-    result = json.loads(told.read_text())["results"][0]
-    assert [entry["splats"] for entry in result["levels"]] == [289, 58]
+    assert made(files / "out") == {"room.lod1.splat": 289, "room.lod2.splat": 58}
+    assert [level["splats"] for level in entry["levels"]] == [289, 58]
 
 
-@pytest.mark.slow
-def test_by_default_splats_are_merged_and_four_levels_are_made(merges, files):
+def test_by_default_four_levels_are_made(files):
     """Halves of halves, about: 289, 145, 70 and 35 of 577, rounded up."""
-    assert call(files, "lod", "-o", str(files / "out"), "--views", "2", "--quiet") == 0
-    made = [len(read_splats(files / f"out/scene.lod{number}.ply")) for number in range(1, 5)]
-    assert made == [289, 145, 70, 35]
-    source = {row.tobytes() for row in read_splats(files / "scene.ply").rows}
-    rows = read_splats(files / "out/scene.lod4.ply").rows
-    assert any(row.tobytes() not in source for row in rows)
+    assert call(files, "lod", "-o", files / "out", "--views", "2", "--quiet") == 0
+    assert list(made(files / "out").values()) == [289, 145, 70, 35]
 
 
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        (["--levels", ".5,.6"], "comes after"),
-        (["--levels", "half"], "numbers with commas"),
-        (["--levels", "2"], "less than 1"),
-        (["--psnr", "30,40"], "comes after"),
-        (["--psnr", "40", "--levels", ".5"], "by the shares that stay or by PSNR, got both"),
+        (["-o", "out", "--levels", ".5,.6"], "comes after"),
+        (["-o", "out", "--levels", "half"], "numbers with commas"),
+        (["-o", "out", "--levels", "2"], "less than 1"),
+        (["-o", "out", "--psnr", "30,40"], "comes after"),
+        (["-o", "out", "--psnr", "40", "--levels", ".5"], "by PSNR, got both"),
         (["-o", "levels.ply.gz"], "is not written, expected one of .ply"),
+        ([], "expected -o OUT"),
+        (["-o", "web/lod-meta.json", "--report", "web/lod-meta.json"], "a file of its own"),
     ],
 )
-def test_wrong_usage_ends_before_any_work(files, capsys, options, word):
-    """Code 2, and no folder."""
-    assert call(files, "lod", "-o", str(files / "out"), *options) == 2
+def test_wrong_usage_ends_before_any_work(files, monkeypatch, capsys, options, word):
+    monkeypatch.chdir(files)
+    before = contents(files)
+
+    assert main(["lod", "scene.ply", "--cameras", "cameras.json", *options]) == 2
     assert word in capsys.readouterr().err
-    assert not (files / "out").exists()
-
-
-def test_a_folder_for_the_files_is_required(files, capsys):
-    """The option is named."""
-    assert call(files, "lod") == 2
-    assert "expected -o OUT" in capsys.readouterr().err
-
-
-def test_files_that_exist_are_replaced_when_told_alone(files, capsys):
-    """The second run fails on the first level, the third replaces both."""
-    run = ["lod", "--levels", ".5,.1", "-o", str(files / "out"), *QUICK]
-    assert call(files, *run) == 0
-
-    assert call(files, *run) == 1
-    assert "scene.lod1.ply: exists already" in capsys.readouterr().err
-    assert call(files, *run, "--overwrite") == 0
-
-
-def test_ctrl_c_leaves_nothing(files, monkeypatch, capsys):
-    """Interrupted while the second level is made: 130, and the first level is gone again."""
-    module = importlib.import_module("refine_addon.core.lod")
-    made = module.lod
-
-    def interrupted(*given, **named):
-        for level in made(*given, **named):
-            if level.number == 2:
-                raise KeyboardInterrupt
-            yield level
-
-    monkeypatch.setattr(LOD, "lod", interrupted)
-
-    assert call(files, "lod", "-o", str(files / "out"), *QUICK) == 130
-    assert "nothing was left half-written" in capsys.readouterr().err
-    assert not (files / "out").exists()
+    assert contents(files) == before
 
 
 def test_without_cameras_there_are_no_levels(files, capsys):
-    """They decide what goes."""
     assert main(["lod", str(files / "scene.ply"), "-o", str(files / "out")]) == 2
     assert "no cameras" in capsys.readouterr().err
 
 
-def test_one_level_is_one(files, capsys):
-    """It was "1 levels"."""
-    assert call(files, "lod", "--levels", ".5", "-o", str(files / "out"), *QUICK) == 0
-    assert ": 1 level of 577 splats, by 2 of 6 views, " in capsys.readouterr().out
+def test_files_that_exist_are_replaced_when_told_alone_and_none_is_taken_away(files, capsys):
+    """No list says whose a third level of a run before is, so it stays and is named."""
+    run = ["lod", "-o", files / "out", *QUICK, "--levels"]
+    assert call(files, *run, ".5,.3,.1") == 0
+    before = made(files / "out")
+
+    assert call(files, *run, ".4,.2") == 1
+    assert "scene.lod1.ply: exists already" in capsys.readouterr().err
+    assert made(files / "out") == before
+    assert call(files, *run, ".4,.2", "--overwrite") == 0
+    assert "note: scene.lod3.ply is of another run" in capsys.readouterr().out
+    assert list(made(files / "out").values()) == [231, 116, 58]
+
+
+def test_ctrl_c_leaves_what_was_there(files, stops, capsys):
+    """Before the second level: the first is gone again, too; before any, a run before stays."""
+    run = ["lod", "-o", files / "out", *QUICK]
+    stops.add(2)
+    assert call(files, *run) == 130
+    assert "nothing was left half-written" in capsys.readouterr().err
+    assert not (files / "out").exists()
+    stops.clear()
+    assert call(files, *run) == 0
+    before = contents(files)
+
+    stops.add(0)
+    assert call(files, *run, "--overwrite") == 130
+    assert contents(files) == before
 
 
 def test_levels_that_would_be_equal_are_made_once(files, capsys):
     """Of 577, .999 are all (576.4); .002 and .0019 are both 2 (1.2 and 1.1)."""
-    options = ["--levels", ".999,.5,.002,.0019", "-o", str(files / "out"), *QUICK]
+    options = ["--levels", ".999,.5,.002,.0019", "-o", files / "out", *QUICK]
 
     assert call(files, "lod", *options) == 0
     said = capsys.readouterr().out
-    assert "2 levels of 577" in said
     assert "note: no level for 0.999: it would be a copy of the input" in said
     assert "note: no level for 0.0019: it would be a copy of level 2" in said
-    made = sorted((files / "out").iterdir())
-    assert [(path.name, len(read_splats(path))) for path in made] == [
-        ("scene.lod1.ply", 289),
-        ("scene.lod2.ply", 2),
-    ]
+    assert made(files / "out") == {"scene.lod1.ply": 289, "scene.lod2.ply": 2}
 
 
 def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):
     """Alone it is an error; beside another the note says so. 1 dB is out of reach."""
-    run = ["lod", "-o", str(files / "out"), "--method", "occlusion", "--views", "2"]
+    run = ["lod", "-o", files / "out", "--method", "occlusion", "--views", "2"]
 
     assert call(files, *run, "--psnr", "99.9") == 1
     assert "no level has fewer splats than the input, which has 577" in capsys.readouterr().err
     assert not (files / "out").exists()
     assert call(files, *run, "--psnr", "99.9,1") == 0
     said = capsys.readouterr().out
+    assert ": 1 level of 577 splats" in said
     assert "note: no level for 99.9 dB: it would be a copy of the input" in said
     assert "note: level 1: the estimate ends at 95% removed" in said
 
@@ -156,48 +157,20 @@ def test_levels_with_names_that_are_too_long_leave_no_empty_folder(files, capsys
 def test_a_level_can_be_the_source_of_a_new_run(files):
     """It is in the folder: it stays."""
     out = files / "out"
-    assert call(files, "lod", "-o", str(out), "--levels", ".5", *QUICK) == 0
-    source, cameras = str(out / "scene.lod1.ply"), ["--cameras", str(files)]
+    assert call(files, "lod", "-o", out, "--levels", ".5", *QUICK) == 0
+    words = ["lod", out / "scene.lod1.ply", "--cameras", files, "-o", out, "--overwrite", *QUICK]
 
-    assert main(["lod", source, *cameras, "-o", str(out), "--overwrite", *QUICK]) == 0
+    assert main([str(word) for word in [*words, "--levels", ".5"]]) == 0
 
-    assert (out / "scene.lod1.ply").exists()
-    assert (out / "scene.lod1.lod1.ply").exists()
-
-
-def test_a_run_that_stops_before_its_first_level_leaves_the_run_before(files, monkeypatch):
-    """Nothing is taken away until there is something to replace it."""
-    out = files / "out"
-    assert call(files, "lod", "-o", str(out), *QUICK) == 0
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
-
-    def interrupted(*_given, **_named):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(LOD, "lod", interrupted)
-
-    assert call(files, "lod", "-o", str(out), "--overwrite", *QUICK) == 130
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert made(out) == {"scene.lod1.lod1.ply": 145, "scene.lod1.ply": 289}
 
 
 def test_levels_that_are_one_file_by_a_link_are_refused(files, capsys):
-    out = files / "out"
-    out.mkdir()
-    (out / "scene.lod2.ply").symlink_to("scene.lod1.ply")
+    (files / "out").mkdir()
+    (files / "out/scene.lod2.ply").symlink_to("scene.lod1.ply")
 
-    assert call(files, "lod", "-o", str(out), "--overwrite", *QUICK) == 1
+    assert call(files, "lod", "-o", files / "out", "--overwrite", *QUICK) == 1
     assert "by a link" in capsys.readouterr().err
-
-
-def test_more_levels_of_a_run_before_are_named(files, capsys):
-    """No list says whose they are, so they stay."""
-    run = ["lod", "-o", str(files / "out"), "--overwrite", *QUICK]
-    assert call(files, *run, "--levels", ".5,.3,.1") == 0
-
-    assert call(files, *run, "--levels", ".5,.3") == 0
-
-    assert "note: scene.lod3.ply is of another run" in capsys.readouterr().out
-    assert len(list((files / "out").iterdir())) == 3
 
 
 @pytest.fixture
@@ -205,13 +178,14 @@ def streamed(files):
     """Return the index of a streamed SOG to be made, and the command that makes it."""
     pytest.importorskip("PIL", reason="needs Pillow, which SOG does outside of Blender")
     path = files / "web/lod-meta.json"
-    return path, ["lod", "--levels", ".5,.1", "-o", str(path), *QUICK]
+    return path, ["lod", "--levels", ".5,.1", "-o", path, *QUICK]
 
 
 def test_a_streamed_sog_has_all_levels_and_the_source(files, streamed, capsys):
     """577 splats as level 0, 289 and 58; positions to 16 bits, of the levels that files have."""
     path, run = streamed
-    assert call(files, "lod", "--levels", ".5,.1", "-o", str(files / "out"), *QUICK) == 0
+    assert call(files, "lod", "--levels", ".5,.1", "-o", files / "out", *QUICK) == 0
+    capsys.readouterr()
 
     assert call(files, *run) == 0
 
@@ -244,44 +218,30 @@ def test_a_streamed_sog_is_replaced_when_told_alone(files, streamed, capsys):
 def test_what_must_go_is_in_no_level_of_a_streamed_sog(files, streamed):
     """Nor in level 0: a viewer shows that, too."""
     path, run = streamed
-    box = "box:-1,-1,0,1,1,99"
     everything = read_splats(files / "scene.ply").splats().means
     inside = (np.abs(everything[:, :2]) < 1).all(axis=1)
 
-    assert call(files, *run, "--remove-inside", box) == 0
+    assert call(files, *run, "--remove-inside", "box:-1,-1,0,1,1,99") == 0
 
     assert len(read_splats(path)) == 577 - inside.sum() < 577
 
 
-def test_a_streamed_sog_that_is_stopped_leaves_nothing(files, streamed, monkeypatch):
-    """Neither of a new one, nor of one to be replaced, which stays as it was."""
+def test_a_streamed_sog_that_is_stopped_leaves_what_was_there(files, streamed, stops):
     path, run = streamed
-    module = importlib.import_module("refine_addon.core.lod")
-    made, stops = module.lod, [True]
-
-    def interrupted(*given, **named):
-        for level in made(*given, **named):
-            if level.number == 2 and stops:
-                raise KeyboardInterrupt
-            yield level
-
-    monkeypatch.setattr(LOD, "lod", interrupted)
+    stops.add(2)
     assert call(files, *run) == 130
     assert not path.parent.exists()
     stops.clear()
     assert call(files, *run) == 0
-    before = {entry: entry.read_bytes() for entry in path.parent.rglob("*") if entry.is_file()}
-    stops.append(True)
+    before = contents(files)
 
+    stops.add(2)
     assert call(files, *run, "--overwrite") == 130
-
-    after = {entry: entry.read_bytes() for entry in path.parent.rglob("*") if entry.is_file()}
-    assert after == before
+    assert contents(files) == before
 
 
-def test_a_library_that_is_missing_is_told_before_the_work(streamed, monkeypatch, capsys):
+def test_a_library_that_is_missing_is_told_before_the_work(files, streamed, monkeypatch, capsys):
     """Nothing is scored for a streamed SOG that could not be written."""
-    path, run = streamed
 
     def missing(name):
         raise ImportError(name)
@@ -289,17 +249,6 @@ def test_a_library_that_is_missing_is_told_before_the_work(streamed, monkeypatch
     monkeypatch.setattr(importlib, "import_module", missing)
     monkeypatch.setattr(LOD, "lod", None)
 
-    assert call(path.parents[1], *run) == 1
+    assert call(files, *streamed[1]) == 1
     assert "WebP images need a library" in capsys.readouterr().err
-    assert not path.parent.exists()
-
-
-def test_a_report_over_a_streamed_sog_ends_before_any_work(streamed, capsys, monkeypatch):
-    """Code 2, and no folder."""
-    path, run = streamed
-    monkeypatch.chdir(path.parents[1])
-
-    assert call(path.parents[1], *run, "--report", "web/lod-meta.json") == 2
-
-    assert "expected a file of its own" in capsys.readouterr().err
-    assert not path.parent.exists()
+    assert not streamed[0].parent.exists()

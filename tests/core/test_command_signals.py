@@ -7,8 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import tomllib
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,8 @@ import pytest
 from refine_addon import command
 from refine_addon.command import subcommands
 from refine_addon.core import read_ply
+
+from .test_command_files import read_all
 
 ROOT = Path(__file__).parents[2]
 ROOM = ROOT / "tests/data/room_small"
@@ -47,15 +47,10 @@ def outputs(folder):
     return sorted(path.name for path in folder.iterdir() if path.name != "in.ply")
 
 
-def start(
-    *words: str,
-    ignored: tuple[int, ...] = (),
-    stderr: int = subprocess.PIPE,
-    stdin: int = subprocess.DEVNULL,
-) -> subprocess.Popen[bytes]:
+def start(*words, ignored=(), stderr=subprocess.PIPE, stdin=subprocess.DEVNULL):
     """Start Python on this checkout, as from a terminal, less the signals that are ignored."""
 
-    def listen() -> None:
+    def listen():
         # Whoever runs the tests in the background has Ctrl-C ignored, and programs inherit that.
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN if number in ignored else signal.SIG_DFL)
@@ -68,6 +63,13 @@ def start(
         stderr=stderr,
         preexec_fn=listen,
     )
+
+
+def ended(*words):
+    """Run to the end; return the code, what was printed, and the errors."""
+    with start(*words) as process:
+        said = process.communicate(timeout=SECONDS)
+    return process.returncode, *said
 
 
 CALLED = """
@@ -89,59 +91,46 @@ sys.exit(main())
 
 
 @pytest.mark.parametrize(
-    "moment",
-    ["3", "100", "3000", "30000", "parse_args", "read_cameras", "read_splats", "score", "select"],
+    "moment", ["3", "3000", "30000", "parse_args", "read_cameras", "score", "select"]
 )
 def test_ctrl_c_at_any_moment_is_code_130_and_one_line(folder, moment):
     """A real SIGINT at the n-th call of a function of Python, or the first of a name.
 
     The imports are some 90,000 calls; parsing, reading and scoring follow.
     """
-    with start("-c", CALLED, moment, *PRUNE) as process:
-        said = process.communicate(timeout=SECONDS)
-
-    assert (process.returncode, *said) == (130, b"", CANCELLED)
+    assert ended("-c", CALLED, moment, *PRUNE) == (130, b"", CANCELLED)
     assert outputs(folder) == []
 
 
-def test_ctrl_c_while_refitting_writes_what_that_has_reached(folder):
+def test_ctrl_c_while_refitting_writes_what_that_has_reached_but_in_a_dry_run(folder):
     """As many splats as asked for, in a whole file; the command ends all the same.
 
     The signal comes in the first round: kept splats have merged by then.
     """
-    words = [*PRUNE[:6], "--method", "refit", "--views", "8", "--keep", "100"]
+    words = ["-c", CALLED, "_solve", *PRUNE[:6], "--method", "refit", "--views", "8"]
 
-    with start("-c", CALLED, "_solve", *words) as process:
-        said = process.communicate(timeout=SECONDS)
+    code, _, told = ended(*words, "--dry-run")
+    assert code == 130
+    assert b"written with" not in told
+    assert outputs(folder) == []
 
     told = b"refine: error: cancelled; refitting was stopped before its first round was done; "
     told += b"out.ply is written with what that had reached; nothing was left half-written\n"
-    assert (process.returncode, *said) == (130, b"", told)
+    assert ended(*words, "--keep", "100") == (130, b"", told)
     assert outputs(folder) == ["out.ply"]
     assert len(read_ply(folder / "out.ply")) == 100
 
 
-def test_ctrl_c_while_refitting_writes_nothing_in_a_dry_run(folder):
-    words = [*PRUNE[:4], "--method", "refit", "--views", "8", "--dry-run"]
-
-    with start("-c", CALLED, "_solve", *words) as process:
-        said = process.communicate(timeout=SECONDS)
-
-    assert process.returncode == 130
-    assert b"written with" not in said[1]
-    assert outputs(folder) == []
-
-
-COUNTED = """
+IMPORTED = """
 import os, runpy, signal, sys
 
-moment, imports = int(sys.argv.pop(1)), 0
+moment, imports = sys.argv.pop(1), 0
 
 def count(event, arguments):
     global imports
     if event == "import" and (imports or arguments[0] == "refine_addon.command"):
         imports += 1
-        if imports == moment:
+        if str(imports) == moment or arguments[0] == moment and "numpy" in sys.modules:
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.addaudithook(count)
@@ -149,60 +138,22 @@ runpy.run_module("refine_addon", run_name="__main__", alter_sys=True)
 """
 
 
+@pytest.mark.parametrize("moment", ["1", "30", "200", "datetime"])
 @pytest.mark.usefixtures("folder")
-def test_ctrl_c_at_any_import_is_code_130_and_one_line():
+def test_ctrl_c_at_any_import_is_code_130_and_one_line(moment):
     """A real SIGINT as the n-th module is looked up, of the some 300 that the command loads.
 
-    Some of NumPy's are among them, which says of an exception there that NumPy is broken.
+    Some of NumPy's are among them, which says of an exception there that NumPy is broken: its
+    compiled part imports datetime, and turns what is raised there into an ImportError.
     """
-    for moment in (1, 4, 30, 120, 200):
-        with start("-c", COUNTED, str(moment), *PRUNE) as process:
-            said = process.communicate(timeout=SECONDS)
-
-        assert (process.returncode, *said) == (130, b"", CANCELLED), moment
-
-
-AMID_NUMPY = """
-import os, runpy, signal, sys
-
-def stop(event, arguments):
-    if event == "import" and arguments[0] == "datetime" and "numpy" in sys.modules:
-        os.kill(os.getpid(), signal.SIGINT)
-
-sys.addaudithook(stop)
-runpy.run_module("refine_addon", run_name="__main__", alter_sys=True)
-"""
-
-
-@pytest.mark.usefixtures("folder")
-def test_ctrl_c_amid_the_import_of_numpy_is_code_130_and_one_line():
-    """NumPy's compiled part imports datetime, and turns what is raised there into an ImportError.
-
-    That would end in a traceback that says not to import NumPy from its source directory.
-    """
-    with start("-c", AMID_NUMPY, *PRUNE) as process:
-        said = process.communicate(timeout=SECONDS)
-
-    assert (process.returncode, *said) == (130, b"", CANCELLED)
+    assert ended("-c", IMPORTED, moment, *PRUNE) == (130, b"", CANCELLED)
 
 
 def test_nothing_loads_numpy_before_signals_are_listened_to():
     """Whoever imports the command has no NumPy yet: `main` loads it within `listening`."""
     check = "import sys, refine_addon.command; sys.exit('numpy' in sys.modules)"
 
-    with start("-c", check) as process:
-        process.communicate(timeout=SECONDS)
-
-    assert process.returncode == 0
-
-
-def test_the_installed_script_is_what_python_runs():
-    """`refine` of pyproject.toml is the function that ``python -m refine_addon`` calls."""
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
-    entry = metadata.EntryPoint("refine", scripts["refine"], "console_scripts")
-
-    assert entry.value == "refine_addon.__main__:main"
-    assert callable(entry.load())
+    assert ended("-c", check)[0] == 0
 
 
 STOPPED = """
@@ -241,39 +192,29 @@ def halfway(folder):
     return begin
 
 
-@pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize(
-    ("number", "reason"),
+    ("name", "reason", "before"),
     [
-        (signal.SIGINT, "cancelled"),
-        (signal.SIGTERM, "terminated"),
-        (getattr(signal, "SIGHUP", 0), "hung up"),
+        ("SIGINT", "cancelled", b""),
+        ("SIGTERM", "terminated", b"old"),
+        ("SIGHUP", "hung up", b"old"),
     ],
 )
 def test_stopped_in_the_middle_of_a_write_it_leaves_what_was_there(
-    folder, halfway, number, reason, overwrite
+    folder, halfway, name, reason, before
 ):
     """Code 128 + n as a shell has it: 130, 143, 129; no temporary file, one line."""
-    if overwrite:
-        (folder / "out.ply").write_bytes(b"old")
-    with halfway(*(["--overwrite"] if overwrite else [])) as process:
+    number = getattr(signal, name)
+    if before:
+        (folder / "out.ply").write_bytes(before)
+    with halfway(*(["--overwrite"] if before else [])) as process:
         process.send_signal(number)
         _, errors = process.communicate(timeout=SECONDS)
 
     assert process.returncode == 128 + number
     assert errors.decode() == f"refine: error: {reason}; nothing was left half-written\n"
-    if overwrite:
-        assert (folder / "out.ply").read_bytes() == b"old"
-    assert outputs(folder) == ["out.ply"] * overwrite
-
-
-def read_to_the_end(terminal):
-    """Yield what was written to a pseudo-terminal, which gives some 4 kB at a time."""
-    try:
-        while some := os.read(terminal, 1 << 16):
-            yield some
-    except OSError:  # Linux's way to say that nothing more can come
-        return
+    assert outputs(folder) == (["out.ply"] if before else [])
+    assert not before or (folder / "out.ply").read_bytes() == before
 
 
 def test_ctrl_c_wipes_away_the_progress_before_it_says_so(halfway):
@@ -284,8 +225,7 @@ def test_ctrl_c_wipes_away_the_progress_before_it_says_so(halfway):
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=SECONDS)
     os.close(theirs)
-    drawn = b"".join(read_to_the_end(ours))
-    os.close(ours)
+    drawn = read_all(ours)
 
     assert drawn.split(b"\r\x1b[K")[-1] == CANCELLED.replace(b"\n", b"\r\n")
 
@@ -330,7 +270,7 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 0)])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_python_tidies_up_comes_too_late(folder, number):
     """All is written and said: the code is 0."""
     with start("-c", LEAVING, *PRUNE, "--quiet", stdin=subprocess.PIPE) as process:
@@ -342,8 +282,7 @@ def test_a_signal_while_python_tidies_up_comes_too_late(folder, number):
     assert outputs(folder) == ["out.ply"]
 
 
-def handlers() -> list[object]:
-    """Return who listens."""
+def handlers():
     return [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 
 

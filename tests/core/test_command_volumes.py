@@ -2,118 +2,82 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
-from refine_addon.command import main
 from refine_addon.core import read_ply
 
 from .test_cleaning import SIDE
-from .test_command_clean import files  # noqa: F401 - a fixture: a wall with a floater before it
+from .test_command_clean import WHOLE, call, files, told  # noqa: F401 - a wall, a floater before it
 
-WALL = SIDE**2
 HALF = "box:-inf,-inf,-inf,0,inf,inf"
 """All with x below 0; the wall is as wide to both sides."""
 
 
 @pytest.fixture
 def scene(files):
-    """Return the folder, and where the splats lie along x and z."""
+    """Return the folder, where the splats lie along x and z, and the file to be written."""
     means = read_ply(files / "scene.ply").splats().means
-    return files, means[:, 0], means[:, 2]
-
-
-def call(folder, command, *options):
-    """Run a subcommand on the scene, and return its exit code."""
-    words = [command, str(folder / "scene.ply"), "--cameras", str(folder), *options]
-    return main([*words, "--overwrite", "--report", str(folder / "report.json")])
-
-
-def told(folder):
-    """Return what the report says of the file."""
-    return json.loads((folder / "report.json").read_text())["results"][0]
+    return files, means[:, 0], means[:, 2], files / "out.ply"
 
 
 def test_prune_removes_protects_and_says_how_many(scene, capsys):
     """With nothing left to the budget, what goes is half of the wall but its farthest column."""
-    folder, x, z = scene
+    folder, x, z, out = scene
     stays = (x < -2.9) & (z > 3.0)
     goes = (x < 0.0) & ~stays
-    out = folder / "out.ply"
     options = ["--remove-inside", HALF, "--protect", "box:-9,-9,3,-2.9,9,9", "--ratio", "0"]
 
-    assert call(folder, "prune", *options, "-o", str(out)) == 0
+    entry = told(folder, "prune", *options, "-o", out)
 
     assert len(read_ply(out)) == len(x) - goes.sum()
     assert (read_ply(out).splats().means[:, 0] >= 0.0).sum() == (x >= 0.0).sum()
-    entry = told(folder)
     assert entry["splats"]["protected"] == stays.sum() == SIDE
     assert entry["splats"]["removed_by_user"] == goes.sum()
-    assert entry["volumes"][1] == {
-        "role": "remove", "name": f"'{HALF}'", "splats": int((x < 0.0).sum())
-    }  # fmt: skip
+    inside = int((x < 0.0).sum())
+    assert entry["volumes"][1] == {"role": "remove", "name": f"'{HALF}'", "splats": inside}
     line = f"\n  {SIDE} protected, {goes.sum()} removed by you (protect 'box:-9,-9,3,-2.9,9,9': "
     assert f"{line}{SIDE}" in capsys.readouterr().out
 
 
 def test_volumes_of_a_kind_are_joined(scene):
     """Two spheres about splats of the wall keep these two."""
-    folder, *_ = scene
+    folder, _, _, out = scene
     means = read_ply(folder / "scene.ply").splats().means
     spheres = [f"sphere:{','.join(map(str, means[row].tolist()))},1e-3" for row in (0, 300)]
     options = [word for sphere in spheres for word in ("--keep-inside", sphere)]
-    out = folder / "out.ply"
 
-    assert call(folder, "prune", *options, "--ratio", "0", "-o", str(out)) == 0
+    assert call(folder, "prune", *options, "--ratio", "0", "-o", out) == 0
     assert len(read_ply(out)) == 2
 
 
-def test_clean_leaves_out_what_must_go_and_spares_what_is_protected(scene):
-    """The floater, which `clean` would take, stays; half of the wall goes."""
-    folder, x, z = scene
-    out = folder / "out.ply"
-    near = "box:-9,-9,-9,9,9,3"
+def test_clean_and_score_leave_out_what_must_go(scene, capsys):
+    """The floater, which `clean` would take, is spared; half of the wall goes, and scores 0."""
+    folder, x, z, out = scene
+    options = ["--protect", "box:-9,-9,-9,9,9,3", "--remove-inside", HALF]
 
-    assert call(folder, "clean", "--protect", near, "--remove-inside", HALF, "-o", str(out)) == 0
+    entry = told(folder, "clean", *options, "-o", out)
 
-    left = read_ply(out).splats().means
-    assert len(left) == ((x >= 0.0) | (z < 3.0)).sum()
-    assert told(folder)["splats"]["removed_by_user"] == ((x < 0.0) & (z > 3.0)).sum()
-
-
-def test_score_leaves_out_what_must_go(scene):
-    """It scores 0 in the file, and nothing else does."""
-    folder, x, _ = scene
-    out = folder / "out.ply"
-
-    assert call(folder, "score", "--remove-inside", HALF, "-o", str(out)) == 0
+    assert len(read_ply(out)) == ((x >= 0.0) | (z < 3.0)).sum()
+    assert entry["splats"]["removed_by_user"] == ((x < 0.0) & (z > 3.0)).sum()
+    assert call(folder, "score", "--remove-inside", HALF, "-o", out, "--overwrite") == 0
     assert np.array_equal(read_ply(out).rows["refine_score"] == 0.0, x < 0.0)
-    assert call(folder, "score", "--protect", HALF, "-o", str(out)) == 2
+    assert call(folder, "score", "--protect", HALF, "-o", out, "--overwrite") == 2
 
 
 @pytest.mark.slow
 def test_levels_leave_out_what_must_go(scene):
     """Both levels lie in the right half; the report counts what went."""
-    folder, x, _ = scene
-    options = [
-        "--remove-inside",
-        HALF,
-        "--levels",
-        ".4,.2",
-        "-o",
-        str(folder / "lod"),
-        "--method",
-        "occlusion",
-    ]
+    folder, x, _, _ = scene
+    options = ["--levels", ".4,.2", "--method", "occlusion", "-o", folder / "lod"]
 
-    assert call(folder, "lod", *options) == 0
-    for entry in told(folder)["levels"]:
-        level = read_ply(folder / "lod" / entry["file"])
-        assert (level.splats().means[:, 0] >= 0.0).all()
-    assert told(folder)["splats"]["removed_by_user"] == (x < 0.0).sum()
-    assert told(folder)["splats"]["before"] == WALL + 1
+    entry = told(folder, "lod", "--remove-inside", HALF, *options)
+
+    for each in entry["levels"]:
+        assert (read_ply(folder / "lod" / each["file"]).splats().means[:, 0] >= 0.0).all()
+    assert len(entry["levels"]) == 2
+    assert entry["splats"]["removed_by_user"] == (x < 0.0).sum()
+    assert entry["splats"]["before"] == WHOLE
 
 
 @pytest.mark.parametrize(
@@ -127,11 +91,9 @@ def test_levels_leave_out_what_must_go(scene):
         (["--remove-inside", "sphere:0,0,0,99"], 1, "all 577 splats lie where they must go"),
     ],
 )
-def test_what_cannot_be_is_refused(scene, capsys, options, code, expected):
-    """With what was got; nothing is written."""
-    folder, *_ = scene
-    out = folder / "out.ply"
+def test_what_cannot_be_is_refused_and_nothing_is_written(scene, capsys, options, code, expected):
+    folder, _, _, out = scene
 
-    assert call(folder, "prune", *options, "-o", str(out)) == code
+    assert call(folder, "prune", *options, "-o", out) == code
     assert expected in capsys.readouterr().err
     assert not out.exists()

@@ -26,40 +26,44 @@ TESTS = {
 }
 
 
-@pytest.fixture(params=DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
-def text(request):
-    """Give a document."""
-    return request.param.read_text(encoding="utf-8")
+PROSE = [path for path in DOCUMENTS if path.name not in {"trade.md", "CHANGELOG.md"}]
+"""Documents but the generated one, and the one in which an entry is a line."""
 
 
-def test_every_python_file_and_folder_that_is_named_exists(text):
-    """In backquotes, from any folder on: ``core/views.py`` is ``refine_addon/core/views.py``."""
-    named = re.findall(r"`([\w./-]+\.py|(?:refine_addon|benchmarks|tests)/[\w/]*)(?:::\w+)?`", text)
-
-    missing = [name for name in named if not any(_names(name, file) for file in FILES)]
-
-    assert missing == []
+def place(path):
+    return path.relative_to(ROOT).as_posix()
 
 
-def test_every_name_that_is_given_with_its_file_is_defined_there(text):
-    """``core/views.py::View``: a class, function, method, constant or test of that name."""
-    given = re.findall(r"`([\w./-]+\.py)::(\w+)(_\.\.\.)?`", text)
+@pytest.fixture(params=DOCUMENTS, ids=place)
+def document(request):
+    return request.param
 
-    missing = [
-        f"{path}::{name}"
-        for path, name, cut in given
-        if not any(
-            re.search(
-                rf"^\s*(?:def|class) {name}{'' if cut else chr(92) + 'b'}|^(?:\w+, )*{name}\b.* = ",
-                (ROOT / file[1:]).read_text(encoding="utf-8"),
-                re.MULTILINE,
-            )
-            for file in FILES
-            if file.endswith("/" + path)
-        )
-    ]
 
-    assert missing == []
+def test_every_file_folder_name_and_test_that_is_named_exists(document):
+    """In backquotes, from any folder on: ``core/views.py::View`` is defined in that file of ours.
+
+    ``test_x_...`` stands for a test whose name begins so.
+    """
+    text = document.read_text(encoding="utf-8")
+    files = re.findall(r"`([\w./-]+\.py|(?:refine_addon|benchmarks|tests)/[\w/]*)(?:::\w+)?`", text)
+    names = re.findall(r"`([\w./-]+\.py)::(\w+?)(_\.\.\.)?`", text)
+    tests = re.findall(r"`(?:test_\w+\.py::)?(test_\w+?)(_\.\.\.)?`", text)
+
+    assert [name for name in files if not any(_names(name, file) for file in FILES)] == []
+    assert [name for name in names if not _defined(*name)] == []
+    begun = [name for name, cut in tests if not (cut and any(t.startswith(name) for t in TESTS))]
+    assert [name for name in begun if name not in TESTS] == []
+
+
+def _names(name: str, file: str) -> bool:
+    return file.endswith("/" + name) or (not name.endswith(".py") and file.startswith("/" + name))
+
+
+def _defined(path: str, name: str, cut: str) -> bool:
+    """Say whether a file defines a class, function, method, constant or test of that name."""
+    pattern = rf"^\s*(?:def|class) {name}{'' if cut else chr(92) + 'b'}|^(?:\w+, )*{name}\b.* = "
+    sources = [ROOT / file[1:] for file in FILES if file.endswith("/" + path)]
+    return any(re.search(pattern, each.read_text("utf-8"), re.MULTILINE) for each in sources)
 
 
 def test_every_class_that_the_architecture_names_is_defined():
@@ -70,28 +74,10 @@ def test_every_class_that_the_architecture_names_is_defined():
 
     named = set(re.findall(r"`([A-Z][a-z]+[A-Za-z]*)(?:\.\w+)?`", text))
 
-    assert named - defined == set()
     assert named
+    assert named - defined == set()
 
 
-def _names(name: str, file: str) -> bool:
-    return file.endswith("/" + name) or (not name.endswith(".py") and file.startswith("/" + name))
-
-
-def test_every_test_that_is_named_exists(text):
-    """``test_x_...`` stands for a name that begins so."""
-    named = re.findall(r"`(?:test_\w+\.py::)?(test_\w+?)(_\.\.\.)?`", text)
-
-    missing = [
-        name
-        for name, cut in named
-        if name not in TESTS and not (cut and any(test.startswith(name) for test in TESTS))
-    ]
-
-    assert missing == []
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_every_link_leads_somewhere(document):
     """To a file, and to a heading of it where one is named."""
     for target in re.findall(r"\]\(([^)]+)\)", document.read_text(encoding="utf-8")):
@@ -106,11 +92,7 @@ def test_every_link_leads_somewhere(document):
             assert heading in [re.sub(r"[^\w -]", "", line).replace(" ", "-") for line in headings]
 
 
-PROSE = [path for path in DOCUMENTS if path.name not in {"trade.md", "CHANGELOG.md"}]
-"""Documents but the generated one, and the one in which an entry is a line."""
-
-
-@pytest.mark.parametrize("document", PROSE, ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("document", PROSE, ids=place)
 def test_lines_end_where_sentences_do(document):
     """So a change of a sentence is a change of its line. Tables and fenced blocks are as they are.
 
