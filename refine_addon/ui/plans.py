@@ -43,8 +43,6 @@ _made: list[tuple[Any, dict[str, Any]]] = []  # The last plan, and its key; one 
 _waiting: list[tuple[str, str]] = []
 """Scene and objects, by name, to be marked when the slider rests."""
 
-_edited: set[str] = set()  # Objects in edit mode, by name, with changed marks, to be counted later
-
 _answers: dict[Hashable, Any] = {}  # What `cached` keeps
 
 _NOISE = 1e-6  # Relative to the largest number beside it: difference that another machine may make
@@ -87,11 +85,6 @@ def mark_again(context: bpy.types.Context) -> None:
         _refresh(context.scene, [*first, *others])
     elif first or others:
         _wait(context.scene, [*first, *others], REST)
-
-
-def mark_after_edit_mode(obj: bpy.types.Object) -> None:
-    """Mark all again when an object leaves edit mode, where nothing can be counted."""
-    _edited.add(obj.name)
 
 
 def ask(context: bpy.types.Context) -> None:
@@ -381,22 +374,18 @@ def _undone(*_: object) -> None:
 
 @persistent
 def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
-    """Watch moving volumes, splats moving under them, and the end of edit mode."""
+    """Watch moving volumes, and splats moving under them."""
     _forget()
-    if depsgraph is None or bpy.app.background:
+    if depsgraph is None or bpy.app.background or not scene.refine.volumes:
         return
-    edited = {bpy.data.objects.get(name) for name in _edited} - {None}
-    left = bool(edited) and all(obj.mode != "EDIT" for obj in edited)
-    if left:
-        _edited.clear()
-    volumes = {item.object for item in demands.listed(scene)} if scene.refine.volumes else set()
+    volumes = {item.object for item in demands.listed(scene)}
     shapes = volumes | {obj.data for obj in volumes}
     for update in depsgraph.updates if volumes else ():
         original = update.id.original
         splats = update.is_updated_transform and isinstance(original, bpy.types.Object)
-        left |= original in shapes or (splats and mesh_layout.looks_like_splats(original))
-    if left:
-        mark_again(bpy.context)
+        if original in shapes or (splats and mesh_layout.looks_like_splats(original)):
+            mark_again(bpy.context)
+            return
 
 
 HANDLERS = {
@@ -410,5 +399,5 @@ def unregister() -> None:
     """Plan no more."""
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
-    for kept in (_made, _waiting, _edited, _answers):
+    for kept in (_made, _waiting, _answers):
         kept.clear()

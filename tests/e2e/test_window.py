@@ -137,7 +137,6 @@ def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Pat
     assert found["SCENE"] == found["STAYS"] + found["GOES"]
     assert found["GOES"] > found["unscored GOES"]
     assert found["moved"] != 0
-    assert found["edited"] == 39_755
     assert found["failure"] == ""
 
 

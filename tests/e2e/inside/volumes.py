@@ -71,20 +71,8 @@ def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[
     box.location.x -= 0.5
     yield from wait(lambda: not marked(demands, splats, before))
     found["moved"] = demands.facts(splats.data)["removed_by_user"] - before
-    found["edited"] = yield from edit(show, demands, splats)
     found["failure"] = show.draw.failure()
     return found
-
-
-def edit(show: Show, demands: Any, splats: bpy.types.Object) -> Generator[float, None, int]:
-    """Protect all splats in edit mode; return how many the panel counts when it is left."""
-    show.call(bpy.ops.object.mode_set, mode="EDIT")
-    show.call(bpy.ops.mesh.select_all, action="SELECT")
-    show.call(bpy.ops.refine.protect, mark="STAY")
-    yield 0.5
-    show.call(bpy.ops.object.mode_set, mode="OBJECT")
-    yield from wait(lambda: marked(demands, splats, 0))
-    return int(demands.facts(splats.data)["protected"])
 
 
 def mark(splats: bpy.types.Object, count: int) -> None:
