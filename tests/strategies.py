@@ -11,24 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_SPELLED = {
+    "i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16",
+    "i4": "int int32", "u4": "uint uint32", "f4": "float float32", "f8": "double float64",
+}  # fmt: skip
+TYPES = {name: kind for kind, names in _SPELLED.items() for name in names.split()}
 """Every name that a PLY gives a type -> NumPy's."""
 
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
@@ -49,42 +36,26 @@ def splat_names(degree: int, *, normals: bool = False) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class PlyCase:
-    """A PLY file in its parts.
+    """A PLY file in its parts."""
 
-    Attributes
-    ----------
-    form : str
-        ``ascii``, ``binary_little_endian`` or ``binary_big_endian``.
-    line_end : bytes
-        Of the header.
-    head : tuple of bytes
-        The header ahead of the number of vertices, the number, and the header behind it.
-    before, after : bytes
-        The body ahead of the vertex rows, and behind them.
-    rows : (N,) structured
-        What the vertex rows hold.
-    parts : tuple of bytes
-        Each row as it stands in the file.
-    """
-
-    form: str
-    line_end: bytes
-    head: tuple[bytes, bytes, bytes]
-    before: bytes
-    after: bytes
-    rows: np.ndarray
-    parts: tuple[bytes, ...]
+    form: str  # ascii, binary_little_endian or binary_big_endian
+    line_end: bytes  # of the header
+    head: tuple[bytes, bytes, bytes]  # ahead of the number of vertices, that, and behind it
+    before: bytes  # the body ahead of the vertex rows
+    after: bytes  # and behind them
+    rows: np.ndarray  # (N,) structured: what the vertex rows hold
+    parts: tuple[bytes, ...]  # each row as it stands in the file
 
     @property
     def data(self) -> bytes:
         """The file."""
         return b"".join([*self.head, self.before, *self.parts, self.after])
 
-    def pruned(self, keep: np.ndarray) -> bytes:
-        """Return the file that holds the kept rows alone."""
-        count = int(keep.sum())
-        number = self.head[1] if count == len(self.parts) else str(count).encode()
-        kept = [part for part, stays in zip(self.parts, keep, strict=True) if stays]
+    def pruned(self, keep: np.ndarray, parts: Sequence[bytes] | None = None) -> bytes:
+        """Return the file that holds the kept rows alone, or others in their place."""
+        number = self.head[1] if keep.all() else str(int(keep.sum())).encode()
+        parts = self.parts if parts is None else parts
+        kept = [part for part, stays in zip(parts, keep, strict=True) if stays]
         return b"".join([self.head[0], number, self.head[2], self.before, *kept, self.after])
 
 
@@ -140,39 +111,27 @@ def _splat_kinds(draw: st.DrawFn, random: np.random.Generator) -> list[tuple[str
 
 def _texts(random: np.random.Generator, rows: np.ndarray) -> list[bytes]:
     """Write rows as text, each number so that it reads back as itself."""
-    end = random.choice(["\n", "\r\n"])
-    space = random.choice([" ", "  ", "\t"])
-    lines = []
+    end, space = random.choice(["\n", "\r\n"]), random.choice([" ", "  ", "\t"])
+    around, lines = ["", " "], []
     for row in rows:
-        words = [str(row[name]) for name in rows.dtype.names]
-        lines.append(
-            f"{random.choice(['', ' '])}{space.join(words)}{random.choice(['', ' '])}{end}"
-        )
-    return [line.encode() for line in lines]
+        words = space.join(str(row[name]) for name in rows.dtype.names)
+        lines.append(f"{random.choice(around)}{words}{random.choice(around)}{end}".encode())
+    return lines
 
 
 def _elements(
     draw: st.DrawFn, random: np.random.Generator, form: str, prefix: str
 ) -> list[tuple[list[bytes], bytes]]:
-    """Draw other elements, as their header lines and their body."""
+    """Draw other elements, as their header lines and their body; lists only behind the splats."""
+    length = st.sampled_from(["", *(["uchar", "uint8", "int", "ushort"] * (prefix == "tail"))])
+    column = st.tuples(length, st.sampled_from(sorted(TYPES)))
     elements = []
     for number in range(draw(st.integers(0, 2))):
-        count = draw(st.integers(0, 3))
-        columns = draw(
-            st.lists(
-                st.tuples(
-                    st.sampled_from(
-                        ["", *(["uchar", "uint8", "int", "ushort"] * (prefix == "tail"))]
-                    ),
-                    st.sampled_from(sorted(TYPES)),
-                ),
-                min_size=1,
-                max_size=3,
-            )
-        )
+        count, columns = draw(st.integers(0, 3)), draw(st.lists(column, min_size=1, max_size=3))
         lines = [f"element {prefix}{number} {count}"]
-        for index, (length, kind) in enumerate(columns):
-            lines.append(f"property {f'list {length} ' if length else ''}{kind} {prefix}_{index}")
+        for index, (length_kind, kind) in enumerate(columns):
+            listed = f"list {length_kind} " if length_kind else ""
+            lines.append(f"property {listed}{kind} {prefix}_{index}")
         body = b"".join(_element_row(random, form, columns) for _ in range(count))
         elements.append(([line.encode() for line in lines], body))
     return elements
@@ -191,20 +150,16 @@ def _element_row(random: np.random.Generator, form: str, columns: list[tuple[str
     return (" ".join(words) + "\n").encode() if form == "ascii" else b"".join(parts)
 
 
+REMARKS = (
+    *("comment element vertex 7", "comment", "comment end_header", "obj_info num_cols 3", ""),
+    "comment gemacht für Zoë 🎈",
+)
+
+
 def _header_lines(draw: st.DrawFn, form: str, elements: tuple) -> tuple[list[bytes], list[bytes]]:
     """Return the header's lines ahead of the vertex element and behind it, comments among them."""
     before, kinds, after = elements
-    remark = st.sampled_from(
-        [
-            [],
-            [b"comment element vertex 7"],
-            [b"comment"],
-            [b"comment end_header"],
-            ["comment gemacht für Zoë 🎈".encode()],
-            [b"obj_info num_cols 3"],
-            [b""],
-        ]
-    )
+    remark = st.sampled_from([[], *([text.encode()] for text in REMARKS)])
     lead = [b"ply", *draw(remark), b"format %s 1.0" % form.encode(), *draw(remark)]
     lead += [line for lines, _ in before for line in lines]
     rest = draw(remark) + [f"property {kind} {name}".encode() for name, kind in kinds]

@@ -1,0 +1,67 @@
+"""What a reader must do with a file that is wrong, and ways to make one."""
+
+from __future__ import annotations
+
+import json
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from refine_addon.core import RefineError, read_splats
+
+
+def refused(
+    path: Path,
+    expected: str,
+    data: bytes | None = None,
+    *,
+    read: Callable = read_splats,
+    file: Path | None = None,
+    memory: float = 5e6,
+) -> str:
+    """Read `path`, which may first be filled, and return the message.
+
+    It names the file (`file`, if that is another) and then what is expected, in a sentence, and
+    the reader took no memory beyond what small files account for.
+    """
+    if data is not None:
+        path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        with np.errstate(all="raise"), pytest.raises(RefineError) as caught:
+            read(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    message = str(caught.value)
+    assert message.startswith(f"{file or path}: ")
+    assert expected in message
+    assert len(message) < 1000
+    assert peak < memory
+    return message
+
+
+def with_value(content: Any, *path_and_value: Any) -> Any:
+    """Return a copy of parsed JSON in which the value at a path is another."""
+    *path, key, value = path_and_value
+    content = json.loads(json.dumps(content))
+    held = content
+    for step in path:
+        held = held[step]
+    held[key] = value
+    return content
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Return the processor time of one thread that `work` takes, the least of three tries."""
+    times = []
+    for _ in range(3):
+        start = time.thread_time()
+        work()
+        times.append(time.thread_time() - start)
+    return min(times)
