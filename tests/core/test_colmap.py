@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, read_cameras
+from tests.hostile import refused
 
 POSE = (0.5, 0.5, 0.5, -0.5, -2, 3, 1)
 """The camera of `test_camera_files.test_every_format_gives_the_same_view`."""
@@ -42,6 +42,7 @@ VALUES = {"f": 100, "fx": 100, "fy": 120, "cx": 30.5, "cy": 24}
 
 PINHOLE = (1, 1, 64, 48, (100, 120, 32, 24))
 IMAGE = (1, POSE, 1, "a.png", 0)
+TWO = ([PINHOLE, (2, 0, 8, 8, (1, 2, 3))], [IMAGE, (2, POSE, 2, "b", 2)])
 
 
 @pytest.fixture(autouse=True)
@@ -92,7 +93,6 @@ WRITERS = {".bin": (binary_cameras, binary_images), ".txt": (text_cameras, text_
 
 def write(folder, suffix, cameras=(PINHOLE,), images=(IMAGE,)):
     """Write a model; `cameras` and `images` may also be the bytes of the file."""
-    folder.mkdir(parents=True, exist_ok=True)
     for stem, things, writer in zip(
         ("cameras", "images"), (cameras, images), WRITERS[suffix], strict=True
     ):
@@ -101,15 +101,8 @@ def write(folder, suffix, cameras=(PINHOLE,), images=(IMAGE,)):
     return folder
 
 
-def refused(folder, file):
-    """Return the message, which names the file."""
-    with pytest.raises(RefineError) as caught:
-        read_cameras(folder)
-    message = str(caught.value)
-
-    assert message.startswith(f"{folder / file}: ")
-
-    return message
+def wrong(folder, file, expected, memory=2e6):
+    return refused(folder, expected, read=read_cameras, file=folder / file, memory=memory)
 
 
 def project(view, point):
@@ -117,91 +110,58 @@ def project(view, point):
     return [view.fx * x / z + view.cx, view.fy * y / z + view.cy]
 
 
-both = pytest.mark.parametrize("suffix", [".bin", ".txt"])
+both = pytest.mark.parametrize("suffix", WRITERS)
 
 
 # What is read ----------------------------------------------------------------------------------
 
 
 @both
-def test_a_point_lands_on_the_pixel_derived_by_hand(tmp_path, suffix):
-    """(57, 39), by the docstring of `test_every_format_gives_the_same_view`."""
-    (view,) = read_cameras(write(tmp_path, suffix))
-
-    assert project(view, POINT) == pytest.approx([57, 39], abs=1e-12)
-
-
-@both
-def test_the_upper_left_corner_of_the_image_is_the_origin(tmp_path, suffix):
-    """COLMAP's centre of a 64 x 48 image is (32, 24) as is ours, so it is not shifted by 0.5."""
-    (view,) = read_cameras(write(tmp_path, suffix))
-
-    assert (view.cx, view.cy) == (view.width / 2, view.height / 2)
-
-
-@both
 @pytest.mark.parametrize(("name", "number", "layout"), MODELS)
 def test_every_camera_model_gives_its_pinhole(tmp_path, suffix, name, number, layout):
-    """A second camera follows, which is found only if the number of parameters is right."""
+    """A second camera follows, which is found only if the number of parameters is right.
+
+    COLMAP's centre of a 64 x 48 image is (32, 24) as is ours, so it is not shifted by 0.5.
+    Distortion is noted of cameras that an image uses alone: here two of three.
+    """
+    fisheye = f"{{}} (fisheye, {name}) taken as pinhole: wrong away from the centre"
     values = [VALUES.get(key, 0) for key in layout.split()]
-    cameras = [(5, number, 64, 48, values), PINHOLE]
     images = [(1, POSE, 5, "a", 3), (2, POSE, 1, "b", 0)]
 
-    views = read_cameras(write(tmp_path, suffix, cameras, images))
+    views = read_cameras(write(tmp_path, suffix, [(5, number, 64, 48, values), PINHOLE], images))
 
     assert (views[0].fx, views[0].fy) == (100, 120 if "fy" in layout else 100)
     assert (views[0].cx, views[0].cy) == (30.5, 24)
     assert (views[1].cx, views[1].cy) == (32, 24)
-    fisheye = f"1 camera (fisheye, {name}) taken as pinhole: wrong away from the centre"
-    assert views.note == (fisheye if "FISHEYE" in name else "")
-
-
-@both
-@pytest.mark.parametrize(("name", "number", "layout"), MODELS[2:])
-def test_distortion_is_ignored_and_noted(tmp_path, suffix, name, number, layout):
-    """Only cameras that an image uses count: here two of three."""
+    assert views.note == (fisheye.format("1 camera") if "FISHEYE" in name else "")
+    if len(layout.split()) in (3, 4) and "k" not in layout:
+        return
     values = [VALUES.get(key, 0.01) for key in layout.split()]
     cameras = [(index, number, 64, 48, values) for index in (1, 2, 3)]
     images = [(index, POSE, 1 + index % 2, f"{index}", 0) for index in range(5)]
+    note = read_cameras(write(tmp_path, suffix, cameras, images)).note
+    distorted = f"distortion of 2 cameras ignored (model {name})"
+    assert note == (fisheye.format("2 cameras") if "FISHEYE" in name else distorted)
+
+
+@both
+def test_views_are_sorted_by_name_and_id_whatever_the_order_of_the_file(tmp_path, suffix):
+    """Images without points do not swallow the next one's line; several models are noted alike."""
+    given = [(9, "c"), (3, "b/2.png"), (4, "c"), (2, "a 1.png")]
+    images = [(key, (*POSE[:6], key), 1 + key % 2, name, key % 3) for key, name in given]
+    cameras = [(1, 2, 64, 48, [9, 32, 24, 0.1]), (2, 4, 64, 48, [9, 9, 32, 24, 0, 0, 0, 1])]
 
     views = read_cameras(write(tmp_path, suffix, cameras, images))
 
-    fisheye = f"2 cameras (fisheye, {name}) taken as pinhole: wrong away from the centre"
-    distorted = f"distortion of 2 cameras ignored (model {name})"
-    assert views.note == (fisheye if "FISHEYE" in name else distorted)
-
-
-@both
-def test_several_models_are_noted_one_by_one(tmp_path, suffix):
-    cameras = [(1, 2, 64, 48, [9, 32, 24, 0.1]), (2, 4, 64, 48, [9, 9, 32, 24, 0, 0, 0, 1])]
-    images = [(1, POSE, 1, "a", 0), (2, POSE, 2, "b", 0)]
-
-    assert read_cameras(write(tmp_path, suffix, cameras, images)).note == (
-        "distortion of 1 camera ignored (model SIMPLE_RADIAL); "
-        "distortion of 1 camera ignored (model OPENCV)"
-    )
-
-
-@both
-def test_views_are_sorted_by_name_whatever_the_order_of_the_file(tmp_path, suffix):
-    images = [(3, POSE, 1, "b/2.png", 1), (1, POSE, 1, "c 3.png", 0), (2, POSE, 1, "a.png", 2)]
-
-    views = read_cameras(write(tmp_path, suffix, [PINHOLE], images))
-
-    assert [view.name for view in views] == ["a.png", "b/2.png", "c 3.png"]
-
-
-@both
-def test_images_of_one_name_stand_in_the_order_of_their_ids(tmp_path, suffix):
-    images = [(9, (*POSE[:6], 9), 1, "a", 0), (4, (*POSE[:6], 4), 1, "a", 0)]
-
-    views = read_cameras(write(tmp_path, suffix, [PINHOLE], images))
-
-    assert [(view.rotation @ -view.center)[2] for view in views] == pytest.approx([4, 9])
+    assert [view.name for view in views] == ["a 1.png", "b/2.png", "c", "c"]
+    assert [(view.rotation @ -view.center)[2] for view in views] == pytest.approx([2, 3, 4, 9])
+    one = "distortion of 1 camera ignored (model {})".format
+    assert views.note == f"{one('SIMPLE_RADIAL')}; {one('OPENCV')}"
 
 
 @both
 def test_a_quaternion_of_any_length_and_sign_is_the_same_rotation(tmp_path, suffix):
+    """(57, 39), by the docstring of `test_every_format_gives_the_same_view`."""
     poses = [tuple(factor * value for value in POSE[:4]) + POSE[4:] for factor in (1, -3, 1e-8)]
     images = [(index, pose, 1, "a", 0) for index, pose in enumerate(poses)]
 
@@ -209,13 +169,12 @@ def test_a_quaternion_of_any_length_and_sign_is_the_same_rotation(tmp_path, suff
         assert project(view, POINT) == pytest.approx([57, 39], abs=1e-9)
 
 
-@both
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
 @given(
     quaternion=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: max(map(abs, q)) > 1e-3),
     center=st.tuples(*[st.floats(-1e6, 1e6)] * 3),
 )
-def test_any_pose_survives_a_round_trip(tmp_path, suffix, quaternion, center):
+def test_any_pose_survives_a_round_trip(tmp_path, quaternion, center):
     """Rotating the basis by q v q* (the definition) gives the columns of R; t = -R c."""
     tame = np.where(np.abs(quaternion) < 1e-9, 0, quaternion)
     w, *axis = tame / np.linalg.norm(tame)
@@ -226,36 +185,34 @@ def test_any_pose_survives_a_round_trip(tmp_path, suffix, quaternion, center):
     center = np.where(np.abs(center) < 1e-9, 0, center)
     pose = [float(value) for value in (w, *axis, *(-rotation @ center))]
 
-    (view,) = read_cameras(write(tmp_path, suffix, [PINHOLE], [(1, pose, 1, "a", 0)]))
-
-    np.testing.assert_allclose(view.rotation, rotation, atol=1e-12)
-    np.testing.assert_allclose(view.center, center, atol=1e-8)
-
-
-def test_binary_is_preferred_to_text_as_by_colmap_itself(tmp_path):
-    write(tmp_path, ".bin", images=[(1, POSE, 1, "binary", 0)])
-    write(tmp_path, ".txt", images=[(1, POSE, 1, "text", 0)])
-
-    assert read_cameras(tmp_path)[0].name == "binary"
-    assert read_cameras(tmp_path / "images.txt")[0].name == "text"
+    for suffix in WRITERS:
+        write(tmp_path, suffix, [PINHOLE], [(1, pose, 1, "a", 0)])
+        (view,) = read_cameras(tmp_path / f"images{suffix}")
+        np.testing.assert_allclose(view.rotation, rotation, atol=1e-12)
+        np.testing.assert_allclose(view.center, center, atol=1e-8)
 
 
-@both
-@pytest.mark.parametrize("stem", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_any_file_of_the_model_leads_to_it(tmp_path, suffix, stem):
-    """Rigs and frames of newer models lie beside; the poses are in images all the same."""
-    write(tmp_path, suffix)
-    (tmp_path / f"{stem}{suffix}").touch()
+def test_any_file_of_the_model_leads_to_it(tmp_path):
+    """Rigs and frames of newer models lie beside; the poses are in images all the same.
 
-    assert read_cameras(tmp_path / f"{stem}{suffix}")[0].name == "a.png"
+    Of a folder binary is preferred to text, as by COLMAP itself.
+    """
+    for suffix in WRITERS:
+        write(tmp_path, suffix, images=[(1, POSE, 1, suffix, 0)])
+        for stem in ("cameras", "images", "points3D", "rigs", "frames"):
+            (tmp_path / f"{stem}{suffix}").touch()
+            assert read_cameras(tmp_path / f"{stem}{suffix}")[0].name == suffix
+    assert read_cameras(tmp_path)[0].name == ".bin"
+
+
+LINE = b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png"
 
 
 @pytest.mark.parametrize(
     "images",
     [
-        b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png",
-        b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png\n",
-        b"\n\n1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png\r\n\r\n\r\n",
+        LINE,
+        b"\n\n" + LINE + b"\r\n\r\n\r\n",
         b"\xef\xbb\xbf# Images\n1  0.5 0.5 0.5\t-0.5 -2 3 1 1 a.png \n1 2 -1 3 4 5\n",
     ],
 )
@@ -266,23 +223,11 @@ def test_the_line_of_points_may_be_empty_or_absent(tmp_path, images):
     assert view.name == "a.png"
 
 
-@pytest.mark.slow
 def test_empty_lines_take_no_memory(tmp_path):
     """A place was made for each and kept: 250 bytes of memory for one of the file."""
-    text = b"\n" * 100_000 + b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png"
-    write(tmp_path, ".txt", images=text)
-    tracemalloc.start()
+    write(tmp_path, ".txt", images=b"\n" * 20_000 + b"1 2 3")
 
-    assert len(read_cameras(tmp_path)) == 1
-
-    assert tracemalloc.get_traced_memory()[1] < 1_000_000
-    tracemalloc.stop()
-
-
-def test_an_image_without_points_does_not_swallow_the_next(tmp_path):
-    images = [(1, POSE, 1, "a", 0), (2, POSE, 1, "b", 0), (3, POSE, 1, "c", 40)]
-
-    assert len(read_cameras(write(tmp_path, ".txt", [PINHOLE], images))) == 3
+    wrong(tmp_path, "images.txt", "line 20001 image row 0", memory=500_000)
 
 
 # What is refused -------------------------------------------------------------------------------
@@ -290,76 +235,39 @@ def test_an_image_without_points_does_not_swallow_the_next(tmp_path):
 
 @both
 @pytest.mark.parametrize("file", ["cameras", "images"])
-def test_an_empty_file_is_refused(tmp_path, suffix, file):
-    write(tmp_path, suffix, **{file: b""})
+def test_an_empty_or_missing_half_is_named(tmp_path, suffix, file):
+    path = write(tmp_path, suffix, **{file: b""}) / f"{file}{suffix}"
+    wrong(tmp_path, path.name, "the file is empty, expected cameras")
+    path.unlink()
+    beside = tmp_path / f"points3D{suffix}"
+    beside.touch()
+    refused(beside, "cannot be read (", read=read_cameras, file=path)
 
-    assert "the file is empty, expected cameras" in refused(tmp_path, f"{file}{suffix}")
 
-
-@both
-@pytest.mark.parametrize("file", ["cameras", "images"])
-def test_a_missing_half_is_named(tmp_path, suffix, file):
-    write(tmp_path, suffix)
-    (tmp_path / f"{file}{suffix}").unlink()
-    (tmp_path / f"points3D{suffix}").touch()
-
-    with pytest.raises(RefineError) as caught:
-        read_cameras(tmp_path / f"points3D{suffix}")
-
-    assert str(caught.value).startswith(f"{tmp_path / file}{suffix}: cannot be read (")
+FINITE = "expected a finite number up to 1e18, got"
 
 
 @both
 @pytest.mark.parametrize(
-    ("key", "value", "problem"),
+    ("pose", "camera", "problem"),
     [
-        (0, float("nan"), "QW: expected a finite number up to 1e18, got NaN"),
-        (4, float("inf"), "TX: expected a finite number up to 1e18, got Infinity"),
-        (6, -1e300, "TZ: expected a finite number up to 1e18, got -1e+300"),
+        ((float("nan"), *POSE[1:]), 1, f"QW: {FINITE} NaN"),
+        ((*POSE[:4], float("inf"), 3, 1), 1, f"TX: {FINITE} Infinity"),
+        ((*POSE[:6], -1e300), 1, f"TZ: {FINITE} -1e+300"),
+        ((0, 0, 0, 0, 1, 2, 3), 1, "expected a quaternion (w, x, y, z)"),
+        # Turned by 45 degrees about z, t = (9e17, -9e17, 0) is sqrt(2) * 9e17 along one axis.
+        (
+            (0.9238795325112867, 0, 0, 0.3826834323650898, 9e17, -9e17, 0),
+            1,
+            "the camera's centre is farther than 1e18",
+        ),
+        (POSE, 7, "refers to camera 7, expected one of the 1 in cameras"),
     ],
 )
-def test_a_wrong_pose_is_named_with_the_image(tmp_path, suffix, key, value, problem):
-    pose = [*POSE[:key], value, *POSE[key + 1 :]]
-    write(tmp_path, suffix, images=[IMAGE, (2, pose, 1, "b", 0)])
+def test_a_wrong_pose_is_named_with_the_image(tmp_path, suffix, pose, camera, problem):
+    write(tmp_path, suffix, images=[IMAGE, (2, pose, camera, "b", 0)])
 
-    message = refused(tmp_path, f"images{suffix}")
-
-    assert "image row 1 " in message
-    assert problem in message
-
-
-@both
-def test_a_zero_quaternion_is_no_rotation(tmp_path, suffix):
-    write(tmp_path, suffix, images=[(1, (0, 0, 0, 0, 1, 2, 3), 1, "a", 0)])
-
-    assert "image row 0" in refused(tmp_path, f"images{suffix}")
-    assert "expected a quaternion (w, x, y, z)" in refused(tmp_path, f"images{suffix}")
-
-
-@both
-def test_a_centre_too_far_to_square_is_refused(tmp_path, suffix):
-    """Turned by 45 degrees about z, t = (9e17, -9e17, 0) is sqrt(2) * 9e17 along one axis."""
-    pose = (0.9238795325112867, 0, 0, 0.3826834323650898, 9e17, -9e17, 0)
-    write(tmp_path, suffix, images=[(1, pose, 1, "a", 0)])
-
-    assert "the camera's centre is farther than 1e18" in refused(tmp_path, f"images{suffix}")
-
-
-@both
-def test_an_image_of_an_unknown_camera_is_named(tmp_path, suffix):
-    write(tmp_path, suffix, images=[IMAGE, (2, POSE, 7, "b", 0)])
-
-    message = refused(tmp_path, f"images{suffix}")
-
-    assert "image row 1" in message
-    assert f"refers to camera 7, expected one of the 1 in cameras{suffix}" in message
-
-
-@both
-def test_a_camera_that_is_there_twice_is_refused(tmp_path, suffix):
-    write(tmp_path, suffix, [PINHOLE, PINHOLE])
-
-    assert "camera 1 is there twice" in refused(tmp_path, f"cameras{suffix}")
+    assert "image row 1 " in wrong(tmp_path, f"images{suffix}", problem).replace(":", " ")
 
 
 @both
@@ -367,101 +275,85 @@ def test_a_camera_that_is_there_twice_is_refused(tmp_path, suffix):
     ("camera", "problem"),
     [
         ((1, 1, 0, 48, (100, 120, 32, 24)), "width: expected a whole number of pixels"),
-        ((1, 1, 64, 2**64 - 1, (100, 120, 32, 24)), "height: expected a finite number up to 1e18"),
+        ((1, 1, 64, 2**64 - 1, (100, 120, 32, 24)), f"height: {FINITE}"),
         ((1, 1, 64, 48, (100, 0.0, 32, 24)), "focal length: expected a positive focal length"),
-        ((1, 1, 64, 48, (100, 120, float("nan"), 24)), "parameter 2: expected a finite number"),
-        ((1, 2, 64, 48, (100, 32, 24, float("inf"))), "parameter 3: expected a finite number"),
+        ((1, 1, 64, 48, (100, 120, float("nan"), 24)), f"parameter 2: {FINITE}"),
+        ((1, 2, 64, 48, (100, 32, 24, float("inf"))), f"parameter 3: {FINITE}"),
+        ((9, 1, 64, 48, (100, 120, 32, 24)), "camera 9 is there twice"),
     ],
 )
 def test_a_wrong_camera_is_named_with_its_place(tmp_path, suffix, camera, problem):
     write(tmp_path, suffix, [(9, *PINHOLE[1:]), camera])
 
-    message = refused(tmp_path, f"cameras{suffix}")
+    message = wrong(tmp_path, f"cameras{suffix}", problem)
 
     assert ("line 3" if suffix == ".txt" else "camera row 1 at byte 64") in message
-    assert problem in message
 
 
-def test_panoramas_are_refused(tmp_path):
-    write(tmp_path, ".bin", [(1, 17, 64, 48, (64, 48))] * 2)
+@pytest.mark.parametrize(
+    ("number", "problem"),
+    [
+        (17, "EQUIRECTANGULAR is a panorama"),
+        (-1, "camera row 1 at byte 64: unknown camera model -1, expected 0 to 17"),
+        (18, "camera row 1 at byte 64: unknown camera model 18, expected 0 to 17"),
+    ],
+)
+def test_a_model_that_is_no_pinhole_or_unknown_is_named(tmp_path, number, problem):
+    """Parameters of an unknown one cannot be counted, so nothing behind it can be read either."""
+    write(tmp_path, ".bin", [PINHOLE, (2, number, 64, 48, (1, 2))])
 
-    assert "EQUIRECTANGULAR is a panorama" in refused(tmp_path, "cameras.bin")
-
-
-@pytest.mark.parametrize("number", [-1, 18, 2**31 - 1])
-def test_an_unknown_model_number_is_named(tmp_path, number):
-    """Its parameters cannot be counted, so nothing behind it can be read either."""
-    write(tmp_path, ".bin", [PINHOLE, (2, number, 64, 48, (1, 2, 3, 4))])
-
-    message = refused(tmp_path, "cameras.bin")
-
-    assert f"camera row 1 at byte 64: unknown camera model {number}, expected 0 to 17" in message
+    wrong(tmp_path, "cameras.bin", problem)
 
 
 @both
 def test_no_image_at_all_is_refused(tmp_path, suffix):
     write(tmp_path, suffix, images=[])
 
-    assert "no registered image, expected at least one" in refused(tmp_path, f"images{suffix}")
+    wrong(tmp_path, f"images{suffix}", "no registered image, expected at least one")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["cameras", "images"])
 def test_a_binary_cut_off_at_any_byte_is_refused(tmp_path, file):
     """The message tells the byte where the missing part should have started."""
-    write(tmp_path, ".bin", [PINHOLE, (2, 0, 8, 8, (1, 2, 3))], [IMAGE, (2, POSE, 2, "b", 2)])
+    write(tmp_path, ".bin", *TWO)
     whole = (tmp_path / f"{file}.bin").read_bytes()
     for length in range(1, len(whole)):
         (tmp_path / f"{file}.bin").write_bytes(whole[:length])
 
-        message = refused(tmp_path, f"{file}.bin")
+        message = wrong(tmp_path, f"{file}.bin", "truncated: ")
 
-        assert "truncated: " in message
         assert int(message.split(": byte ")[1].split(":")[0]) <= length
 
 
 @pytest.mark.parametrize("count", [2, 2**32, 2**63, 2**64 - 1])
-@pytest.mark.parametrize("file", ["cameras", "images"])
-def test_a_count_that_the_file_does_not_back_allocates_nothing(tmp_path, file, count):
-    write(tmp_path, ".bin")
-    path = tmp_path / f"{file}.bin"
-    path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
+def test_a_count_that_the_file_does_not_back_allocates_nothing(tmp_path, count):
+    number = struct.pack("<Q", count)
+    for file in ("cameras", "images"):
+        path = write(tmp_path, ".bin") / f"{file}.bin"
+        path.write_bytes(number + path.read_bytes()[8:])
+        problem = f"truncated: number of {file}: {count} of at least "
+        wrong(tmp_path, path.name, problem)
+    write(tmp_path, ".bin", images=binary_images([IMAGE])[:-8] + number)
+    wrong(tmp_path, "images.bin", f"truncated: {count} points of image row 0")
 
-    message = refused(tmp_path, path.name)
 
-    assert f"truncated: number of {file}: {count} of at least " in message
-
-
-@pytest.mark.parametrize("file", ["cameras", "images"])
-def test_a_count_below_what_the_file_holds_is_refused(tmp_path, file):
+@pytest.mark.parametrize(("file", "first"), [("cameras", 8 + 24 + 4 * 8), ("images", 8 + 64 + 14)])
+def test_a_count_below_what_the_file_holds_is_refused(tmp_path, file, first):
     """Two are there and one is announced: nobody can tell which the count is wrong about."""
-    write(tmp_path, ".bin", [PINHOLE, (2, 0, 8, 8, (1, 2, 3))], [IMAGE, (2, POSE, 2, "b", 2)])
-    path = tmp_path / f"{file}.bin"
+    path = write(tmp_path, ".bin", *TWO) / f"{file}.bin"
     whole = path.read_bytes()
-    first = {"cameras": 8 + 24 + 4 * 8, "images": 8 + 64 + len("a.png") + 1 + 8}[file]
     path.write_bytes(struct.pack("<Q", 1) + whole[8:])
 
-    message = refused(tmp_path, path.name)
-
     expected = f"byte {first}: expected the end of the file after 1 {file[:-1]}"
-    assert f"{expected}, got {len(whole) - first} more bytes" in message
-
-
-@pytest.mark.parametrize("count", [1, 2**32, 2**63, 2**64 - 1])
-def test_a_count_of_points_that_the_file_does_not_back_is_refused(tmp_path, count):
-    data = binary_images([IMAGE])
-    write(tmp_path, ".bin", images=data[:-8] + struct.pack("<Q", count))
-
-    assert f"truncated: {count} points of image row 0" in refused(tmp_path, "images.bin")
+    wrong(tmp_path, path.name, f"{expected}, got {len(whole) - first} more bytes")
 
 
 def test_a_name_without_end_is_refused(tmp_path):
-    data = binary_images([IMAGE])
-    write(tmp_path, ".bin", images=data[: 8 + 64] + b"x" * 100)
+    write(tmp_path, ".bin", images=binary_images([IMAGE])[: 8 + 64] + b"x" * 100)
 
-    message = refused(tmp_path, "images.bin")
-
-    assert "byte 72: truncated: name of image row 0: expected a zero byte" in message
+    expected = "byte 72: truncated: name of image row 0: expected a zero byte"
+    wrong(tmp_path, "images.bin", expected)
 
 
 @pytest.mark.parametrize(
@@ -481,10 +373,7 @@ def test_a_name_without_end_is_refused(tmp_path):
 def test_a_wrong_line_of_cameras_is_named(tmp_path, line, problem):
     write(tmp_path, ".txt", cameras=f"# comment\n\n{line}\n".encode("latin-1"))
 
-    message = refused(tmp_path, "cameras.txt")
-
-    assert "cameras.txt: line 3" in message
-    assert problem in message
+    assert "cameras.txt: line 3" in wrong(tmp_path, "cameras.txt", problem)
 
 
 @pytest.mark.parametrize(
@@ -499,30 +388,23 @@ def test_a_wrong_line_of_cameras_is_named(tmp_path, line, problem):
 def test_a_wrong_line_of_images_is_named(tmp_path, line, problem):
     write(tmp_path, ".txt", images=f"1 1 0 0 0 0 0 0 1 a\n\n{line}\n".encode())
 
-    message = refused(tmp_path, "images.txt")
-
-    assert "images.txt: line 3 image row 1: " in message
-    assert problem in message
+    wrong(tmp_path, "images.txt", f"line 3 image row 1: {problem}")
 
 
 def test_images_without_their_lines_of_points_are_told(tmp_path):
     """Else every second image would be taken for the points of the one before, and vanish."""
-    line = b"1 1 0 0 0 0 0 0 1 a\n"
-    write(tmp_path, ".txt", images=line * 4)
+    write(tmp_path, ".txt", images=b"1 1 0 0 0 0 0 0 1 a\n" * 4)
 
-    message = refused(tmp_path, "images.txt")
-
-    assert "images.txt: line 2: expected the points of image row 0" in message
+    wrong(tmp_path, "images.txt", "line 2: expected the points of image row 0")
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_damage_gives_views_or_a_located_error(tmp_path, data):
     """Bytes are replaced, removed or inserted anywhere; there is no other exception."""
     suffix = data.draw(st.sampled_from([".bin", ".txt"]))
     stem = data.draw(st.sampled_from(["cameras", "images"]))
-    write(tmp_path, suffix, [PINHOLE, (2, 0, 8, 8, (1, 2, 3))], [IMAGE, (2, POSE, 2, "b", 2)])
-    path = tmp_path / f"{stem}{suffix}"
+    path = write(tmp_path, suffix, *TWO) / f"{stem}{suffix}"
     content = path.read_bytes()
     start = data.draw(st.integers(0, len(content)))
     end = data.draw(st.integers(start, min(start + 12, len(content))))
