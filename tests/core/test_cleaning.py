@@ -31,8 +31,7 @@ def made(means, scale, opacity, color):
 
 def joined(*parts):
     """Return all splats of some sets."""
-    names = ARRAYS
-    return Splats(**{name: np.concatenate([getattr(s, name) for s in parts]) for name in names})
+    return Splats(**{name: np.concatenate([getattr(s, name) for s in parts]) for name in ARRAYS})
 
 
 def wall():
@@ -67,42 +66,11 @@ def test_what_views_see_past_goes_as_being_in_front():
     assert cleaned.facts()["sure"]["front"] == pytest.approx(7 / 8)
 
 
-def test_a_wall_stays_whole():
-    """Each splat of the wall has others beside it, and nothing lies behind them."""
-    cleaned = clean(wall(), cameras())
-
-    assert cleaned.keep.all()
-    assert cleaned.in_words() == "nothing to clean away"
-
-
-def test_a_clump_in_front_of_the_wall_is_isolated():
-    """Its 12 opaque splats support each other, but with all of them gone nothing does."""
-    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (12, 3))
-    splats = joined(wall(), made(places, 0.06, 0.95, 0.1))
-
-    cleaned = clean(splats, cameras())
-
-    assert cleaned.keep[: SIDE**2].all()
-    assert not cleaned.keep[SIDE**2 :].any()
-    assert cleaned.by_reason["isolated"].sum() >= 6
-
-
 def test_a_clump_of_many_splats_is_a_thing():
     """A cluster of 100 splats or more is no floater, wherever it is."""
-    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.1, (260, 3))
-    splats = joined(wall(), made(places, 0.06, 0.95, 0.1))
+    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.1, (130, 3))
 
-    assert clean(splats, cameras(12)).keep.all()
-
-
-def test_a_veil_before_the_wall_is_giant():
-    """Its standard deviation reaches across 60 x 1.5 / 2 = 45 of 80 pixels."""
-    splats = joined(wall(), made([[0.0, 0.0, 2.0]], 1.5, 0.2, 0.1))
-
-    cleaned = clean(splats, cameras(9))
-
-    assert cleaned.counts() == {"front": 0, "isolated": 0, "giant": 1, "needle": 0}
-    assert cleaned.keep[: SIDE**2].all()
+    assert clean(joined(wall(), made(places, 0.06, 0.95, 0.1)), cameras()).keep.all()
 
 
 def test_a_dome_behind_all_stays():
@@ -156,7 +124,7 @@ def test_what_one_view_alone_sees_past_stays(count, stays):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_neither_order_nor_unit_nor_frame_decides(unit):
     """The scene reversed, turned by a quarter about x and in another unit loses the same splats."""
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -183,31 +151,29 @@ def test_extreme_and_undrawable_splats_are_survived():
     odd.log_scales[3:] = [[80, 80, 80], [-np.inf, -np.inf, -np.inf], [-90, 3, -90]]
     odd.opacity_logits[2] = np.inf
 
-    cleaned = clean(joined(wall(), odd), cameras())
-
-    assert cleaned.keep[: SIDE**2].all()
-    assert cleaned.keep[SIDE**2 : SIDE**2 + 2].all()
+    assert clean(joined(wall(), odd), cameras()).keep[: SIDE**2 + 2].all()
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_next_to_nothing_is_survived(count):
-    """No splats, or one alone, behind which nothing is: nothing to clean away."""
-    assert clean(FLOATER.take(slice(count)), cameras()).keep.all()
+@pytest.mark.parametrize("splats", [FLOATER.take(slice(0)), FLOATER, wall()])
+def test_where_nothing_floats_nothing_is_cleaned_away(splats):
+    """No splats, one with nothing behind it, a wall, whose splats support each other."""
+    cleaned = clean(splats, cameras())
+
+    assert cleaned.keep.all()
+    assert cleaned.in_words() == "nothing to clean away"
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("settings", "message"),
     [
-        (lambda: Cleaning(("fog",)), "reason is 'fog', expected some of front, isolated, giant"),
-        (lambda: Cleaning(()), "reason is none, expected"),
-        (lambda: Cleaning(views=-1), "views is -1, expected 0 (all) or more"),
+        ({"reasons": ("fog",)}, "reason is 'fog', expected some of front, isolated, giant"),
+        ({"reasons": ()}, "reason is none, expected"),
+        ({"views": -1}, r"views is -1, expected 0 \(all\) or more"),
     ],
 )
-def test_settings_that_cannot_be_are_refused(make, message):
-    """The message names the value and what was expected."""
-    with pytest.raises(RefineError) as caught:
-        make()
-    assert str(caught.value).startswith(message)
+def test_settings_that_cannot_be_are_refused(settings, message):
+    with pytest.raises(RefineError, match=f"^{message}"):
+        Cleaning(**settings)
 
 
 def test_connected_parts_have_one_number():

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from refine_addon.core import Cleaning, View, ViewSet, clean
-from refine_addon.core.cleaning import search, support
-from refine_addon.core.cleaning.clean import REASONS
+from refine_addon.core.cleaning import support
+from refine_addon.core.cleaning.clean import REASONS, judge
+from refine_addon.core.cleaning.search import Search, is_slender
+from refine_addon.core.execute import silent
 from refine_addon.core.visibility import cast, projection
 
 from .test_cleaning import FLOATER, SIDE, cameras, joined, made, wall
@@ -25,6 +28,9 @@ def stretched(place, scales, opacity=0.8, color=0.1):
     return replace(
         made([place], 1.0, opacity, color), log_scales=np.log(np.array([scales], np.float32))
     )
+
+
+VEIL = made([[0.0, 0.0, 2.0]], 1.5, 0.2, 0.1)
 
 
 def reasons(*parts, count=1, views=6):
@@ -45,7 +51,7 @@ def reasons(*parts, count=1, views=6):
         (stretched([0.1, 0, 2], [0.3, 0.3, 0.003]), "front"),
         (made([[0.2, 0, 0.25]], 0.1, 0.8, 0.1), "front"),
         (made([[0.0, 0, 3.0]], 0.8, 0.5, 0.1), "front"),
-        (made([[0.0, 0, 2.0]], 1.5, 0.2, 0.1), "giant"),
+        (VEIL, "giant"),
     ],
     ids=["needle", "short", "flake", "near", "far", "giant"],
 )
@@ -70,143 +76,113 @@ def test_a_giant_may_lie_at_a_surface_by_less_than_half(half, expected):
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     square = made(np.stack([x, y, np.full_like(x, 2.0)], axis=1), 0.07, 0.95, 0.5)
 
-    assert reasons(square, made([[0.0, 0.0, 2.0]], 1.5, 0.2, 0.1), views=30) == expected
+    assert reasons(square, VEIL, views=30) == expected
 
 
-def clump():
-    """Return 40 splats that hold together in the air, and support each other."""
-    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (40, 3))
-    return made(places, 0.06, 0.95, 0.1)
+def clump(count=40):
+    """Return splats that hold together in the air, and support each other, the inmost last."""
+    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (count, 3))
+    inmost_last = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1))
+    return made(places[inmost_last], 0.06, 0.95, 0.1)
 
 
 def test_a_clump_is_isolated_and_each_splat_has_one_reason():
-    """Those at its rim, which the others support little, are in front of the wall."""
+    """Those at its rim, which the others support little, are in front of the wall.
+
+    Fog of opacity .05 that leads from it to the wall holds no cluster together.
+    """
+    depth = np.arange(2.3, 4.01, 0.1)
+    fog = made(np.stack([0 * depth, 0 * depth, depth], axis=1), 0.06, 0.05, 0.1)
+
     told = reasons(clump(), count=40)
 
     assert told["isolated"] >= 36
     assert sum(told.values()) == 40
-
-
-def test_fog_holds_no_cluster_together():
-    """A clump in the air stays isolated where splats of opacity .05 lead from it to the wall."""
-    depth = np.arange(2.3, 4.01, 0.1)
-    fog = made(np.stack([0 * depth, 0 * depth, depth], axis=1), 0.06, 0.05, 0.1)
-
     assert not clean(joined(wall(), fog, clump()), cameras()).keep[-40:].any()
 
 
-def seen_as(monkeypatch, near, behind, contrast, views, past):
-    """Let the views have seen that of every suspect, whatever they see."""
-    searching = search.Search.find
-
-    def find(self, *how):
-        found = searching(self, *how)
-        found.views[-1] = views
-        seen = (near, behind, contrast * behind, views, past)
-        for values, value in zip(found.evidence, seen, strict=True):
-            values[-1] = value
-        return found
-
-    monkeypatch.setattr(search.Search, "find", find)
-    # The splat put in last is the last Gaussian, too.
-    monkeypatch.setattr(
-        projection, "spatial_order", lambda place, _ties=None, **_: np.arange(len(place))
-    )
+SUSPECTS = {"floater": FLOATER, "veil": VEIL, "nine": clump(9), "ten": clump(10)}
 
 
-@pytest.mark.parametrize(
-    ("evidence", "expected"),
-    [
-        ((0.0, 1.0, 0.8, 6, 6), {"front": 1}),
-        ((0.0, 1.0, 0.8, 20, 2), {"front": 1}),
-        ((0.0, 1.0, 0.8, 21, 2), {}),
-        ((0.0, 1.0, 0.8, 2, 1), {}),
-        ((0.0, 1.0, 0.8, 0, 0), {}),
-        ((0.49, 0.51, 0.8, 6, 6), {"front": 1}),
-        ((0.51, 0.49, 0.8, 6, 6), {}),
-        ((0.0, 1.0, 0.0011, 6, 6), {"front": 1}),
-        ((0.0, 1.0, 0.0010, 6, 6), {"transparent": 1}),
-        ((0.0, 1.0, 0.0038, 2, 2), {"front": 1}),
-        ((0.0, 1.0, 0.0037, 2, 2), {"transparent": 1}),
-    ],
-)
-def test_evidence_decides_of_what_is_doubted(monkeypatch, evidence, expected):
-    """Support below .5; two views at least and one in ten.
+@cache
+def searched(name):
+    """Return Gaussians of a wall and what stands before it, what is found, the last one's row."""
+    splats, views = joined(wall(), SUSPECTS[name]), cameras(2 if name == "veil" else 6)
+    gaussians, scene, _ = projection.prepare(splats, views)
+    slender = is_slender(splats.log_scales[gaussians.index])
+    found = Search(gaussians, scene, list(views), 1).find(slender, silent)
+    return gaussians, found, int(np.flatnonzero(gaussians.index == len(splats) - 1)[0])
 
-    It changes a pixel by .8 of its contrast: 4/255 over 7^1.5, .00085, where six views see past it,
-    and over 3^1.5, .0030, where two do.
-    In this order: light near, light behind, contrast, views, views that see past it.
-    """
-    seen_as(monkeypatch, *evidence)
 
-    assert reasons(FLOATER, views=4) == expected
+def judged(name, near, behind, contrast, views, past, denied=()):
+    """Return which splats float and show, and which only float, if views saw that of the last."""
+    gaussians, found, row = searched(name)
+    evidence = support.Evidence(*(values.copy() for values in found.evidence))
+    seen = (near, behind, contrast * behind, views, past)
+    for values, value in zip(evidence, seen, strict=True):
+        values[row] = value
+    by_part = found.by_part.copy()
+    by_part[1, list(denied)] = 0.0
+    back = np.argsort(gaussians.index)
+    shows, faint, _ = judge(gaussians, found._replace(evidence=evidence, by_part=by_part))
+    return shows[back], faint[back]
 
 
 @pytest.mark.parametrize(
-    ("evidence", "expected"),
+    ("name", "evidence", "expected"),
     [
-        ((0.49, 0.51, 0.8, 90, 0), {"giant": 1}),
-        ((0.51, 0.49, 0.8, 90, 0), {}),
-        ((0.3, 0.7, 0.8, 31, 0), {"giant": 1}),
-        ((0.3, 0.7, 0.8, 29, 0), {}),
-        ((0.0, 1.0, 0.50, 10, 10), {"giant": 1}),
-        ((0.0, 1.0, 0.48, 10, 10), {}),
-        ((0.0, 1.0, 0.8, 0, 0), {}),
+        ("floater", (0.0, 1.0, 0.8, 20, 2), "shows"),
+        ("floater", (0.0, 1.0, 0.8, 21, 2), ""),
+        ("floater", (0.0, 1.0, 0.8, 2, 1), ""),
+        ("floater", (0.0, 1.0, 0.8, 0, 0), ""),
+        ("floater", (0.49, 0.51, 0.8, 6, 6), "shows"),
+        ("floater", (0.51, 0.49, 0.8, 6, 6), ""),
+        ("floater", (0.0, 1.0, 0.0011, 6, 6), "shows"),
+        ("floater", (0.0, 1.0, 0.0010, 6, 6), "faint"),
+        ("floater", (0.0, 1.0, 0.0038, 2, 2), "shows"),
+        ("floater", (0.0, 1.0, 0.0037, 2, 2), "faint"),
+        ("veil", (0.49, 0.51, 0.8, 90, 0), "shows"),
+        ("veil", (0.51, 0.49, 0.8, 90, 0), ""),
+        ("veil", (0.3, 0.7, 0.8, 31, 0), "shows"),
+        ("veil", (0.3, 0.7, 0.8, 29, 0), ""),
+        ("veil", (0.0, 1.0, 0.50, 10, 10), "shows"),
+        ("veil", (0.0, 1.0, 0.48, 10, 10), ""),
+        ("veil", (0.0, 1.0, 0.8, 0, 0), ""),
     ],
 )
-def test_evidence_decides_of_giants(monkeypatch, evidence, expected):
-    """No view need see past; the light that passes counts, .7 x 31 views.
+def test_evidence_decides_of_what_is_suspect(name, evidence, expected):
+    """Light near and behind, contrast, views, views that see past: support is below .5.
 
-    Its standard deviation is 45 to 50 of 80 px, from the sides, up to 12.6 times .05. It touches 8
-    splats of the wall: 8 x 4/255 / 11^1.5 x 8^sqrt(8) is needed, 1.23, which is .098 x 12.6, and
-    .098 is .2 of a contrast of .49. With .3 of the light near it 150^.3 times as much is needed:
-    1.93 of 31 views, 2.13 of 29; .157, where the change ends, x 12.6 is 1.98.
+    The floater needs two views at least that see past it, and one in ten. It changes a pixel by .8
+    of its contrast: 4/255 over 7^1.5, .00085, where six do, and over 3^1.5, .0030, where two do.
+
+    Past the veil no view need see; the light that passes counts, .7 x 31 views. Its standard
+    deviation is 45 to 50 of 80 px, from the sides, up to 12.6 times .05. It touches 8 splats of the
+    wall: 8 x 4/255 / 11^1.5 x 8^sqrt(8) is needed, 1.23, which is .098 x 12.6, and .098 is .2 of a
+    contrast of .49. With .3 of the light near it 150^.3 times as much is needed: 1.93 of 31 views,
+    2.13 of 29; .157, where the change ends, x 12.6 is 1.98.
     """
-    seen_as(monkeypatch, *evidence)
+    shows, faint = judged(name, *evidence)
 
-    assert reasons(made([[0.0, 0.0, 2.0]], 1.5, 0.2, 0.1), views=2) == expected
-
-
-@pytest.mark.parametrize(("near", "expected"), [(0.049, 1), (0.051, 0)])
-def test_what_is_only_isolated_must_have_little_near(monkeypatch, near, expected):
-    """Of 9 splats that support each other, the last has .049 or .051 of the light near it.
-
-    Ten would be judged as one clump.
-    """
-    seen_as(monkeypatch, near, 1.0 - near, 0.8, 6, 6)
-    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (9, 3))
-    inmost_last = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1))
-
-    told = reasons(made(places[inmost_last], 0.06, 0.95, 0.1))
-
-    assert (told["isolated"], told["front"]) == (expected, 0)
+    assert shows[-1] == (expected == "shows")
+    assert name == "veil" or faint[-1] == (expected == "faint")
 
 
-@pytest.mark.parametrize("denied", [(), (0,), (3,)])
-def test_a_clump_goes_as_one_unless_a_group_of_views_denies_it(monkeypatch, denied):
+def test_a_clump_goes_as_one_unless_a_group_of_views_denies_it():
     """Of ten splats, the last has .051 of the light near it, and goes only with its clump.
 
     The six views are in four groups by turns: two views each in the first two, one in the others.
+    Nine are no clump: what is only isolated must have less than .05 of the light near it.
     """
-    seen_as(monkeypatch, 0.051, 0.949, 0.8, 6, 6)
-    searching = search.Search.find
-    looked = []
+    _, found, row = searched("ten")
 
-    def find(self, *how):
-        found = searching(self, *how)
-        looked.append(found.by_part[1, :, -1].tolist())
-        found.by_part[1, list(denied)] = 0.0
-        return found
-
-    monkeypatch.setattr(search.Search, "find", find)
-    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (10, 3))
-    inmost_last = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1))
-
-    cleaned = clean(joined(wall(), made(places[inmost_last], 0.06, 0.95, 0.1)), cameras(), ALL)
-
-    assert looked == [[2.0, 2.0, 1.0, 1.0]]
-    assert cleaned.keep[-10:].tolist() == [False] * 9 + [bool(denied)]
-    assert cleaned.keep[: SIDE**2].all()
+    assert found.by_part[1, :, row].tolist() == [2.0, 2.0, 1.0, 1.0]
+    for denied in ((), (0,), (3,)):
+        shows, _ = judged("ten", 0.051, 0.949, 0.8, 6, 6, denied)
+        assert shows[-10:].tolist() == [True] * 9 + [not denied]
+        assert not shows[: SIDE**2].any()
+    for near, expected in ((0.049, True), (0.051, False)):
+        assert judged("nine", near, 1.0 - near, 0.8, 6, 6)[0][-1] == expected
 
 
 def test_rays_are_aimed_at_small_suspects(monkeypatch):
@@ -314,7 +290,7 @@ def test_what_takes_no_light_hides_nothing(absent, expected):
     assert set(gaussians.index[seen.hit[seen.owner]].tolist()) == expected
 
 
-def test_a_splat_lies_where_it_is_densest_on_a_ray(monkeypatch):
+def test_a_splat_lies_where_it_is_densest_on_a_ray():
     """A large flat splat turned by 45 degrees: z = 4 + x, so 4 (1 + u) on the ray x = u z.
 
     To first order in u; at 7.5 px from the centre and f = 60, u = .125 and the next order 1.6 %.
@@ -324,18 +300,13 @@ def test_a_splat_lies_where_it_is_densest_on_a_ray(monkeypatch):
     views = ViewSet((View(np.eye(3), np.zeros(3), 60, 60, 8, 8, 16, 16, name="a"),))
     gaussians, scene, _ = projection.prepare(splats, views)
     footprints = projection.project(gaussians, scene, views.views[0])
-    told, depths = [], support._depths
 
-    def noted(gaussians, footprints, scene, view, rays, reached):
-        told.append(rays.pixels_of(rays.ray[reached])[0])
-        told.append(depths(gaussians, footprints, scene, view, rays, reached))
-        return told[-1]
+    seen = support.hits_of_view(
+        gaussians, footprints, scene, (views.views[0], 0), np.zeros(1, np.bool_)
+    )
 
-    monkeypatch.setattr(support, "_depths", noted)
-    numbered = (views.views[0], 0)
-    support.hits_of_view(gaussians, footprints, scene, numbered, np.zeros(1, np.bool_))
-
-    columns, measured = told
+    columns = np.floor(seen.key) % 16  # rays go through all 16 x 16 pixels
+    nearness = (np.floor(seen.key) + 0.999 - seen.key) / seen.scale
     expected = 4.0 / scene.size * (1.0 + (columns + 0.5 - 8.0) / 60.0)
-    np.testing.assert_allclose(measured, expected, rtol=0.001)
+    np.testing.assert_allclose(1.0 / nearness, expected, rtol=0.001)
     assert np.ptp(columns) == 15

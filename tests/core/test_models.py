@@ -64,14 +64,12 @@ def write(path, splats, comments=()):
     ("comments", "model"),
     [
         ([], "default"),
-        ([b"SplatRenderMode: mip"], "antialiased"),
         ([b"splatrendermode:  MIP "], "antialiased"),
         ([b"SplatRenderMode: 2dgs"], "2dgs"),
         ([b"antialiased 1"], "antialiased"),
         ([b"antialiased 0"], "default"),
         ([b"antialiased 1", b"SplatRenderMode: default"], "default"),
-        ([b"SplatRenderMode: something new"], "default"),
-        ([b"of antialiased 1"], "default"),
+        ([b"SplatRenderMode: something new", b"of antialiased 1"], "default"),
     ],
 )
 def test_comments_of_a_ply_say_how_it_is_drawn(tmp_path, comments, model):
@@ -83,18 +81,27 @@ def test_comments_of_a_ply_say_how_it_is_drawn(tmp_path, comments, model):
 
 
 def test_splats_without_a_third_scale_are_discs_and_stay_so(tmp_path):
-    """They are read as of size 0 along their third axis, and written without it."""
+    """They are read as of size 0 along their third axis, and written without it.
+
+    So are discs of several files, whether these have it or not.
+    """
     splats = replace(cloud(5), model="2dgs")
     path = write(tmp_path / "in.ply", splats, [b"antialiased 1"])
+    other = write(tmp_path / "other.ply", cloud(3), [b"SplatRenderMode: 2dgs"])
     assert b"scale_2" not in path.read_bytes()
 
     convert_files([path], tmp_path / "out.ply")
+    convert_files([other, path], tmp_path / "both.ply")
 
-    read = read_splats(tmp_path / "out.ply")
+    read, both = (read_splats(tmp_path / name) for name in ("out.ply", "both.ply"))
     assert read.model == "2dgs"
     np.testing.assert_array_equal(read.splats().log_scales[:, 2], np.float32(LOG_ZERO))
     np.testing.assert_array_equal(read.splats().log_scales[:, :2], splats.log_scales[:, :2])
     assert (tmp_path / "out.ply").read_bytes() == path.read_bytes()
+    assert b"scale_2" not in both.header
+    expected = joined([read_splats(other).splats(), read.splats()])
+    np.testing.assert_array_equal(both.splats().log_scales, expected.log_scales)
+    np.testing.assert_array_equal(both.splats().quaternions, expected.quaternions)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -115,20 +122,6 @@ def test_a_format_tells_the_model_or_its_notes_do(tmp_path, form, model):
     assert (b"scale_2" in back.read_bytes()) == (read_splats(back).model != "2dgs")
 
 
-def test_discs_of_several_files_are_written_without_a_third_scale(tmp_path):
-    """Whether the files have it or not; what is read from them is the same."""
-    one = write(tmp_path / "one.ply", cloud(3), [b"SplatRenderMode: 2dgs"])
-    other = write(tmp_path / "other.ply", with_model(cloud(4), "2dgs"))
-
-    convert_files([one, other], tmp_path / "both.ply")
-
-    both = read_splats(tmp_path / "both.ply")
-    assert b"scale_2" not in both.header
-    expected = joined([read_splats(one).splats(), read_splats(other).splats()])
-    np.testing.assert_array_equal(both.splats().log_scales, expected.log_scales)
-    np.testing.assert_array_equal(both.splats().quaternions, expected.quaternions)
-
-
 def test_what_is_asked_for_replaces_what_the_file_says(tmp_path):
     path = write(tmp_path / "in.ply", cloud(5), [b"SplatRenderMode: mip", b"by hand"])
 
@@ -143,18 +136,15 @@ def test_what_is_asked_for_replaces_what_the_file_says(tmp_path):
     assert read_splats(path, "antialiased").header == read_splats(path).header
 
 
-@pytest.mark.parametrize(
-    ("model", "expected"),
-    [("default", "in.ply: splats without scale_2 are drawn as 2dgs, got default"),
-     ("mip", "model is 'mip', expected one of default, antialiased, 2dgs")],
-)  # fmt: skip
-def test_a_model_that_cannot_be_is_refused(tmp_path, model, expected):
+def test_a_model_that_cannot_be_is_refused(tmp_path):
     path = write(tmp_path / "in.ply", replace(cloud(5), model="2dgs"))
 
-    with pytest.raises(RefineError) as caught:
-        read_splats(path, model)
-
-    assert expected in str(caught.value)
+    with pytest.raises(RefineError, match="splats without scale_2 are drawn as 2dgs, got"):
+        read_splats(path, "default")
+    with pytest.raises(RefineError, match="model is 'mip', expected one of default, antialiased"):
+        read_splats(path, "mip")
+    with pytest.raises(RefineError, match="different models"):
+        joined([cloud(2), with_model(cloud(2), "2dgs")])
 
 
 VIEW = View(np.eye(3), np.zeros(3), 100.0, 110.0, 60.3, 41.7, 120, 80, near=0.2)
@@ -178,7 +168,7 @@ def before_the_camera(count, size, model):
     return with_model(splats, model)
 
 
-@pytest.mark.parametrize("size", [-4.0, -3.0, -2.0])
+@pytest.mark.parametrize("size", [-4.0, -2.0])
 def test_an_antialiased_footprint_keeps_the_integral_of_its_alpha(size):
     """``o' 2 pi sqrt(det(C + .3 I))`` is ``o 2 pi sqrt(det C)``: by the sigmas of both."""
     plain, _ = footprints_of(before_the_camera(50, size, "default"))
@@ -216,9 +206,7 @@ def test_a_ray_hits_a_disc_where_it_meets_its_plane():
     assert found > 50
 
 
-@pytest.mark.parametrize(
-    ("a", "b"), [(4.0, 2.0), (9.0, 0.01), (0.3, 0.1), (0.6, 0.4), (30.0, 1e-6)]
-)
+@pytest.mark.parametrize(("a", "b"), [(4.0, 2.0), (9.0, 0.01), (0.3, 0.1), (30.0, 1e-6)])
 def test_the_ellipse_of_a_disc_covers_what_the_disc_covers(a, b):
     """Half axes s and t stand for ``2 pi s t``: the integral of the larger of both Gaussians."""
     axes = projection.disc_axes(np.array([[a], [b]], np.float32))[:, 0]
@@ -230,22 +218,35 @@ def test_the_ellipse_of_a_disc_covers_what_the_disc_covers(a, b):
     assert axes[0] >= axes[1]
 
 
+def two(means, sizes, model):
+    """Return two splats of one shape, along the axes."""
+    splats = replace(
+        cloud(2),
+        means=np.array(means),
+        log_scales=np.log(np.tile(sizes, (2, 1))),
+        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
+        opacity_logits=np.full(2, -1.0),
+        sh_dc=np.ones((2, 3)),
+    )
+    return with_model(splats, model)
+
+
+def merged_to_one(splats):
+    """Merge splats in a view to which all contribute alike."""
+
+    def seen_whole(left, _expected, _progress):
+        return np.repeat([[10.0], [1.0]], len(left), axis=1)
+
+    views, seen = ViewSet((VIEW,)), seen_whole(range(2), None, None)
+    return merge(splats, views, seen, seen_whole, 1).splats
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_two_small_splats_merge_into_one_of_their_mass(model):
     """Seen by the camera that measured them, what they cover together stays, but for overlap."""
-    count = 2
-    splats = replace(
-        cloud(count),
-        means=np.array([[-0.02, 0.0, 2.0], [0.02, 0.0, 2.0]]),
-        log_scales=np.full((count, 3), np.log(0.01)),
-        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        opacity_logits=np.full(count, -1.0),
-        sh_dc=np.ones((count, 3)),
-    )
-    splats = with_model(splats, model)
-    views = ViewSet((VIEW,))
+    splats = two([[-0.02, 0.0, 2.0], [0.02, 0.0, 2.0]], [0.01, 0.01, 0.01], model)
 
-    merged = merge(splats, views, seen_whole(range(2), None, None), seen_whole, 1).splats
+    merged = merged_to_one(splats)
 
     assert merged.model == model
     before, after = (
@@ -254,14 +255,12 @@ def test_two_small_splats_merge_into_one_of_their_mass(model):
     assert after == pytest.approx(before, rel=0.12)
 
 
-def seen_whole(left, _expected, _progress):
-    """Return what merging asks of views: all splats contribute alike."""
-    return np.repeat([[10.0], [1.0]], len(left), axis=1)
+def test_of_discs_one_behind_the_other_comes_one_that_faces_the_camera():
+    """The shortest axis of both lies across: without it the disc would be seen from its edge."""
+    merged = merged_to_one(two([[0.0, 0.0, 1.95], [0.0, 0.0, 2.05]], [0.02, 0.01, 1.0], "2dgs"))
 
-
-def test_splats_of_different_models_are_no_scene():
-    with pytest.raises(RefineError, match="different models"):
-        joined([cloud(2), with_model(cloud(2), "2dgs")])
+    assert abs(rotation_matrices(merged.quaternions)[0, 2, 2]) > 0.99
+    np.testing.assert_allclose(np.sort(np.exp(merged.log_scales[0, :2])), [0.01, 0.02], rtol=0.02)
 
 
 def test_discs_are_without_the_shortest_axis_of_what_they_were():
@@ -311,33 +310,13 @@ def test_what_merges_into_a_disc_looks_like_it_from_where_it_is_viewed(spread):
     assert np.median(lost[100:]) < (0.03 if spread else 0.01)
 
 
-def test_of_discs_one_behind_the_other_comes_one_that_faces_the_camera():
-    """The shortest axis of both lies across: without it the disc would be seen from its edge."""
-    discs = replace(
-        cloud(2),
-        means=np.array([[0.0, 0.0, 1.95], [0.0, 0.0, 2.05]]),
-        log_scales=np.log(np.tile([0.02, 0.01, 1.0], (2, 1))),
-        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
-        opacity_logits=np.full(2, -1.0),
-        sh_dc=np.ones((2, 3)),
-    )
-
-    merged = merge(
-        with_model(discs, "2dgs"), ViewSet((VIEW,)), seen_whole(range(2), None, None), seen_whole, 1
-    ).splats
-
-    assert abs(rotation_matrices(merged.quaternions)[0, 2, 2]) > 0.99
-    np.testing.assert_allclose(np.sort(np.exp(merged.log_scales[0, :2])), [0.01, 0.02], rtol=0.02)
-
-
 @pytest.mark.parametrize("model", MODELS)
 def test_levels_and_scores_are_files_of_the_same_model(tmp_path, model):
     """Of splats that the file calls ordinary and `model=` does not; discs stay discs."""
     source = write(tmp_path / "in.ply", before_the_camera(60, -2.0, "default"))
     views = ViewSet((VIEW,))
-    levels = Levels((0.5,))
 
-    lod_file(source, tmp_path / "levels", views, levels, model=model)
+    lod_file(source, tmp_path / "levels", views, Levels((0.5,)), model=model)
     score_file(source, tmp_path / "scored.ply", views, model=model)
 
     assert read_splats(tmp_path / "levels/in.lod1.ply").model == model

@@ -18,9 +18,8 @@ def view(center=(0.0, 0.0, 0.0), **changes) -> View:
 
 
 def ring(count: int) -> ViewSet:
-    angles = np.arange(count) * 2 * np.pi / count
     views = []
-    for index, angle in enumerate(angles):
+    for index, angle in enumerate(np.arange(count) * 2 * np.pi / count):
         c, s = np.cos(angle), np.sin(angle)
         rotation = np.array([[-s, c, 0], [0, 0, -1], [-c, -s, 0]])  # looks inwards
         views.append(view([3 * c, 3 * s, 0], rotation=rotation, name=str(index)))
@@ -32,35 +31,31 @@ def ring(count: int) -> ViewSet:
     [
         ({"fx": 0.0}, "positive focal lengths"),
         ({"width": 1.5}, "whole numbers"),
-        ({"width": 0}, "positive focal lengths"),
         ({"cx": np.nan}, "must be finite"),
         ({"near": 2.0, "far": 1.0}, "0 <= near < far"),
         ({"weight": -1.0}, "weight >= 0"),
         ({"rotation": np.ones((3, 3))}, "not orthonormal"),
         ({"rotation": np.full((3, 3), np.inf)}, "must be finite"),
         ({"rotation": np.eye(2)}, r"expected rotation \(3, 3\)"),
-        ({"center": (np.nan, 0, 0)}, "must be finite"),
         ({"center": (1e39, 0, 0)}, "float32"),
+        ({"fx": "wide"}, ""),
+        ({"rotation": [[1, 0], [0]]}, ""),
+        ({"rotation": np.full((3, 3), 1e200)}, ""),
     ],
 )
 def test_a_view_that_cannot_be_is_refused_by_name(changes, message):
-    """Every message starts with the view's name."""
-    with pytest.raises(RefineError, match=rf"view 'left'.*{message}"):
+    with np.errstate(all="raise"), pytest.raises(RefineError, match=rf"view 'left'.*{message}"):
         view(name="left", **changes)
 
 
 def test_a_rotation_rounded_by_a_file_becomes_exactly_orthonormal():
-    """Four decimals are what a text file may leave."""
+    """Four decimals are what a text file may leave. A mirrored camera, of -1, stays mirrored."""
     rounded = np.round(ring(7)[1].rotation, 4)
 
     rotation = view(rotation=rounded).rotation
 
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
     np.testing.assert_allclose(rotation, rounded, atol=1e-4)
-
-
-def test_a_mirrored_camera_stays_mirrored():
-    """A determinant of -1 is a flipped picture, not an error."""
     assert np.linalg.det(view(rotation=np.diag([-1.0, 1, 1])).rotation) == pytest.approx(-1)
 
 
@@ -89,13 +84,14 @@ def test_views_are_found_by_name():
         views.select(["x"])
 
 
-def test_a_subset_of_a_ring_is_a_ring():
-    """Farthest-point sampling takes every second of 8 views, or every fourth."""
-    chosen = sorted(int(v.name) for v in ring(8).spread(4))
-    opposite = sorted(int(v.name) for v in ring(8).spread(2))
+def test_a_subset_of_a_ring_is_a_ring_and_nested():
+    """Farthest-point sampling takes every second of 8 views, or every fourth; 0 means all."""
+    some = [sorted(int(v.name) for v in ring(8).spread(count)) for count in (0, 4, 2, 9)]
 
-    assert chosen in ([0, 2, 4, 6], [1, 3, 5, 7])
-    assert opposite[1] - opposite[0] == 4
+    assert some[0] == some[3] == list(range(8))
+    assert some[1] in ([0, 2, 4, 6], [1, 3, 5, 7])
+    assert set(some[2]) < set(some[1])
+    assert some[2][1] - some[2][0] == 4
 
 
 def test_the_subset_does_not_depend_on_order_or_unit():
@@ -116,19 +112,6 @@ def test_the_subset_does_not_depend_on_order_or_unit():
     assert {v.name for v in large.spread(9)} == expected
 
 
-def test_subsets_are_nested_so_that_more_views_only_add():
-    """The sampling is greedy from one start."""
-    views = ring(12)
-
-    assert {v.name for v in views.spread(3)} < {v.name for v in views.spread(6)}
-
-
-@pytest.mark.parametrize("count", [0, 5, 9])
-def test_all_views_stay_where_all_are_asked_for(count):
-    """0 means all; so does any number not below the size of the set."""
-    assert len(ring(5).spread(count)) == 5
-
-
 def test_views_of_weight_zero_are_never_used():
     """They would cost time and change nothing."""
     views = ViewSet((view(weight=0.0, name="off"), view([1, 0, 0], name="on")))
@@ -144,17 +127,7 @@ def test_cameras_in_one_place_are_spread_by_direction():
     assert len({tuple(v.rotation[2]) for v in views.spread(2)}) == 2
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{"fx": "wide"}, {"rotation": [[1, 0], [0]]}, {"rotation": np.full((3, 3), 1e200)}],
-)
-def test_values_that_are_no_numbers_or_far_beyond_are_refused_too(changes):
-    """A program's mistake gets a sentence as a file's does."""
-    with np.errstate(all="raise"), pytest.raises(RefineError, match="view 'left'"):
-        view(name="left", **changes)
-
-
-@pytest.mark.parametrize("away", [1e6, 1e15, 1e38])
+@pytest.mark.parametrize("away", [1e6, 1e38])
 def test_the_middle_of_views_ignores_a_stray_one(away):
     """Of a ring of radius 3 it is the axis, 9 the squared distance; a stray view moves it little.
 
@@ -176,16 +149,11 @@ def test_views_count_for_the_middle_and_its_variance_by_their_weight():
     places = ([1, 2, 3], 3.0), ([11, 2, 3], 1.0), ([21, 2, 3], 1.0)
 
     middle, variance = ViewSet(tuple(view(at, weight=weight) for at, weight in places)).middle()
+    alone, none = ViewSet((view([1, 2, 3]),)).middle()
 
     np.testing.assert_allclose(middle, [1, 2, 3], atol=1e-6)
     assert variance < 1e-12
-
-
-def test_the_middle_of_one_view_is_its_place():
-    """Without any distance."""
-    middle, spread = ViewSet((view([1, 2, 3]),)).middle()
-
-    assert (middle.tolist(), spread) == ([1, 2, 3], 0.0)
+    assert (alone.tolist(), none) == ([1, 2, 3], 0.0)
 
 
 @pytest.mark.parametrize("away", [1e2, 1e5])
