@@ -37,34 +37,55 @@ def call(files, *arguments):
 
 
 def test_files_are_merged_in_their_order(files, capsys):
-    """20 and 5 splats, those of degree 1 with zeros above, every value to the bit."""
-    assert call(files, "a.ply", "b.ply", "out.ply") == 0
+    """20 and 5 splats, those of degree 1 with zeros above, every value to the bit.
 
-    one, two, both = (read_splats(files / f"{n}.ply").splats() for n in ("a", "b", "out"))
+    The report names both inputs and their bytes together. One of them is replaced when told alone.
+    """
+    told = files / "report.json"
+    one, two = (read_splats(files / f"{name}.ply").splats() for name in ("a", "b"))
+    bytes_before = sum((files / name).stat().st_size for name in ("a.ply", "b.ply"))
+    assert call(files, "a.ply", "b.ply", "a.ply") == 1
+    assert len(read_splats(files / "a.ply")) == 20
+    capsys.readouterr()
+
+    assert call(files, "a.ply", "b.ply", "a.ply", "--overwrite", "--report", str(told)) == 0
+
+    both = read_splats(files / "a.ply").splats()
+    padded = np.pad(one.sh_rest, ((0, 0), (0, 5), (0, 0)))
     for name in ARRAYS:
-        values = getattr(both, name)
-        if name == "sh_rest":
-            np.testing.assert_array_equal(values[:20, :3], one.sh_rest)
-            assert not values[:20, 3:].any()
-        else:
-            np.testing.assert_array_equal(values[:20], getattr(one, name))
-        np.testing.assert_array_equal(values[20:], getattr(two, name))
+        first = padded if name == "sh_rest" else getattr(one, name)
+        np.testing.assert_array_equal(getattr(both, name)[:20], first)
+        np.testing.assert_array_equal(getattr(both, name)[20:], getattr(two, name))
     assert "a.ply + " in capsys.readouterr().out
+    (entry,) = json.loads(told.read_text())["results"]
+    assert entry["files"]["input"] == f"{files / 'a.ply'} + {files / 'b.ply'}"
+    assert entry["files"]["input_bytes"] == bytes_before
+    assert entry["splats"] == {"before": 25, "written": 25, "left_out": 0}
 
 
 def test_each_input_is_moved_by_its_own(files):
-    """The second by half a turn about z, twice as large."""
+    """The second by half a turn about z, twice as large, in any format within its bounds."""
     moves = Move((1, 0, -2)), Move((1, 0, -2), (0, 0, 180), 2)
+    inputs = [files / "a.ply", files / "b.ply"]
+    one, two = (read_splats(path).splats() for path in inputs)
 
-    convert_files([files / "a.ply", files / "b.ply"], files / "out.ply", moves=moves)
+    convert_files(inputs, files / "out.ply", moves=moves)
 
-    one, two, both = (read_splats(files / f"{n}.ply").splats() for n in ("a", "b", "out"))
+    both = read_splats(files / "out.ply").splats()
     np.testing.assert_allclose(both.means[:20], one.means + np.array([1, 0, -2]), atol=1e-6)
     np.testing.assert_allclose(both.means[20:], two.means * [-2, -2, 2] + [1, 0, -2], atol=1e-5)
     np.testing.assert_allclose(both.log_scales[20:], two.log_scales + np.log(2.0), atol=1e-6)
     # Of degree 1, the functions of y and x change their sign.
     expected = two.sh_rest[:, :3] * np.array([-1, 1, -1])[:, None]
     np.testing.assert_allclose(both.sh_rest[20:, :3], expected, atol=1e-6)
+    move = Move((0.5, 0.0, 0.0), (10.0, 20.0, 30.0), 1.5)
+    for suffix, turn in ((".ply", 1e-5), (".splat", 0.07), (".glb", 1e-5)):
+        convert_files(inputs[:1], files / f"out{suffix}", moves=(move,), overwrite=True)
+        found = read_splats(files / f"out{suffix}").splats()
+        apart = differences(found, transformed(one, move.matrix))
+        assert apart["mean"] < 1e-5
+        assert apart["log scale"] < 1e-5
+        assert apart["rotation"] < turn
 
 
 def test_turns_come_about_x_then_y_then_z():
@@ -77,30 +98,6 @@ def test_turns_come_about_x_then_y_then_z():
     np.testing.assert_allclose(Move(rotate=(0, 90, 0)).matrix @ x, [0, 0, -1, 1], atol=1e-12)
     matrix = Move((1, 2, 3), scale=2.0).matrix
     np.testing.assert_allclose(matrix @ point, [1, 2, 5, 1], atol=1e-12)
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".splat", ".glb"])
-def test_what_is_moved_is_what_the_matrix_makes_of_it(files, suffix):
-    """In any format, within its bounds."""
-    move = Move((0.5, 0.0, 0.0), (10.0, 20.0, 30.0), 1.5)
-
-    convert_files([files / "a.ply"], files / f"out{suffix}", moves=(move,))
-
-    expected = transformed(read_splats(files / "a.ply").splats(), move.matrix)
-    found = differences(read_splats(files / f"out{suffix}").splats(), expected)
-    assert found["mean"] < 1e-5
-    assert found["log scale"] < 1e-5
-    assert found["rotation"] < (0.07 if suffix == ".splat" else 1e-5)
-
-
-def test_bands_are_left_out(files):
-    """All above the degree; what stays is what it was, to the bit."""
-    assert call(files, "b.ply", "out.ply", "--degree", "1") == 0
-
-    before, after = (read_splats(files / f"{name}.ply").splats() for name in ("b", "out"))
-    assert after.sh_degree == 1
-    np.testing.assert_array_equal(after.sh_rest, before.sh_rest[:, :3])
-    np.testing.assert_array_equal(after.means, before.means)
 
 
 def test_a_curve_puts_nearby_order(tmp_path):
@@ -138,26 +135,24 @@ def test_a_single_file_of_which_nothing_is_asked_stays_as_it_is(tmp_path):
     assert "mine" not in read_splats(tmp_path / "out.ply").rows.dtype.names
 
 
-def test_models_are_not_mixed(files, capsys):
-    """What is drawn one way is not merged with what is drawn another."""
+def test_models_are_not_mixed_and_bands_are_left_out(files, capsys):
+    """What is drawn one way is not merged with what is drawn another.
+
+    All bands above the degree go; what stays is what it was, to the bit.
+    """
+    before = read_splats(files / "b.ply").splats()
     data = (files / "b.ply").read_bytes()
     mip = data.replace(b"\nelement", b"\ncomment SplatRenderMode: mip\nelement", 1)
-    (files / "b.ply").write_bytes(mip)
+    (files / "mip.ply").write_bytes(mip)
 
-    assert call(files, "a.ply", "b.ply", "out.ply") == 1
-    assert "b.ply: its splats are antialiased, those of" in capsys.readouterr().err
+    assert call(files, "a.ply", "mip.ply", "out.ply") == 1
+    assert "mip.ply: its splats are antialiased, those of" in capsys.readouterr().err
     assert not (files / "out.ply").exists()
-    assert call(files, "b.ply", "out.ply", "--degree", "0") == 0
-    assert read_splats(files / "out.ply").model == "antialiased"
-
-
-def test_a_merge_may_replace_one_of_its_inputs(files):
-    """All are read before one is replaced."""
-    assert call(files, "a.ply", "b.ply", "a.ply") == 1
-    assert len(read_splats(files / "a.ply")) == 20
-
-    assert call(files, "a.ply", "b.ply", "a.ply", "--overwrite") == 0
-    assert len(read_splats(files / "a.ply")) == 25
+    assert call(files, "mip.ply", "out.ply", "--degree", "1") == 0
+    after = read_splats(files / "out.ply")
+    assert after.model == "antialiased"
+    np.testing.assert_array_equal(after.splats().sh_rest, before.sh_rest[:, :3])
+    np.testing.assert_array_equal(after.splats().means, before.means)
 
 
 def test_a_level_of_a_streamed_sog_is_converted(tmp_path):
@@ -175,40 +170,19 @@ def test_a_level_of_a_streamed_sog_is_converted(tmp_path):
         convert_files([source], out, level=7, overwrite=True)
 
 
-def test_the_report_names_all_inputs(files):
-    """And their bytes together."""
-    told = files / "report.json"
-    assert call(files, "a.ply", "b.ply", "out.spz", "--report", str(told), "--quiet") == 0
-
-    (entry,) = json.loads(told.read_text())["results"]
-    sizes = [(files / name).stat().st_size for name in ("a.ply", "b.ply")]
-    assert entry["files"]["input"] == f"{files / 'a.ply'} + {files / 'b.ply'}"
-    assert entry["files"]["input_bytes"] == sum(sizes)
-    assert entry["splats"] == {"before": 25, "written": 25, "left_out": 0}
-
-
-def test_wrong_usage_ends_before_any_work(files, capsys):
-    """Code 2, and no file."""
-    assert call(files, "a.ply", "b.ply", "out.ply", "--degree", "5") == 2
-    assert "invalid choice" in capsys.readouterr().err
-    assert call(files, "a.ply", "b.ply", "folder") == 2
-    assert "folder: expected a name that ends in .ply" in capsys.readouterr().err
-    assert not (files / "out.ply").exists()
-
-
 @pytest.mark.parametrize(
     ("values", "word"),
     [
         ({"scale": 0}, "scale is 0, expected more than 0"),
         ({"scale": float("nan")}, "expected finite numbers to move by"),
+        ({"scale": 1e31}, "scale"),  # beyond what float32 holds; the matrix says so
     ],
 )
-def test_a_move_that_is_none_is_refused(values, word):
+def test_a_move_that_is_none_is_refused(files, capsys, values, word):
+    """Before any work, as a degree or a name that cannot be is."""
     with pytest.raises(RefineError, match=word):
-        Move(**values)
-
-
-def test_a_move_that_splats_cannot_follow_is_refused(files):
-    """Beyond what float32 holds; the matrix says so."""
-    with pytest.raises(RefineError, match="scale"):
-        convert_files([files / "a.ply"], files / "o.ply", moves=(Move(scale=1e31),))
+        convert_files([files / "a.ply"], files / "o.ply", moves=(Move(**values),))
+    assert call(files, "a.ply", "o.ply", "--degree", "5") == 2
+    assert call(files, "a.ply", "b.ply", "folder") == 2
+    assert "folder: expected a name that ends in .ply" in capsys.readouterr().err
+    assert not (files / "o.ply").exists()

@@ -14,6 +14,9 @@ from refine_addon.core.views import View, pinhole
 SIZE = 100
 
 
+EVERYWHERE = np.ones((SIZE, SIZE), np.bool_)
+
+
 def splats(means, colors=None, *, scale=0.02, logit=8.0):
     """Return round splats, opaque but for e^-8, grey or of some colours."""
     means = np.array(means, np.float32).reshape(-1, 3)
@@ -55,33 +58,37 @@ def walls():
     return len(near), seen(splats(np.concatenate([near, far]), colors))
 
 
-def everywhere():
-    """Return an area that is all of the image."""
-    return np.ones((SIZE, SIZE), np.bool_)
-
-
 def test_what_a_wall_hides_is_not_taken(walls):
-    """Splats 3 cm apart with sigmas of 2 cm leave no gap; told so, both walls are taken."""
+    """Splats 3 cm apart with sigmas of 2 cm leave no gap; told so, both walls are taken.
+
+    The left 49 columns of the image hold the centres of the near wall with x < -.02.
+    """
     count, shown = walls
-    taken = shown.in_area(everywhere())
-    through = shown.in_area(everywhere(), hidden=True)
+    taken, through = (shown.in_area(EVERYWHERE, hidden=hidden) for hidden in (False, True))
+    left = shown.in_area(EVERYWHERE & (np.arange(SIZE) < 49))[:count]
+    means = shown.prepared.splats.means[:count]
+    inner = (np.abs(means[:, :2]) < 0.99).all(axis=1)  # 50 px at depth 2 are 1
 
     assert taken[:count].any()
     assert not taken[count:].any()
     assert np.array_equal(through[:count], taken[:count])
     assert through[count:].any()
+    assert np.array_equal(left[inner], means[inner, 0] < -0.02)
 
 
-def test_a_splat_is_taken_where_its_centre_is(walls):
-    """The left 49 columns of the image hold the centres of the near wall with x < -.02."""
-    count, shown = walls
-    area = everywhere()
-    area[:, 49:] = False
-    taken = shown.in_area(area)[:count]
-    means = shown.prepared.splats.means[:count]
-    inner = (np.abs(means[:, :2]) < 0.99).all(axis=1)  # 50 px at depth 2 are 1
+def test_a_veil_hides_nothing_and_what_is_not_in_the_view_is_never_taken():
+    """Opacity .1 lets nine tenths of the light through, from one wall of it to the next.
 
-    assert np.array_equal(taken[inner], means[inner, 0] < -0.02)
+    One before the view, one behind it, one beside the image, one that is not finite.
+    """
+    near, far = wall(2.0), wall(3.0)
+    scene = splats(np.concatenate([near, far]))
+    scene.opacity_logits[: len(near)] = -4.0
+    four = seen(splats([[0, 0, 2], [0, 0, -2], [9, 0, 2], [np.nan, 0, 2]]))
+
+    assert seen(scene).in_area(EVERYWHERE)[len(near) :].any()
+    taken = four.in_area(EVERYWHERE, hidden=True)
+    assert taken.tolist() == [True, False, False, False]
 
 
 @pytest.mark.slow
@@ -111,57 +118,27 @@ def test_surfaces_lie_where_a_ray_has_lost_its_light():
         assert found[row, column] == depths[np.argmax(left < 0.1)]
 
 
-def test_a_veil_hides_nothing():
-    """Opacity .1 lets nine tenths of the light through, from one wall of it to the next."""
-    near, far = wall(2.0), wall(3.0)
-    scene = splats(np.concatenate([near, far]))
-    scene.opacity_logits[: len(near)] = -4.0
-    taken = seen(scene).in_area(everywhere())
+def test_a_ball_and_a_colour_take_what_is_near_them(walls):
+    """At (60, 50) the ray is (.105, .005, 1): it meets the wall at 2, where 1 m takes 50 px.
 
-    assert taken[len(near) :].any()
-
-
-def test_splats_behind_the_view_and_beside_the_image_are_never_taken():
-    """One before the view, one behind it, one beside the image, one that is not finite."""
-    shown = seen(splats([[0, 0, 2], [0, 0, -2], [9, 0, 2], [np.nan, 0, 2]]))
-
-    taken = shown.in_area(everywhere(), hidden=True)
-    assert taken.tolist() == [True, False, False, False]
-
-
-def test_the_surface_under_a_pixel_is_that_of_the_near_wall(walls):
-    """At (60, 50) the ray is (.105, .005, 1): it meets the wall at 2, where 1 m takes 50 px."""
-    _, shown = walls
-    surface = shown.surface(60, 50)
+    A ball around (0, 0, 2), .3 wide: the far wall is 1 away. A colour .05 from the near wall's in
+    each channel; the far wall is .7 away from it in red.
+    """
+    count, shown = walls
+    surface, nothing = shown.surface(60, 50), seen(splats([[0, 0, 2]])).surface(3, 3)
+    ball = shown.in_ball(np.array([0.0, 0.0, 2.0]), 0.3, hidden=True)
+    away = np.linalg.norm(shown.prepared.splats.means - [0.0, 0.0, 2.0], axis=1)
+    near, none = (
+        shown.of_color(np.array([0.85, 0.1, 0.15]), d, hidden=True) for d in (0.051, 0.049)
+    )
 
     np.testing.assert_allclose(surface.place, [0.21, 0.01, 2.0], atol=1e-6)
     np.testing.assert_allclose(surface.color, [0.9, 0.1, 0.1], atol=0.01)
     assert surface.scale == pytest.approx(50.0)
-
-
-def test_where_there_is_nothing_there_is_no_surface():
-    """One splat of 1 px in the middle: nothing is met in a corner."""
-    assert seen(splats([[0, 0, 2]])).surface(3, 3) is None
-
-
-def test_a_ball_takes_what_lies_around_its_middle(walls):
-    """Around (0, 0, 2), .3 wide: the far wall is 1 away."""
-    count, shown = walls
-    taken = shown.in_ball(np.array([0.0, 0.0, 2.0]), 0.3, hidden=True)
-    away = np.linalg.norm(shown.prepared.splats.means - [0.0, 0.0, 2.0], axis=1)
-
-    assert np.array_equal(taken[:count], away[:count] <= 0.3)
-    assert not taken[count:].any()
-
-
-def test_a_colour_takes_what_is_near_it(walls):
-    """.05 from the near wall's in each channel; the far wall is .7 away from it in red."""
-    count, shown = walls
-    near = shown.of_color(np.array([0.85, 0.1, 0.15]), 0.051, hidden=True)
-    none = shown.of_color(np.array([0.85, 0.1, 0.15]), 0.049, hidden=True)
-
+    assert nothing is None
+    assert np.array_equal(ball[:count], away[:count] <= 0.3)
     assert near[:count].any()
-    assert not near[count:].any()
+    assert not (ball | near)[count:].any()
     assert not none.any()
 
 
@@ -177,17 +154,6 @@ def test_a_piece_is_what_hangs_together_with_a_place():
     assert np.array_equal(sight.piece(both, np.array([1.0, 0.0, 2.0])), both & ~first)
     assert sight.piece(first & (np.arange(len(means)) == 3), np.zeros(3)).sum() == 1
     assert not sight.piece(both & ~both, np.zeros(3)).any()
-
-
-@pytest.mark.parametrize(
-    ("mode", "expected"), [("SET", 0b1010), ("ADD", 0b1110), ("SUBTRACT", 0b0100), ("INTERSECT", 8)]
-)
-def test_modes_combine_two_selections(mode, expected):
-    """1100 before, 1010 taken: the four bits are all pairs there are."""
-    before, taken = (np.array([bit == "1" for bit in bits]) for bits in ("1100", "1010"))
-
-    found = picking.combined(before, taken, mode)
-    assert found.tolist() == [bit == "1" for bit in f"{expected:04b}"]
 
 
 def test_a_polygon_holds_the_pixels_that_angles_say_it_holds():
@@ -216,43 +182,27 @@ def test_a_brush_paints_what_lies_near_its_way():
 
 
 def test_a_selection_grows_by_neighbours_and_shrinks_back():
-    """On a line each point's 8 nearest are 4 to each side; at an end those that there are."""
+    """On a line each point's 8 nearest are 4 to each side; at an end those that there are.
+
+    Modes combine 1100 before with 1010 taken, all pairs of bits that there are. Where all are NaN
+    nothing grows; where some are, each has an index within range.
+    """
     line = np.stack([np.arange(60.0), np.zeros(60), np.zeros(60)], axis=1)
     neighbours = picking.neighbours_of(line)
-    chosen = np.zeros(60, np.bool_)
-    chosen[28:32] = True
+    chosen = (np.arange(60) >= 28) & (np.arange(60) < 32)
     grown = picking.grown(neighbours, chosen)
-
-    assert np.flatnonzero(grown).tolist() == list(range(24, 36))
-    assert np.array_equal(picking.shrunk(neighbours, grown), chosen)
-
-
-def test_splats_that_are_not_finite_have_neighbours_that_do_no_harm():
-    """All of them NaN: nothing grows; some of them: an index each, within range."""
+    before, taken = np.array([True, True, False, False]), np.array([True, False, True, False])
     nothing = picking.neighbours_of(np.full((5, 3), np.nan))
     some = picking.neighbours_of(np.array([[0, 0, 0], [1, 0, 0], [np.nan, 0, 0]]))
 
+    assert np.flatnonzero(grown).tolist() == list(range(24, 36))
+    assert np.array_equal(picking.shrunk(neighbours, grown), chosen)
+    for mode, expected in (("SET", "1010"), ("ADD", "1110"), ("SUBTRACT", "0100"),
+                           ("INTERSECT", "1000")):  # fmt: skip
+        found = picking.combined(before, taken, mode)
+        assert "".join(str(int(bit)) for bit in found) == expected
     assert picking.grown(nothing, np.zeros(5, np.bool_)).sum() == 0
     assert ((some >= 0) & (some < 3)).all()
-
-
-def opengl(camera, near=0.01, far=100.0):
-    """Return the projection matrix of a view in OpenGL's form."""
-    matrix = np.zeros((4, 4))
-    matrix[0, 0], matrix[1, 1] = 2 * camera.fx / camera.width, 2 * camera.fy / camera.height
-    matrix[0, 2] = 1 - 2 * camera.cx / camera.width
-    matrix[1, 2] = 2 * camera.cy / camera.height - 1
-    matrix[2, 2], matrix[2, 3] = -(far + near) / (far - near), -2 * far * near / (far - near)
-    matrix[3, 2] = -1
-    return matrix
-
-
-def to_camera(camera):
-    """Return a view's matrix in OpenGL's form."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.diag([1, -1, -1]) @ camera.rotation
-    matrix[:3, 3] = -matrix[:3, :3] @ camera.center
-    return matrix
 
 
 def test_the_view_of_opengls_matrices_is_the_one_they_were_made_of():
@@ -260,7 +210,15 @@ def test_the_view_of_opengls_matrices_is_the_one_they_were_made_of():
     c, s = math.cos(math.pi / 6), 0.5
     turned = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     camera = View(turned, np.array([1.0, 2, 3]), 80.0, 90.0, 60.0, 45.0, 120, 100, 0.01)
-    found = pinhole(to_camera(camera), opengl(camera), (120, 100), np.zeros((1, 3)))
+    pose, lens, far = np.eye(4), np.zeros((4, 4)), 100.0
+    pose[:3, :3] = np.diag([1, -1, -1]) @ turned
+    pose[:3, 3] = -pose[:3, :3] @ camera.center
+    lens[0, [0, 2]] = 2 * 80 / 120, 1 - 2 * 60 / 120
+    lens[1, [1, 2]] = 2 * 90 / 100, 2 * 45 / 100 - 1
+    lens[2, [2, 3]] = -(far + 0.01) / (far - 0.01), -2 * far * 0.01 / (far - 0.01)
+    lens[3, 2] = -1
+
+    found = pinhole(pose, lens, (120, 100), np.zeros((1, 3)))
 
     np.testing.assert_allclose(found.rotation, camera.rotation, atol=1e-12)
     np.testing.assert_allclose(found.center, camera.center, atol=1e-12)

@@ -31,15 +31,17 @@ def slow_keep(values, count: int, protected) -> list[bool]:
     return keep
 
 
+@pytest.mark.slow
 @given(values=scores(), data=st.data())
 def test_the_lowest_scores_go_and_the_first_of_equal_ones(values, data):
-    """As if one went after the other, with any of them protected."""
+    """As if one went after the other, with any of them protected; whole numbers are of any kind."""
     count = len(values)
     protected = data.draw(st.one_of(st.none(), masks(count)))
-    stay = data.draw(st.integers(1, count + 3))
+    stay = data.draw(st.one_of(st.integers(1, count + 3), st.just(10**400)))
+    kind = data.draw(st.sampled_from([int, float, np.int64, np.float32])) if stay < 1e300 else int
     shield = np.zeros(count, np.bool_) if protected is None else protected
 
-    keep = select(scored(values), Budget(keep=stay), protected=protected)
+    keep = select(scored(values), Budget(keep=kind(stay)), protected=protected)
 
     assert slow_keep(values, max(count - stay, 0), shield) == keep.tolist()
     assert np.bool_ == keep.dtype
@@ -85,7 +87,7 @@ def test_a_ratio_is_the_decimal_that_was_written(ratio, count, expected):
 
 
 @given(
-    megabytes=st.floats(1e-4, 1e3),
+    megabytes=st.one_of(st.floats(1e-4, 1e3), st.sampled_from([1e303, 1.7e308])),
     row=st.integers(1, 1000),
     fixed=st.integers(0, 2000),
     count=st.integers(1, 10**6),
@@ -105,33 +107,23 @@ def test_a_size_is_met_by_as_many_splats_as_fit(megabytes, row, fixed, count):
     assert kept == count or fixed + (kept + 1) * row > size
 
 
-@pytest.mark.parametrize("megabytes", [1e303, 1.7e308])
-def test_a_size_beyond_all_files_keeps_every_splat(megabytes):
-    """In bytes it is beyond what floating point holds."""
-    assert Budget(max_mb=megabytes).removals(10, 248, 1000) == 0
-
-
-def test_a_size_without_the_size_of_a_splat_is_refused():
-    """From Python, where `select` is not told."""
-    with pytest.raises(RefineError, match="max_mb needs to know how many bytes"):
-        select(scored([1, 2]), Budget(max_mb=1.0))
-
-
 def test_a_threshold_removes_what_scores_below_it():
-    """Equal to it stays; what is protected stays; none may be left over."""
-    values = scored([0.0, 0.5, 1.0, 2.0])
+    """Equal to it stays; what is protected stays; none may be left over.
+
+    Beyond the range of single precision it is infinite, without a warning from any NumPy.
+    """
+    values = scored([0.0, 0.5, 1.0, np.inf])
     protected = np.array([True, False, False, False])
 
-    assert select(values, Budget(threshold=1.0)).tolist() == [False, False, True, True]
-    assert (select(values, Budget(threshold=1.0), protected=protected).tolist()) == [
-        True,
-        False,
-        True,
-        True,
-    ]
-    assert select(values, Budget(threshold=-1.0)).tolist() == [True] * 4
+    def kept(threshold, **more):
+        return select(values, Budget(threshold=threshold), **more).tolist()
+
+    assert kept(1.0) == [False, False, True, True]
+    assert kept(1.0, protected=protected) == [True, False, True, True]
+    assert kept(-1.0) == [True] * 4
+    assert kept(3.4028235677973366e38) == [False] * 3 + [True]
     with pytest.raises(RefineError, match="threshold would remove all 4 splats; nothing was"):
-        select(values, Budget(threshold=2.5))
+        select(scored([0, 1, 1, 2]), Budget(threshold=2.5))
 
 
 @pytest.mark.parametrize(
@@ -155,26 +147,6 @@ def test_splats_in_too_few_views_go(percent, views, least):
     assert keep[least:].all()
 
 
-def test_protected_splats_stay_whatever_the_budget():
-    """Two of four are protected; of three to go, only the two others can."""
-    protected = np.array([True, False, True, False])
-
-    keep = select(scored([0, 1, 0, 1]), Budget(keep=1), protected=protected)
-
-    assert protected.tolist() == keep.tolist()
-    assert (
-        select(scored([0, 1, 0, 1]), Budget(keep=1), protected=~keep | keep).tolist() == [True] * 4
-    )
-
-
-def test_a_budget_is_exactly_one_number():
-    """None, or two, are refused with what was given."""
-    with pytest.raises(RefineError, match="expected one of ratio, keep, max_mb, threshold, min_"):
-        Budget()
-    with pytest.raises(RefineError, match=re.escape("got ['ratio', 'keep']")):
-        Budget(ratio=0.5, keep=3)
-
-
 NAN, INF = float("nan"), float("inf")
 
 
@@ -189,17 +161,21 @@ NAN, INF = float("nan"), float("inf")
         ("psnr", (-1, 0, 100, NAN, INF), "expected more than 0 and less than 100 dB"),
     ],
 )
-def test_a_number_that_cannot_be_is_refused_with_its_name(name, values, expected):
-    """Each says what it is and what was expected."""
+def test_a_budget_that_cannot_be_is_refused_with_its_name(name, values, expected):
+    """Each says what it is and what was expected; it is exactly one number."""
     for value in values:
         with pytest.raises(RefineError, match=re.escape(f"{name} is {value}, {expected}")):
             Budget(**{name: value})
+    with pytest.raises(RefineError, match="expected one of ratio, keep, max_mb, threshold, min_"):
+        Budget()
+    with pytest.raises(RefineError, match=re.escape("got ['min_seen', 'psnr']")):
+        Budget(min_seen=50, psnr=3)
 
 
 def test_only_a_threshold_and_a_number_of_views_need_scores_to_count_what_goes():
-    """The others say a number: `removals` is one exactly where no scores are needed.
+    """The others say a number, a PSNR for any method.
 
-    A PSNR depends on the pictures, and means the same whatever the method.
+    From Python, where `select` is not told the size of a splat, one in megabytes is refused.
     """
     assert not Budget(psnr=40.0).needs_scores
     assert Budget(psnr=40.0).removals(10, 248) is None
@@ -209,14 +185,8 @@ def test_only_a_threshold_and_a_number_of_views_need_scores_to_count_what_goes()
 
         assert budget.needs_scores == (kind in ("threshold", "min_seen"))
         assert budget.needs_scores == (budget.removals(10, 248) is None)
-
-
-def test_whole_numbers_of_any_kind_are_taken():
-    """3, 3.0 and NumPy's 3 keep three; more than there are keeps all."""
-    for keep in (3, 3.0, np.int64(3), np.float32(3)):
-        assert np.count_nonzero(select(scored(np.arange(5)), Budget(keep=keep))) == 3
-    for keep in (5, 10**400):
-        assert select(scored(np.arange(5)), Budget(keep=keep)).all()
+    with pytest.raises(RefineError, match="max_mb needs to know how many bytes"):
+        select(scored([1, 2]), Budget(max_mb=1.0))
 
 
 @given(values=scores())
@@ -240,21 +210,18 @@ MANY = (1 << 24) + 100
 
 @pytest.mark.slow
 def test_ranks_of_more_splats_than_float32_can_tell_apart_are_distinct():
-    """Scored in the order of the file, the rank of row k is k / (N - 1), each above the last."""
+    """Scored in the order of the file, the rank of row k is k / (N - 1), each above the last.
+
+    Of shares half, 2^23 + 50, go to the 2^23 numbers from 0.5 to 1: as quotients 50 would tie.
+    """
     ranks = rank(np.arange(MANY, dtype=np.float32))  # neighbours tie, and go by row
-
-    assert (np.diff(ranks) > 0.0).all()
-    assert (ranks[0], ranks[-1]) == (0.0, 1.0)
-
-
-@pytest.mark.slow
-def test_shares_of_more_splats_than_float32_can_tell_apart_are_distinct():
-    """Half of them, 2^23 + 50, go to the 2^23 numbers from 0.5 to 1: as quotients 50 would tie."""
     places = np.arange(1, MANY + 1)
     quotients = (places / MANY).astype(np.float32)
 
     shares = shares_gone(places, MANY)
 
+    assert (np.diff(ranks) > 0.0).all()
+    assert (ranks[0], ranks[-1]) == (0.0, 1.0)
     assert np.float32 == shares.dtype
     assert np.count_nonzero(np.diff(quotients) == 0.0) == 50
     assert (np.diff(shares) > 0.0).all()
@@ -263,7 +230,10 @@ def test_shares_of_more_splats_than_float32_can_tell_apart_are_distinct():
 
 
 def test_a_round_of_a_very_large_scene_scores_as_all_rounds_at_once():
-    """50 million places: where a round ends, the next goes on; a thousand of each part tell."""
+    """50 million places: where a round ends, the next goes on; a thousand of each part tell.
+
+    Shares of fewer splats are quotients, each rounded once.
+    """
     count = 50_000_000
     for start in (1, count // 4, count // 2 - 500, 3 * count // 4, count - 999):
         places = np.arange(start, start + 1000)
@@ -271,22 +241,6 @@ def test_a_round_of_a_very_large_scene_scores_as_all_rounds_at_once():
 
         assert (np.diff(shares) > 0.0).all()
         np.testing.assert_array_equal(shares[600:], shares_gone(places[600:], count))
-
-
-@given(count=st.integers(1, 1 << 24), data=st.data())
-def test_shares_of_fewer_splats_are_the_quotients(count, data):
-    """Each rounded once."""
-    places = np.array(data.draw(st.lists(st.integers(1, count), min_size=1)))
-
-    np.testing.assert_array_equal(np.float32(places / count), shares_gone(places, count))
-
-
-def test_a_threshold_beyond_the_range_of_scores_removes_all_that_are_finite():
-    """Rounded to single precision it is infinite, without a warning from any NumPy."""
-    known = Scores(
-        np.array([0.0, np.inf], np.float32), np.array([0, 1]), views_used=2, undrawable=0
-    )
-
-    keep = select(known, Budget(threshold=3.4028235677973366e38))
-
-    assert keep.tolist() == [False, True]
+    for fewer in (1, 3, 1 << 24):
+        places = np.unique(np.linspace(1, fewer, 10_000).astype(int))
+        np.testing.assert_array_equal(np.float32(places / fewer), shares_gone(places, fewer))

@@ -9,6 +9,7 @@ import pytest
 
 from refine_addon.core import Splats
 from refine_addon.core.splats import (
+    ARRAYS,
     base_color,
     drawable,
     opacity,
@@ -36,7 +37,7 @@ def one(**changes) -> Splats:
     ("logit", "expected"),
     [
         (0.0, 0.5),
-        (np.log(3.0), 0.75),
+        (np.log(3.0), 0.75),  # 1 / (1 + 1/3)
         (-np.log(3.0), 0.25),
         (np.inf, 1.0),
         (-50.0, 1.9287498479639178e-22),  # e^-50 / (1 + e^-50)
@@ -44,7 +45,6 @@ def one(**changes) -> Splats:
     ],
 )
 def test_opacity_is_the_logistic_function(logit, expected):
-    """1 / (1 + e^-x): x = ln 3 gives 1 / (1 + 1/3) = 3/4."""
     with np.errstate(all="raise"):
         assert opacity(np.array(logit)) == pytest.approx(expected, rel=1e-12)
 
@@ -62,43 +62,28 @@ def single(values):
         return np.asarray(values, np.float32)
 
 
-EDGES = [0.0, 1e-45, 1e-38, 1e-7, 0.25, 0.5, 1.0 - 2.0**-24, 1.0]
-"""Opacities in float32: the ends, the smallest number, the largest below 1."""
+def test_logits_and_log_scales_of_what_is_stored_give_it_back_to_the_bit():
+    """Ends, the smallest number, the largest below 1; the activated value rounds to what was.
 
-
-def test_logits_of_stored_opacities_give_them_back_to_the_bit():
-    """The logistic function of the logit, in float64, rounds to the opacity; all are finite."""
-    stored = single(EDGES)
+    Scales of 0 too: exp(-104) is 6.8e-46, less than half of the smallest float32, 7.0e-46. What is
+    0 is not drawn, the smallest float32 is, of either.
+    """
+    stored = single([0.0, 1e-45, 1e-38, 1e-7, 0.25, 0.5, 1.0 - 2.0**-24, 1.0])
+    sizes = np.append(stored, np.float32(3e38))
 
     with np.errstate(all="raise", under="ignore"):
-        logits = single_logits(stored)
+        logits, logs = single_logits(stored), single_log_scales(sizes)
 
     assert np.isfinite(logits).all()
+    assert np.isfinite(logs).all()
     assert single(opacity(logits)).tobytes() == stored.tobytes()
+    assert single(scales(logs)).tobytes() == sizes.tobytes()
+    assert single_log_scales(-sizes).tobytes() == logs.tobytes()
     assert logits[0] == pytest.approx(-104.0)
     assert logits[-1] == pytest.approx(np.log(2.0**26 - 1.0))  # the logit of 1 - 2^-26
-
-
-def test_log_scales_of_stored_scales_give_them_back_to_the_bit():
-    """0 too: exp(-104) is 6.8e-46, less than half of the smallest float32, 7.0e-46."""
-    stored = single([0.0, 1e-45, 1e-38, 1e-7, 0.25, 1.0, 3e38])
-
-    with np.errstate(all="raise", under="ignore"):
-        logs = single_log_scales(stored)
-
-    assert np.isfinite(logs).all()
-    assert single(scales(logs)).tobytes() == stored.tobytes()
-    assert single_log_scales(-stored).tobytes() == logs.tobytes()
-
-
-def test_what_is_0_stays_undrawable_and_what_is_not_drawable():
-    """Opacity 0 and scale 0 on every axis are not drawn; the smallest float32 is, of either."""
-    least = np.float32(1e-45)
-    for value, seen in ((0.0, False), (least, True)):
-        logits = single(single_logits(np.array([value])))
-        logs = single(single_log_scales(np.full((1, 3), value)))
-        assert drawable(one(opacity_logits=logits)).tolist() == [seen]
-        assert drawable(one(log_scales=logs)).tolist() == [seen]
+    for k, seen in ((0, False), (1, True)):
+        assert drawable(one(opacity_logits=single(logits[[k]]))).tolist() == [seen]
+        assert drawable(one(log_scales=single(logs[[[k, k, k]]]))).tolist() == [seen]
 
 
 def test_no_number_of_a_file_changes_by_a_millionth_on_the_way_through_float32():
@@ -137,43 +122,30 @@ def test_base_color_is_the_constant_harmonic_and_a_half():
     assert base_color(np.array([1.0, 1e20, -1e20])) == pytest.approx([0.7820947917738781, 1, 0])
 
 
+@pytest.mark.parametrize("small", [0.0, 1e-160, 1e-200, 1e-320])
 @pytest.mark.parametrize("length", [1e-300, 1.0, 3.7, 1e300])
-def test_a_quaternion_of_any_length_is_a_rotation(length):
-    """(1, 0, 0, 1) turns a quarter about z: x goes to y."""
+def test_a_quaternion_of_any_length_is_a_rotation(length, small):
+    """(1, 0, 0, 1) turns a quarter about z: x goes to y. What is small beside the rest is nothing.
+
+    One that says nothing counts as the identity.
+    """
+    quarter = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    quaternion = length * np.array([1.0, small, -small, 1.0])
     with np.errstate(all="raise"):
-        matrix = rotation_matrices(length * np.array([1.0, 0.0, 0.0, 1.0]))
+        matrix = rotation_matrices(quaternion)
+        none = rotation_matrices(np.array([[0, 0, 0, 0], [np.nan, 0, 0, 0], [np.inf, 1, 0, 0]]))
 
-    np.testing.assert_allclose(matrix, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
-
-
-@pytest.mark.parametrize("small", [1e-160, 1e-200, 1e-320])
-def test_what_is_small_beside_the_rest_of_a_quaternion_is_nothing(small):
-    """Squares and quotients of it underflow, silently."""
-    with np.errstate(all="raise"):
-        matrix = rotation_matrices(np.array([2.0, small, -small, small]))
-
-    np.testing.assert_allclose(matrix, np.eye(3), atol=1e-150)
+    np.testing.assert_allclose(matrix, quarter, atol=1e-15)
+    np.testing.assert_array_equal(none, np.tile(np.eye(3), (3, 1, 1)))
 
 
-@pytest.mark.parametrize("broken", [[0, 0, 0, 0], [np.nan, 0, 0, 0], [np.inf, 1, 0, 0]])
-def test_a_quaternion_that_says_nothing_counts_as_the_identity(broken):
-    """Zero has no direction."""
-    with np.errstate(all="raise"):
-        np.testing.assert_array_equal(rotation_matrices(np.array(broken, float)), np.eye(3))
-
-
-NAMES = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"]
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ARRAYS)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_value_that_is_not_finite_makes_a_splat_undrawable(name, value):
     """Except opacity 1 (logit +inf) and a flat splat (one log scale -inf)."""
     values = getattr(one(), name).copy()
     values.flat[-1] = value
-    fine = (name == "opacity_logits" and value == np.inf) or (
-        name == "log_scales" and value == -np.inf
-    )
+    fine = (name, value) in (("opacity_logits", np.inf), ("log_scales", -np.inf))
 
     with np.errstate(all="raise"):
         assert drawable(one(**{name: values})).tolist() == [fine]
@@ -199,21 +171,3 @@ def test_what_leaves_the_range_of_float32_cannot_be_drawn(changes, expected):
 
     with np.errstate(all="raise"):
         assert drawable(replace(one(), **arrays)).tolist() == [expected]
-
-
-def test_take_keeps_the_order_of_the_index():
-    """Integers, masks and slices, on every array."""
-    splats = one(
-        means=np.arange(9.0).reshape(3, 3),
-        **{name: np.repeat(getattr(one(), name), 3, axis=0) for name in NAMES[1:]},
-    )
-
-    assert splats.take(np.array([2, 0])).means[:, 0].tolist() == [6.0, 0.0]
-    assert splats.take(np.array([True, False, True])).means[:, 0].tolist() == [0.0, 6.0]
-    assert len(splats.take(slice(0, 2)).sh_rest) == 2
-
-
-@pytest.mark.parametrize(("count", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3), (24, 4)])
-def test_the_degree_follows_from_the_number_of_coefficients(count, degree):
-    """(degree + 1)^2 - 1 above the constant."""
-    assert one(sh_rest=np.zeros((1, count, 3))).sh_degree == degree

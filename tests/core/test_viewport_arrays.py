@@ -31,73 +31,61 @@ def _eye(place=(0.0, 0.0, -5.0), *, perspective=True):
 
 @pytest.mark.parametrize("degree", [0, 1, 3, 4])
 def test_colours_are_those_of_the_harmonics_along_the_line_from_the_eye(degree):
-    """Within 4 units of float16's 2^-11: coefficients up to 4 times a basis below 1."""
-    splats, eye = _splats(degree=degree), _eye()
-    away = splats.means - eye.place
+    """Within 4 units of float16's 2^-11: coefficients up to 4 times a basis below 1.
+
+    Without perspective the eye's place is the direction of view, of any length. Without an eye
+    they are ``1/2 + SH_C0 f_dc``, at least 0 and not cut at 1: blending does that.
+    """
+    splats = _splats(degree=degree)
+    packed = arrays.pack(splats)
+    away = splats.means - [0.0, 0.0, -5.0]
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    expected = spherical_harmonics.colors(away, splats.sh_dc, splats.sh_rest).clip(0.0)
-    packed = arrays.pack(splats)
-    found = arrays.colors(packed, eye)
-
-    np.testing.assert_allclose(found[:, :3], expected, atol=8e-3)
-    np.testing.assert_array_equal(found[:, 3], packed.opacities)
-
-
-def test_without_perspective_every_splat_is_seen_along_the_same_line():
-    """The eye's place is then the direction of view, of any length."""
-    splats = _splats(degree=2)
     along = np.broadcast_to([0.0, 0.6, 0.8], (50, 3))
-    expected = spherical_harmonics.colors(along, splats.sh_dc, splats.sh_rest).clip(0.0)
-    found = arrays.colors(arrays.pack(splats), _eye((0.0, 3.0, 4.0), perspective=False))
 
-    np.testing.assert_allclose(found[:, :3], expected, atol=8e-3)
-
-
-def test_constant_colours_need_no_eye():
-    """They are ``1/2 + SH_C0 f_dc``, at least 0 and not cut at 1: blending does that."""
-    splats = _splats()
-    expected = (0.5 + 0.28209479 * splats.sh_dc).clip(0.0)
-
-    np.testing.assert_allclose(arrays.colors(arrays.pack(splats))[:, :3], expected, atol=2e-3)
+    for direction, eye in ((away, _eye()), (along, _eye((0.0, 3.0, 4.0), perspective=False))):
+        found = arrays.colors(packed, eye)
+        expected = spherical_harmonics.colors(direction, splats.sh_dc, splats.sh_rest).clip(0.0)
+        np.testing.assert_allclose(found[:, :3], expected, atol=8e-3)
+        np.testing.assert_array_equal(found[:, 3], packed.opacities)
+    plain = (0.5 + 0.28209479 * splats.sh_dc).clip(0.0)
+    np.testing.assert_allclose(arrays.colors(packed)[:, :3], plain, atol=2e-3)
 
 
-def test_what_cannot_be_drawn_is_not_packed():
-    """One not finite, one more transparent than 1/255, whose logit is -5.5; the rest in order."""
+def test_what_cannot_be_drawn_is_not_packed_and_the_rest_is_of_half_precision():
+    """One not finite, one more transparent than 1/255, whose logit is -5.5; the rest in order.
+
+    The largest number of half precision is 65504. Scales 3, 2, 1 turned a quarter about z by a
+    quaternion of any length are 2 along x, 3 along y: variances 4, 9, 1.
+    """
     splats = _splats(5)
-    splats.means[1, 0] = np.nan
-    splats.opacity_logits[3] = -5.6
+    splats.means[1, 0], splats.opacity_logits[3] = np.nan, -5.6
+    splats.sh_rest[0, 0, 0], splats.sh_rest[2, 1, 1] = 1e9, -1e9
+    splats.log_scales[4], splats.quaternions[4] = np.log([3.0, 2.0, 1.0]), [0.5, 0.0, 0.0, 0.5]
 
-    assert arrays.pack(splats).vertices.tolist() == [0, 2, 4]
-
-
-def test_harmonics_beyond_half_precision_are_cut_at_its_end():
-    """Its largest number is 65504."""
-    splats = _splats(2)
-    splats.sh_rest[0, 0, 0], splats.sh_rest[1, 1, 1] = 1e9, -1e9
     packed = arrays.pack(splats)
 
-    assert packed.harmonics[0, 1, 0] == 65504.0
-    assert packed.harmonics[1, 2, 1] == -65504.0
+    assert packed.vertices.tolist() == [0, 2, 4]
+    assert [packed.harmonics[0, 1, 0], packed.harmonics[1, 2, 1]] == [65504.0, -65504.0]
     assert np.isfinite(arrays.colors(packed, _eye())).all()
+    expected = [4.0, 0.0, 0.0, 9.0, 0.0, 1.0]
+    np.testing.assert_allclose(packed.covariances[2], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("perspective", [True, False])
 def test_splats_are_drawn_from_the_farthest_to_the_nearest(perspective):
-    """Depths fall but for steps of 16 bits: of the range, or in perspective of its logarithms."""
+    """Depths fall but for steps of 16 bits: of the range, or in perspective of its logarithms.
+
+    Equals stay as they come.
+    """
     depths = np.exp(np.random.default_rng(1).uniform(-3.0, 6.0, 20_000)).astype(np.float32)
     found = depths[arrays.farthest_first(depths, perspective=perspective)]
     step = np.ptp(np.log(depths)) / 65535.0 * found[1:] if perspective else np.ptp(depths) / 65535.0
 
     assert sorted(found) == sorted(depths)
     assert (np.diff(found) <= 1.01 * step).all()
-
-
-def test_equal_depths_and_none_at_all_are_in_order():
-    """A stable sort leaves equals as they come."""
-    assert arrays.farthest_first(np.full(4, 2.0, np.float32), perspective=True).tolist() == [
-        *(0, 1, 2, 3)
-    ]
-    assert arrays.farthest_first(np.empty(0, np.float32), perspective=True).tolist() == []
+    for count in (4, 0):
+        same = arrays.farthest_first(np.full(count, 2.0, np.float32), perspective=perspective)
+        assert same.tolist() == list(range(count))
 
 
 def test_what_lies_behind_the_near_plane_is_left_out():
@@ -111,7 +99,10 @@ def test_what_lies_behind_the_near_plane_is_left_out():
 
 
 def test_few_splats_are_those_of_the_highest_rank_or_the_largest_and_most_opaque():
-    """Opacity times squared sizes: of equal opacity the larger first; ranks overrule that."""
+    """Opacity times squared sizes: of equal opacity the larger first; ranks overrule that.
+
+    30 of 60 is half of each of two objects; where all fit, all.
+    """
     splats = _splats(3)
     splats.log_scales[:] = np.array([-2.0, 0.0, -1.0], np.float32)[:, None]
     splats.opacity_logits[:] = 0.0
@@ -119,12 +110,7 @@ def test_few_splats_are_those_of_the_highest_rank_or_the_largest_and_most_opaque
 
     assert arrays.most_important_first(packed).tolist() == [1, 2, 0]
     assert arrays.most_important_first(packed, np.array([0.5, 0.0, 1.0])).tolist() == [2, 0, 1]
-
-
-def test_several_objects_share_what_is_drawn_while_moving():
-    """30 of 60 is half of each; where all fit, all."""
-    assert arrays.first_of_each([40, 20], 30) == [20, 10]
-    assert arrays.first_of_each([40, 20], 60) == [40, 20]
+    assert [arrays.first_of_each([40, 20], most) for most in (30, 60)] == [[20, 10], [40, 20]]
 
 
 def test_a_texture_holds_a_value_after_the_other_in_rows_of_its_width():
@@ -139,32 +125,20 @@ def test_a_texture_holds_a_value_after_the_other_in_rows_of_its_width():
     assert arrays.as_texture(np.empty(0)).shape == (1, arrays.WIDTH)
 
 
-def test_heat_goes_along_the_ramp_by_rank():
-    """Ranks 0, 1/2 and 1 of a ramp of three; a rank that is no number counts as 0."""
+def test_heat_goes_along_the_ramp_by_rank_and_a_tint_leaves_opacity_alone():
+    """Ranks 0, 1/2 and 1 of a ramp of three; a rank that is no number counts as 0.
+
+    A quarter of red in a grey of .4: .55, .3, .3; above white counts as white.
+    """
     packed = arrays.pack(_splats(4))
     ramp = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0]])
     found = arrays.heat(packed, np.array([0.0, 0.5, 1.0, np.nan]), ramp)
+    rgba = np.array([[0.4, 0.4, 0.4, 0.7], [3.0, 0.0, 0.0, 0.1]], np.float32)
+    tinted = arrays.tinted(rgba, (1.0, 0.0, 0.0), 0.25)
 
     assert found[:, 0].tolist() == [0.0, 0.5, 1.0, 0.0]
     np.testing.assert_array_equal(found[:, 3], packed.opacities)
-
-
-def test_a_tint_leaves_opacity_alone():
-    """A quarter of red in a grey of .4: .55, .3, .3; above white counts as white."""
-    rgba = np.array([[0.4, 0.4, 0.4, 0.7], [3.0, 0.0, 0.0, 0.1]], np.float32)
-    found = arrays.tinted(rgba, (1.0, 0.0, 0.0), 0.25)
-
-    np.testing.assert_allclose(found, [[0.55, 0.3, 0.3, 0.7], [1.0, 0.0, 0.0, 0.1]], rtol=1e-6)
-
-
-def test_a_covariance_is_turned_as_its_splat():
-    """Scales 3, 2, 1 turned a quarter about z: 2 along x, 3 along y; variances 4, 9, 1."""
-    splats = _splats(1)
-    splats.log_scales[0] = np.log([3.0, 2.0, 1.0])
-    splats.quaternions[0] = [0.5, 0.0, 0.0, 0.5]  # of any length
-    expected = [4.0, 0.0, 0.0, 9.0, 0.0, 1.0]
-
-    np.testing.assert_allclose(arrays.pack(splats).covariances[0], expected, atol=1e-5)
+    np.testing.assert_allclose(tinted, [[0.55, 0.3, 0.3, 0.7], [1.0, 0.0, 0.0, 0.1]], rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["SCENE", "HEAT"])
@@ -173,8 +147,7 @@ def test_a_covariance_is_turned_as_its_splat():
 def test_tints_are_seen_on_black_grey_and_white(mode, mark, ground):
     """A channel changes by more than .15, 38 of 255; white, a tint before, changed no white."""
     rgba = np.array([[ground, ground, ground, 1.0]], np.float32)
-    tinted = arrays.marked(rgba, np.array([mark]), mode)
-
-    assert np.abs(tinted - rgba).max() > 0.15
     selected = arrays.tinted(rgba, arrays.SELECTED, arrays.SELECTED_SHARE)
+
+    assert np.abs(arrays.marked(rgba, np.array([mark]), mode) - rgba).max() > 0.15
     assert np.abs(selected - rgba).max() > 0.25
