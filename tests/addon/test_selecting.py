@@ -8,7 +8,7 @@ import pytest
 
 from tests.e2e.inside.clouds import as_cloud
 
-COUNT = 39_755
+COUNT = 9_939
 
 
 @pytest.fixture
@@ -16,9 +16,8 @@ def chosen(addon):
     """Return functions that select rows of an object, and tell which are selected."""
 
     def choose(obj, rows):
-        flags = np.zeros(addon.mesh.layout.splat_count(obj.data), np.bool_)
-        flags[rows] = True
-        addon.mesh.selection.select(obj, flags)
+        count = addon.mesh.layout.splat_count(obj.data)
+        addon.mesh.selection.select(obj, np.isin(np.arange(count), rows))
 
     def read(obj):
         return np.flatnonzero(addon.mesh.selection.selected(obj)).tolist()
@@ -27,204 +26,172 @@ def chosen(addon):
     return choose
 
 
-@pytest.fixture(params=["MESH", "POINTCLOUD"])
-def either(request, addon, room):
-    """Give the room as a mesh, and as a point cloud."""
-    return as_cloud(addon, room) if request.param == "POINTCLOUD" else room
+def test_the_selection_is_blenders_own_undone_and_in_the_file(addon, chosen, quarter, tmp_path):
+    """Blender selects the vertices that are added to a mesh; an import selects none.
 
-
-def test_an_import_selects_nothing(addon, room):
-    """Blender selects the vertices that are added to a mesh."""
-    assert addon.mesh.selection.count(room) == 0
-
-
-def test_the_selection_is_blenders_own(chosen, room):
-    """What is selected here is selected in edit mode, and the other way round."""
-    chosen(room, [3, 5])
+    What is selected here is selected in edit mode, and the other way round.
+    """
+    assert addon.mesh.selection.count(quarter) == 0
+    chosen(quarter, [3, 5])
     bpy.ops.object.mode_set(mode="EDIT")
-    assert (chosen.read(room), room.data.total_vert_sel) == ([3, 5], 2)
-    chosen(room, [7])
+    assert (chosen.read(quarter), quarter.data.total_vert_sel) == ([3, 5], 2)
+    chosen(quarter, [7])
     bpy.ops.object.mode_set(mode="OBJECT")
+    assert chosen.read(quarter) == [7]
 
-    assert chosen.read(room) == [7]
-
-
-def test_all_none_and_the_others(chosen, either):
-    """39,755 in all; all but two when two are inverted."""
-    for action, count in (("ALL", COUNT), ("NONE", 0)):
-        bpy.ops.refine.select(action=action)
-        assert len(chosen.read(either)) == count
-    chosen(either, [0, 9])
-    bpy.ops.refine.select(action="INVERT")
-
-    assert len(chosen.read(either)) == COUNT - 2
-
-
-def test_what_is_hidden_is_not_selected(addon, chosen, either):
-    """Ten hidden, then all: 39,745; all but five of these hidden, then revealed: all again."""
-    chosen(either, list(range(10)))
-    bpy.ops.refine.select(action="HIDE")
-    assert chosen.read(either) == []
+    bpy.ops.ed.undo_push(message="one")
     bpy.ops.refine.select(action="ALL")
-    assert chosen.read(either) == list(range(10, COUNT))
-    chosen(either, [20, 21, 22, 23, 24])
-    bpy.ops.refine.select(action="ISOLATE")
-    assert np.flatnonzero(~addon.mesh.selection.hidden(either)).tolist() == [20, 21, 22, 23, 24]
-    assert chosen.read(either) == [20, 21, 22, 23, 24]
-    bpy.ops.refine.select(action="REVEAL")
-
-    assert len(chosen.read(either)) == COUNT
-    assert ".hide_vert" not in either.data.attributes
+    bpy.ops.ed.undo_push(message="all")
+    bpy.ops.ed.undo()
+    assert chosen.read(bpy.data.objects["room"]) == [7]
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "selected.blend"))
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    assert chosen.read(bpy.data.objects["room"]) == [7]
 
 
-@pytest.mark.parametrize(
-    ("action", "words"), [("HIDE", "no splat is selected"), ("ISOLATE", "no splat is selected")]
-)
-def test_nothing_is_hidden_where_nothing_is_selected(room, unchanged, action, words):
-    """In one sentence."""
-    unchanged.start()
-    with pytest.raises(RuntimeError, match=words):
+@pytest.mark.parametrize("kind", ["MESH", "POINTCLOUD"])
+def test_splats_are_selected_hidden_and_taken_by_what_they_are(addon, chosen, quarter, kind):
+    """All but two when two are inverted; what is hidden is not selected.
+
+    Less opaque than .25 by the logistic function; longer than the median of all sizes.
+    """
+    obj = as_cloud(addon, quarter) if kind == "POINTCLOUD" else quarter
+
+    def after(action):
         bpy.ops.refine.select(action=action)
-    unchanged()
+        return chosen.read(obj)
 
+    assert len(after("ALL")) == COUNT
+    assert after("NONE") == []
+    chosen(obj, [0, 9])
+    assert len(after("INVERT")) == COUNT - 2
 
-def test_faint_and_large_splats_are_taken(addon, chosen, either):
-    """Less opaque than .25 by the logistic function; longer than the median of all sizes."""
-    columns = addon.mesh.attributes.stored_columns(addon.mesh.layout.check(either))
+    chosen(obj, range(10))
+    assert after("HIDE") == []
+    assert after("ALL") == list(range(10, COUNT))
+    chosen(obj, range(20, 25))
+    assert after("ISOLATE") == list(range(20, 25))
+    assert np.flatnonzero(~addon.mesh.selection.hidden(obj)).tolist() == list(range(20, 25))
+    assert len(after("REVEAL")) == COUNT
+    assert ".hide_vert" not in obj.data.attributes
+
+    columns = addon.mesh.attributes.stored_columns(addon.mesh.layout.check(obj))
     logits = np.asarray(columns["opacity"], np.float64)
     logs = np.max([columns[f"scale_{axis}"] for axis in range(3)], axis=0)
     settings = bpy.context.scene.refine
     settings.select_opacity, settings.select_size = 0.25, np.exp(np.median(logs))
-
     bpy.ops.refine.select_by(what="FAINT")
-    faint = chosen.read(either)
+    faint = chosen.read(obj)
     bpy.ops.refine.select_by(what="LARGE", mode="INTERSECT")
-    both = chosen.read(either)
+    both = chosen.read(obj)
     bpy.ops.refine.select_by(what="FAINT", mode="SUBTRACT")
-
     assert faint == np.flatnonzero(logits < np.log(0.25 / 0.75)).tolist()
     assert 0 < len(both) < len(faint) < COUNT
     assert set(both) <= set(np.flatnonzero(logs >= np.median(logs)).tolist())
-    assert chosen.read(either) == []
+    assert chosen.read(obj) == []
+
+
+def test_what_cannot_be_is_refused_in_a_sentence(chosen, quarter, unchanged):
+    """Nothing is selected, scored or searched; of all splats none would be left of the object."""
+    operators = bpy.ops.refine
+    for operator, options, words in (
+        (operators.select, {"action": "HIDE"}, "no splat is selected"),
+        (operators.select, {"action": "ISOLATE"}, "no splat is selected"),
+        (operators.grow_selection, {}, "no splat is selected"),
+        (operators.select_by, {"what": "GOING"}, "score the splats first"),
+        (operators.select_by, {"what": "FLOATERS"}, "look for floaters first"),
+        (operators.separate_selected, {}, "none would be left"),
+    ):
+        chosen(quarter, range(COUNT if "separate" in operator.idname() else 0))
+        unchanged.start()
+        with pytest.raises(RuntimeError, match=words):
+            operator(**options)
+        unchanged()
 
 
 @pytest.mark.usefixtures("room_cameras")
-def test_plans_floaters_and_demands_take_splats(addon, chosen, room):
-    """Each is what the attribute, the search and the volumes say of the splats."""
-    with pytest.raises(RuntimeError, match="score the splats first"):
-        bpy.ops.refine.select_by(what="GOING")
-    with pytest.raises(RuntimeError, match="look for floaters first"):
-        bpy.ops.refine.select_by(what="FLOATERS")
+def test_plans_and_demands_take_splats(addon, chosen, quarter):
+    """Each is what the attribute and the volumes say of the splats."""
     bpy.ops.refine.score()
     bpy.ops.refine.select_by(what="GOING")
     read = addon.mesh.attributes.read_attribute
-    assert chosen.read(room) == np.flatnonzero(read(room.data, "refine_remove")).tolist()
+    assert chosen.read(quarter) == np.flatnonzero(read(quarter.data, "refine_remove")).tolist()
     bpy.ops.refine.add_volume(role="KEEP", shape="BOX")
     box = bpy.context.scene.refine.volumes[0].object
     box.scale = [0.5 * size for size in box.scale]
     bpy.context.view_layer.update()
-    bpy.context.view_layer.objects.active = room
+    bpy.context.view_layer.objects.active = quarter
     bpy.ops.refine.select_by(what="OUTSIDE")
-    places = read(room.data, "position") - np.array(box.location)
+    places = read(quarter.data, "position") - np.array(box.location)
     outside = (np.abs(places) > np.array(box.scale)).any(axis=1)
 
     assert 0 < outside.sum() < COUNT
-    assert abs(len(chosen.read(room)) - outside.sum()) < 3  # on a face, by rounding
+    assert abs(len(chosen.read(quarter)) - outside.sum()) < 3  # on a face, by rounding
 
 
-def test_the_selection_grows_and_shrinks(chosen, quarter):
+def test_the_selection_grows_and_shrinks(addon, chosen, quarter):
     """By neighbours: more than was, and of the inner ones not fewer than were."""
-    place = np.empty(3 * len(quarter.data.vertices), np.float32)
-    quarter.data.vertices.foreach_get("co", place)
-    left = np.flatnonzero(place.reshape(-1, 3)[:, 0] < np.median(place.reshape(-1, 3)[:, 0]))
+    x = addon.mesh.attributes.read_attribute(quarter.data, "position")[:, 0]
+    left = np.flatnonzero(x < np.median(x)).tolist()
     chosen(quarter, left)
     bpy.ops.refine.grow_selection(shrink=False)
     grown = chosen.read(quarter)
     bpy.ops.refine.grow_selection(shrink=True)
-    shrunk = chosen.read(quarter)
 
-    assert set(left.tolist()) < set(grown)
-    assert set(left.tolist()) <= set(shrunk) < set(grown)
-    chosen(quarter, [])
-    with pytest.raises(RuntimeError, match="no splat is selected"):
-        bpy.ops.refine.grow_selection()
+    assert set(left) < set(grown)
+    assert set(left) <= set(chosen.read(quarter)) < set(grown)
 
 
-def test_the_selected_splats_are_deleted_but_for_protected_ones(addon, chosen, room):
-    """Of 100 selected, 10 are marked to stay: 39,665 are left, and 10 of them selected."""
-    chosen(room, list(range(10)))
+def test_the_selected_splats_are_deleted_but_for_protected_ones_or_parted(addon, chosen, quarter):
+    """Of 100 selected, 10 are marked to stay: 90 go, and the 10 are selected.
+
+    Every other one of the rest becomes an object, with the columns of its rows, at the same place.
+    """
+    chosen(quarter, range(10))
     bpy.ops.refine.protect(mark="STAY")
-    chosen(room, list(range(100)))
+    chosen(quarter, range(100))
     bpy.ops.refine.delete(what="SELECTED")
+    assert addon.mesh.layout.splat_count(quarter.data) == COUNT - 90
+    assert chosen.read(quarter) == list(range(10))
 
-    assert addon.mesh.layout.splat_count(room.data) == COUNT - 90
-    assert chosen.read(room) == list(range(10))
-
-
-def test_the_selected_splats_become_an_object(addon, chosen, room):
-    """Every other one: 19,878 and 19,877, with the columns of their rows, at the same place."""
-    opacities = addon.mesh.attributes.read_attribute(room.data, "opacity")
-    room.location = (1.0, 2.0, 3.0)
-    chosen(room, np.arange(0, COUNT, 2))
+    read = addon.mesh.attributes.read_attribute
+    opacities = read(quarter.data, "opacity")
+    quarter.location = (1.0, 2.0, 3.0)
+    chosen(quarter, np.arange(0, COUNT, 2))
     bpy.ops.refine.separate_selected()
     apart = bpy.data.objects["room.001"]
-    read = addon.mesh.attributes.read_attribute
-
     assert np.array_equal(read(apart.data, "opacity"), opacities[::2])
-    assert np.array_equal(read(room.data, "opacity"), opacities[1::2])
-    assert apart.location == room.location
-    assert chosen.read(apart) == chosen.read(room) == []
+    assert np.array_equal(read(quarter.data, "opacity"), opacities[1::2])
+    assert apart.location == quarter.location
+    assert chosen.read(apart) == chosen.read(quarter) == []
     assert apart.select_get()
 
 
-def test_all_splats_are_not_parted_from_none(chosen, room, unchanged):
-    """Nothing would be left of the object."""
-    chosen(room, list(range(COUNT)))
-    unchanged.start()
-    with pytest.raises(RuntimeError, match="none would be left"):
-        bpy.ops.refine.separate_selected()
-    unchanged()
-
-
 @pytest.mark.usefixtures("room_cameras")
-def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
-    """The 100 best of 39,755 are marked; of those that 19,877 remove they are 100.
+def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, quarter):
+    """The 100 best of 9,939 are marked; of those that 4,969 remove they are 100.
 
     A mark to stay takes the place of one to go. What was marked after scoring asks for new scores.
     """
     bpy.ops.refine.score()
-    scores = addon.mesh.attributes.read_attribute(room.data, "refine_score")
+    scores = addon.mesh.attributes.read_attribute(quarter.data, "refine_score")
     best = np.argsort(-scores, kind="stable")[:100]
-    chosen(room, best)
+    chosen(quarter, best)
     bpy.ops.refine.protect(mark="GO")
-    assert "what must go changed" in addon.ui.plans.stale(bpy.context, room)
-    assert addon.objects.demands.facts(room.data)["removed_by_user"] == 100
+    assert "what must go changed" in addon.ui.plans.stale(bpy.context, quarter)
+    assert addon.objects.demands.facts(quarter.data)["removed_by_user"] == 100
     bpy.ops.refine.score()
-    assert addon.ui.plans.stale(bpy.context, room) == []
-    going = addon.mesh.attributes.read_attribute(room.data, "refine_remove")
+    assert addon.ui.plans.stale(bpy.context, quarter) == []
+    going = addon.mesh.attributes.read_attribute(quarter.data, "refine_remove")
     assert going[best].all()
-    assert going.sum() == 19_877
-    chosen(room, best[:40])
+    assert going.sum() == 4_969
+    chosen(quarter, best[:40])
     bpy.ops.refine.protect(mark="STAY")
-    facts = addon.objects.demands.facts(room.data)
+    facts = addon.objects.demands.facts(quarter.data)
 
     assert (facts["protected"], facts["removed_by_user"]) == (40, 60)
     bpy.ops.refine.delete(what="VOLUMES")
-    assert addon.mesh.layout.splat_count(room.data) == COUNT - 60
-
-
-def test_the_selection_is_undone_and_in_the_file(chosen, room, tmp_path):
-    """One step back: what was selected before; saved and opened: what is selected."""
-    chosen(room, [1, 2])
-    bpy.ops.ed.undo_push(message="two")
-    bpy.ops.refine.select(action="ALL")
-    bpy.ops.ed.undo_push(message="all")
-    bpy.ops.ed.undo()
-    assert chosen.read(bpy.data.objects["room"]) == [1, 2]
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "selected.blend"))
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-
-    assert chosen.read(bpy.data.objects["room"]) == [1, 2]
+    assert addon.mesh.layout.splat_count(quarter.data) == COUNT - 60
 
 
 def test_tools_are_in_the_toolbar_of_both_modes(addon):

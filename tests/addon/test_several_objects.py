@@ -2,50 +2,47 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
 
 from tests.e2e.inside.clouds import as_cloud
 
-ROOM = Path(__file__).parents[1] / "data" / "room_small"
-COUNT = 39_755
+COUNT, FIRST = 9_939, 5_000
 
 
 @pytest.fixture
-def halves(addon, room_cameras):
-    """Return the room as two selected objects: its first 20,000 splats, and the rest."""
-    file = addon.core.read_ply(ROOM / "point_cloud.ply")
-    made = []
-    for name, first in (("a", True), ("b", False)):
-        keep = (np.arange(COUNT) < 20_000) == first
-        path = Path(bpy.app.tempdir) / f"{name}.ply"
-        file.write(path, keep, overwrite=True)
-        mesh = addon.mesh.attributes.mesh_from_file(addon.core.read_ply(path))
-        obj = bpy.data.objects.new(name, mesh)
-        bpy.context.scene.collection.objects.link(obj)
-        obj.data.attributes.new("row", "INT", "POINT")
-        obj.data.attributes["row"].data.foreach_set("value", np.flatnonzero(keep).astype(np.int32))
+def halves(addon, quarter, room_cameras):
+    """Return the room as two selected objects: its first 5,000 splats, and the rest."""
+    rows = np.arange(COUNT)
+    addon.mesh.attributes.write_attribute(quarter.data, "row", "INT", rows)
+    other = quarter.copy()
+    other.data = quarter.data.copy()
+    bpy.context.scene.collection.objects.link(other)
+    for obj, name, gone in ((quarter, "a", rows >= FIRST), (other, "b", rows < FIRST)):
+        obj.name = name
+        addon.mesh.edit.delete_vertices(obj, gone)
         obj.select_set(True)
-        made.append(obj)
-    bpy.context.view_layer.objects.active = made[1]
-    return made
+    bpy.context.view_layer.objects.active = other
+    return [quarter, other]
 
 
-def rows(addon, objects):
-    """Return which splats of the file the objects hold."""
-    found = [addon.mesh.attributes.read_attribute(obj.data, "row") for obj in objects]
-    return np.sort(np.concatenate(found))
+@pytest.fixture
+def whole(addon, quarter_file, room_views):
+    """Return a function that decides what stays of the file with both."""
+
+    def whole(ratio, method):
+        core = addon.core
+        splats = core.read_ply(quarter_file).splats()
+        return core.prune(splats, room_views, core.Budget(ratio=ratio), method)
+
+    return whole
 
 
-def test_the_object_that_cannot_be_scored_is_named(halves):
-    """The one that is not the active one, scaled to nothing."""
-    halves[0].scale = (0.0, 0.0, 0.0)
-
-    with pytest.raises(RuntimeError, match="object 'a': the transform is flat"):
-        bpy.ops.refine.score()
+def read(addon, objects, name):
+    """Return an attribute of all splats of objects."""
+    found = [addon.mesh.attributes.read_attribute(obj.data, name) for obj in objects]
+    return np.concatenate(found)
 
 
 @pytest.mark.parametrize(
@@ -56,125 +53,81 @@ def test_the_object_that_cannot_be_scored_is_named(halves):
         pytest.param("merge", marks=pytest.mark.slow),
     ],
 )
-def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, method):
-    """70 % of 39,755 are 27,828 by one order of removal; 11,927 stay, unevenly in both objects."""
-    settings = bpy.context.scene.refine
-    settings.method, settings.views, settings.ratio = method, 16, 0.7
-    core = addon.core
-    expected = core.prune(
-        core.read_ply(ROOM / "point_cloud.ply").splats(),
-        room_views,
-        core.Budget(ratio=0.7),
-        core.METHODS[method](16),
-    )
+def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, whole, method):
+    """80 % of 9,939 are 7,951 by one order of removal; 1,988 stay, unevenly in both objects.
+
+    The pictures' quality was estimated for both: one alone has no curve of its own.
+    """
+    settings, group = bpy.context.scene.refine, addon.objects.splat_group
+    settings.method, settings.views, settings.ratio = method, 4, 0.8
+    expected = whole(0.8, addon.core.METHODS[method](4))
 
     assert bpy.ops.refine.score() == {"FINISHED"}
     plan = addon.ui.plans.stored(halves[1], settings)
+    members = group.members(bpy.context.view_layer, addon.mesh.layout.check(halves[1]))
+    found = group.forced(bpy.context.scene, members)
+    arguments = group.stored_arguments(members, settings.to_budget(), found, settings.to_method())
+    assert (arguments["scores"].quality is None) == (method == "closed-form")
+    assert all(addon.mesh.scores.stored_scores([one]).quality is None for one in members)
+    ranks = np.sort(read(addon, halves, "refine_rank"))
+    np.testing.assert_allclose(ranks, np.linspace(0, 1, COUNT), atol=1e-6)
     assert bpy.ops.refine.apply() == {"FINISHED"}
 
-    assert (plan["splats"], plan["kept"]) == (COUNT, COUNT - 27_828)
-    np.testing.assert_array_equal(rows(addon, halves), np.flatnonzero(expected.keep))
-    check, gather = addon.mesh.layout.check, addon.objects.splat_group.gather
-    left = [gather([check(obj)], whole=True) for obj in halves]
-    wanted = expected.splats
-    np.testing.assert_allclose(
-        np.concatenate([part.means for part in left]), wanted.means, rtol=1e-6, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        np.concatenate([part.sh_rest for part in left]), wanted.sh_rest, rtol=1e-5, atol=1e-5
-    )
+    assert (plan["splats"], plan["kept"]) == (COUNT, COUNT - 7_951)
+    np.testing.assert_array_equal(read(addon, halves, "row"), np.flatnonzero(expected.keep))
+    left = group.gather([addon.mesh.layout.check(obj) for obj in halves], whole=True)
+    np.testing.assert_allclose(left.means, expected.splats.means, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(left.sh_rest, expected.splats.sh_rest, rtol=1e-5, atol=1e-5)
 
 
-def test_a_mesh_and_a_point_cloud_share_a_budget(addon, halves, room_views):
+def test_a_mesh_and_a_point_cloud_share_a_budget(addon, halves, whole):
     """The second becomes a point cloud of Blender's own splats; 50 % of both together go."""
     clouds = [halves[0], as_cloud(addon, halves[1])]
-    halves[0].select_set(True)
+    clouds[0].select_set(True)
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
-    core = addon.core
-    expected = core.prune(
-        core.read_ply(ROOM / "point_cloud.ply").splats(),
-        room_views,
-        core.Budget(ratio=0.5),
-        addon.core.ClosedForm(),
-    ).keep
+    expected = np.flatnonzero(whole(0.5, addon.core.ClosedForm()).keep)
 
     assert [obj.type for obj in clouds] == ["MESH", "POINTCLOUD"]
-    assert len(np.setxor1d(rows(addon, clouds), np.flatnonzero(expected))) <= 4  # activated
+    assert len(np.setxor1d(read(addon, clouds, "row"), expected)) <= 2  # activated
 
 
 def test_marks_and_sentence_are_those_of_the_selection(addon, halves):
-    """Together 19,877 of 39,755 are marked; of the second alone floor(19,755 / 2) = 9,877."""
+    """Together 4,969 of 9,939 are marked; of the second alone floor(4,939 / 2) = 2,469.
+
+    An active object that is not selected is the only one that is meant.
+    """
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     bpy.ops.refine.score()
-
-    def marked():
-        return [
-            int(addon.mesh.attributes.read_attribute(obj.data, "refine_remove").sum())
-            for obj in halves
-        ]
-
-    assert sum(marked()) == 19_877
-    assert "of 39,755" in plans.sentence(plans.stored(halves[1], settings))
+    assert read(addon, halves, "refine_remove").sum() == 4_969
+    assert "of 9,939" in plans.sentence(plans.stored(halves[1], settings))
 
     halves[0].select_set(False)
     assert plans.stored(halves[1], settings) is None  # of both, not of this one
     plans.refresh(bpy.context)
-
-    assert marked()[1] == 9_877
-    assert "of 19,755" in plans.sentence(plans.stored(halves[1], settings))
-
-
-def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):
-    """The pictures' quality was estimated for both: one alone has no curve of its own."""
-    settings = bpy.context.scene.refine
-    settings.method, settings.views = "occlusion", 8
-    bpy.ops.refine.score()
-    group, scores = addon.objects.splat_group, addon.mesh.scores
-    members = group.members(bpy.context.view_layer, addon.mesh.layout.check(halves[1]))
-
-    found = group.forced(bpy.context.scene, members)
-    arguments = group.stored_arguments(members, settings.to_budget(), found, settings.to_method())
-
-    assert arguments["scores"].quality is not None
-    assert all(scores.stored_scores([member]).quality is None for member in members)
-    ranks = [addon.mesh.attributes.read_attribute(obj.data, "refine_rank") for obj in halves]
-    np.testing.assert_allclose(np.sort(np.concatenate(ranks)), np.linspace(0, 1, COUNT), atol=1e-6)
-
-
-def test_objects_that_were_not_scored_together_are_refused(halves, unchanged):
-    """Each was scored by itself: their scores are places in two orders."""
-    for obj, other in (halves, halves[::-1]):
-        obj.select_set(True)
-        other.select_set(False)
-        bpy.context.view_layer.objects.active = obj
-        bpy.ops.refine.score()
+    assert read(addon, halves[1:], "refine_remove").sum() == 2_469
+    assert "of 4,939" in plans.sentence(plans.stored(halves[1], settings))
     halves[0].select_set(True)
-    halves[1].select_set(True)
-    unchanged.start()
-
-    with pytest.raises(RuntimeError, match="the 2 selected objects were not scored together"):
-        bpy.ops.refine.apply()
-
-    unchanged()
+    halves[1].select_set(False)
+    assert addon.objects.splat_group.chosen(bpy.context.view_layer, halves[1]) == [halves[1]]
 
 
-def test_where_one_cannot_be_changed_none_is(halves, unchanged):
-    """Shape keys hold every vertex again; the other object stays whole as well."""
+def test_objects_that_cannot_be_scored_together_are_named(halves):
+    """The one that is not the active one, scaled to nothing; two that share their data."""
+    halves[0].scale = (0.0, 0.0, 0.0)
+    with pytest.raises(RuntimeError, match="object 'a': the transform is flat"):
+        bpy.ops.refine.score()
+    halves[0].scale = (1.0, 1.0, 1.0)
+    twin = halves[0].copy()
+    bpy.context.scene.collection.objects.link(twin)
+    twin.select_set(True)
+    with pytest.raises(RuntimeError, match=r"objects 'a' and 'a\.001' share their data"):
+        bpy.ops.refine.score()
+
+
+def test_where_one_cannot_be_changed_none_is(addon, halves, unchanged, monkeypatch):
+    """Blender fails at the second one; shape keys hold every vertex again."""
     bpy.ops.refine.score()
-    halves[0].shape_key_add(name="key")
-    unchanged.start()
-
-    with pytest.raises(RuntimeError, match="object 'a': has shape keys"):
-        bpy.ops.refine.apply()
-
-    unchanged()
-
-
-@pytest.mark.usefixtures("halves")
-def test_where_blender_fails_at_the_second_the_first_is_whole_again(addon, unchanged, monkeypatch):
-    bpy.ops.refine.score()
-    unchanged.start()
     delete, calls = addon.mesh.edit.delete_vertices, []
 
     def fails_once(obj, remove):
@@ -183,56 +136,55 @@ def test_where_blender_fails_at_the_second_the_first_is_whole_again(addon, uncha
             raise addon.core.RefineError("no second time")
         delete(obj, remove)
 
+    unchanged.start()
     monkeypatch.setattr(addon.mesh.edit, "delete_vertices", fails_once)
     with pytest.raises(RuntimeError, match="no second time"):
         bpy.ops.refine.apply()
-
     assert calls == ["a", "b"]
     unchanged()
 
+    halves[1].shape_key_add(name="key")
+    unchanged.start()
+    with pytest.raises(RuntimeError, match="object 'b': has shape keys"):
+        bpy.ops.refine.apply()
+    unchanged()
 
-def test_an_object_of_which_nothing_would_be_left_is_refused(halves, unchanged):
-    """The first object is far above all cameras: its 20,000 splats are the lowest half."""
+
+def test_scores_of_each_and_an_object_that_would_be_empty_are_refused(halves, unchanged):
+    """Scored each by itself their scores are places in two orders.
+
+    Far above all cameras the first object's 5,000 splats are the lowest half.
+    """
     halves[0].location.z = -30.0
     bpy.context.scene.refine.ratio = 0.6
     bpy.ops.refine.score()
     unchanged.start()
-
     with pytest.raises(RuntimeError, match="no splat of object 'a' would be left"):
         bpy.ops.refine.apply()
+    unchanged()
 
+    halves[0].location.z = 0.0
+    for obj, other in (halves, halves[::-1]):
+        obj.select_set(True)
+        other.select_set(False)
+        bpy.context.view_layer.objects.active = obj
+        bpy.ops.refine.score()
+    halves[0].select_set(True)
+    unchanged.start()
+    with pytest.raises(RuntimeError, match="the 2 selected objects were not scored together"):
+        bpy.ops.refine.apply()
     unchanged()
 
 
-def test_objects_that_share_their_data_are_refused(halves):
-    twin = halves[0].copy()
-    bpy.context.scene.collection.objects.link(twin)
-    twin.select_set(True)
-
-    with pytest.raises(RuntimeError, match=r"objects 'a' and 'a\.001' share their data"):
-        bpy.ops.refine.score()
-
-
 def test_a_group_that_one_object_has_protects_there(halves):
-    """All of the first object is protected: its 20,000 stay, and 19,755 - 19,877 < 0 go: none."""
-    group = halves[0].vertex_groups.new(name="keep")
-    group.add(range(20_000), 1.0, "REPLACE")
+    """All of the first object is protected: its 5,000 stay, and 40 % of both go of the other."""
+    halves[0].vertex_groups.new(name="keep").add(range(FIRST), 1.0, "REPLACE")
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
     settings.protect, settings.ratio = "keep", 0.4
     bpy.ops.refine.apply()
 
-    assert len(halves[0].data.vertices) == 20_000
-    assert len(halves[1].data.vertices) == 19_755 - 15_902
+    assert [len(obj.data.vertices) for obj in halves] == [FIRST, COUNT - FIRST - 3_975]
     settings.protect = "none"
     with pytest.raises(RuntimeError, match="nothing to protect is named 'none'"):
         bpy.ops.refine.score()
-
-
-def test_one_active_object_beside_a_selection_is_worked_on_alone(addon, halves):
-    """As everywhere: an active object that is not selected is the only one that is meant."""
-    halves[1].select_set(False)
-
-    found = addon.objects.splat_group.chosen(bpy.context.view_layer, halves[1])
-
-    assert found == [halves[1]]
