@@ -9,7 +9,7 @@ import pytest
 
 from refine_addon.core import Cleaning, RefineError, Splats, View, ViewSet, clean
 from refine_addon.core.cleaning.search import connected
-from refine_addon.core.splats import ARRAYS
+from refine_addon.core.splats import joined as core_joined
 
 SIDE = 24
 """Splats along each side of the wall."""
@@ -30,8 +30,7 @@ def made(means, scale, opacity, color):
 
 
 def joined(*parts):
-    """Return all splats of some sets."""
-    return Splats(**{name: np.concatenate([getattr(s, name) for s in parts]) for name in ARRAYS})
+    return core_joined(parts)
 
 
 def wall():

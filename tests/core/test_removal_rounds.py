@@ -98,19 +98,6 @@ def told(sample: RaySample, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     return error, contribution, hits
 
 
-def test_while_all_are_there_rays_are_weighed_against_what_was_measured(scene):
-    sample, measured = scene
-    every = np.arange(len(measured.seen))
-    error, _, hits = told(sample, np.ones(len(every), np.bool_))
-
-    found = _RemovalRounds(sample, measured, silent, 1).remove_and_measure(every, silent)
-
-    expected = (hits * error + KNOWN * measured.error) / (hits + KNOWN)
-    np.testing.assert_allclose(found.error, expected, rtol=1e-9)
-    np.testing.assert_allclose(found.contribution, measured.contribution, rtol=1e-12)
-    np.testing.assert_array_equal(found.seen, measured.seen)
-
-
 @pytest.mark.parametrize("threads", [1, 3])
 def test_what_is_left_grows_as_rays_tell_and_unhit_splats_as_all_do(scene, threads):
     """Removed at once or one half after the other: the same."""
@@ -141,21 +128,6 @@ def test_what_is_left_grows_as_rays_tell_and_unhit_splats_as_all_do(scene, threa
     np.testing.assert_array_equal(found.seen, measured.seen[left])
 
 
-def test_what_no_line_hits_grows_as_all_others(scene):
-    sample, measured = scene
-    last = int(sample.rays[0].hit[-1])
-    sample.rays = [rays.keeping(rays.hit != last) for rays in sample.rays]
-    every = np.arange(len(measured.seen))
-    keep = (every % 3 > 0) | (every == last)
-    before, now = (told(sample, some)[0][keep].sum() for some in (every >= 0, keep))
-
-    left = np.flatnonzero(keep)
-    found = _RemovalRounds(sample, measured, silent, 1).remove_and_measure(left, silent)
-
-    place = int(np.searchsorted(left, last))
-    assert found.error[place] == pytest.approx(measured.error[last] * now / before)
-
-
 WIDE = replace(ring()[0], width=2000, height=1500, fx=900.0, fy=900.0, cx=1000.0, cy=750.0)
 
 
@@ -163,28 +135,6 @@ def footprints_in(view):
     splats = cloud()
     gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)))
     return projection.project(gaussians, frame, view)
-
-
-def test_scoring_rays_are_others_than_validation_rays():
-    """Else an order would look better than it is, on the noise that it was made of.
-
-    By chance 65,536 scoring rays in two views of 3 million pixels meet 1 to 2 % of the others.
-    """
-    views, footprints = [(WIDE, 0.5)] * 2, footprints_in(WIDE)
-
-    judging, ordering = (
-        {
-            (column, row)
-            for number in (0, 1)
-            for rays in [cast.cast_view(views, number, footprints, scoring=scoring)]
-            for column in rays.columns
-            for row in rays.rows
-        }
-        for scoring in (False, True)
-    )
-
-    assert len(ordering) == pytest.approx(4 * len(judging), rel=0.02)
-    assert len(judging & ordering) < 0.03 * len(judging)
 
 
 @pytest.mark.parametrize("count", [8, 16, 37, 64])

@@ -8,26 +8,21 @@ import numpy as np
 import pytest
 
 from refine_addon.core import (
-    Box,
     Budget,
     ClosedForm,
     Levels,
     Merge,
     Occlusion,
     RefineError,
-    Zone,
     clean,
     lod,
     prune,
-    prune_file,
-    read_ply,
     score,
 )
 from tests.core.test_cleaning import FLOATER, cameras, joined, wall
 from tests.core.test_levels import cameras as level_cameras
 from tests.core.test_levels import (
     colourful,
-    file_of,
     merges,  # noqa: F401 - a fixture
 )
 
@@ -213,27 +208,3 @@ def test_cleaning_takes_what_must_go_as_gone():
     assert np.array_equal(found.keep[5:], expected.keep)
     assert found.counts() == expected.counts()
     assert alone.counts()["front"] == 0
-
-
-def test_a_file_is_pruned_by_volumes_as_by_masks(splats, views, tmp_path):
-    """The report names the volumes and how many each holds."""
-    path = file_of(splats, tmp_path / "in.ply")
-    zones = (
-        Zone("keep", "box", Box((-9, -9, -9), (1, 9, 9))),
-        Zone("protect", "edge", Box((-9, -9, -9), (-2, 9, 9))),
-        Zone("remove", "lower", Box((-9, -9, -9), (9, -1, 9))),
-    )
-    loaded, budget = read_ply(path).splats(), Budget(ratio=0.8)
-    x, y, _ = loaded.means.T
-    protected, removed = x < -2, ((x >= 1) | (y < -1)) & (x >= -2)
-
-    found = prune_file(path, tmp_path / "out.ply", views, budget, zones=zones)
-
-    expected = prune(loaded, views, budget, protected=protected, removed=removed)
-    assert np.array_equal(found.keep, expected.keep)
-    assert found.report["volumes"] == [
-        {"role": "keep", "name": "box", "splats": int((x < 1).sum())},
-        {"role": "protect", "name": "edge", "splats": int(protected.sum())},
-        {"role": "remove", "name": "lower", "splats": int((y < -1).sum())},
-    ]
-    assert len(read_ply(tmp_path / "out.ply")) == found.keep.sum()

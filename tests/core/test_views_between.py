@@ -148,9 +148,8 @@ def test_views_between_that_decide_keep_what_they_see():
 
 def test_what_is_stored_of_the_curve_is_read_again():
     """A curve of a file that an older version wrote has nothing to tell of between."""
-    curve = Quality(
-        *np.array([[0.2, 0.5], [50.0, 40.0], [53.0, 46.0]]), between=np.array([48.0, 36.0])
-    )
+    values = np.array([[0.2, 0.5], [50.0, 40.0], [53.0, 46.0], [48.0, 36.0]])
+    curve = Quality(*values[:3], between=values[3])
 
     again = Quality.from_facts(curve.facts())
     old = Quality.from_facts({k: v for k, v in curve.facts().items() if k != "between"})
