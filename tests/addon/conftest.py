@@ -52,7 +52,6 @@ def addon(extension):
 
 @pytest.fixture
 def core(addon):
-    """Give access to the core that the package carries."""
     return addon.core
 
 
@@ -62,20 +61,23 @@ def export(addon, checked, path, **options):
     addon.core.formats.registry.write_splats(path, file)
 
 
+def read(addon, obj, name):
+    """Return a point attribute."""
+    return addon.mesh.attributes.read_attribute(obj.data, name)
+
+
+def splats_of(addon, obj):
+    """Return an object's splats in the world."""
+    return addon.objects.splat_group.gather([addon.mesh.layout.check(obj)], whole=True)
+
+
 def keep_mask(addon, obj, budget, protect=""):
     """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
     checked = addon.mesh.layout.check(obj)
     found = addon.objects.demands.Demands((protect,) if protect else ()).forced(checked)
-    return deleted(addon, checked, budget, found).keep
-
-
-def deleted(addon, checked, budget, found=None):
-    """What *Apply* decides by the scores of an object where splats are deleted."""
-    found = found or addon.core.volumes.Forced()
-    arguments = addon.objects.splat_group.stored_arguments(
-        [checked], budget, found, addon.core.Occlusion(), None
-    )
-    return addon.core.prune(**arguments)
+    method = addon.core.Occlusion()
+    arguments = addon.objects.splat_group.stored_arguments([checked], budget, found, method, None)
+    return addon.core.prune(**arguments).keep
 
 
 def applied(addon, checked, result):
@@ -93,16 +95,20 @@ def empty_scene():
     return scene
 
 
-@pytest.fixture
-def room(addon, empty_scene):
-    """Import the small trained room."""
-    file = addon.core.read_ply(ROOM / "point_cloud.ply")
-    mesh = addon.mesh.attributes.mesh_from_file(file)
+def _linked(addon, path):
+    mesh = addon.mesh.attributes.mesh_from_file(addon.core.read_ply(path))
     obj = bpy.data.objects.new("room", mesh)
-    empty_scene.collection.objects.link(obj)
+    bpy.context.scene.collection.objects.link(obj)
     bpy.context.view_layer.objects.active = obj
     obj.select_set(True)
+    bpy.context.view_layer.update()
     return obj
+
+
+@pytest.fixture
+def room(addon, empty_scene):
+    """Import the small trained room: 39,755 splats."""
+    return _linked(addon, ROOM / "point_cloud.ply")
 
 
 @pytest.fixture
@@ -112,18 +118,28 @@ def quarter(addon, room):
     return room
 
 
-@pytest.fixture(scope="session")
-def quarter_file(addon, tmp_path_factory):
-    """Write every fourth splat of the room to a file."""
-    path = tmp_path_factory.mktemp("quarter") / "room.ply"
-    file = addon.core.read_ply(ROOM / "point_cloud.ply")
-    file.write(path, np.arange(len(file)) % 4 == 0)
-    return path
+@pytest.fixture
+def few(addon, room_cameras, few_file):
+    """Import every tenth splat of the room, 3,976, and the cameras."""
+    return _linked(addon, few_file)
+
+
+def _file(step):
+    @pytest.fixture(scope="session")
+    def file(addon, tmp_path_factory):
+        path = tmp_path_factory.mktemp("part") / "room.ply"
+        whole = addon.core.read_ply(ROOM / "point_cloud.ply")
+        whole.write(path, np.arange(len(whole)) % step == 0)
+        return path
+
+    return file
+
+
+quarter_file, few_file = _file(4), _file(10)
 
 
 @pytest.fixture
 def room_views(addon):
-    """Read the room's camera file."""
     return addon.core.read_cameras(ROOM / "cameras.json")
 
 
@@ -133,9 +149,9 @@ def room_cameras(addon, empty_scene, room_views):
     collection = bpy.data.collections.new("cameras")
     empty_scene.collection.children.link(collection)
     addon.cameras.create_cameras(room_views, collection)
-    empty_scene.refine.collection = collection
-    empty_scene.refine.source = "COLLECTION"
-    empty_scene.refine.method = "closed-form"
+    settings = empty_scene.refine
+    settings.collection, settings.source = collection, "COLLECTION"
+    settings.method = "closed-form"
     return collection
 
 
@@ -153,57 +169,45 @@ def score(addon):
 
 def snapshot():
     """Return what an operator must leave alone where it fails, as plain values."""
-    kinds = ("objects", "meshes", "pointclouds", "cameras", "collections", "node_groups")
-    facts = {
-        kind: sorted(item.name for item in getattr(bpy.data, kind))
-        for kind in (*kinds, "materials")
-    }
-    for mesh in (*bpy.data.meshes, *bpy.data.pointclouds):
-        facts[f"{mesh.id_type} {mesh.name}"] = (
-            len(mesh.attributes["position"].data) if "position" in mesh.attributes else 0,
-            sorted((a.name, a.data_type, a.domain) for a in mesh.attributes),
-            sorted(mesh.keys()),
-        )
-    for obj in bpy.data.objects:
-        facts[f"object {obj.name}"] = (
-            obj.data.name if obj.data else "",
-            [modifier.name for modifier in obj.modifiers],
-            [list(row) for row in obj.matrix_world],
-        )
-    scene = bpy.context.scene
-    facts["scene"] = (scene.frame_current, scene.camera.name if scene.camera else "")
+    data, scene = bpy.data, bpy.context.scene
+    kinds = (data.objects, data.meshes, data.pointclouds, data.cameras, data.collections)
+    facts = [sorted(each.name for each in kind) for kind in (*kinds, data.node_groups)]
+    facts += [sorted(data.materials.keys()), scene.frame_current, scene.camera]
+    for mesh in (*data.meshes, *data.pointclouds):
+        position = mesh.attributes.get("position")
+        attributes = sorted((a.name, a.data_type, a.domain) for a in mesh.attributes)
+        facts += [len(position.data) if position else 0, attributes, sorted(mesh.keys())]
+    for obj in data.objects:
+        facts += [obj.data and obj.data.name, [modifier.name for modifier in obj.modifiers]]
+        facts += [list(row) for row in obj.matrix_world]
     return facts
 
 
 @pytest.fixture
 def unchanged():
-    """Return a function that checks that the scene is what it was when the test asked for it."""
-    state = {}
-
-    def remember():
-        state.update(snapshot())
+    """Return a function that checks that the scene is what it was when `start` was called."""
+    state = []
 
     def check():
         assert snapshot() == state
 
-    check.start = remember
+    check.start = lambda: state.__setitem__(slice(None), snapshot())
     return check
 
 
 @pytest.fixture
 def make_splats():
-    """Return a function that makes columns of random splats."""
-    return _make_splats
+    """Return a function that makes columns of random splats, in the order of the reference."""
 
+    def make(count=8, *, degree=0, seed=0):
+        rng = np.random.default_rng(seed)
+        rest = 3 * ((degree + 1) ** 2 - 1)
+        names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+        names += [f"f_rest_{index}" for index in range(rest)]
+        names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+        columns = {name: rng.normal(size=count).astype(np.float32) for name in names}
+        for index in range(3):
+            columns[f"scale_{index}"] -= 3.0
+        return columns
 
-def _make_splats(count=8, *, degree=0, seed=0):
-    """Return named float32 columns in the order of the reference files."""
-    rng = np.random.default_rng(seed)
-    rest = 3 * ((degree + 1) ** 2 - 1)
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    names += [f"f_rest_{index}" for index in range(rest)]
-    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    columns = {name: rng.normal(size=count).astype(np.float32) for name in names}
-    for index in range(3):
-        columns[f"scale_{index}"] -= 3.0
-    return columns
+    return make

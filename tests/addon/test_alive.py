@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from types import SimpleNamespace
 
 import bpy
@@ -12,18 +11,19 @@ import pytest
 
 from tests.windows import event, started_in_a_window, until, until_over
 
+from .conftest import read
+
 
 @pytest.fixture
-def few(addon, room, room_cameras):
+def obj(few):
     """Every tenth splat of the room, to be scored by four views with what hides what."""
-    addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 10 != 0)
     settings = bpy.context.scene.refine
     settings.method, settings.views = "occlusion", 4
-    return room
+    return few
 
 
 @pytest.fixture
-def start(addon, few):
+def start(addon, obj):
     """Return a function that clicks an operator's button; by default it is *Score*."""
 
     def start(cls=None, **properties):
@@ -55,61 +55,21 @@ def noted(addon, obj):
     return addon.mesh.scores.record(obj.data)
 
 
-def values(obj, name="refine_score"):
-    """Return a point attribute."""
-    found = np.empty(len(obj.data.vertices), np.float32)
-    obj.data.attributes[name].data.foreach_get("value", found)
-    return found
+def scores(addon, obj):
+    """Return the scores and their note."""
+    return read(addon, obj, "refine_score").tobytes(), noted(addon, obj)
 
 
-def scored_by(obj, method):
-    """Return what *Score* writes at once, by a method."""
-    settings = bpy.context.scene.refine
-    before, settings.method = settings.method, method
-    bpy.ops.refine.score()
-    settings.method = before
-    return values(obj).copy()
-
-
-@pytest.mark.parametrize(
-    "kind", ["MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "TAB", "G", "SPACE", "Z"]
-)
-def test_events_go_on_to_the_window(start, gate, kind):
-    """So views orbit, panels scroll and editors work."""
-    operator, context, said = start()
-
-    assert operator.modal(context, event(kind)) == {"PASS_THROUGH"}
-    assert said == []
-
-
-def test_only_one_operation_works_at_a_time(start, gate, addon):
-    """They come back when it is over."""
-    names = ["score", "apply", "levels", "find_floaters", "delete"]
-    names += ["export_ply", "import_ply", "import_cameras"]
+def test_only_one_operation_works_at_a_time(start, gate):
+    """What stays and goes is not changed either, or marks came too late for what was read."""
+    names = ["score", "apply", "levels", "find_floaters", "delete", "protect", "add_volume"]
+    names += ["drop_volume", "export_ply", "import_ply", "import_cameras"]
+    bpy.context.scene.refine.volumes.add()
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()
 
-    def polls(those):
-        return [getattr(bpy.ops.refine, name).poll() for name in those]
-
-    before = polls(names)
-    operator, context, _ = start()
-    during, looks = polls(names), polls(["render"])
-    operator.modal(context, event("ESC"))
-    until_over(operator, context)
-
-    assert before == polls(names) == [True] * len(names)
-    assert during == [False] * len(names)
-    assert looks == [False]
-
-
-def test_what_stays_and_goes_is_not_changed_while_a_thread_works(start, gate):
-    """Else marks would come too late for what was read already; they can be set again after it."""
-    bpy.context.scene.refine.volumes.add()
-    names = ("protect", "add_volume", "drop_volume")
-
     def polls():
-        return [getattr(bpy.ops.refine, name).poll() for name in names]
+        return {name for name in (*names, "render") if getattr(bpy.ops.refine, name).poll()}
 
     before = polls()
     operator, context, _ = start()
@@ -117,11 +77,12 @@ def test_what_stays_and_goes_is_not_changed_while_a_thread_works(start, gate):
     operator.modal(context, event("ESC"))
     until_over(operator, context)
 
-    assert (before, during, polls()) == ([True] * 3, [False] * 3, [True] * 3)
+    assert before == polls() == {*names, "render"}
+    assert during == set()
 
 
 @pytest.mark.parametrize("change", ["marks", "volume"])
-def test_a_merge_is_refused_when_other_splats_must_stay_since(addon, few, start, change):
+def test_a_merge_is_refused_when_other_splats_must_stay_since(addon, obj, start, change):
     """By a mark from a script or a volume that moved: each deletes or keeps what it must not."""
     bpy.ops.refine.score()
     settings = bpy.context.scene.refine
@@ -132,18 +93,16 @@ def test_a_merge_is_refused_when_other_splats_must_stay_since(addon, few, start,
     item = settings.volumes.add()
     item.role, item.object = "PROTECT", volume
     bpy.context.view_layer.update()
-    count = len(few.data.vertices)
     operator, context, said = start(addon.ui.operators.REFINE_OT_apply)
     if change == "marks":
-        addon.mesh.edit.mark_by_hand(few, np.arange(count) < 200)
+        addon.mesh.edit.mark_by_hand(obj, np.arange(3976) < 200)
     else:
         volume.location, volume.scale = (0.0, 0.0, 0.0), (100.0, 100.0, 100.0)
 
     assert until_over(operator, context) == {"CANCELLED"}
-
     assert "what must stay or go has changed meanwhile" in said[-1]
-    assert len(few.data.vertices) == count
-    assert noted(addon, few) is not None
+    assert len(obj.data.vertices) == 3976
+    assert noted(addon, obj) is not None
 
 
 def test_a_fault_on_the_thread_is_raised_and_locks_nothing(start, gate):
@@ -151,7 +110,6 @@ def test_a_fault_on_the_thread_is_raised_and_locks_nothing(start, gate):
     gate.error = ValueError("a fault")
     gate.open.set()
     operator, context, _ = start()
-
     with pytest.raises(ValueError, match="a fault"):
         until_over(operator, context)
 
@@ -160,60 +118,66 @@ def test_a_fault_on_the_thread_is_raised_and_locks_nothing(start, gate):
     assert operator.modal(context, event("TIMER")) == {"CANCELLED"}
 
 
-def test_only_sidebars_are_drawn_again(start, gate):
-    """A 3D view with a million splats is not; the status bar says phase and share, .4 of 97 %."""
-    operator, context, _ = start()
+def test_scoring_on_the_thread_writes_what_scoring_at_once_writes_and_esc_nothing(
+    start, gate, addon, obj
+):
+    """To the bit. The status bar says phase and share, .4 of 97 %; only sidebars are drawn."""
+    bpy.ops.refine.score()
+    (expected, plain), settings = scores(addon, obj), bpy.context.scene.refine
+    settings.views = 8
+    operator, context, said = start()
     until(operator, context, lambda: any("39%" in str(text) for text in context.said))
     operator.modal(context, event("ESC"))
-    until_over(operator, context)
-
+    assert until_over(operator, context) == {"CANCELLED"}
+    assert said == ["Scoring splats cancelled; nothing was changed"]
+    assert scores(addon, obj) == (expected, plain)
     assert set(context.drawn) == {"VIEW_3D UI"}
     assert "Scoring splats (looking); Esc cancels: 39%" in context.said
     assert context.timers == 0
 
-
-def _replace(obj):
-    obj.data = obj.data.copy()
-
-
-def _move_a_vertex(obj):
-    obj.data.vertices[7].co.x += 1e-3
-
-
-def _fade_a_splat(obj):
-    obj.data.attributes["opacity"].data[7].value -= 0.5
-
-
-def _add_a_vertex(obj):
-    obj.data.vertices.add(1)
-
-
-CHANGED = "object 'room': its splats were changed meanwhile; start again"
-
-
-@pytest.mark.parametrize("change", [_replace, _move_a_vertex, _fade_a_splat, _add_a_vertex])
-def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, few, change):
-    """Whatever was done to the object; nothing is written to what it is now."""
-    operator, context, said = start()
-    change(few)
     gate.open.set()
-    answer = until_over(operator, context)
+    settings.views = 4
+    del obj.data[addon.mesh.scores.RECORD]
+    assert until_over(*start()[:2]) == {"FINISHED"}
+    found, note = scores(addon, obj)
+    assert found == expected
+    assert note | {"seconds": plain["seconds"]} == plain
 
-    assert said == [CHANGED]
-    assert answer == {"CANCELLED"}
-    assert noted(addon, few) is None
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda obj: setattr(obj, "data", obj.data.copy()),
+        lambda obj: setattr(obj.data.vertices[7].co, "x", 0.1),
+        lambda obj: setattr(obj.data.attributes["opacity"].data[7], "value", 0.5),
+        lambda obj: obj.data.vertices.add(1),
+    ],
+)
+def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, obj, change):
+    """Of all objects that are written to; here the second is the one that changed."""
+    other = obj.copy()
+    other.data = obj.data.copy()
+    bpy.context.scene.collection.objects.link(other)
+    other.select_set(True)
+    operator, context, said = start()
+    change(other)
+    gate.open.set()
+
+    assert until_over(operator, context) == {"CANCELLED"}
+    assert said == ["object 'room.001': its splats were changed meanwhile; start again"]
+    assert noted(addon, obj) is None
     assert context.timers == 0
     assert addon.ui.operator_bases.now() is None
 
 
 @pytest.mark.parametrize("how", ["removed", "out of the scene"])
-def test_an_object_that_is_deleted_ends_the_work_at_once(start, gate, addon, few, how):
+def test_an_object_that_is_deleted_ends_the_work_at_once(start, gate, addon, obj, how):
     """With one sentence, while the thread is still held back; every button comes back."""
     operator, context, said = start()
     if how == "removed":
-        bpy.data.objects.remove(few)
+        bpy.data.objects.remove(obj)
     else:  # as Blender's own *Delete* does
-        bpy.context.scene.collection.objects.unlink(few)
+        bpy.context.scene.collection.objects.unlink(obj)
 
     assert operator.modal(context, event("TIMER")) == {"CANCELLED"}
     assert said == ["object 'room': was deleted; scoring splats has ended"]
@@ -222,37 +186,12 @@ def test_an_object_that_is_deleted_ends_the_work_at_once(start, gate, addon, few
     assert bpy.ops.refine.import_ply.poll()
 
 
-def test_all_objects_that_are_written_to_have_to_be_as_they_were(start, gate, addon, few):
-    """Where an operator writes to several; the second is the one that changed."""
-    other = few.copy()
-    other.data = few.data.copy()
-    bpy.context.scene.collection.objects.link(other)
-    other.select_set(True)
-    operator, context, said = start()
-    _move_a_vertex(other)
-    gate.open.set()
-
-    assert until_over(operator, context) == {"CANCELLED"}
-    assert said == ["object 'room.001': its splats were changed meanwhile; start again"]
-    assert noted(addon, few) is None
-
-
-def test_a_renamed_object_gets_its_result(start, gate, addon, few):
-    """Another one has its name by then, and stays as it is."""
+def test_a_renamed_object_gets_its_result_once_edit_mode_is_left(start, gate, addon, obj):
+    """Attributes cannot be written there. Another object has its name by then, and stays."""
     operator, context, _ = start()
-    few.name = "other"
-    decoy = bpy.data.objects.new("room", few.data.copy())
+    obj.name = "other"
+    decoy = bpy.data.objects.new("room", obj.data.copy())
     bpy.context.scene.collection.objects.link(decoy)
-    gate.open.set()
-
-    assert until_over(operator, context) == {"FINISHED"}
-    assert noted(addon, few)["method"] == "occlusion"
-    assert noted(addon, decoy) is None
-
-
-def test_a_result_waits_until_edit_mode_is_left(start, gate, addon, few):
-    """Attributes cannot be written there."""
-    operator, context, _ = start()
     bpy.ops.object.mode_set(mode="EDIT")
     gate.open.set()
     until(operator, context, lambda: addon.ui.operator_bases.now().waits)
@@ -261,73 +200,12 @@ def test_a_result_waits_until_edit_mode_is_left(start, gate, addon, few):
 
     assert waits == "Scoring splats: go back to object mode for the result (Esc cancels)"
     assert until_over(operator, context) == {"FINISHED"}
-    assert noted(addon, few)["method"] == "occlusion"
-
-
-def test_scoring_on_the_thread_writes_what_scoring_at_once_writes(start, addon, few):
-    """To the bit; it is one step."""
-    expected, plain = scored_by(few, "occlusion"), noted(addon, few)
-    del few.data[addon.mesh.scores.RECORD]
-    operator, context, _ = start()
-
-    assert until_over(operator, context) == {"FINISHED"}
-    assert np.array_equal(values(few), expected)
-    assert noted(addon, few) | {"seconds": plain["seconds"]} == plain
-
-
-def test_esc_leaves_the_old_scores(start, gate, addon, few):
-    """To the bit, with their note."""
-    expected, note = scored_by(few, "occlusion"), noted(addon, few)
-    operator, context, said = start()
-    operator.modal(context, event("ESC"))
-
-    assert until_over(operator, context) == {"CANCELLED"}
-    assert said == ["Scoring splats cancelled; nothing was changed"]
-    assert np.array_equal(values(few), expected)
-    assert noted(addon, few) == note
-
-
-def threads():
-    """Return the threads of operators."""
-    return [thread for thread in threading.enumerate() if thread.name == "refine"]
-
-
-@pytest.mark.parametrize("how", ["another file", "disabled"])
-def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):
-    """Another file is loaded, or the extension is switched off: nothing runs on or is left."""
-    operator, context, _ = start()
-    assert threads()
-    if how == "another file":
-        bpy.ops.wm.read_homefile(use_empty=True)
-        operator.cancel(context)  # as Blender does, after load_pre
-        assert context.timers == 0
-    else:
-        addon.ui.operator_bases.unregister()
-
-    assert threads() == []
-    assert addon.ui.operator_bases.now() is None
-    assert bpy.ops.refine.import_ply.poll()
-
-
-def test_work_that_listens_to_nobody_is_left_behind(start, addon, few, monkeypatch):
-    """It still waits when the operator is over; what it comes to later is dropped."""
-    free, expected = threading.Event(), scored_by(few, "occlusion")
-    monkeypatch.setattr(addon.ui.operators, "score", lambda *_, **__: free.wait(600.0))
-    operator, context, _ = start()
-    operator.modal(context, event("ESC"))
-    answer = until_over(operator, context)
-    waits = len(threads())
-    free.set()
-    for thread in threads():
-        thread.join()
-
-    assert answer == {"CANCELLED"}
-    assert waits == 1
-    assert np.array_equal(values(few), expected)
+    assert noted(addon, obj)["method"] == "occlusion"
+    assert noted(addon, decoy) is None
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".sog"])
-def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, tmp_path, suffix):
+def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, tmp_path, suffix):
     """The same bytes, images of a SOG by Blender's library on the main thread included."""
     export, read = addon.ui.export_operators.REFINE_OT_export_ply, addon.ui.import_operators
     at_once, later = (tmp_path / f"{name}{suffix}" for name in ("now", "later"))
@@ -342,14 +220,13 @@ def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, 
     assert ended == imported == {"FINISHED"}
     assert later.read_bytes() == at_once.read_bytes()
     assert said[-1] == "Imported 3,976 splats from 1 file"
-    assert (obj.name, len(obj.data.vertices)) == ("later", len(few.data.vertices))
+    assert (obj.name, len(obj.data.vertices)) == ("later", 3976)
 
 
-def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, monkeypatch):
-    """Packing does not listen; what it wrote is not put in place afterwards, a second file is."""
+def test_a_file_whose_writing_is_cancelled_is_none(start, addon, tmp_path, monkeypatch):
+    """Packing does not listen, and is left behind; a second file is put in place."""
     begun, free = threading.Event(), threading.Event()
     form = addon.core.formats.by_name.SPLAT
-    registry = addon.core.formats.registry
 
     def write(stream, _splats):
         stream.write(b"half")
@@ -359,38 +236,20 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
     held = SimpleNamespace(
         suffix=".splat", degree=form.degree, write=write, loss="", sizes=None, models=form.models
     )
-    monkeypatch.setattr(registry, "format_named", lambda _path: held)
-    export = addon.ui.export_operators.REFINE_OT_export_ply
-    options = {"overwrite": False, "apply_transform": False}
-    operator, context, _ = start(export, filepath=str(tmp_path / "out.splat"), **options)
+    monkeypatch.setattr(addon.core.formats.registry, "format_named", lambda _path: held)
+    export, out = addon.ui.export_operators.REFINE_OT_export_ply, tmp_path / "out.splat"
+    options = {"filepath": str(out), "overwrite": False, "apply_transform": False}
+    operator, context, _ = start(export, **options)
     assert begun.wait(60.0)
     operator.modal(context, event("ESC"))
-    answer = until_over(operator, context)
+
+    assert until_over(operator, context) == {"CANCELLED"}
+    (thread,) = (thread for thread in threading.enumerate() if thread.name == "refine")
     free.set()
-    for thread in threads():
-        thread.join()
-
-    assert answer == {"CANCELLED"}
+    thread.join()
     assert list(tmp_path.iterdir()) == []
-    assert until_over(*start(export, filepath=str(tmp_path / "out.splat"), **options)[:2]) == {
-        "FINISHED"
-    }
-    assert (tmp_path / "out.splat").read_bytes() == b"half"
-
-
-def served(addon, function):
-    """Return what a thread gets that asks the main thread to call a function."""
-    worker = addon.ui.operator_bases.Worker(lambda _progress: addon.main_thread.call(function))
-    while worker.running():
-        addon.main_thread.serve()
-    return worker.result()
-
-
-def test_the_main_thread_answers_the_thread(addon):
-    """With what the function returns or raises."""
-    assert served(addon, threading.current_thread) == threading.main_thread()
-    with pytest.raises(ZeroDivisionError):
-        served(addon, lambda: 1 // 0)
+    assert until_over(*start(export, **options)[:2]) == {"FINISHED"}
+    assert out.read_bytes() == b"half"
 
 
 def test_an_answer_just_after_the_time_out_is_no_time_out(addon, monkeypatch):
@@ -413,25 +272,3 @@ def test_an_answer_just_after_the_time_out_is_no_time_out(addon, monkeypatch):
     answered.set()
 
     assert worker.result() == 7
-
-
-def test_a_time_out_of_the_function_itself_is_raised(addon):
-    """It is no answer that is late."""
-    with pytest.raises(TimeoutError, match="disk"):
-        served(addon, lambda: (_ for _ in ()).throw(TimeoutError("disk")))
-
-
-def test_a_thread_that_is_cancelled_waits_for_no_answer(addon):
-    """And what it asked for is not done."""
-    main_thread, calls = addon.main_thread, []
-    worker = addon.ui.operator_bases.Worker(
-        lambda _progress: main_thread.call(lambda: calls.append(1))
-    )
-    while not main_thread._asked.qsize():
-        time.sleep(0.01)
-    worker.end()
-    main_thread.serve()
-
-    assert calls == []
-    with pytest.raises(addon.core.Cancelled):
-        worker.result()

@@ -1,4 +1,4 @@
-"""The panel imports and exports every format that core knows."""
+"""Files in the panel: every format that core knows, and how their splats are drawn."""
 
 from __future__ import annotations
 
@@ -9,40 +9,27 @@ import bpy
 import numpy as np
 import pytest
 
-ROOM = Path(__file__).parents[1] / "data/room_small"
+from tests.e2e.inside.clouds import as_cloud
+from tests.strategies import ply_of
+
+from .conftest import ROOM, applied, export, splats_of
 
 
-@pytest.fixture
-def small(addon, tmp_path):
-    """Return the path of 500 splats of the room, with harmonics of degree 3."""
-    file = addon.core.read_ply(ROOM / "point_cloud.ply")
-    file.write(tmp_path / "small.ply", np.arange(len(file)) < 500)
-    return tmp_path / "small.ply"
-
-
-def suffixes(addon):
-    """Return the endings of all formats that are written."""
-    return addon.core.formats.registry.SUFFIXES
-
-
-def test_every_format_is_exported_and_imported(addon, small, tmp_path):
+def test_every_format_is_exported_and_imported(addon, few, few_file, tmp_path):
     """Blender writes what core writes of the same splats, and holds what core reads of it."""
-    bpy.ops.refine.import_ply(filepath=str(small))
-    source = bpy.context.object
     core = addon.core
-    for suffix in suffixes(addon):
-        bpy.context.view_layer.objects.active = source
+    for suffix in core.formats.registry.SUFFIXES:
+        bpy.context.view_layer.objects.active = few
         made, expected = tmp_path / f"panel{suffix}", tmp_path / f"core{suffix}"
         bpy.ops.refine.export_ply(filepath=str(made))
-        core.write_splats(expected, core.read_ply(small))
-
+        core.write_splats(expected, core.read_ply(few_file))
         bpy.ops.refine.import_ply(filepath=str(made))
 
         read = core.read_splats(made)
         layout = addon.mesh.layout.check(bpy.context.object)
         stored = addon.mesh.attributes.stored_columns(layout)
         assert made.read_bytes() == expected.read_bytes()
-        assert len(read) == len(layout) == 500
+        assert len(read) == len(layout) == 3976
         for name in read.rows.dtype.names:
             assert np.array_equal(stored[name], read.rows[name]), name
 
@@ -52,45 +39,40 @@ def test_the_file_name_follows_the_format_that_is_chosen(addon):
 
     `check` is what the file browser calls when an option or the name changes.
     """
-
-    class Browser:
-        check = addon.ui.export_operators.REFINE_OT_export_ply.check
-
-    browser = Browser()
-    browser.filepath, browser.suffix, browser.settled = "a.compressed.ply", ".spz", ".ply"
-    changed = browser.check(None), browser.filepath, browser.check(None)
+    check = addon.ui.export_operators.REFINE_OT_export_ply.check
+    browser = SimpleNamespace(filepath="a.compressed.ply", suffix=".spz", settled=".ply")
+    assert [check(browser, None), browser.filepath, check(browser, None)] == [True, "a.spz", False]
     browser.suffix = ".compressed.ply"
-    browser.check(None)
-    chosen = browser.filepath
+    check(browser, None)
+    assert browser.filepath == "a.compressed.ply"
     browser.filepath = "b.SPLAT"
-    typed = browser.check(None), browser.filepath, browser.suffix
+    check(browser, None)
+    assert (browser.filepath, browser.suffix) == ("b.splat", ".splat")
     browser.filepath = "c"
-    browser.check(None)
-
-    assert changed == (True, "a.spz", False)
-    assert chosen == "a.compressed.ply"
-    assert typed == (True, "b.splat", ".splat")
+    check(browser, None)
     assert browser.filepath == "c.splat"
 
 
 def test_all_formats_can_be_dropped_and_picked(addon):
-    """The file handler and both file browsers know every ending."""
-    handler = addon.ui.import_operators.REFINE_FH_ply.bl_file_extensions.split(";")
-    globs = [
-        operator.get_rna_type().properties["filter_glob"].default.split(";")
-        for operator in (bpy.ops.refine.import_ply, bpy.ops.refine.export_ply)
-    ]
+    """The file handlers and browsers know every ending."""
+    module, registry = addon.ui.import_operators, addon.core.formats.registry
+    shown = {
+        name: getattr(bpy.ops.refine, name).get_rna_type().properties["filter_glob"].default
+        for name in ("import_ply", "export_ply", "import_cameras")
+    }
+    handled = set(module.REFINE_FH_ply.bl_file_extensions.split(";"))
 
-    read = addon.core.formats.registry.READ_SUFFIXES
-    assert set(handler) == {Path(f"a{suffix}").suffix for suffix in read} - {".json"}
-    assert globs == [[f"*{end}" for end in read], [f"*{end}" for end in suffixes(addon)]]
+    assert shown["import_ply"] == ";".join(f"*{end}" for end in registry.READ_SUFFIXES)
+    assert shown["export_ply"] == ";".join(f"*{end}" for end in registry.SUFFIXES)
+    assert handled == {Path(f"a{end}").suffix for end in registry.READ_SUFFIXES} - {".json"}
+    assert module.REFINE_FH_cameras.bl_file_extensions == shown["import_cameras"].replace("*", "")
+    assert {module.REFINE_FH_ply, module.REFINE_FH_cameras} <= set(addon.registration.CLASSES)
 
 
 @pytest.mark.usefixtures("addon")
 def test_a_level_of_a_streamed_sog_is_imported():
     """76 of 151 splats and 15 of the environment, in an object of its folder's name."""
     path = ROOM.parent / "other_tools/streamed/lod-meta.json"
-
     bpy.ops.refine.import_ply(filepath=str(path), level=1)
 
     assert len(bpy.context.object.data.vertices) == 76 + 15
@@ -100,51 +82,94 @@ def test_a_level_of_a_streamed_sog_is_imported():
 @pytest.mark.parametrize("name", ["a/lod-meta.json", "META.JSON", "a/transforms.json"])
 def test_a_json_file_that_is_dropped_is_one_of_splats_by_its_name(addon, monkeypatch, name):
     """The handler of .json is that of cameras, which hands over an index of splats."""
-    cls, called = addon.ui.import_operators.REFINE_OT_import_cameras, []
+    module, called = addon.ui.import_operators, []
     operators = SimpleNamespace(import_ply=lambda *given, **named: called.append((given, named)))
-    monkeypatch.setattr(addon.ui.import_operators.bpy.ops, "refine", operators, raising=False)
+    monkeypatch.setattr(module.bpy.ops, "refine", operators, raising=False)
     properties = SimpleNamespace(filepath=name, is_property_set=lambda _: True)
     operator = SimpleNamespace(
         properties=properties, invoke_popup=lambda _: {"ASKED"}, upright=False
     )
-
-    answer = cls.invoke(operator, bpy.context, None)
+    answer = module.REFINE_OT_import_cameras.invoke(operator, bpy.context, None)
 
     expected = [(("INVOKE_DEFAULT",), {"filepath": name})] if "transf" not in name else []
     assert called == expected
     assert (answer == {"ASKED"}) == (not expected)
 
 
-def test_an_object_is_pruned_to_a_size_in_another_format(addon, small, tmp_path):
-    """3,200 bytes hold 100 splats of a .splat; the size of a .spz does not follow from them."""
-    bpy.ops.refine.import_ply(filepath=str(small))
-    core, views = addon.core, addon.core.read_cameras(ROOM / "cameras.json")
-    prune, name = addon.objects.splat_group.prune_object, bpy.context.object.name
-
-    report = prune(name, views, core.Budget(max_mb=0.0032), output=tmp_path / "a.splat")
-
-    assert len(core.read_splats(tmp_path / "a.splat")) == report["splats"]["kept"] == 100
-    assert report["files"]["output_bytes"] == 3200
-    with pytest.raises(core.RefineError, match=r"a size cannot be kept to in \.spz"):
-        prune(name, views, core.Budget(max_mb=1.0), output=tmp_path / "a.spz")
-
-
 def test_the_images_of_blender_are_those_of_pillow(addon):
     """What one writes the other reads, to the bit: any bytes, where alpha is not 0."""
-    random = np.random.default_rng(0)
-    pixels = random.integers(0, 256, (12, 20, 4), np.uint8)
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 20, 4), np.uint8)
     pixels[..., 3] |= 1
-    pillow, blender = addon.core.images._Pillow(), addon.main_thread.BlenderImages()
-    before = len(bpy.data.images)
+    both = addon.core.images._Pillow(), addon.main_thread.BlenderImages()
 
-    for writer in (pillow, blender):
-        data = writer.encode(pixels)
-        for reader in (pillow, blender):
+    for data in [writer.encode(pixels) for writer in both]:
+        for reader in both:
             assert reader.size(data) == (20, 12)
             assert np.array_equal(reader.decode(data), pixels)
+            for broken in (b"", b"RIFF1234WEBPVP8L", data[:40]):
+                with pytest.raises(ValueError, match=r"."):
+                    reader.decode(broken)
+    assert not bpy.data.images
 
-    assert len(bpy.data.images) == before
-    for reader in (pillow, blender):
-        for broken in (b"", b"RIFF1234WEBPVP8L", data[:40]):
-            with pytest.raises(ValueError, match=r"."):
-                reader.decode(broken)
+
+def imported(columns, path, *comments):
+    """Import a file with these comments; return the object."""
+    path.write_bytes(ply_of(columns, comments=comments))
+    bpy.ops.refine.import_ply(filepath=str(path))
+    return bpy.context.object
+
+
+@pytest.mark.parametrize("comment", ["SplatRenderMode: mip", "antialiased 1"])
+def test_the_tag_of_a_file_goes_with_the_object_to_the_file(addon, make_splats, tmp_path, comment):
+    """Others than those of such a model are no scene with it."""
+    obj = imported(make_splats(20), tmp_path / "in.ply", comment)
+    checked, gather = addon.mesh.layout.check(obj), addon.objects.splat_group.gather
+    export(addon, checked, tmp_path / "out.ply")
+
+    assert bpy.context.scene.refine.model == gather([checked]).model == "antialiased"
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
+    other = addon.mesh.layout.check(imported(make_splats(20), tmp_path / "other.ply"))
+    with pytest.raises(addon.core.RefineError, match="different models"):
+        gather([checked, other])
+
+
+def test_discs_go_through_an_object_as_they_are(addon, make_splats, tmp_path, room_views):
+    """Without a third scale, in a mesh and in a point cloud of Blender's own splats.
+
+    A turn of the object, baked into the file, and merging leave discs.
+    """
+    columns, core = make_splats(40, degree=1), addon.core
+    del columns["scale_2"]
+    obj = imported(columns, tmp_path / "in.ply")
+    export(addon, addon.mesh.layout.check(obj), tmp_path / "out.ply")
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
+    obj.rotation_euler = (0.3, 0.2, 0.1)
+    bpy.context.view_layer.update()
+    splats = splats_of(addon, obj)
+    result = core.prune(splats, room_views, core.Budget(ratio=0.5), core.Refit(rounds=1))
+    applied(addon, addon.mesh.layout.check(obj), result)
+
+    assert result.merged is not None
+    assert addon.mesh.layout.check(obj).layout.model == "2dgs"
+    assert "scale_2" not in obj.data.attributes
+    left = splats_of(addon, obj)
+    cloud = addon.mesh.layout.check(as_cloud(addon, obj))
+    export(addon, cloud, tmp_path / "turned.ply", apply_transform=True)
+    turned = core.read_ply(tmp_path / "turned.ply").splats()
+    assert (len(turned), turned.model) == (20, "2dgs")
+    np.testing.assert_allclose(turned.means, left.means, rtol=1e-4)
+    np.testing.assert_allclose(turned.log_scales, left.log_scales, rtol=1e-4)
+
+
+def test_the_box_says_how_an_object_is_drawn_and_its_file_too(addon, make_splats, tmp_path):
+    """Where the file said nothing; what looks the same with another word has another digest."""
+    obj, settings = imported(make_splats(20), tmp_path / "in.ply"), bpy.context.scene.refine
+    before = addon.mesh.attributes.digest(addon.mesh.layout.check(obj))
+    assert settings.model == "default"
+    settings.model = "antialiased"
+
+    checked = addon.mesh.layout.check(obj)
+    assert checked.layout.model == settings.model == "antialiased"
+    assert addon.mesh.attributes.digest(checked) != before
+    export(addon, checked, tmp_path / "out.ply")
+    assert addon.core.read_ply(tmp_path / "out.ply").model == "antialiased"

@@ -8,208 +8,110 @@ from dataclasses import replace
 import bpy
 import numpy as np
 import pytest
-from mathutils import Euler, Matrix
 
 from tests.windows import event, started_in_a_window, until, until_over
 
+from .conftest import read, splats_of
+
 
 @pytest.fixture
-def few(addon, room, room_cameras):
+def obj(few):
     """Every tenth splat of the room, to be merged to two fifths."""
-    core = addon.core
-    remove = np.arange(len(room.data.vertices)) % 10 != 0
-    addon.mesh.edit.delete_vertices(room, remove)
     settings = bpy.context.scene.refine
-    settings.method, settings.ratio = "merge", 0.6
-    return room, core.Budget(ratio=0.6)
+    settings.method, settings.ratio, settings.views = "merge", 0.6, 4
+    return few
 
 
 BOTH = pytest.mark.parametrize("method", ["merge", "refit"])
 
 
-def merged_in_core(addon, obj, views, budget, method="merge"):
-    return addon.core.prune(
-        addon.objects.splat_group.gather([addon.mesh.layout.check(obj)], whole=True),
-        views,
-        budget,
-        addon.core.METHODS[method](),
-    )
+def in_core(addon, obj, views, method="merge"):
+    asked = addon.core.Budget(ratio=0.6), addon.core.METHODS[method](4)
+    return addon.core.prune(splats_of(addon, obj), views, *asked)
 
 
 @BOTH
-def test_apply_leaves_what_core_says(addon, few, room_views, method):
-    """Kept splats, changed or not, equal to the last bit: the object stands where its data is."""
-    room, budget = few
-    bpy.context.scene.refine.method = method
-    expected = merged_in_core(addon, room, room_views, budget, method).merged
+def test_panel_and_command_leave_what_core_says(addon, obj, room_views, capfd, tmp_path, method):
+    """Kept splats, changed or not, equal to the last bit; the command leaves the object alone.
+
+    The sentences are those of the report: of refitting its own, and into how many others.
+    """
+    bpy.context.scene.refine.method, out = method, tmp_path / "out.ply"
+    expected, core = in_core(addon, obj, room_views, method), addon.core
+    told = addon.objects.splat_group.prune_object(
+        obj.name, room_views, core.Budget(ratio=0.6), core.METHODS[method](4), output=out
+    )
+    written, count = core.read_ply(out).splats(), len(obj.data.vertices)
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
 
-    splats = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(room))
-
+    stored = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(obj))
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
-        wanted = getattr(expected.splats, name).astype(np.float32)
-        np.testing.assert_array_equal(getattr(splats, name), wanted)
-    assert expected.changed.sum() > 100
+        wanted = getattr(expected.merged.splats, name).astype(np.float32)
+        np.testing.assert_array_equal(getattr(stored, name), wanted)
+        np.testing.assert_array_equal(getattr(written, name), wanted)
+    assert expected.merged.changed.sum() > 100
+    assert told["merged"] == expected.report["merged"]
+    assert ("refitted" in told) == (method == "refit")
+    assert count == 3976
+    said = capfd.readouterr().out
+    assert f" splats were merged into {told['merged']['changed']:,} others; " in said
+    assert ("were refitted in" in said) == (method == "refit")
 
 
-@BOTH
-def test_apply_says_what_became_of_the_splats(addon, few, room_views, capfd, method):
-    """The sentences of the report: of refitting its own, and into how many others were merged."""
-    room, budget = few
-    bpy.context.scene.refine.method = method
-    report = merged_in_core(addon, room, room_views, budget, method).report
+@pytest.mark.parametrize(("scale", "done"), [(1.0, "merge"), (2.0, "occlusion")])
+def test_splats_are_merged_unless_the_scale_is_uneven(addon, obj, room_views, scale, done):
+    """Colours cannot follow a stretch: rows stay then, and refitting, if asked for, is refused."""
+    obj.scale = (1.0, scale, 1.0)
+    bpy.context.view_layer.update()
+    settings, prune = bpy.context.scene.refine, addon.objects.splat_group.prune_object
+    report = prune(obj.name, room_views, addon.core.Budget(ratio=0.6), dry_run=True)
     bpy.ops.refine.score()
+    if scale != 1.0:
+        settings.method = "refit"
+        with pytest.raises(RuntimeError, match=r"object 'room': .* scales directions differently"):
+            bpy.ops.refine.apply()
+        assert len(obj.data.vertices) == 3976
+        settings.method = "merge"
     bpy.ops.refine.apply()
 
-    told = capfd.readouterr().out
-    assert f" splats were merged into {report['merged']['changed']:,} others; " in told
-    assert ("were refitted in" in told) == (method == "refit")
-
-
-def test_a_moved_object_is_merged_in_its_own_frame(addon, few, room_views):
-    """Object and cameras moved together: the data changes as if neither had been."""
-    room, budget = few
-    still = merged_in_core(addon, room, room_views, budget).merged
-    move = Matrix.Translation((1, 2, 3)) @ Euler((0.3, 0.2, 0.1)).to_matrix().to_4x4()
-    for obj in (room, *(o for o in bpy.data.objects if o.type == "CAMERA")):
-        obj.matrix_world = move @ obj.matrix_world
-    bpy.context.view_layer.update()
-    bpy.ops.refine.score()
-    bpy.ops.refine.apply()
-
-    splats = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(room))
-
-    # float32 matrices move a few merges across; most kept splats are the same ones.
-    here = {tuple(row) for row in np.round(splats.means, 3)}
-    there = {tuple(row) for row in np.round(still.splats.means.astype(np.float32), 3)}
-    assert len(splats) == len(still.splats)
-    assert len(here & there) / len(there) > 0.95
-
-
-def test_uneven_scale_is_refused_and_nothing_changes(addon, few):
-    """Colours cannot follow a stretch, and refitting writes colours."""
-    room, _ = few
-    bpy.context.scene.refine.method = "refit"
-    bpy.ops.refine.score()
-    room.scale = (1, 2, 1)
-    bpy.context.view_layer.update()
-    before = addon.mesh.attributes.read_attribute(room.data, "f_dc_0")
-
-    with pytest.raises(RuntimeError, match=r"object 'room': .* scales directions differently"):
-        bpy.ops.refine.apply()
-
-    np.testing.assert_array_equal(addon.mesh.attributes.read_attribute(room.data, "f_dc_0"), before)
-    room.scale = (1, 1, 1)
-
-
-@BOTH
-def test_the_command_on_an_object_writes_the_same_splats(addon, few, room_views, tmp_path, method):
-    """Exported without touching the object."""
-    room, budget = few
-    expected = merged_in_core(addon, room, room_views, budget, method)
-    count = len(room.data.vertices)
-    out = tmp_path / "out.ply"
-
-    report = addon.objects.splat_group.prune_object(
-        room.name, room_views, budget, addon.core.METHODS[method](), output=out
-    )
-
-    written = addon.core.read_ply(out).splats()
-    wanted = expected.merged.splats.means.astype(np.float32)
-    np.testing.assert_array_equal(np.asarray(written.means), wanted)
-    assert report["merged"] == expected.report["merged"]
-    assert ("refitted" in report) == (method == "refit")
-    assert len(room.data.vertices) == count
-
-
-def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tmp_path):
-    """Splats as in core, their scores to look at, and none to apply once more."""
-    room, budget = few
-    expected = merged_in_core(addon, room, room_views, budget).merged
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-
-    addon.objects.splat_group.prune_object(room.name, room_views, budget, save=True)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
-
-    obj = bpy.data.objects["room"]
-    means = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(obj)).means
-    np.testing.assert_array_equal(means, expected.splats.means.astype(np.float32))
-    assert "refine_score" in obj.data.attributes
-    assert addon.mesh.scores.record(obj.data) is None
+    assert report["method"]["done"] == done
+    assert len(obj.data.vertices) == 3976 - 3976 * 6 // 10
 
 
 def test_nothing_is_saved_over_where_refitting_was_stopped(
-    addon, few, room_views, tmp_path, monkeypatch
+    addon, obj, room_views, tmp_path, monkeypatch
 ):
     """A .blend is not taken back by Ctrl+Z: object and file stay, and no file is written either."""
-    room, budget = few
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-    before, count = (tmp_path / "scene.blend").read_bytes(), len(room.data.vertices)
-    prune, out = addon.core.prune, tmp_path / "out.ply"
+    before = (tmp_path / "scene.blend").read_bytes()
+    core, prune, out = addon.core, addon.core.prune, tmp_path / "out.ply"
 
     def stopped(*arguments, **options):
-        return replace(prune(*arguments, **options), stopped=addon.core.Cancelled())
+        return replace(prune(*arguments, **options), stopped=core.Cancelled())
 
-    monkeypatch.setattr(addon.core.operations, "prune", stopped)
-    asked = room.name, room_views, budget, addon.core.ClosedForm()
-
-    with pytest.raises(addon.core.Cancelled):
+    monkeypatch.setattr(core.operations, "prune", stopped)
+    asked = obj.name, room_views, core.Budget(ratio=0.6), core.ClosedForm()
+    with pytest.raises(core.Cancelled):
         addon.objects.splat_group.prune_object(*asked, output=out, save=True)
 
     assert not out.exists()
     assert (tmp_path / "scene.blend").read_bytes() == before
-    assert len(room.data.vertices) == count
-    with pytest.raises(addon.core.Cancelled):
+    assert len(obj.data.vertices) == 3976
+    with pytest.raises(core.Cancelled):
         addon.objects.splat_group.prune_object(*asked, output=out)
     assert out.exists()
 
 
-def test_protected_splats_neither_vanish_nor_change(addon, few):
-    """A boolean attribute names every third."""
-    room, _ = few
-    marked = np.arange(len(room.data.vertices)) % 3 == 0
-    addon.mesh.attributes.write_attribute(room.data, "mine", "BOOLEAN", marked)
-    before = addon.mesh.attributes.read_attribute(room.data, "position")[marked]
-    bpy.context.scene.refine.protect = "mine"
-    bpy.ops.refine.score()
-    bpy.ops.refine.apply()
-    bpy.context.scene.refine.protect = ""
-
-    after = addon.mesh.attributes.read_attribute(room.data, "position")
-    still = addon.mesh.attributes.read_attribute(room.data, "mine")
-
-    np.testing.assert_array_equal(after[still], before)
-
-
-@pytest.mark.parametrize(("scale", "done"), [(1.0, "merge"), (2.0, "occlusion")])
-def test_splats_are_merged_unless_the_scale_is_uneven(addon, few, room_views, scale, done):
-    """The panel, as the command: colours cannot follow a stretch, so that rows stay then."""
-    room, budget = few
-    room.scale = (1.0, scale, 1.0)
-    bpy.context.view_layer.update()
-
-    report = addon.objects.splat_group.prune_object(room.name, room_views, budget, dry_run=True)
-    bpy.ops.refine.score()
-    before = len(room.data.vertices)
-    bpy.ops.refine.apply()
-
-    room.scale = (1.0, 1.0, 1.0)
-    assert report["method"]["done"] == done
-    assert len(room.data.vertices) == before - before * 6 // 10
-
-
 @pytest.mark.parametrize("rounds", [0, 1])
-def test_esc_while_refitting_keeps_what_that_has_reached(addon, few, monkeypatch, rounds):
+def test_esc_while_refitting_keeps_what_that_has_reached(addon, obj, monkeypatch, rounds):
     """Merged, or refitted in a round: as many splats as asked for, and the sentence says which.
 
     The bar says so beforehand; what ends the work is told by core, at once.
     """
-    room, _ = few
     bpy.context.scene.refine.method = "refit"
     bpy.ops.refine.score()
     done, measured = [], addon.core.refit.round_rays.RoundRays.psnr
-    count = len(room.data.vertices)
 
     def count_rounds(rays, *arguments):
         psnr = measured(rays, *arguments)
@@ -224,43 +126,33 @@ def test_esc_while_refitting_keeps_what_that_has_reached(addon, few, monkeypatch
     until(operator, context, lambda: len(done) > rounds)
     sentence = addon.ui.operator_bases.now().sentence
     operator.modal(context, event("ESC"))
-    answer = until_over(operator, context)
 
     assert first == "cancels"
     assert sentence == "Pruning splats (refitting); Esc keeps what that has reached"
-    assert answer == {"FINISHED"}
-    assert len(room.data.vertices) == count - int(0.6 * count)
+    assert until_over(operator, context) == {"FINISHED"}
+    assert len(obj.data.vertices) == 3976 - int(0.6 * 3976)
     words = "after round 1" if rounds else "before its first round was done"
     assert f"refitting was stopped {words}" in said
     assert any("were refitted in" in text for text in said) == (rounds > 0)
 
 
-def test_esc_while_the_result_of_refitting_waits_changes_nothing(addon, few):
-    """In edit mode nothing can be written; whoever does not want to leave it gets nothing."""
-    room, _ = few
+def test_an_object_moved_while_apply_works_keeps_its_splats_together(addon, obj, room_views):
+    """The data is what it is without the move: splats are in the frame of their object.
+
+    In edit mode nothing can be written; whoever presses Esc there gets nothing.
+    """
+    expected = in_core(addon, obj, room_views).merged.splats.means
     bpy.ops.refine.score()
-    count = len(room.data.vertices)
     operator, context, said = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
     bpy.ops.object.mode_set(mode="EDIT")
     until(operator, context, lambda: addon.ui.operator_bases.now().waits)
     operator.modal(context, event("ESC"))
-    answer = until_over(operator, context)
+    assert until_over(operator, context) == {"CANCELLED"}
     bpy.ops.object.mode_set(mode="OBJECT")
-
-    assert answer == {"CANCELLED"}
     assert said == ["Pruning splats cancelled; nothing was changed"]
-    assert len(room.data.vertices) == count
+    assert len(obj.data.vertices) == 3976
 
-
-def test_an_object_moved_while_apply_works_keeps_its_splats_together(addon, few, room_views):
-    """The data is what it is without the move: splats are in the frame of their object."""
-    room, budget = few
-    expected = merged_in_core(addon, room, room_views, budget).merged.splats.means
-    bpy.ops.refine.score()
     operator, context, _ = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
-    room.location.x += 1.0
-    answer = until_over(operator, context)
-
-    means = addon.mesh.attributes.read_attribute(room.data, "position")
-    assert answer == {"FINISHED"}
-    np.testing.assert_array_equal(means, expected.astype(np.float32))
+    obj.location.x += 1.0
+    assert until_over(operator, context) == {"FINISHED"}
+    np.testing.assert_array_equal(read(addon, obj, "position"), expected.astype(np.float32))

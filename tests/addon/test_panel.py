@@ -1,16 +1,19 @@
-"""The panel draws in every state, and computes nothing while it does."""
+"""The panel draws in every state, and computes nothing while it does; what a budget costs."""
 
 from __future__ import annotations
 
-import json
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
 from tests.e2e.inside.clouds import as_cloud
+
+from .conftest import read, splats_of
 
 
 class Layout:
@@ -23,53 +26,36 @@ class Layout:
         """Take any setting."""
 
     def row(self, **_options):
-        """Return itself, as a part of the layout."""
         return self
 
-    column = row
-
-    def grid_flow(self, **_options):
-        """Return itself."""
-        return self
+    column = grid_flow = row
 
     def panel(self, _name, **_options):
-        """Return itself as the header and the body of a part that is open."""
         return self, self
 
-    def operator(self, name, **_options):
-        """Note a button, and return something to set its properties on."""
+    def operator(self, name, property="rna_type", **_options):
         room, _, operator = name.partition(".")
-        assert getattr(getattr(bpy.ops, room), operator).get_rna_type()
+        assert property in getattr(getattr(bpy.ops, room), operator).get_rna_type().properties
         self.drawn.append(name)
         return SimpleNamespace()
 
-    def operator_menu_enum(self, name, property, **_options):
-        """Note a menu, and return something to set its properties on."""
-        assert property in bpy.ops.refine.__getattr__(name.split(".")[1]).get_rna_type().properties
-        self.drawn.append(name)
-        return SimpleNamespace()
+    operator_menu_enum = operator
 
     def prop(self, data, name, **_options):
-        """Note a property; it must exist."""
         assert name in data.bl_rna.properties
         self.drawn.append(name)
 
     def prop_enum(self, data, name, value, *, text="", **_options):
-        """Note one value of a property, and its text; it must exist."""
         assert value in data.bl_rna.properties[name].enum_items
         self.drawn += [name, text]
 
     def label(self, *, text="", **_options):
-        """Note a text."""
         self.drawn.append(text)
+
+    progress = label
 
     def template_icon(self, icon_value, **_options):
-        """Note the chart."""
         self.drawn.append("chart")
-
-    def progress(self, *, text, **_options):
-        """Note a bar."""
-        self.drawn.append(text)
 
 
 @pytest.fixture
@@ -96,138 +82,57 @@ def draw(addon, monkeypatch):
     return draw
 
 
-def test_an_empty_scene_says_what_to_do_first(draw):
-    """All six steps are there from the start."""
+def test_an_empty_scene_says_what_to_do_first(draw, empty_scene):
+    """All six steps are there from the start, and each choice of cameras: 25 of 250 frames."""
     drawn = draw()
 
     buttons = ["import_ply", "import_cameras", "score", "view", "render", "apply", "export_ply"]
     assert [b for b in buttons if f"refine.{b}" in drawn] == buttons
     assert "Select an object that holds splats" in drawn
+    for source in ("VISIBLE", "ACTIVE", "SELECTED", "COLLECTION", "FRAMES"):
+        empty_scene.refine.source = source
+        drawn = draw()
+        assert ("25 frames" in drawn) == (source == "FRAMES")
+        assert ("collection" in drawn) == (source == "COLLECTION")
 
 
-def test_each_step_shows_what_came_of_it(draw, room, room_cameras):
-    """Counts and sizes of the room: 39755 splats of 248 bytes, 9.9 MB; half go."""
+def test_each_step_shows_what_came_of_it(addon, draw, few, room_cameras):
+    """3976 splats of 248 bytes, of which half go; a point cloud of the same shows the same.
+
+    A plan of another budget, changed while nothing was active, is not shown: a timer makes one.
+    """
+    settings, layer = bpy.context.scene.refine, bpy.context.view_layer
     imported = draw()
     bpy.ops.refine.score()
     scored = draw()
+    cloud = as_cloud(addon, few)
+    addon.ui.plans.refresh(bpy.context)
+    of_cloud = draw()
+    layer.objects.active, settings.ratio = None, 0.9
+    layer.objects.active = cloud
+    unplanned = draw()
+    settings.ratio = 0.5
     bpy.ops.refine.apply()
     applied = draw()
+    for camera in list(room_cameras.objects)[1:]:
+        room_cameras.objects.unlink(camera)
+    layer.update()
 
-    assert "room: 39,755 splats, SH degree 3, 9.9 MB" in " ".join(imported)
-    assert "72 cameras" in imported
-    assert "Keeps 19,878 of 39,755, 4.9 of 9.9 MB, by 64 of 72 views" in " ".join(scored)
-    assert "room: 19,878 splats, SH degree 3" in " ".join(applied)
+    assert "room: 3,976 splats, SH degree 3, 1.0 MB" in " ".join(imported)
+    assert {"72 cameras", "Merge · what goes is merged"} <= set(imported)
+    assert "Keeps 1,988 of 3,976, 0.5 of 1.0 MB, by 64 of 72 views" in " ".join(scored)
+    assert of_cloud == scored
+    assert "Keeps" not in " ".join(unplanned)
+    assert "room: 1,988 splats, SH degree 3" in " ".join(applied)
     assert not [text for text in applied if text.startswith(("Keeps", "chart"))]
     assert "Splats were deleted: score again" in applied
+    assert "1 camera" in draw()
 
 
-def test_what_floats_is_told_with_how_sure_that_is(draw, addon, room, room_cameras):
-    """More by a higher strength; per cent are the mean over what goes."""
-    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(room)])
-    views = addon.ui.operators.chosen_views(bpy.context)
-    expected = addon.core.clean(splats, views, addon.core.Cleaning())
-    counts, sure, told = expected.counts(), expected.surety(), []
-
-    bpy.ops.refine.find_floaters()
-    for strength in ("CAREFUL", "USUAL", "STRONG"):
-        bpy.context.scene.refine.strength = strength
-        told += [text for text in draw() if " of 39,755 float" in text]
-
-    careful = counts["front"] + counts["isolated"]
-    known = sum(counts[name] * (sure[name] or 0.0) for name in ("front", "isolated"))
-    assert told[0] == f"{careful:,} of 39,755 float, {100.0 * known / careful:.0f} % sure"
-    totals = [int(text.split()[0].replace(",", "")) for text in told]
-    assert 0 < totals[0] <= totals[1] == sum(counts.values()) <= totals[2]
-
-
-def test_each_method_is_drawn_with_its_price(draw, room, room_cameras):
-    """Before there are scores with what it means; then dB, in between too, and seconds."""
-    settings = bpy.context.scene.refine
-    settings.method, settings.views = "occlusion", 8
-    before = draw()
-    bpy.ops.refine.score()
-    prices = [text for text in draw() if " · " in text]
-
-    assert "Merge · what goes is merged" in before
-    assert prices[0] == "Closed Form · rows stay as they were"
-    assert re.fullmatch(r"Occlusion · about \d\d dB(, \d\d between)?", prices[1])
-    assert re.fullmatch(r"Merge · about \d\d dB(, \d\d between)? · \d+ .*", prices[2])
-    assert re.fullmatch(r"Refit · about \d\d dB.* · \d+ .*", prices[3])
-    assert "chart" in draw()
-
-
-def test_after_deletion_by_hand_the_panel_asks_for_scores_and_says_why(
-    addon,
-    room,
-    room_cameras,
-):
-    """Nothing was applied, and the panel does not say so."""
-    bpy.ops.refine.score()
-    rows = np.arange(len(room.data.vertices))
-    addon.mesh.selection.select(room, rows < 100)
-    bpy.ops.refine.delete(what="SELECTED")
-
-    drawn = []
-    panel = addon.ui.panel.REFINE_PT_prune
-    panel.draw(SimpleNamespace(layout=Layout(drawn)), bpy.context)
-
-    assert "Splats were deleted: score again" in " ".join(drawn)
-    assert "Applied" not in " ".join(drawn)
-
-
-def test_a_tool_says_in_the_header_how_many_splats_it_has_selected(addon, room):
-    """The box *Select* may be closed, as it is at first; without splats nothing is counted."""
-    drawn = []
-    tools = addon.ui.select_tools
-    addon.mesh.selection.select(room, np.arange(len(room.data.vertices)) < 1234)
-    tool = SimpleNamespace(idname="refine.select_box")
-
-    tools._draw_settings(bpy.context, Layout(drawn), tool)
-    bpy.context.view_layer.objects.active = None
-    tools._draw_settings(bpy.context, Layout(drawn), tool)
-
-    assert drawn == ["select_hidden", "1,234 selected", "select_hidden"]
-
-
-def test_a_point_cloud_is_drawn_as_a_mesh_is(addon, draw, room, room_cameras):
-    """Scored as a mesh before: the same lines, and the size of its file, 248 bytes a row."""
-    bpy.ops.refine.score()
-    mesh = draw()
-    as_cloud(addon, room)
-    addon.ui.plans.refresh(bpy.context)
-
-    assert draw() == mesh
-    assert "room: 39,755 splats, SH degree 3" in " ".join(mesh)
-    assert "Keeps 19,878 of 39,755, 4.9 of 9.9 MB" in " ".join(mesh)
-
-
-def test_what_an_old_blender_left_of_splats_is_not_just_nothing(draw, empty_scene):
-    """A point cloud of 5.3 without its colours, which Blender 5.0 and older drop."""
-    cloud = bpy.data.pointclouds.new("left")
-    cloud.attributes.new("scale", "FLOAT_VECTOR", "POINT")
-    cloud.attributes.new("rotation", "QUATERNION", "POINT")
-    obj = bpy.data.objects.new("left", cloud)
-    empty_scene.collection.objects.link(obj)
-    bpy.context.view_layer.objects.active = obj
-
-    assert "Colours were lost: open it in Blender 5.2" in " ".join(draw())
-
-
-def test_a_plan_that_no_longer_holds_is_not_drawn(draw, room, room_cameras):
-    """The budget changed while another object was active; in a window a timer makes another."""
-    bpy.ops.refine.score()
-    bpy.context.view_layer.objects.active = None
-    bpy.context.scene.refine.ratio = 0.9
-    bpy.context.view_layer.objects.active = room
-
-    assert "Keeps" not in " ".join(draw())
-
-
-def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_cameras):
-    """In one line."""
+def test_scores_older_than_a_change_ask_to_be_made_again(draw, few):
     bpy.ops.refine.score()
     fresh = draw()
-    room.location.x = 1.0
+    few.location.x = 1.0
     bpy.context.scene.refine.views = 8
     bpy.context.view_layer.update()
     old = draw()
@@ -239,142 +144,179 @@ def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_camera
     assert not [text for text in draw() if text.startswith("Score again")]
 
 
-def test_nothing_is_asked_of_the_scene_twice_until_it_changes(
-    draw,
-    addon,
-    room,
-    room_cameras,
-    monkeypatch,
-):
-    """Cameras, sizes and changes are asked once; a lens or a setting that changes asks anew."""
-    asked = []
-
-    def counting(name, ask):
-        def counted(*arguments):
-            asked.append(name)
-            return ask(*arguments)
-
-        return counted
-
-    bpy.ops.refine.score()
-    panel = addon.ui.panel
-    monkeypatch.setattr(panel, "_cameras", counting("cameras", panel._cameras))
-    for module, name in ((panel.plans, "stale"), (panel.mesh_layout, "export_bytes")):
-        monkeypatch.setattr(module, name, counting(name, getattr(module, name)))
-    bpy.context.view_layer.update()
-    draw()
-    first = sorted(asked)
-    draw()
-    again = sorted(asked)
-    room_cameras.objects[0].data.lens = 99.0
-    bpy.context.view_layer.update()
-    draw()
-    lens = sorted(asked)
-    bpy.context.scene.refine.source = "VISIBLE"
-    draw()
-
-    assert first == again == ["cameras", "export_bytes", "stale"]
-    assert lens == sorted(2 * first)
-    assert sorted(asked) == sorted(3 * first)
-
-
-def test_the_cameras_that_say_most_are_listed(draw, addon, room, room_cameras, room_views):
-    """First one that is turned away, and sees nothing, which is said too; then what sees least."""
-    camera = room_cameras.objects[7]
+def test_the_cameras_that_say_most_are_listed(draw, addon, few, room_cameras, room_views):
+    """First one that sees nothing, and one 860 m behind, which is said; then what sees least."""
+    camera, view = room_cameras.objects[7], room_views[0]
     camera.location.z += 1000.0
+    far = room_cameras.objects[9]
+    far.matrix_world = far.matrix_world @ Matrix.Translation((0.0, 0.0, 860.0))
     bpy.context.view_layer.update()
-    before = draw()
     bpy.ops.refine.score()
     drawn = draw()
     lines = [text for text in drawn if re.match(r"\d+: ", text)]
-    counts = dict(addon.mesh.scores.record(room.data)["cameras"])
-    means = addon.objects.splat_group.gather([addon.mesh.layout.check(room)]).means
-    local = room_views[0].rotation @ (means - room_views[0].center).T
-    x = room_views[0].fx * local[0] / local[2] + room_views[0].cx
-    y = room_views[0].fy * local[1] / local[2] + room_views[0].cy
-    there = (local[2] > 0) & (x >= 0) & (x <= room_views[0].width) & (y >= 0)
-    sees = int((there & (y <= room_views[0].height)).sum())
+    counts = dict(addon.mesh.scores.record(few.data)["cameras"])
+    local = view.rotation @ (splats_of(addon, few).means - view.center).T
+    pixels = np.array([view.fx, view.fy])[:, None] * local[:2] / local[2]
+    pixels += [[view.cx], [view.cy]]
+    inside = (pixels >= 0) & (pixels <= [[view.width], [view.height]])
 
-    assert not [text for text in before if re.match(r"\d+: ", text)]
-    assert counts[room_views[0].name] == sees
-    least = sorted(counts.items(), key=lambda pair: pair[1])[1:8]
-    assert lines == [f"{camera.name}: nothing", *(f"{name}: {seen:,}" for name, seen in least)]
+    assert counts[view.name] == ((local[2] > 0) & inside.all(axis=0)).sum()
+    least = sorted(counts.items(), key=lambda pair: pair[1])[1:7]
+    least = [f"{name}: {seen:,}" for name, seen in least]
+    assert lines[0] == f"{camera.name}: nothing"
+    assert lines[1].startswith(f"{far.name}: ")
+    assert lines[2:] == least
     assert "and 64 that change less" in drawn
     assert " ".join(drawn).count("No splat lies in the view of 1 camera") == 1
+    assert " ".join(drawn).count("1 camera sees the splats from so far away") == 1
 
 
-def test_one_is_not_counted_as_many(draw, room, room_cameras):
-    """A scene with one camera has "1 camera", not "1 cameras"."""
-    for camera in list(room_cameras.objects)[1:]:
-        room_cameras.objects.unlink(camera)
-    bpy.context.view_layer.update()
+@pytest.mark.parametrize("method", ["closed-form", "occlusion", "merge"])
+def test_what_a_plan_keeps_is_what_is_marked_and_what_apply_leaves(addon, few, method, capfd):
+    """For every budget, of files of 248 bytes a row; also where merging is foretold to need more.
 
-    assert "1 camera" in draw()
+    A success is said without a warning.
+    """
+    settings, plans = bpy.context.scene.refine, addon.ui.plans
+    settings.method, settings.views, settings.budget = method, 8, "psnr"
+    bpy.ops.refine.score()
+    for kind, value in {"ratio": 0.25, "keep": 1000, "max_mb": 0.25, "psnr": 35.0}.items():
+        settings.budget = kind
+        setattr(settings, kind, value)
+        plan = plans.stored(few, settings)
+        marked = read(addon, few, "refine_remove")
+        assert marked.sum() == plan["removed"] == 3976 - plan["kept"] > 0
+        assert plan["about"] == (kind == "psnr" and method == "merge")
+    way = {"merge": "merge"}.get(method, "delete")
+    assert plan["quality"].at(plan["share"], way) == pytest.approx(35.0, abs=0.03)
+    settings.budget, settings.ratio = "ratio", 0.75
+    plan = plans.stored(few, settings)
+    assert plan["removed"] == 2982
+    bpy.ops.refine.apply()
 
-
-@pytest.fixture
-def at_work(addon):
-    """Return a function that lets the panel believe that an operator works."""
-    running = addon.ui.operator_bases
-
-    def at_work(operator, doing):
-        worker = SimpleNamespace(fraction=0.43, what="looking")
-        now = running.Running.__new__(running.Running)
-        now.operator, now.doing, now.waits, now._offers = operator, doing, "", ""
-        now.worker, now._left = worker, running.TimeLeft()
-        running._now[:] = [now]
-
-    yield at_work
-    running._now.clear()
-
-
-@pytest.mark.parametrize("name", ["score", "find_floaters", "apply", "levels"])
-@pytest.mark.usefixtures("room")
-def test_one_bar_is_drawn_in_the_box_of_the_button_that_was_clicked(draw, at_work, name):
-    """It says what is done and how to cancel; the buttons stay where they are."""
-    before = draw()
-    at_work(f"refine.{name}", "Working")
-    drawn = draw()
-
-    buttons = {text for text in before if text.startswith("refine.")}
-    assert drawn.count("43%") == 1
-    assert drawn.count("Working (looking); Esc cancels") == 1
-    assert f"refine.{name}" in buttons <= set(drawn)
+    assert len(few.data.vertices) == plan["kept"]
+    file = addon.mesh.attributes.file_from_object(addon.mesh.layout.check(few))
+    assert plan["bytes_after"] == file.size()
+    said = capfd.readouterr().out
+    assert "Info: Kept 994 splats" in said
+    assert "Warning" not in said
 
 
-@pytest.mark.parametrize("source", ["VISIBLE", "ACTIVE", "SELECTED", "COLLECTION", "FRAMES"])
-def test_every_source_of_cameras_is_drawn(draw, source):
-    """A shot of 250 frames, every tenth: 25."""
-    bpy.context.scene.refine.source = source
-    drawn = draw()
-
-    assert ("25 frames" in drawn) == (source == "FRAMES")
-    assert ("collection" in drawn) == (source == "COLLECTION")
-
-
-def test_the_quality_of_the_pictures_is_a_budget(draw, addon, room, room_cameras):
-    """Its own number is drawn; scores made without an estimate say what to do."""
+def test_a_share_is_set_in_per_cent_and_kept_as_a_share(addon, few):
+    """The budget gets the decimal that was typed; what a script sets is shown in per cent."""
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
+    for percent, ratio in {29.0: 0.29, 33.3: 0.333, 0.0: 0.0, 99.99: 0.9999, 12.5: 0.125}.items():
+        settings.percent = percent
+        assert settings.to_budget().ratio == ratio
+        assert settings.percent == np.float32(percent)
+    settings.ratio = 0.75
+    assert settings.percent == 75.0
+    settings.percent = 10.0
+    assert addon.ui.plans.stored(few, settings)["removed"] == 397
+
+
+def test_each_method_has_its_price(addon):
+    """A straight curve, 50 dB with 20 % removed, 30 with 80 %, of which merging gains 6 dB.
+
+    Estimates above 60 dB are all the same; without an estimate there is no price.
+    """
+    price, psnr = addon.ui.plans.price, np.array([50.0, 40.0, 30.0])
+    curve = addon.core.quality.curve.Quality(np.array([0.2, 0.5, 0.8]), psnr, psnr + 6.0)
+    between = replace(curve, between=curve.psnr - 2.0)
+    seconds = {"delete": 0.0, "merge": 17.0, "refit": 60.0}
+    plan = {"quality": between, "share": 0.5, "closed": False, "seconds": seconds}
+    few = plan | {"quality": replace(curve, foretold=False)}
+    seen = plan | {"quality": replace(curve, psnr=np.full(3, 70.0)), "seconds": {}}
+
+    assert price(plan, "closed-form") == price(None, "merge") == price({"error": ""}, "merge") == ""
+    assert price(plan, "occlusion") == "about 40 dB, 38 between"
+    assert price(plan, "merge").startswith("about 46 dB, 44 between · 17 s")
+    assert price(few, "occlusion") == "about 40 dB"
+    assert price(few, "merge") == price(few, "refit") == ""
+    assert price(seen, "occlusion") == "more than 60 dB"
+    assert price(plan | {"closed": True}, "closed-form") == "about 40 dB, 38 between"
+
+
+def test_a_quality_out_of_reach_is_said(addon, few):
+    """Beyond 95 % nothing is estimated; above what removing one splat leaves, none can go.
+
+    The closed form makes no estimate unless Quality was the budget.
+    """
+    settings, plans = bpy.context.scene.refine, addon.ui.plans
+    bpy.ops.refine.score()
+    none = plans.stored(few, settings)
+    assert none["remark"] == "Score by another method, or with Quality as the budget, to see dB"
+    assert "dB" not in plans.sentence(none) + plans.price(none, "closed-form")
     settings.budget = "psnr"
-
-    assert "psnr" in draw()
-    assert "score again with a PSNR as budget" in " ".join(draw())
-
     bpy.ops.refine.score()
-    stored = addon.mesh.scores.stored_scores([addon.mesh.layout.check(room)])
-    assert stored.quality is not None
-    assert any(text.startswith("Keeps ") for text in draw())
+    for psnr, remark in {
+        1.0: "ends at 95% removed",
+        99.0: "By the estimate nothing can go at 99 dB", 35.0: "",
+    }.items():  # fmt: skip
+        settings.psnr = psnr
+        plan = plans.stored(few, settings)
+        assert remark in plan["remark"]
 
 
-def test_a_curve_of_more_splats_than_are_left_is_not_used(addon, room, room_cameras):
-    """Where some were deleted by hand since, a share of the rest is another."""
-    bpy.context.scene.refine.budget = "psnr"
+PICTURES = ["Compare: before", "Compare: after", "Compare: difference"]
+
+
+def pixels(name):
+    """Return an image in 8 bits, (H, W, 3), the top row first."""
+    image = bpy.data.images[name]
+    width, height = image.size
+    values = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(values)
+    return np.rint(values.reshape(height, width, 4)[::-1, :, :3] * 255.0).astype(np.uint8)
+
+
+@pytest.mark.parametrize("method", ["closed-form", "merge"])
+def test_the_pictures_are_those_of_what_apply_leaves(addon, few, room_cameras, method):
+    """Before: the splats as they are; after: once *Apply* was clicked; by the same camera."""
+    scene = bpy.context.scene
+    scene.camera = room_cameras.objects[24]
+    scene.refine.ratio, scene.refine.method, scene.refine.views = 0.7, method, 16
     bpy.ops.refine.score()
-    scores = addon.mesh.scores
-    noted = json.loads(room.data[scores.RECORD])
-    room.data[scores.RECORD] = json.dumps(noted | {"splats": noted["splats"] + 5})
+    before = splats_of(addon, few)
+    mine = bpy.data.images.new(PICTURES[0], 4, 4)
+    for _ in range(2):  # the second one replaces the first
+        assert bpy.ops.refine.compare() == {"FINISHED"}
 
-    stored = scores.stored_scores([addon.mesh.layout.check(room)])
+    assert len(few.data.vertices) == 3976
+    bpy.ops.refine.apply()
+    after = splats_of(addon, few)
+    assert len(after) == 3976 - 2783  # floor(.7 * 3976)
+    views = addon.cameras.CameraChoice("ACTIVE").views(bpy.context, few)
+    (expected,) = addon.core.pictures.compare(before, after, views)
+    assert (expected.view.width, expected.view.height) == (240, 160)
+    made = [
+        f"{PICTURES[0]}.001",
+        *PICTURES[1:],
+    ]  # an image of the user stays
+    assert sorted(image.name for image in bpy.data.images) == sorted([PICTURES[0], *made])
+    assert (bpy.data.images[PICTURES[0]], *mine.size) == (mine, 4, 4)
+    for name, wanted in zip(made, ("before", "after", "difference"), strict=True):
+        apart = np.abs(pixels(name).astype(int) - getattr(expected, wanted))
+        assert apart.max() <= (8 if wanted == "difference" else 1)  # what is merged is float32 then
 
-    assert stored.quality is None
+
+def test_what_was_measured_stays_in_the_panel_while_the_plan_is_the_same(addon, few, room_cameras):
+    """Another share, or other scores, and it is no longer shown; without a camera it says so."""
+    scene, measured = bpy.context.scene, addon.ui.operators.measured
+    assert not bpy.ops.refine.compare.poll()
+    bpy.ops.refine.score()
+    with pytest.raises(RuntimeError, match="has no active camera"):
+        bpy.ops.refine.compare()
+    assert not bpy.data.images
+    scene.camera = room_cameras.objects[24]
+    assert measured(few, scene.refine) == ""
+    bpy.ops.refine.compare()
+    shown = measured(few, scene.refine)
+    assert re.fullmatch(rf"Measured in '{scene.camera.name}': \d\d\.\d dB", shown)
+    scene.refine.ratio = 0.7
+    assert measured(few, scene.refine) == ""
+    bpy.ops.refine.compare()
+    scene.refine.views = 8
+    bpy.ops.refine.score()
+    assert measured(few, scene.refine) == ""
