@@ -65,18 +65,10 @@ def fisher(
 ) -> NDArray[np.float64]:
     """Sum J' J over the pixels and channels of all views.
 
-    Parameters
-    ----------
-    splats : Splats
-    views : iterable of View
-    near : float
-        As in `rasterizer.render`.
-    background : (3,) float
+    - near: As in `rasterizer.render`.
+    - background, (3,) float
 
-    Returns
-    -------
-    (N, 6, 6) float64
-        By the mean (3) and the logarithms of the scales (3).
+    - returned, (N, 6, 6) float64: By the mean (3) and the logarithms of the scales (3).
     """
     scene = gaussians_of(splats)
     visible = scene.opacities > 0.0

@@ -48,16 +48,10 @@ def reduce(
 ) -> Splats:
     """Return `keep_count` splats in place of all.
 
-    Parameters
-    ----------
-    splats : Splats
-        Those that cannot be drawn go first.
-    keep_count : int
-        1 to N.
-    dress : {"nearest", "moments"}
-        See the module's docstring.
-    seed : int
-        Of the draw of the first centres.
+    - splats: Those that cannot be drawn go first.
+    - keep_count: 1 to N.
+    - dress, {"nearest", "moments"}: See the module's docstring.
+    - seed: Of the draw of the first centres.
     """
     rows = np.flatnonzero(drawable(splats))
     if keep_count >= len(rows):

@@ -40,10 +40,7 @@ Layers = list[tuple["NDArray[np.float64]", "NDArray[np.float64]"]]
 def score(splats: Splats, weights: Path) -> NDArray[np.float64]:
     """Score splats by a trained network, (N,) float64; higher stays.
 
-    Raises
-    ------
-    RefineError
-        If `weights` is no such file.
+    - RefineError: if `weights` is no such file.
     """
     values = features(splats)
     layers = read_weights(weights)
@@ -139,10 +136,7 @@ def read_weights(path: Path) -> Layers:
     The file is a zip: a pickle names the tensors, and each lies in a member of its own. Of what a
     pickle can call, only what rebuilds tensors is allowed, and that by functions of our own.
 
-    Raises
-    ------
-    RefineError
-        If the file is not that, or not a network from 15 features to 2 outputs.
+    - RefineError: if the file is not that, or not a network from 15 features to 2 outputs.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -33,14 +33,10 @@ def refine(
 ) -> NDArray[np.float64]:
     """Score drawable splats as published, (N,).
 
-    Parameters
-    ----------
-    splats : Splats
-    views : ViewSet
-    depth : {"z", "distance"}
-        Along the view's axis, as in the paper; or to its centre, as in the authors' code.
-    visibility, projection, equal_weights : bool
-        The paper's ablations: H without alpha, H without 1 / (d^2 + eta), lambda = 1/3 each.
+    - depth, {"z", "distance"}: Along the view's axis, as in the paper; or to its centre, as in the
+      authors' code.
+    - visibility, projection, equal_weights: The paper's ablations: H without alpha, H without 1 /
+      (d^2 + eta), lambda = 1/3 each.
     """
     eta, beside = CONSTANTS[depth]
     means = splats.means.astype(np.float64)

@@ -85,17 +85,9 @@ def removed_in_rounds(
 
     POTR prunes so: what one removal costs depends on what else has gone.
 
-    Parameters
-    ----------
-    splats, views
-    keep_count : int
-        How many stay.
-    rounds : int
+    - keep_count: How many stay.
 
-    Returns
-    -------
-    (keep_count,) int64
-        Which splats stay, ascending; of equal errors the first.
+    - returned, (keep_count,) int64: Which splats stay, ascending; of equal errors the first.
     """
     left = np.arange(len(splats))
     for number in range(1, rounds + 1):

@@ -18,13 +18,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from refine_addon.core.errors import RefineError
 
 PACKAGES = ("@playcanvas/splat-transform@3.7.0", "node@22", "gltf-validator@2.0.0-dev.3.10")
-FOLDER = Path(__file__).resolve().parents[2] / "build/splat-transform"
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "build/splat-transform"
 MISSING = (
     "splat-transform is not installed: python -m benchmarks.baselines.splat_transform (needs npm)"
 )
@@ -35,12 +37,9 @@ FLAGS = ("--decimate", "--decimate-adaptive")
 class Run:
     """One decimation, from file to file.
 
-    Attributes
-    ----------
-    seconds, busy : float
-        Of the whole process, its start included, and of the processor, all cores together.
-    peak_bytes : int or None
-        Largest resident memory; None where the system does not tell.
+    - seconds, busy: Of the whole process, its start included, and of the processor, all cores
+      together.
+    - peak_bytes: Largest resident memory; None where the system does not tell.
     """
 
     seconds: float
@@ -71,18 +70,10 @@ def version() -> str:
 def command(source: Path, target: Path, flag: str, keep_count: int) -> list[str]:
     """Return the command line that writes `source`, decimated to `keep_count`, to `target`.
 
-    Parameters
-    ----------
-    source, target : Path
-        3DGS PLY files.
-    flag : str
-        One of `FLAGS`.
-    keep_count : int
+    - source, target: 3DGS PLY files.
+    - flag: One of `FLAGS`.
 
-    Raises
-    ------
-    RefineError
-        If it is not installed.
+    - RefineError: if it is not installed.
     """
     start = find()
     if start is None:
@@ -93,10 +84,7 @@ def command(source: Path, target: Path, flag: str, keep_count: int) -> list[str]
 def decimate(source: Path, target: Path, flag: str, keep_count: int) -> Run:
     """Run `command`.
 
-    Raises
-    ------
-    RefineError
-        If it is not installed, or fails; with what it said.
+    - RefineError: if it is not installed, or fails; with what it said.
     """
     arguments = command(source, target, flag, keep_count)
     with tempfile.TemporaryFile() as said:
@@ -146,6 +134,27 @@ def processor_seconds(whose: int) -> float:
     """Return the seconds of all cores so far, of `resource.RUSAGE_SELF` or ``RUSAGE_CHILDREN``."""
     usage = resource.getrusage(whose)
     return usage.ru_utime + usage.ru_stime
+
+
+def measured(order: Sequence[str | Path]) -> tuple[float, float, float]:
+    """Run a command in the checkout; return its seconds, the processor's, and peak megabytes.
+
+    Those that belong to the process, and to those that it starts, alone (RssAnon): what is mapped
+    of a file is the page cache's.
+
+    - subprocess.CalledProcessError: if it fails.
+    """
+    peak = 0
+    before = processor_seconds(resource.RUSAGE_CHILDREN)
+    start = time.perf_counter()
+    with subprocess.Popen(order, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        while process.poll() is None:
+            peak = max(peak, memory("RssAnon", process.pid) or 0)
+            time.sleep(0.002)
+        seconds = time.perf_counter() - start
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, list(map(str, order)))
+    return seconds, processor_seconds(resource.RUSAGE_CHILDREN) - before, peak / 1e6
 
 
 def install() -> int:

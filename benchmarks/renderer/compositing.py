@@ -47,12 +47,10 @@ class Bins(NamedTuple):
 class Target(NamedTuple):
     """Where the tiles draw.
 
-    Attributes
-    ----------
-    background : (3,) float64
-    image : (H, W, 3) float64
-    sums : (entries of the bins, 5) float64
-        What each splat does in each tile; empty where nobody asks.
+    - background, (3,) float64
+    - image, (H, W, 3) float64
+    - sums, (entries of the bins, 5) float64: What each splat does in each tile; empty where nobody
+      asks.
     """
 
     background: NDArray[np.float64]
@@ -131,14 +129,11 @@ def tile_hits(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
     """Find which splats cover which pixels of a tile, until a pixel's transmittance is < `stop`.
 
-    Returns
-    -------
-    starts : (pixels + 1,) int64
-        Hits of pixel p (row by row in the tile) are ``starts[p]:starts[p + 1]``, front to back;
-        the last of them may be the one that took the transmittance below `stop`.
-    owners : (hits,) int32
-        Which of `entries` it is.
-    alphas : (hits,) float64
+    - returned starts, (pixels + 1,) int64: Hits of pixel p (row by row in the tile) are
+      ``starts[p]:starts[p + 1]``, front to back; the last of them may be the one that took the
+      transmittance below `stop`.
+    - returned owners, (hits,) int32: Which of `entries` it is.
+    - returned alphas, (hits,) float64
     """
     pixels = size[0] * size[1]
     through = np.ones(pixels)
@@ -320,18 +315,12 @@ def removal_errors(
     of the colours per pixel (before squaring), and the decision m where a transmittance
     meets the stop to the last bit.
 
-    Parameters
-    ----------
-    owners : (hits,) int32
-        Row of `sums` for each hit of the pixel.
-    alphas : (hits,) float64
-        The hits go on past `end` until T < 1e-6, so that m is always among them.
-    end : int
-        n.
-    blended : tuple
-        T, (hits + 1,); C, (hits + 1, 3); background (3,).
-    sums : (entries, 5) float64
-        Column `REMOVAL` is added to.
+    - owners, (hits,) int32: Row of `sums` for each hit of the pixel.
+    - alphas, (hits,) float64: The hits go on past `end` until T < 1e-6, so that m is always among
+      them.
+    - end: n.
+    - blended: T, (hits + 1,); C, (hits + 1, 3); background (3,).
+    - sums, (entries, 5) float64: Column `REMOVAL` is added to.
     """
     through, colors, background = blended
     for i in range(min(end + 1, len(owners))):

@@ -31,21 +31,15 @@ NEAR = COLUMNS + 9
 class Gaussians(NamedTuple):
     """N splats as the renderer wants them; `gaussians` makes one from plain arrays.
 
-    Attributes
-    ----------
-    means : (N, 3) float64
-        Centres, world units.
-    covariances : (N, 6) float64
-        xx, xy, xz, yy, yz, zz of the world covariance, world units squared.
-    opacities : (N,) float64
-        0 to 1; 0 is never drawn, whatever the other values.
-    harmonics : (N, (degree + 1)^2, 3) float32
-        Spherical-harmonics coefficients of red, green, blue.
-    antialiased : bool
-        Whether opacities fall where the low-pass widens footprints.
-    tangents : (N, 3, 2) float64
-        Of discs (2DGS): their two axes as columns, as long as a standard deviation, world units; of
-        others (0, 3, 2).
+    - means, (N, 3) float64: Centres, world units.
+    - covariances, (N, 6) float64: xx, xy, xz, yy, yz, zz of the world covariance, world units
+      squared.
+    - opacities, (N,) float64: 0 to 1; 0 is never drawn, whatever the other values.
+    - harmonics, (N, (degree + 1)^2, 3) float32: Spherical-harmonics coefficients of red, green,
+      blue.
+    - antialiased: Whether opacities fall where the low-pass widens footprints.
+    - tangents, (N, 3, 2) float64: Of discs (2DGS): their two axes as columns, as long as a standard
+      deviation, world units; of others (0, 3, 2).
     """
 
     means: NDArray[np.float64]
@@ -72,16 +66,12 @@ class Camera(NamedTuple):
 class Footprints(NamedTuple):
     """The M splats that may touch the image, front to back.
 
-    Attributes
-    ----------
-    index : (M,) int64
-        Which splat it is.
-    table : (M, 11) float64
-        u, v: centre, pixels; a, b, c: inverse covariance, 1 / px^2; determinant of the covariance,
-        px^4; largest squared Mahalanobis distance drawn; opacity; red, green, blue. Of discs
-        (M, 21): see `_project_disc`.
-    boxes : (M, 4) int32
-        First and last pixel column, first and last pixel row, clipped to the image.
+    - index, (M,) int64: Which splat it is.
+    - table, (M, 11) float64: u, v: centre, pixels; a, b, c: inverse covariance, 1 / px^2;
+      determinant of the covariance, px^4; largest squared Mahalanobis distance drawn; opacity; red,
+      green, blue. Of discs (M, 21): see `_project_disc`.
+    - boxes, (M, 4) int32: First and last pixel column, first and last pixel row, clipped to the
+      image.
     """
 
     index: NDArray[np.int64]
@@ -100,24 +90,14 @@ def gaussians(
 ) -> Gaussians:
     """Prepare plain arrays for rendering; once for any number of views.
 
-    Parameters
-    ----------
-    means : (N, 3) floating
-        Centres, world units.
-    scales : (N, 3) floating
-        Standard deviations along the splat's axes, world units.
-    quaternions : (N, 4) floating
-        w x y z, of any length.
-    opacities : (N,) floating
-        0 to 1.
-    harmonics : (N, K, 3) floating
-        K = (degree + 1)^2 coefficients of each channel, degree 0 to 4.
-    model : {"default", "antialiased", "2dgs"}
+    - means, (N, 3) floating: Centres, world units.
+    - scales, (N, 3) floating: Standard deviations along the splat's axes, world units.
+    - quaternions, (N, 4) floating: w x y z, of any length.
+    - opacities, (N,) floating: 0 to 1.
+    - harmonics, (N, K, 3) floating: K = (degree + 1)^2 coefficients of each channel, degree 0 to 4.
+    - model, {"default", "antialiased", "2dgs"}
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not belong together.
+    - ValueError: if the shapes do not belong together.
     """
     means, scales, opacities = (
         np.ascontiguousarray(a, np.float64) for a in (means, scales, opacities)
@@ -397,12 +377,8 @@ def sh_basis(x: float, y: float, z: float, out: NDArray[np.float64]) -> None:
     -C y, C z, -C x (C = sqrt(3 / 4 pi)). Constants: Sloan, "Stupid Spherical Harmonics Tricks",
     2008, appendix A2.
 
-    Parameters
-    ----------
-    x, y, z : float
-        Direction from the camera to the splat, length 1, world frame.
-    out : (25,) float64
-        Filled with bands 0 to 4.
+    - x, y, z: Direction from the camera to the splat, length 1, world frame.
+    - out, (25,) float64: Filled with bands 0 to 4.
     """
     out[0] = math.sqrt(1.0 / (4.0 * math.pi))
     c = math.sqrt(3.0 / (4.0 * math.pi))

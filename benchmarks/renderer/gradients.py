@@ -47,21 +47,13 @@ def gradient(
 ) -> NDArray[np.float64]:
     """Return the gradient of a loss by the parameters of the splats.
 
-    Parameters
-    ----------
-    scene : Gaussians
-    axes : (N, 3, 3) float64
-        The axes of the splats, each column as long as its scale.
-    camera : Camera
-    by_pixel : (H, W, 3) float64
-        The gradient of the loss by the pixels of what `rasterizer.render` draws.
-    near, background
-        As in `rasterizer.render`.
+    - axes, (N, 3, 3) float64: The axes of the splats, each column as long as its scale.
+    - by_pixel, (H, W, 3) float64: The gradient of the loss by the pixels of what
+      `rasterizer.render` draws.
+    - near, background: As in `rasterizer.render`.
 
-    Returns
-    -------
-    (N, 10 + 3 K) float64
-        See `MEAN`; K coefficients of each channel. 0 for splats that are not drawn.
+    - returned, (N, 10 + 3 K) float64: See `MEAN`; K coefficients of each channel. 0 for splats that
+      are not drawn.
     """
     footprints = footprints_of(scene, camera, near)
     bins = bins_of(footprints.boxes, camera.width, camera.height)

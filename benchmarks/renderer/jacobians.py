@@ -47,15 +47,10 @@ WEIGHT, E_X, E_Y, CONTRAST, MOVES, VALUES = 0, 1, 2, 3, 6, 7
 class Hits(NamedTuple):
     """What is drawn in a tile, pixel by pixel and front to back.
 
-    Attributes
-    ----------
-    owners : (hits,) int32
-        Which of the tile's entries it is.
-    pixels : (hits,) int32
-        Row by row in the image.
-    values : (hits, 7) float64
-        alpha T; e, 1 / px; alpha T (colour - B) of red, green, blue; 0 where alpha is clamped,
-        else 1.
+    - owners, (hits,) int32: Which of the tile's entries it is.
+    - pixels, (hits,) int32: Row by row in the image.
+    - values, (hits, 7) float64: alpha T; e, 1 / px; alpha T (colour - B) of red, green, blue; 0
+      where alpha is clamped, else 1.
     """
 
     owners: NDArray[np.int32]
@@ -124,15 +119,11 @@ def shape_gradient(
 ) -> None:
     """Differentiate u, v, xx, xy, yy by mean and log scale.
 
-    Parameters
-    ----------
-    mean : (3,) float64
-    axes : (3, 3) float64
-        Columns: the splat's axes, each as long as its scale; their outer products sum to the
-        covariance S.
-    camera : Camera
-    out : (5, 6) float64
-        Filled; columns 0 to 2 by the mean, 3 to 5 by the logarithms of the scales.
+    - mean, (3,) float64
+    - axes, (3, 3) float64: Columns: the splat's axes, each as long as its scale; their outer
+      products sum to the covariance S.
+    - out, (5, 6) float64: Filled; columns 0 to 2 by the mean, 3 to 5 by the logarithms of the
+      scales.
 
     Notes
     -----
@@ -194,13 +185,9 @@ def color_gradient(
 ) -> None:
     """Differentiate the colour by the mean, which turns the direction it is seen along.
 
-    Parameters
-    ----------
-    mean : (3,) float64
-    camera : Camera
-    harmonics : (K, 3) float32
-    out : (3, 3) float64
-        Filled; rows red, green, blue.
+    - mean, (3,) float64
+    - harmonics, (K, 3) float32
+    - out, (3, 3) float64: Filled; rows red, green, blue.
 
     Notes
     -----
@@ -232,12 +219,8 @@ def turn_gradient(
 ) -> None:
     """Differentiate xx, xy, yy by a small turn of the splat about the axes of the world.
 
-    Parameters
-    ----------
-    mean, axes, camera
-        As in `shape_gradient`.
-    out : (3, 3) float64
-        Filled; columns: the turn's x, y, z, radians.
+    - mean, axes, camera: As in `shape_gradient`.
+    - out, (3, 3) float64: Filled; columns: the turn's x, y, z, radians.
 
     Notes
     -----

@@ -84,19 +84,13 @@ class Statistics:
     A hit is a pixel in which the splat is drawn: alpha at least 1/255 and the pixel not finished.
     T is the transmittance in front of the splat there.
 
-    Attributes
-    ----------
-    weight_sum : (N,) float64
-        Sum of alpha T over all hits.
-    weight_max : (N,) float64
-        Largest alpha T of any hit; 0 without a hit.
-    opacity_sum : (N,) float64
-        Sum of opacity T over all hits, LightGaussian's count (Fan et al. 2024, Eq. 3).
-    hits : (N,) int64
-        Number of hits.
-    removal_error : (N,) float64
-        Sum over pixels and channels of the squared change of the picture if this one splat were
-        removed. See `compositing.removal_errors` for the derivation.
+    - weight_sum, (N,) float64: Sum of alpha T over all hits.
+    - weight_max, (N,) float64: Largest alpha T of any hit; 0 without a hit.
+    - opacity_sum, (N,) float64: Sum of opacity T over all hits, LightGaussian's count (Fan et al.
+      2024, Eq. 3).
+    - hits, (N,) int64: Number of hits.
+    - removal_error, (N,) float64: Sum over pixels and channels of the squared change of the picture
+      if this one splat were removed. See `compositing.removal_errors` for the derivation.
     """
 
     weight_sum: NDArray[np.float64]
@@ -115,21 +109,12 @@ def render(
 ) -> NDArray[np.float64]:
     """Draw one view.
 
-    Parameters
-    ----------
-    splats : Splats or Gaussians
-        `Gaussians` saves the activation where many views are drawn.
-    view : View or Camera
-        Its clip distances and weight mean nothing here.
-    near : float
-        Splats whose mean is not deeper than this are not drawn, world units.
-    background : sequence of 3 float
-        Colour where nothing is.
+    - splats: `Gaussians` saves the activation where many views are drawn.
+    - view: Its clip distances and weight mean nothing here.
+    - near: Splats whose mean is not deeper than this are not drawn, world units.
+    - background: Colour where nothing is.
 
-    Returns
-    -------
-    (height, width, 3) float64
-        Not clipped: colours may exceed 1.
+    - returned, (height, width, 3) float64: Not clipped: colours may exceed 1.
     """
     image, _ = _draw(_prepared(splats), _camera(view), near, background, statistics=False)
     return image

@@ -45,11 +45,7 @@ VAST = 0.06
 def make(count: int, degree: int = 3) -> Splats:
     """Return a scene of `count` splats, always the same.
 
-    Parameters
-    ----------
-    count : int
-    degree : int
-        Of the harmonics.
+    - degree: Of the harmonics.
     """
     random = np.random.default_rng(7)
     far, inside, floating, floor = (int(share * count) for share in (FAR, INSIDE, FLOATING, FLOOR))

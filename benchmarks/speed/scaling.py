@@ -32,12 +32,8 @@ CORES = (2, 4, 8, 16)
 class Division:
     """What of a run is done in pieces, and what is not.
 
-    Attributes
-    ----------
-    calls : list of (str, list of float)
-        What each call does, and seconds of its pieces.
-    serial : cProfile.Profile
-        Of all that is not in pieces.
+    - calls, list of (str, list of float): What each call does, and seconds of its pieces.
+    - serial: Of all that is not in pieces.
     """
 
     def __init__(self) -> None:

@@ -9,26 +9,20 @@ tile is seen by its own and by those that look along the street; with ``--one-ro
 stand in the middle one. They are compared with reading and writing the same bytes: `cat` of all
 tiles into one file.
 
-Memory is VmRSS, what is mapped included, of the process and those that it starts, each for itself.
-Seconds of the processor, of all of them and of the busiest one, tell what a busy machine hides:
-where no core waits for another, a run takes as long as its busiest process.
+Memory is that of the process and those that it starts, without what is mapped of files. Seconds of
+the processor tell what a busy machine hides.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
-import resource
 import shutil
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -78,75 +72,6 @@ def make_cameras(path: Path, tiles: int) -> None:
     path.write_text(json.dumps(cameras))
 
 
-class Cost(NamedTuple):
-    """What a command takes.
-
-    Attributes
-    ----------
-    seconds : float
-    busy, busiest : float
-        Seconds of the processor, of all processes, and of the one that took most.
-    peak : float
-        The most megabytes of a process.
-    """
-
-    seconds: float
-    busy: float
-    busiest: float
-    peak: float
-
-
-def run(command: Sequence[str | Path]) -> Cost:
-    """Run a command; return what it took.
-
-    Raises
-    ------
-    subprocess.CalledProcessError
-        If it fails.
-    """
-    peak, each = 0.0, {}
-    before = splat_transform.processor_seconds(resource.RUSAGE_CHILDREN)
-    start = time.perf_counter()
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
-        while process.poll() is None:
-            for member in _family(process.pid):
-                peak = max(peak, _resident(member))
-                each[member] = max(each.get(member, 0.0), _processor(member))
-            time.sleep(0.02)
-        seconds = time.perf_counter() - start
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, list(map(str, command)))
-    busy = splat_transform.processor_seconds(resource.RUSAGE_CHILDREN) - before
-    return Cost(seconds, busy, max(each.values(), default=0.0), peak)
-
-
-def _family(process: int) -> list[int]:
-    """Return a process and all that it started."""
-    found = [process]
-    for each in found:
-        for thread in Path(f"/proc/{each}/task").glob("*/children"):
-            with contextlib.suppress(OSError):  # it ended
-                found += map(int, thread.read_text().split())
-    return found
-
-
-def _processor(process: int) -> float:
-    """Return the seconds of the processor that a process has had."""
-    try:
-        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _resident(process: int) -> float:
-    try:
-        lines = Path(f"/proc/{process}/status").read_text().splitlines()
-    except OSError:
-        return 0.0
-    return sum(int(line.split()[1]) / 1000 for line in lines if line.startswith("VmRSS:"))
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print what each way takes."""
     parser = argparse.ArgumentParser(description="Time tiles that are pruned together.")
@@ -176,11 +101,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             more = ["--workers", str(workers)] if workers else []
             commands.append((f"{workers} workers", [*prune, "-o", output, *more]))
         for name, command in commands:
-            cost = run(command)
+            seconds, busy, peak = splat_transform.measured(command)
             shutil.rmtree(output, ignore_errors=True)
             print(
-                f"{name:10} {cost.seconds:7.1f} s, processor {cost.busy:7.1f} s, busiest process "
-                f"{cost.busiest:7.1f} s, {cost.peak:6.0f} MB",
+                f"{name:10} {seconds:7.1f} s, processor {busy:7.1f} s, {peak:6.0f} MB",
                 flush=True,
             )
 

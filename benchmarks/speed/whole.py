@@ -24,7 +24,6 @@ from typing import NamedTuple
 from ..baselines import splat_transform
 from ..tables.million import write_cameras, write_ply
 from . import capture
-from .file_to_file import run
 
 SIZES = (160_000, 1_000_000, 2_200_000)
 FIGURES = Path(__file__).parent / "figures.json"
@@ -71,7 +70,7 @@ def measured(count: int) -> dict[str, Figure]:
         write_ply(folder / "in.ply", capture.make(count))
         write_cameras(folder / "cameras.json", capture.cameras())
         for name, command in commands(folder, count).items():
-            _, busy, megabytes = run(command)
+            _, busy, megabytes = splat_transform.measured(command)
             figures[name] = Figure(round(busy, 2), round(megabytes))
             print(f"{count:,}, {name}: {busy:.1f} s, {megabytes:.0f} MB", flush=True)
             (folder / "out.ply").unlink()

@@ -9,13 +9,9 @@ from dataclasses import dataclass
 class Cost:
     """What something took.
 
-    Attributes
-    ----------
-    seconds, busy : float
-        Medians of the runs: by the clock, and of the processor, all cores together.
-    runs : int
-    peak_bytes : int or None
-        Beyond what was held before; of a program of its own, all it had. None: not to be had here.
+    - seconds, busy: Medians of the runs: by the clock, and of the processor, all cores together.
+    - peak_bytes: Beyond what was held before; of a program of its own, all it had. None: not to be
+      had here.
     """
 
     seconds: float

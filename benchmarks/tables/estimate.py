@@ -2,13 +2,12 @@
 
 ::
 
-    python -m benchmarks.tables.estimate SCENE_DIR ... --ratios .3 .5 .7 .9 --psnr 40 --views 64
+    python -m benchmarks.tables.estimate SCENE_DIR ... --ratios .3 .5 .7 .9 --views 64
 
 For a scene's folder see `evaluate`. The splats are deleted by occlusion's order, and merged; the
 estimates are those of the reports. Every view that scores is rendered. "Expected" is what a result
-of deleting says of merging. With `--psnr` the pictures are those of that budget. The last
-columns are of single views: by how much their estimates are off on average and at most, and which
-place the view that is expected to change most has among those that do (1: it does).
+of deleting says of merging. The last columns are of single views: by how much their estimates are
+off on average and at most.
 
 With `--between` the estimate of the views between is set beside the held-out views instead, with
 the standard error of their mean, and it is said whether the report warns that few views see much.
@@ -40,9 +39,9 @@ from .evaluate import Evaluator, read_scene
 METHODS: dict[Way, type[Method]] = {"delete": Occlusion, "merge": Merge, "refit": Refit}
 WAYS: tuple[Way, ...] = ("delete", "merge")
 HEADING = (
-    f"{'scene':12}{'':10}{'budget':>12}{'removed':>9}{'estimate':>10}{'truth':>8}{'off by':>8}"
+    f"{'scene':12}{'':10}{'removed':>9}{'estimate':>10}{'truth':>8}{'off by':>8}"
     f"{'expected':>10}{'seconds':>9}"
-    f"{'views off':>11}{'at most':>9}{'worst is':>9}"
+    f"{'views off':>11}{'at most':>9}"
 )
 
 BETWEEN_HEADING = (
@@ -55,33 +54,21 @@ BETWEEN_HEADING = (
 class Estimated:
     """An estimate and the truth.
 
-    Attributes
-    ----------
-    way : {"delete", "merge", "refit"}
-    budget : Budget
-    removed : float
-        Share of the splats.
-    estimate, truth : float
-        PSNR, dB; the truth is the mean over all views that score.
-    expected : float or None
-        What a result of deleting says of merging, dB.
-    seconds : float
-        Of the prune.
-    single : (V,) float64
-        By how much the estimates of single views exceed the truth, dB.
-    worst : int
-        Place of the view of the lowest estimate among the views by their truth, from 1.
+    - way, {"delete", "merge", "refit"}
+    - removed: Share of the splats.
+    - estimate, truth: PSNR, dB; the truth is the mean over all views that score.
+    - expected: What a result of deleting says of merging, dB.
+    - seconds: Of the prune.
+    - single, (V,) float64: By how much the estimates of single views exceed the truth, dB.
     """
 
     way: Way
-    budget: Budget
     removed: float
     estimate: float
     truth: float
     expected: float | None
     seconds: float
     single: NDArray[np.float64]
-    worst: int
 
     @property
     def off(self) -> float:
@@ -97,10 +84,7 @@ def measure(
 ) -> Iterator[Estimated]:
     """Yield estimate and truth of every way and budget, by `views`, all of which score.
 
-    Raises
-    ------
-    RefineError
-        If there is no estimate, since the views see too little.
+    - RefineError: if there is no estimate, since the views see too little.
     """
     evaluator = Evaluator(splats, views, metrics=("psnr",))
     for way in ways:
@@ -123,14 +107,12 @@ def measure(
             truth = np.asarray(truth)[told]
             yield Estimated(
                 way,
-                budget,
                 gone,
                 estimate,
                 renders.mean["psnr"],
                 result.report["method"]["psnr"]["merge"] if way == "delete" else None,
                 seconds,
                 guess - truth,
-                1 + int(np.count_nonzero(truth < truth[np.argmin(guess)])),
             )
 
 
@@ -138,16 +120,10 @@ def measure(
 class Between:
     """The estimate of the views between, and what held-out views see.
 
-    Attributes
-    ----------
-    way : {"delete", "merge", "refit"}
-    ratio : float
-    estimate : float
-        Of the views between, dB.
-    held : (H,) float64
-        PSNR of each held-out view, dB.
-    warned : bool
-        Whether the report says that views from elsewhere may lose more.
+    - way, {"delete", "merge", "refit"}
+    - estimate: Of the views between, dB.
+    - held, (H,) float64: PSNR of each held-out view, dB.
+    - warned: Whether the report says that views from elsewhere may lose more.
     """
 
     way: Way
@@ -175,10 +151,7 @@ def measure_between(
 ) -> Iterator[Between]:
     """Yield, by `views`, the estimate of those between them beside the held-out views.
 
-    Raises
-    ------
-    RefineError
-        If there is no estimate, since nothing lies between the views.
+    - RefineError: if there is no estimate, since nothing lies between the views.
     """
     evaluator = Evaluator(splats, held, metrics=("psnr",))
     for way in ways:
@@ -199,7 +172,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print a line for each scene, way and budget; return the exit code."""
     options = _parse(arguments)
     budgets = [Budget(ratio=ratio) for ratio in options.ratios]
-    budgets += [Budget(psnr=psnr) for psnr in options.psnr]
     ways = [options.only] if options.only else WAYS
     print(BETWEEN_HEADING if options.between else HEADING)
     errors: list[float] = []
@@ -223,13 +195,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _line(name: str, row: Estimated) -> str:
-    kind = "psnr" if row.budget.psnr is not None else "ratio"
-    goal = f"{kind} {getattr(row.budget, kind):g}"
     expected = "" if row.expected is None else f"{row.expected:.1f}"
     return (
-        f"{name:12}{row.way:10}{goal:>12}{row.removed:9.1%}{row.estimate:10.2f}{row.truth:8.2f}"
+        f"{name:12}{row.way:10}{row.removed:9.1%}{row.estimate:10.2f}{row.truth:8.2f}"
         f"{row.off:+8.2f}{expected:>10}{row.seconds:9.1f}"
-        f"{np.abs(row.single).mean():11.2f}{np.abs(row.single).max():9.2f}{row.worst:9}"
+        f"{np.abs(row.single).mean():11.2f}{np.abs(row.single).max():9.2f}"
     )
 
 
@@ -240,7 +210,6 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE_DIR")
     parser.add_argument("--ratios", type=float, nargs="*", default=[0.3, 0.5, 0.7, 0.9])
-    parser.add_argument("--psnr", type=float, nargs="*", default=[40.0])
     parser.add_argument("--views", type=int, default=64, help="that score, at most")
     parser.add_argument("--only", choices=METHODS, help="one of the ways")
     parser.add_argument(

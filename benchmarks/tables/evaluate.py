@@ -1,4 +1,4 @@
-"""How good the pictures of a pruned scene are, and the table of it for a scene and some methods.
+"""How good the pictures of a pruned scene are.
 
 Pictures are compared clipped to 0..1, as a screen shows them:
 
@@ -8,33 +8,24 @@ Pictures are compared clipped to 0..1, as a screen shows them:
 - FLIP (Andersson et al. 2020), at its default 67 pixels per degree, 0 is identical. It needs the
   package ``flip-evaluator``; without it the others are still measured.
 
-::
-
-    python -m benchmarks.tables.evaluate SCENE_DIR --method closed-form lightgaussian --ratios .3 .5
-
-SCENE_DIR holds ``point_cloud.ply``, ``cameras.json`` and, optionally, ``split.json`` (``{"train":
-[names], "test": [names]}``; without it every 8th view is held out) and ``images/NAME.png`` or
-``.jpg``. The train views decide what goes.
+A folder of a scene holds ``point_cloud.ply``, ``cameras.json`` and, optionally, ``split.json``
+(``{"train": [names], "test": [names]}``; without it every 8th view is held out) and
+``images/NAME.png`` or ``.jpg``. The train views decide what goes.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
-import sys
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from skimage.metrics import structural_similarity
 
-from refine_addon.core import METHODS, score
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
 from refine_addon.core.formats.ply import read_ply
@@ -43,10 +34,7 @@ from refine_addon.core.selection import Budget, select
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import ViewSet
 
-from ..baselines import rap
-from ..baselines.rendered import BASELINES, RENDERED
 from ..renderer import rasterizer
-from ..renderer.rasterizer import Statistics
 
 PSNR_CAP = 100.0
 """What identical images count as, dB; for comparison, rounding to 8 bits alone makes 59 dB."""
@@ -54,8 +42,6 @@ METRICS = ("psnr", "ssim", "flip")
 HELD_OUT = 8
 """Without a split, every 8th view is held out, the first among them."""
 PICTURE_TYPES = (".png", ".jpg", ".jpeg", ".JPG")
-SCORING = [name for name, method in METHODS.items() if not method.changes]
-"""The methods of the core that delete by scores."""
 FLIP_MISSING = "FLIP needs the package flip-evaluator: pip install flip-evaluator"
 
 
@@ -63,12 +49,9 @@ FLIP_MISSING = "FLIP needs the package flip-evaluator: pip install flip-evaluato
 class Quality:
     """Each metric for each view; all of one length.
 
-    Attributes
-    ----------
-    names : tuple of str
-        The views.
-    values : dict of str to (V,) float64
-        Metric ("psnr", "ssim", "flip") -> its value in every view.
+    - names: The views.
+    - values, dict of str to (V,) float64: Metric ("psnr", "ssim", "flip") -> its value in every
+      view.
     """
 
     names: tuple[str, ...]
@@ -84,12 +67,8 @@ class Quality:
 class Evaluation:
     """What `Evaluator.evaluate` measures.
 
-    Attributes
-    ----------
-    renders : Quality
-        Against renders of the original splats.
-    pictures : Quality or None
-        Against pictures, for the views that have one.
+    - renders: Against renders of the original splats.
+    - pictures: Against pictures, for the views that have one.
     """
 
     renders: Quality
@@ -99,17 +78,10 @@ class Evaluation:
 class Evaluator:
     """Compares changed versions of one scene; the original is rendered once.
 
-    Parameters
-    ----------
-    original : Splats
-    views : ViewSet
-        The views to compare in.
-    pictures : mapping of str to (H, W, 3) floating, optional
-        Name of a view -> its picture, 0..1.
-    metrics : sequence of str
-        Among `METRICS`.
-    near : float
-        Near plane, world units.
+    - views: The views to compare in.
+    - pictures, mapping of str to (H, W, 3) floating, optional: Name of a view -> its picture, 0..1.
+    - metrics: Among `METRICS`.
+    - near: Near plane, world units.
     """
 
     def __init__(
@@ -171,12 +143,8 @@ def compare(
 ) -> dict[str, float]:
     """Compare two images.
 
-    Parameters
-    ----------
-    image, reference : (H, W, 3) floating
-        0..1, sRGB.
-    metrics : sequence of str
-        Among `METRICS`.
+    - image, reference, (H, W, 3) floating: 0..1, sRGB.
+    - metrics: Among `METRICS`.
 
     Examples
     --------
@@ -225,13 +193,9 @@ def _flip(image: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
 class Scene:
     """A benchmark scene.
 
-    Attributes
-    ----------
-    splats : Splats
-    train, test : ViewSet
-        The views that decide, and those held out.
-    pictures : dict of str to (H, W, 3) float64
-        Name of a view -> its picture, 0..1; empty where there are none.
+    - train, test: The views that decide, and those held out.
+    - pictures, dict of str to (H, W, 3) float64: Name of a view -> its picture, 0..1; empty where
+      there are none.
     """
 
     splats: Splats
@@ -243,10 +207,7 @@ class Scene:
 def read_scene(folder: Path | str) -> Scene:
     """Read a folder as the module's docstring describes it.
 
-    Raises
-    ------
-    RefineError
-        If a file is missing or not what it should be.
+    - RefineError: if a file is missing or not what it should be.
     """
     folder = Path(folder)
     views = read_cameras(folder / "cameras.json")
@@ -274,111 +235,3 @@ def _split(file: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
         raise RefineError(
             f"{file}: expected lists of names 'train' and 'test' ({error!r})"
         ) from error
-
-
-def scores_of(
-    method: str, scene: Scene, statistics: Statistics | None, weights: Path | None = None
-) -> Scores:
-    """Score a scene by a baseline, or by a method of the core under its name.
-
-    `weights` are those of the baseline "rap", which is not there without them.
-
-    Raises
-    ------
-    RefineError
-        If there is no such score.
-    """
-    if method in BASELINES:
-        values = BASELINES[method](scene.splats, scene.train, statistics)
-    elif method == "rap" and weights is not None:
-        values = rap.score(scene.splats, weights)
-    elif method in SCORING:
-        return score(scene.splats, scene.train, METHODS[method]())
-    else:
-        raise RefineError(f"expected one of {', '.join((*SCORING, *BASELINES))}, got {method!r}")
-    return Scores(values, np.zeros(len(values), np.int32), len(scene.train), 0)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table; return the exit code."""
-    options = _parse(arguments)
-    numba.set_num_threads(min(options.threads or numba.get_num_threads(), numba.get_num_threads()))
-    if "flip" in options.metrics and not flip_installed():
-        sys.stderr.write(f"{FLIP_MISSING}\n")
-        options.metrics.remove("flip")
-    try:
-        _measure(options)
-    except (RefineError, ValueError) as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
-
-
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    summary = (__doc__ or "").split("\n", maxsplit=1)[0]
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.tables.evaluate", description=summary
-    )
-    parser.add_argument("scene", type=Path, metavar="SCENE_DIR")
-    parser.add_argument("--ratios", type=float, nargs="+", default=[0.3, 0.5, 0.7, 0.9])
-    parser.add_argument("--views", choices=["test", "train"], default="test", help="compared in")
-    parser.add_argument(
-        "--method",
-        nargs="+",
-        default=["occlusion"],
-        help=f"of the core, or {', '.join(BASELINES)}; default: %(default)s",
-    )
-    parser.add_argument("--rap", type=Path, metavar="FILE", help="trained weights: measure RAP too")
-    parser.add_argument("--metrics", nargs="+", choices=METRICS, default=list(METRICS))
-    parser.add_argument("--threads", type=int, help="for rendering; default: all")
-    return parser.parse_args(arguments)
-
-
-def _measure(options: argparse.Namespace) -> None:
-    """Score, prune, render, compare and print a line for each method and ratio."""
-    scene = read_scene(options.scene)
-    views = getattr(scene, options.views)
-    evaluator = Evaluator(scene.splats, views, scene.pictures, metrics=options.metrics)
-    print(
-        f"{options.scene}: {len(scene.splats)} splats, {len(scene.train)} views decide, "
-        f"{len(views)} {options.views} views are compared"
-    )
-    print(_heading(options.metrics, pictures=any(view.name in scene.pictures for view in views)))
-    print(_line("unpruned", "0", "", evaluator.evaluate(scene.splats)))
-    statistics, rendering = None, 0.0
-    if RENDERED.intersection(options.method):
-        start = time.perf_counter()
-        statistics = rasterizer.accumulate_statistics(scene.splats, scene.train)
-        rendering = time.perf_counter() - start
-    for method in [*options.method, *(["rap"] if options.rap else [])]:
-        start = time.perf_counter()
-        scores = scores_of(method, scene, statistics, options.rap)
-        seconds = time.perf_counter() - start + (rendering if method in RENDERED else 0.0)
-        for ratio in options.ratios:
-            keep = select(scores, Budget(ratio=ratio))
-            found = evaluator.evaluate(scene.splats.take(keep))
-            print(_line(method, f"{ratio:g}", f"{seconds:.2f}", found), flush=True)
-
-
-def _heading(metrics: Sequence[str], *, pictures: bool) -> str:
-    """Return the two lines over the table."""
-    names = "".join(f"{name.upper():>9}" for name in metrics)
-    width = len(names)
-    first = f"{'':40}{'vs unpruned':>{width}}" + (f"   {'vs pictures':>{width}}" * pictures)
-    second = f"{'method':20}{'removed':>10}{'score s':>10}{names}" + f"   {names}" * pictures
-    return f"{first}\n{second}"
-
-
-def _line(method: str, ratio: str, seconds: str, found: Evaluation) -> str:
-    """Return one line of the table."""
-    text = f"{method:20}{ratio:>10}{seconds:>10}" + _numbers(found.renders)
-    return text if found.pictures is None else f"{text}   {_numbers(found.pictures)}"
-
-
-def _numbers(quality: Quality) -> str:
-    digits = {"psnr": 2, "ssim": 4, "flip": 4}
-    return "".join(f"{value:9.{digits[name]}f}" for name, value in quality.mean.items())
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -42,15 +42,9 @@ _C1, _C2 = 0.01**2, 0.03**2
 class Tuned:
     """What training won back for one method.
 
-    Attributes
-    ----------
-    name : str
-    ratio : float
-        Share removed.
-    before, after : float
-        PSNR against the held-out photos, dB.
-    seconds : float
-        Of the training.
+    - ratio: Share removed.
+    - before, after: PSNR against the held-out photos, dB.
+    - seconds: Of the training.
     """
 
     name: str
@@ -68,19 +62,10 @@ def tune(
 ) -> Splats:
     """Train splats on photos.
 
-    Parameters
-    ----------
-    splats : Splats
-    views : ViewSet
-        Those without a photo are left out.
-    photos : mapping of str to (H, W, 3) float64
-        Name of a view -> its photo, 0..1.
-    iterations : int
+    - views: Those without a photo are left out.
+    - photos, mapping of str to (H, W, 3) float64: Name of a view -> its photo, 0..1.
 
-    Returns
-    -------
-    Splats
-        Those that can be drawn, in float64.
+    - returned, Splats: Those that can be drawn, in float64.
     """
     now = splats.take(drawable(splats))
     usable = [view for view in views if view.name in photos]
@@ -184,15 +169,10 @@ def loss(
 ) -> tuple[float, NDArray[np.float64]]:
     """Return 0.8 times the mean absolute difference plus 0.2 (1 - SSIM), and its gradient.
 
-    Parameters
-    ----------
-    image, photo : (H, W, 3) float64
+    - image, photo, (H, W, 3) float64
 
-    Returns
-    -------
-    loss : float
-    gradient : (H, W, 3) float64
-        By the pixels of `image`.
+    - returned loss, float
+    - returned gradient, (H, W, 3) float64: By the pixels of `image`.
     """
     share, slope = _ssim(image, photo)
     difference = image - photo
@@ -234,21 +214,11 @@ def measure(
 ) -> list[Tuned]:
     """Train what methods leave.
 
-    Parameters
-    ----------
-    reduced : callable
-        ``(name of a method, share removed) -> Splats``.
-    names : sequence of str
-    training : tuple
-        The views that train, and their photos by name.
-    evaluator : Evaluator
-        Of the held-out views, with their photos.
-    iterations : int
+    - reduced: ``(name of a method, share removed) -> Splats``.
+    - training: The views that train, and their photos by name.
+    - evaluator: Of the held-out views, with their photos.
 
-    Raises
-    ------
-    ValueError
-        If no held-out view has a photo.
+    - ValueError: if no held-out view has a photo.
     """
     rows = []
     for name in names:

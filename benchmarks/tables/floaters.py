@@ -2,12 +2,11 @@
 
 ::
 
-    python -m benchmarks.tables.floaters SCENE_DIR ... --recipe volume --seed 7 [--sure | --why]
+    python -m benchmarks.tables.floaters SCENE_DIR ... --recipe volume --seed 7 [--sure]
 
 The recipes of `benchmarks.floaters` put in 1,000 floaters: 45 % single ones, 25 % in dense
 clusters, 26 % needles and 4 % giant veils. Nothing of the cleaner was chosen by them, nor were they
-written with it in view. `copies`, `chosen` and `mixed` are what constants were chosen with; `none`
-puts in nothing. Those of `copies` are true splats, moved, turned, deformed and faded.
+written with it in view, as `mixed` was; `none` puts in nothing.
 
 Of the 2,000 floaters of `mixed`, 1,100 stand in front of a camera, each by itself; 800 form blobs
 of 5 to 59 in free space; 100 are huge veils. Size, opacity, colour and place vary. Free space is
@@ -27,33 +26,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from refine_addon.core.cleaning.clean import (
-    AGREE,
-    AT_SURFACE,
-    FAINT,
-    FEW,
-    GIANT_NEEDED,
-    GLARING,
-    HAZE_HELD,
-    ISOLATED_SUPPORT,
-    NEEDED,
-    NEEDLE_NEEDED,
-    POWER,
-    SUPPORT,
-    WIDE,
-    Cleaning,
-    clean,
-    judge,
-)
-from refine_addon.core.cleaning.search import Found, Search, is_slender, touching
-from refine_addon.core.cleaning.support import share
-from refine_addon.core.execute import silent
+from refine_addon.core.cleaning.clean import clean
 from refine_addon.core.formats.ply import read_ply
-from refine_addon.core.splats import SH_C0, Splats, joined, opacity
+from refine_addon.core.splats import SH_C0, Splats, joined
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import validation_rays
-from refine_addon.core.visibility.projection import Gaussians
 
 from .evaluate import Evaluator, read_scene
 
@@ -61,17 +39,10 @@ COUNTS = {"front": 1100, "blob": 800, "veil": 100}
 KINDS = ("single", "cluster", "needle", "veil")
 RECIPES = ("volume", "photos", "motion")
 COUNT = 1000
-FAINTEST = 0.1  # opacity of the splats that `copies` copies
 
 
 class Places:
-    """Random places in free space, as views see it.
-
-    Parameters
-    ----------
-    splats : Splats
-    views : ViewSet
-    """
+    """Random places in free space, as views see it."""
 
     def __init__(self, splats: Splats, views: ViewSet) -> None:
         sample = validation_rays(splats, views)
@@ -171,101 +142,14 @@ def _veils(random: np.random.Generator, free: Places) -> tuple[NDArray[np.float6
     return means, scales, random.uniform(0.01, 0.1, count), random.uniform(0.0, 1.0, (count, 3))
 
 
-def _chosen(splats: Splats, views: ViewSet, seed: int) -> tuple[Splats, NDArray[np.int64]]:
-    """Return floaters of all four kinds, of sizes that do not depend on where they are."""
-    random = np.random.default_rng(seed)
-    free = Places(splats, views)
-    counts = (450, 250, 260, 40)
-    rows: list[tuple[NDArray[np.float64], ...]] = []
-    for kind, count in zip(KINDS, counts, strict=True):
-        if kind == "cluster":
-            rows += [_dense(random, free, count // 10) for _ in range(10)]
-            continue
-        means, _ = free.draw(random, count, 0.1, 0.85)
-        low, high = {"single": (0.003, 0.03), "needle": (0.03, 0.3), "veil": (0.2, 1.5)}[kind]
-        scales = free.size * _log_uniform(random, low, high, (count, 1))
-        if kind == "needle":
-            thin = scales * _log_uniform(random, 0.01, 0.08, (count, 2))
-            scales = np.concatenate([scales, thin], axis=1)
-        else:
-            scales = scales * _log_uniform(random, 0.2, 1.0, (count, 3))
-        faint, solid = (0.02, 0.4) if kind == "veil" else (0.1, 0.95)
-        alphas = random.uniform(faint, solid, count)
-        rows.append((means, scales, alphas, random.uniform(0.0, 1.0, (count, 3))))
-    return _as_splats(random, splats, rows), np.repeat(np.arange(4), counts)
-
-
-def _copies(splats: Splats, views: ViewSet, seed: int) -> tuple[Splats, NDArray[np.int64]]:
-    """Return floaters of all four kinds in the colours of the scene: true splats put elsewhere."""
-    random = np.random.default_rng(seed)
-    free = Places(splats, views)
-    alphas = opacity(splats.opacity_logits).astype(np.float64)
-    solid = np.flatnonzero(alphas > FAINTEST)
-    kinds = np.repeat(np.arange(4), (450, 250, 260, 40))
-    source = random.choice(solid, len(kinds))
-    means, scales = np.empty((len(kinds), 3)), np.exp(splats.log_scales[source].astype(np.float64))
-    faded = alphas[source] * random.beta(1.5, 2.5, len(kinds))
-    single, cluster, needle, veil = (np.flatnonzero(kinds == kind) for kind in range(4))
-    for part, low, high in ((single, 0.1, 0.95), (needle, 0.1, 0.9), (veil, 0.2, 0.8)):
-        means[part], _ = free.draw(random, len(part), low, high)
-    larger = random.uniform(0.5, 2.0, (len(single), 1))
-    scales[single] = np.clip(scales[single] * larger, 0.001 * free.size, 0.04 * free.size)
-    for part in np.split(cluster, 10):
-        center, depth = free.draw(random, 1, 0.2, 0.8)
-        radius = depth * _log_uniform(random, 0.008, 0.06, (1,))
-        step = splats.means[solid] - splats.means[random.choice(solid)]
-        source[part] = random.choice(solid[np.argsort((step**2).sum(axis=1))[:60]], len(part))
-        means[part] = center + random.normal(size=(len(part), 3)) * radius
-        scales[part] = radius * _log_uniform(random, 0.1, 0.6, (len(part), 1))
-        scales[part] *= _log_uniform(random, 0.3, 1.0, (len(part), 3))
-        dense = random.binomial(1, 0.6)
-        some = random.uniform(0.3, 0.95, len(part)), random.beta(2.0, 3.0, len(part))
-        faded[part] = some[0] if dense else some[1]
-    scales[needle] = free.size * _log_uniform(random, 0.015, 0.15, (len(needle), 1))
-    scales[needle, 1:] *= _log_uniform(random, 0.01, 0.1, (len(needle), 2))
-    scales[veil] = free.size * _log_uniform(random, 0.15, 0.6, (len(veil), 1))
-    scales[veil] *= _log_uniform(random, 0.1, 1.0, (len(veil), 3))
-    faded[veil] = random.uniform(0.02, 0.2, len(veil))
-    faded = faded.clip(0.01, 0.99)
-    copies = splats.take(source)
-    other = random.binomial(1, 0.5, (len(kinds), 1))
-    floaters = replace(
-        copies,
-        means=means.astype(np.float32),
-        log_scales=np.log(scales).astype(np.float32),
-        quaternions=random.normal(size=(len(kinds), 4)).astype(np.float32),
-        opacity_logits=np.log(faded / (1.0 - faded)).astype(np.float32),
-        sh_dc=copies.sh_dc + other * random.normal(0.0, 0.2, (len(kinds), 3)).astype(np.float32),
-    )
-    return floaters, kinds
-
-
-def _dense(
-    random: np.random.Generator, free: Places, count: int
-) -> tuple[NDArray[np.float64], ...]:
-    center, _ = free.draw(random, 1, 0.2, 0.8)
-    radius = free.size * _log_uniform(random, 0.01, 0.05, (1,))
-    means = center + random.normal(size=(count, 3)) * radius
-    scales = radius * _log_uniform(random, 0.15, 0.7, (count, 1))
-    scales = scales * _log_uniform(random, 0.4, 1.0, (count, 3))
-    colors = random.uniform(0.0, 1.0, 3) + random.normal(0.0, 0.08, (count, 3))
-    return means, scales, random.uniform(0.3, 0.99, count), colors.clip(0.0, 1.0)
-
-
 def dirtied(
     folder: Path, splats: Splats, views: ViewSet, recipe: str, seed: int
 ) -> tuple[Splats, NDArray[np.int64], tuple[str, ...]]:
     """Return a scene with floaters behind its own splats, the kind of each, (n,), and their names.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the scene.
-    splats, views
-        What it holds, and the views that place the floaters of `mixed`, `chosen` and `copies`.
-    recipe : str
-        "none", "mixed", "chosen", "copies", or one of `RECIPES`.
-    seed : int
+    - folder: Of the scene.
+    - splats, views: What it holds, and the views that place the floaters of `mixed`.
+    - recipe: "none", "mixed", or one of `RECIPES`.
     """
     if recipe == "none":
         return splats, np.empty(0, np.int64), ()
@@ -277,25 +161,19 @@ def dirtied(
         added = replace(plain, rows=rows.astype(plain.rows.dtype)).splats()
         kinds = np.array([KINDS.index(kind) for kind in kinds])
         return joined([splats, added]), kinds, KINDS
-    if recipe == "mixed":
-        added, kinds = floaters(splats, views, seed)
-        return joined([splats, added]), kinds, tuple(COUNTS)
-    added, kinds = (_copies if recipe == "copies" else _chosen)(splats, views, seed)
-    return joined([splats, added]), kinds, KINDS
+    added, kinds = floaters(splats, views, seed)
+    return joined([splats, added]), kinds, tuple(COUNTS)
 
 
 def main() -> int:
     """Print a line for each scene."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE_DIR")
-    parser.add_argument(
-        "--recipe", choices=(*RECIPES, "copies", "chosen", "mixed", "none"), default="volume"
-    )
+    parser.add_argument("--recipe", choices=(*RECIPES, "mixed", "none"), default="volume")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--sure", action="store_true", help="compare `sure`, and clean again")
-    parser.add_argument("--why", action="store_true", help="say why the others stay")
     options = parser.parse_args()
-    line = _sure if options.sure else _why if options.why else _line
+    line = _sure if options.sure else _line
     if line is _line:
         print("scene: found (by kind), true splats taken, seconds, PSNR: before, dirty, cleaned")
     for folder in options.scenes:
@@ -335,67 +213,6 @@ def _sure(folder: Path, recipe: str, seed: int) -> str:
         f"{np.count_nonzero(~again.keep & ~left)} of {added} floaters left of {len(kinds)}, "
         f"{np.count_nonzero(~again.keep & left)} of {np.count_nonzero(left)} true splats"
     )
-
-
-def _kept(gaussians: Gaussians, found: Found) -> dict[str, NDArray[np.bool_]]:
-    """Return why Gaussians stay, (M,) each: the first reason in this order; see `judge`."""
-    shows, _, _ = judge(gaussians, found)
-    evidence, giant, large = found.evidence, found.giant, found.large
-    seen, past = evidence.views, evidence.past
-    support = share(evidence.near, evidence.near + evidence.behind)
-    passed = np.where(large, np.maximum(past, seen * (1.0 - support)), past)
-    most = np.where(large | found.doubted, SUPPORT, ISOLATED_SUPPORT)
-    contrast = evidence.contrast / np.where(evidence.behind > 0.0, evidence.behind, 1.0)
-    wide = np.where(giant, np.maximum(found.width, WIDE) / WIDE, 1.0)
-    change = np.minimum(gaussians.alphas * contrast, GLARING) * wide
-    factors = [GIANT_NEEDED * AT_SURFACE**support, NEEDLE_NEEDED]
-    needed = NEEDED * np.select([giant, found.needle], factors, 1.0) / (1.0 + passed) ** POWER
-    hazy = gaussians.alphas < FAINT
-    rows = np.flatnonzero(found.suspects & hazy & ~giant)
-    near, touch = touching(gaussians, rows, silent, None)
-    in_haze = np.zeros(len(seen))
-    in_haze[rows] = np.count_nonzero(touch & hazy[near], axis=1)
-    told = {
-        "not drawn": ~found.shown,
-        "no suspect": ~found.suspects,
-        "no ray": seen == 0.0,
-        "near": support >= most,
-        "few agree": ~large & (past < AGREE * seen),
-        "one view": (past < FEW) & ~(giant & (passed >= FEW)),
-        "small change": change < needed,
-        "haze": change < needed * HAZE_HELD**in_haze,
-        "held": np.ones(len(seen), np.bool_),
-    }
-    why, left = {}, ~shows
-    for name, true in told.items():
-        why[name] = left & true
-        left = left & ~true
-    return why
-
-
-def _why(folder: Path, recipe: str, seed: int) -> str:
-    """Say of each kind of floaters how many are found, and why the others stay, per cent."""
-    scene = read_scene(folder)
-    dirty, kinds, names = dirtied(folder, scene.splats, scene.train, recipe, seed)
-    gaussians, frame, _ = projection.prepare(dirty, scene.train)
-    views = [view for view, _ in scene.train.spread(Cleaning().views).by_distance()]
-    slender = is_slender(dirty.log_scales[gaussians.index])
-    found = Search(gaussians, frame, views, None).find(slender, silent)
-    place = np.full(len(dirty), -1)
-    place[gaussians.index] = np.arange(len(gaussians))
-    rows = np.arange(len(kinds)) + len(scene.splats)
-    why = {
-        name: mask[place[rows]] & (place[rows] >= 0)
-        for name, mask in _kept(gaussians, found).items()
-    }
-    why["not drawn"] |= ~np.isin(rows, gaussians.index)
-    goes = ~np.any(list(why.values()), axis=0)
-    cells = []
-    for kind, name in enumerate(names):
-        of_kind = kinds == kind
-        rest = ", ".join(f"{text} {mask[of_kind].mean():.1%}" for text, mask in why.items())
-        cells.append(f"{name} ({of_kind.sum()}): found {goes[of_kind].mean():.1%}, {rest}")
-    return f"{folder.name}, {recipe}: {'; '.join(cells)}"
 
 
 def _line(folder: Path, recipe: str, seed: int) -> str:

@@ -1,4 +1,4 @@
-"""Levels of detail side by side: ours merged, in one go, deleted; and splat-transform's.
+"""Levels of detail side by side: each merged from the one before, and from the original in one go.
 
 ::
 
@@ -6,38 +6,30 @@
 
 Held-out PSNR at each level against renders of the original, and seconds of the processor: of each
 level where it is made by itself, and of all of them where they come from one run. The train views
-decide, PSNR is of some of the test views. Where splat-transform is not installed, its rows are
-missing.
+decide, PSNR is of some of the test views.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from refine_addon.core import Levels, Merge, Method, Occlusion, lod, prune, read_ply
+from refine_addon.core import Levels, Merge, lod, prune
 from refine_addon.core.methods import DEFAULT
 from refine_addon.core.splats import Splats
 
-from ..baselines import splat_transform
 from .evaluate import Evaluator, Scene, read_scene
 
 SHARES = (0.5, 0.25, 0.12, 0.06)
 
 
-def from_one_another(scene: Scene, method: Method = DEFAULT) -> Iterator[tuple[Splats, str]]:
+def from_one_another(scene: Scene) -> Iterator[tuple[Splats, str]]:
     """Yield the levels of `lod`, and the PSNR that it estimates."""
-    for level in lod(scene.splats, scene.train, Levels(SHARES), method):
+    for level in lod(scene.splats, scene.train, Levels(SHARES), DEFAULT):
         yield level.result.splats, f" [{level.psnr:.1f}]"
-
-
-def deleted(scene: Scene) -> Iterator[tuple[Splats, str]]:
-    """Yield the levels by deletion."""
-    return from_one_another(scene, Occlusion())
 
 
 def in_one_go(scene: Scene) -> Iterator[tuple[Splats, str]]:
@@ -46,16 +38,6 @@ def in_one_go(scene: Scene) -> Iterator[tuple[Splats, str]]:
         start = time.process_time()
         left = prune(scene.splats, scene.train, budget, Merge()).splats
         yield left, f" ({time.process_time() - start:.0f} s)"
-
-
-def decimated(source: Path, flag: str, count: int) -> Iterator[tuple[Splats, str]]:
-    """Yield what splat-transform makes of a file of `count` splats for each level by itself."""
-    for share in SHARES:
-        with tempfile.TemporaryDirectory() as folder:
-            target = Path(folder) / "a.ply"
-            kept = Levels((share,)).budgets(count)[0].keep or 0
-            run = splat_transform.decimate(source, target, flag, kept)
-            yield read_ply(target).splats(), f" ({run.busy:.0f} s)"
 
 
 def main() -> int:
@@ -67,16 +49,11 @@ def main() -> int:
     for folder in options.scenes:
         scene = read_scene(folder)
         evaluator = Evaluator(scene.splats, scene.test.spread(options.views), metrics=("psnr",))
-        source, count = folder / "point_cloud.ply", len(scene.splats)
         ways = {
             "each from the one before": from_one_another(scene),
             "each from the original": in_one_go(scene),
-            "deleted": deleted(scene),
         }
-        if splat_transform.find() is not None:
-            for flag in splat_transform.FLAGS:
-                ways[f"splat-transform {flag}"] = decimated(source, flag, count)
-        print(f"{folder.name}: {count} splats, shares {SHARES}", flush=True)
+        print(f"{folder.name}: {len(scene.splats)} splats, shares {SHARES}", flush=True)
         for name, levels in ways.items():
             start, cells = time.process_time(), []
             made = list(levels)

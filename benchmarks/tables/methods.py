@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from refine_addon import core
-from refine_addon.core import METHODS, Occlusion
+from refine_addon.core import METHODS
 from refine_addon.core.formats.ply import read_ply
-from refine_addon.core.refit.refit import refit
 from refine_addon.core.scores import Scores
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import ARRAYS, Splats
@@ -36,14 +35,9 @@ OURS, LITERATURE, EXTERNAL = "ours", "literature", "external"
 class Task:
     """What every method gets.
 
-    Attributes
-    ----------
-    splats : Splats
-        In memory.
-    views : ViewSet
-        The views that decide.
-    file : Path
-        The splats as a file, for other programs.
+    - splats: In memory.
+    - views: The views that decide.
+    - file: The splats as a file, for other programs.
     """
 
     splats: Splats
@@ -55,20 +49,13 @@ class Task:
 class Method:
     """One way to get rid of splats; exactly one of the three functions is set.
 
-    Attributes
-    ----------
-    name : str
-    group : {"ours", "literature", "external"}
-    about : str
-        What it is, in one line.
-    score : callable, optional
-        ``(task, statistics) -> Scores``.
-    reduce : callable, optional
-        ``(task, keep_count, ratio) -> Splats``.
-    run : callable, optional
-        ``(task, keep_count) -> (Splats, Run)``: another program, which is timed by itself.
-    rendered : bool
-        Whether `score` needs the statistics of rendered views, whose time counts as its own.
+    - group, {"ours", "literature", "external"}
+    - about: What it is, in one line.
+    - score: ``(task, statistics) -> Scores``.
+    - reduce: ``(task, keep_count, ratio) -> Splats``.
+    - run: ``(task, keep_count) -> (Splats, Run)``: another program, which is timed by itself.
+    - rendered: Whether `score` needs the statistics of rendered views, whose time counts as its
+      own.
     """
 
     name: str
@@ -191,7 +178,7 @@ CORE_ABOUT = {
 
 
 def _core() -> list[Method]:
-    """Return every method of the core, and deleting with refitting."""
+    """Return every method of the core."""
     methods = []
     for name, settings in METHODS.items():
         one, about = settings(views=0), CORE_ABOUT.get(name, f"method '{name}'")
@@ -199,18 +186,12 @@ def _core() -> list[Method]:
             methods.append(Method(name, OURS, about, reduce=partial(_pruned, one)))
         else:
             methods.append(Method(name, OURS, about, score=partial(_scored, one)))
-    about = "occlusion deletes, and the rest is refitted: `core/refit`"
-    return [*methods, Method("deleted+refit", OURS, about, reduce=_deleted_and_refitted)]
+    return methods
 
 
 def _pruned(method: core.Method, task: Task, keep_count: int, ratio: float) -> Splats:
     del ratio
     return core.prune(task.splats, task.views, Budget(keep=keep_count), method).splats
-
-
-def _deleted_and_refitted(task: Task, keep_count: int, ratio: float) -> Splats:
-    left = _pruned(Occlusion(0), task, keep_count, ratio)
-    return refit(left, task.splats, task.views).splats
 
 
 def _scored(method: core.Method, task: Task, statistics: Statistics | None) -> Scores:

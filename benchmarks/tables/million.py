@@ -27,9 +27,7 @@ from refine_addon.core.splats import SH_C0, Splats, drawable, joined, opacity, r
 from refine_addon.core.views import ViewSet
 
 from ..baselines import splat_transform
-from ..speed.file_to_file import run
 from .evaluate import Evaluator
-from .sizes import scaled
 
 COUNT = 1_000_000
 RATIO = 0.5
@@ -46,16 +44,9 @@ SHADE = 0.02
 class Command:
     """One command.
 
-    Attributes
-    ----------
-    name : str
-    seconds, busy : float
-        From start to end, and of the processor, all cores together.
-    megabytes : float
-        Most memory of its own.
-    kept : int
-    psnr : float
-        Against renders of the million, mean of the views that are compared, dB.
+    - seconds, busy: From start to end, and of the processor, all cores together.
+    - megabytes: Most memory of its own.
+    - psnr: Against renders of the million, mean of the views that are compared, dB.
     """
 
     name: str
@@ -70,15 +61,9 @@ class Command:
 class Million:
     """What was measured of a million splats.
 
-    Attributes
-    ----------
-    source, splats : int
-        How many there were and how many were made of them.
-    likeness : float
-        PSNR of the renders of these against renders of those, dB.
-    compared : int
-        How many held-out views are compared.
-    commands : list of Command
+    - source, splats: How many there were and how many were made of them.
+    - likeness: PSNR of the renders of these against renders of those, dB.
+    - compared: How many held-out views are compared.
     """
 
     source: int
@@ -95,10 +80,7 @@ def split(splats: Splats, count: int) -> Splats:
     variance ``(1 - ASIDE^2) s^2``: together they have its mean and its covariance. Each gets half
     of its optical thickness times area, ``1 - (1 - opacity)^(1 / (2 sqrt(1 - ASIDE^2)))``.
 
-    Raises
-    ------
-    ValueError
-        If there are more than `count`, or none can be drawn.
+    - ValueError: if there are more than `count`, or none can be drawn.
     """
     now = splats.take(drawable(splats))
     if not 0 < len(now) <= count:
@@ -170,6 +152,18 @@ def write_cameras(path: Path, views: ViewSet) -> None:
     path.write_text(json.dumps(cameras), encoding="utf-8")
 
 
+def scaled(views: ViewSet, width: int) -> ViewSet:
+    """Return the same cameras with pictures of another width, pixels; heights in proportion."""
+    made = []
+    for view in views:
+        height = max(round(view.height * width / view.width), 1)
+        across, down = width / view.width, height / view.height
+        size = {"width": width, "fx": view.fx * across, "cx": view.cx * across}
+        size |= {"height": height, "fy": view.fy * down, "cy": view.cy * down}
+        made.append(replace(view, **size))
+    return replace(views, views=tuple(made))
+
+
 def commands(folder: Path, left: int) -> Mapping[str, Sequence[str | Path]]:
     """Return all commands by name, from ``in.ply`` in a folder to ``out.ply`` there."""
     source, output = folder / "in.ply", folder / "out.ply"
@@ -186,14 +180,8 @@ def commands(folder: Path, left: int) -> Mapping[str, Sequence[str | Path]]:
 def measure(splats: Splats, views: ViewSet, test: ViewSet, count: int = COUNT) -> Million:
     """Split the splats of a scene and run every command on them.
 
-    Parameters
-    ----------
-    splats : Splats
-    views : ViewSet
-        Those that score.
-    test : ViewSet
-        Those that are compared, `COMPARED` of them.
-    count : int
+    - views: Those that score.
+    - test: Those that are compared, `COMPARED` of them.
     """
     many = split(splats, count)
     held_out = scaled(test.spread(COMPARED), WIDTH)
@@ -205,7 +193,7 @@ def measure(splats: Splats, views: ViewSet, test: ViewSet, count: int = COUNT) -
         write_ply(folder / "in.ply", many)
         write_cameras(folder / "cameras.json", scaled(views, WIDTH))
         for name, command in commands(folder, len(many) - int(RATIO * len(many))).items():
-            seconds, busy, peak = run(command)
+            seconds, busy, peak = splat_transform.measured(command)
             left = read_ply(folder / "out.ply").splats()
             psnr = evaluator.evaluate(left).renders.mean["psnr"]
             rows.append(Command(name, seconds, busy, peak, len(left), psnr))

@@ -49,11 +49,7 @@ STARTS: dict[str, Method] = {
 class Cheaper(NamedTuple):
     """Refitting made cheaper.
 
-    Attributes
-    ----------
-    rounds : int, optional
-    views, rays : float
-        Shares of the views that it casts rays from, and of the rays that it casts.
+    - views, rays: Shares of the views that it casts rays from, and of the rays that it casts.
     """
 
     rounds: int | None = None
@@ -77,17 +73,12 @@ CHEAPER = {
 class Curve:
     """Refitting at one ratio.
 
-    Attributes
-    ----------
-    name : str
-        One of `STARTS` or of `CHEAPER`, which begin with "merged".
-    ratio : float
-        Share removed.
-    start : float
-        Processor seconds until refitting begins, all threads together.
-    rounds : list of (float, float)
-        Processor seconds since then and PSNR on held-out views against renders of the unpruned
-        splats, dB: before the first round, and after each that gained.
+    - name: One of `STARTS` or of `CHEAPER`, which begin with "merged".
+    - ratio: Share removed.
+    - start: Processor seconds until refitting begins, all threads together.
+    - rounds, list of (float, float): Processor seconds since then and PSNR on held-out views
+      against renders of the unpruned splats, dB: before the first round, and after each that
+      gained.
     """
 
     name: str

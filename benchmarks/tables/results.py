@@ -7,12 +7,9 @@ from dataclasses import dataclass, field
 from .cost import Cost
 from .estimate import Estimated
 from .finetune import Tuned
-from .flops import Counts
-from .hessian import Energies
 from .methods import Method
 from .million import Million
 from .refits import Curve
-from .sizes import Timed
 from .variants import Line
 
 
@@ -20,12 +17,9 @@ from .variants import Line
 class Row:
     """One method at one ratio.
 
-    Attributes
-    ----------
-    kept, asked : int
-        How many splats are left, and how many should be.
-    quality : dict of (views, reference) to dict of str to float
-        Views "held-out" or "scoring", reference "renders" or "pictures" -> metric -> mean.
+    - kept, asked: How many splats are left, and how many should be.
+    - quality, dict of (views, reference) to dict of str to float: Views "held-out" or "scoring",
+      reference "renders" or "pictures" -> metric -> mean.
     """
 
     method: Method
@@ -38,20 +32,16 @@ class Row:
 
 @dataclass(eq=False)
 class Measured:
-    """All that was measured of one scene; from `sizes` on, each part under its own name."""
+    """All that was measured of one scene; from `estimate` on, each part under its own name."""
 
     name: str
     facts: dict[str, str]
     rows: list[Row] = field(default_factory=list)
     unpruned: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
-    sizes: list[Timed] = field(default_factory=list)
     estimate: list[Estimated] = field(default_factory=list)
     iterations: int = 0
     finetune: list[Tuned] = field(default_factory=list)
     refits: list[Curve] = field(default_factory=list)
     million: Million | None = None
-    cheaper: list[Line] = field(default_factory=list)
     ablation: list[Line] = field(default_factory=list)
-    flops: Counts | None = None
-    hessian: Energies | None = None
     failed: list[str] = field(default_factory=list)

@@ -42,12 +42,9 @@ from . import (
     estimate,
     evaluate,
     finetune,
-    flops,
-    hessian,
     methods,
     million,
     refits,
-    sizes,
     trade_report,
     variants,
 )
@@ -69,9 +66,7 @@ FAILURES = (
 )
 ONCE = ("finetune", "million")
 """Parts that take long and are measured for the first scene only."""
-PARTS = ("methods", "sizes", "estimate", "refits", *ONCE, "cheaper", "ablation", "flops", "hessian")
-HALF = 0.5
-"""Share removed where methods are timed only."""
+PARTS = ("methods", "estimate", "refits", *ONCE, "ablation")
 
 
 class Comparison:
@@ -211,11 +206,7 @@ def _parts(
     """Return how each part but the methods is measured, under its name in `Measured`."""
     splats, scoring, ratios = task.splats, task.views, options.ratios
     offered = {method.name: method for method in methods.everything()}
-    ours = [method for method in offered.values() if method.group == methods.OURS]
     budgets = [Budget(ratio=ratio) for ratio in ratios]
-
-    def timed(method: Method, task: Task) -> Cost:
-        return measured(lambda: leave(method, task, HALF), options.runs)[1]
 
     def left(name: str, ratio: float) -> Splats:
         return leave(offered[name], task, ratio)
@@ -227,15 +218,11 @@ def _parts(
         return finetune.measure(left, finetune.METHODS, training, held_out, options.iterations)
 
     return {
-        "sizes": lambda: sizes.measure(ours, task, timed),
         "estimate": lambda: list(estimate.measure(splats, scoring, budgets)),
         "refits": lambda: refits.measure(task, held_out, ratios),
         "finetune": tuned,
         "million": lambda: million.measure(splats, scoring, scene.test, options.million),
-        "cheaper": lambda: variants.measure(variants.CHEAPER, task, held_out, ratios),
         "ablation": lambda: variants.measure(variants.ABLATION, task, held_out, ratios),
-        "flops": lambda: flops.measure(splats, scoring),
-        "hessian": lambda: hessian.measure(splats, scoring),
     }
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
-from . import finetune, flops, million, refits
-from .cost import Cost
+from . import finetune, million, refits
 from .results import Measured
 
 
@@ -19,36 +18,12 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def sections(scene: Measured, ratios: Sequence[float]) -> list[str]:
     """Return the lines of all parts that were measured of a scene."""
     return [
-        *_sizes_table(scene),
         *_estimate_table(scene, ratios),
         *_refit_tables(scene, ratios),
         *_finetune_table(scene),
         *_million_table(scene),
-        *_cheaper_table(scene, ratios),
         *_ablation_table(scene, ratios),
-        *_flops_table(scene),
-        *_hessian_table(scene),
     ]
-
-
-def _seconds(cost: Cost) -> str:
-    return f"{cost.seconds:.2f} ({cost.busy:.2f})"
-
-
-def _sizes_table(scene: Measured) -> list[str]:
-    if not scene.sizes:
-        return []
-    sizes = list(scene.sizes[0].costs)
-    body = []
-    for line in scene.sizes:
-        costs = [line.costs[size] for size in sizes]
-        growth = costs[-1].busy / max(costs[-2].busy, 1e-9) if len(costs) > 1 else 1.0
-        body.append([line.name, *map(_seconds, costs), f"{growth:.2f}"])
-    heads = ["seconds (of the processor)", *sizes, "last over the one before it"]
-    return ["", f"### {scene.name}: seconds by the size of the pictures", "",
-            ("Half removed. The first size is that of the files; the last column compares "
-            "processor time."), "",
-            *table(heads, body)]  # fmt: skip
 
 
 def _estimate_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
@@ -143,19 +118,6 @@ def _million_table(scene: Measured) -> list[str]:
             ]  # fmt: skip
 
 
-def _cheaper_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
-    if not scene.cheaper:
-        return []
-    body = [
-        [line.name, *(f"{value:.1f}" for value in line.psnr), f"{line.seconds:.2f}"]
-        for line in scene.cheaper
-    ]
-    return ["", f"### {scene.name}: speed for accuracy within occlusion", "",
-            ("PSNR on held-out views against renders. Views are `--views`; cells, density and "
-            "rounds are arguments of `core/scoring/occlusion.py`."), "",
-            *table(["occlusion", *(f"{r:.0%}" for r in ratios), "seconds"], body)]  # fmt: skip
-
-
 def _ablation_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
     if not scene.ablation:
         return []
@@ -164,47 +126,3 @@ def _ablation_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
             ("PSNR on held-out views against renders. Visibility is alpha, projection "
             "1 / (d^2 + eta), equal weights lambda = 1/3."), "",
             *table(["closed form", *(f"{ratio:.0%}" for ratio in ratios)], body)]  # fmt: skip
-
-
-def _flops_table(scene: Measured) -> list[str]:
-    counts = scene.flops
-    if counts is None:
-        return []
-    everything = counts.splats * counts.views / 1e9
-    body = [
-        [one.method, f"{one.per_splat:.0f}", f"{one.per_splat_view:.1f}",
-         f"{one.per_splat_view * everything + one.per_splat * counts.splats / 1e9:.2f}"]
-        for one in counts.methods
-    ]  # fmt: skip
-    rendered = flops.PER_HIT * counts.hits_per_splat_view
-    body.append(["rendered statistics, at least", "", f"{rendered:.0f}",
-                 f"{rendered * everything:.2f}"])  # fmt: skip
-    failed = [f"- {name} could not be counted: {why}" for name, why in counts.failed.items()]
-    return ["", f"### {scene.name}: floating-point operations", "",
-            ("Counted by running the code with arrays that count (`tables/flops.py`, where "
-            "`ANALYTIC` is the closed form's count by hand, which a test compares); the last "
-            f"column is for all {counts.splats:,} splats and {counts.views} views. Rendering "
-            f"draws a splat in {counts.hits_per_splat_view:.1f} pixels of a view on average, "
-            f"{flops.PER_HIT} operations each."),
-            "", *table(["method", "a splat", "a splat and view", "all, 1e9"], body),
-            *(["", *failed] if failed else [])]  # fmt: skip
-
-
-def _hessian_table(scene: Measured) -> list[str]:
-    found = scene.hessian
-    if found is None:
-        return []
-    body = [
-        ["splats (14 parameters each)", found.primitives, found.primitives_unitless],
-        ["attributes of a splat (geometry, opacity, colour)", found.attributes,
-         found.attributes_unitless],
-        ["removals of single splats", found.removals, found.removals],
-    ]  # fmt: skip
-    rows = [[str(name), f"{raw:.3f}", f"{free:.3f}"] for name, raw, free in body]
-    rows[-1][-1] = ""
-    return ["", f"### {scene.name}: how independent splats and attributes are", "",
-            ("Diagonal energy ratio of the Gauss-Newton Hessian of the pictures, 1 is independent; "
-            f"mean over {found.groups} random splats with {found.neighbours} nearest neighbours, "
-            f"{found.views} views (`tables/hessian.py`). Unitless: every parameter's own diagonal "
-            "entry is 1."), "",
-            *table(["diagonal blocks", "as it is", "unitless"], rows)]  # fmt: skip

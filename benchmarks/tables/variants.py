@@ -1,4 +1,4 @@
-"""Scores by other settings: what each part of a method is worth, and what it costs."""
+"""Scores by other settings: what each part of the closed form is worth."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from refine_addon import core
 from refine_addon.core import ClosedForm, Scores
-from refine_addon.core.scoring import occlusion
-from refine_addon.core.visibility.measuring import Sampling
 
 from ..baselines.refine import refine
 from .evaluate import Evaluator
@@ -18,31 +16,11 @@ from .methods import Task, as_scores
 Score = Callable[[Task], Scores]
 
 
-def _occlusion(views: int = 0, rounds: int = 8, **sampling: float) -> Score:
-    return lambda task: occlusion.score(
-        task.splats, task.views.spread(views), rounds=rounds, sampling=Sampling(**sampling)
-    )
-
-
 def _published(depth: str, **changes: bool) -> Score:
     return lambda task: as_scores(
         refine(task.splats, task.views, depth, **changes), len(task.views)
     )
 
-
-CHEAPER = {
-    "default, all views": _occlusion(),
-    "32 views": _occlusion(32),
-    "16 views": _occlusion(16),
-    "8 views": _occlusion(8),
-    "3 rounds": _occlusion(rounds=3),
-    "1 round": _occlusion(rounds=1),
-    "density 3": _occlusion(density=3.0),
-    "cells of 6 px": _occlusion(cell=6.0),
-    "cells of 8 px": _occlusion(cell=8.0),
-    "cells of 8 px, 3 rounds": _occlusion(cell=8.0, rounds=3),
-}
-"""Occlusion made cheaper: how much accuracy each way to save time costs."""
 
 _PARTS = {
     "whole": {},
@@ -62,13 +40,8 @@ ABLATION = {
 class Line:
     """Seconds and PSNR by one of the settings.
 
-    Attributes
-    ----------
-    name : str
-    seconds : float
-        For the scores, from which any number of splats can be removed.
-    psnr : tuple of float
-        For each ratio, dB, on held-out views against renders of the unpruned splats.
+    - seconds: For the scores, from which any number of splats can be removed.
+    - psnr: For each ratio, dB, on held-out views against renders of the unpruned splats.
     """
 
     name: str

@@ -128,20 +128,6 @@ def test_wrong_usage_is_code_2(files, monkeypatch, capsys, words, expected):
     assert expected in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_clean_takes_many_files_and_one_that_fails_does_not_stop_the_others(files, capsys):
-    """As `prune` does: the second is no PLY."""
-    (files / "broken.ply").write_bytes(b"no")
-    (files / "again.ply").write_bytes((files / "scene.ply").read_bytes())
-    more = [files / "broken.ply", files / "again.ply"]
-
-    assert call(files, "clean", "-o", files / "out", more=more) == 1
-
-    assert "broken.ply" in capsys.readouterr().err
-    assert sorted(path.name for path in (files / "out").iterdir()) == ["again.ply", "scene.ply"]
-    assert len(read_ply(files / "out/again.ply")) == SIDE**2
-
-
 def test_a_file_of_splats_that_cannot_be_drawn_is_not_called_clean(files, capsys):
     """All positions are NaN: it said that there was nothing to clean away."""
     spoil(files, WHOLE)

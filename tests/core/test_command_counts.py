@@ -101,14 +101,3 @@ def test_sizes_and_limits_are_in_units_that_show_them(files, capsys):
     assert f"note: already {size:.1f} kB: the budget removes nothing" in capsys.readouterr().out
     assert call(files, "prune", "--max-mb", ".02", *out, "--overwrite") == 0
     assert "already" not in capsys.readouterr().out
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("psnr", "words"),
-    [("99", "by the estimate nothing can go at 99 dB"), ("1", "the estimate ends at 95% removed")],
-)
-def test_a_psnr_out_of_reach_is_said(files, capsys, psnr, words):
-    """Nothing can go at 99 dB, and at 95 % removed these still have more than 1."""
-    assert call(files, "prune", "--psnr", psnr, "--dry-run", "--views", "2") == 0
-    assert f"note: {words}" in capsys.readouterr().out

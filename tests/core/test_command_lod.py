@@ -42,7 +42,10 @@ def made(folder):
 
 
 def test_lod_writes_levels_and_says_what_each_costs(files, capsys):
-    """577 splats: .5 are 289 (288.5), .1 are 58 (57.7); a line for each, and the report."""
+    """577 splats: .5 are 289 (288.5), .1 are 58 (57.7); a line for each, and the report.
+
+    By default four levels are made, halves of halves, about: 289, 145, 70 and 35.
+    """
     options = ["--levels", ".5,.1", "-o", files / "out/room.splat"]
 
     entry = told(files, "lod", *options, *QUICK)
@@ -52,12 +55,8 @@ def test_lod_writes_levels_and_says_what_each_costs(files, capsys):
     assert "room.lod1.splat: 289 splats" in said
     assert made(files / "out") == {"room.lod1.splat": 289, "room.lod2.splat": 58}
     assert [level["splats"] for level in entry["levels"]] == [289, 58]
-
-
-def test_by_default_four_levels_are_made(files):
-    """Halves of halves, about: 289, 145, 70 and 35 of 577, rounded up."""
-    assert call(files, "lod", "-o", files / "out", "--views", "2", "--quiet") == 0
-    assert list(made(files / "out").values()) == [289, 145, 70, 35]
+    assert call(files, "lod", "-o", files / "four", "--views", "2", "--quiet") == 0
+    assert list(made(files / "four").values()) == [289, 145, 70, 35]
 
 
 @pytest.mark.parametrize(
@@ -70,6 +69,7 @@ def test_by_default_four_levels_are_made(files):
         (["-o", "out", "--psnr", "40", "--levels", ".5"], "by PSNR, got both"),
         (["-o", "levels.ply.gz"], "is not written, expected one of .ply"),
         ([], "expected -o OUT"),
+        (["-o", "out"], "no cameras"),
         (["-o", "web/lod-meta.json", "--report", "web/lod-meta.json"], "a file of its own"),
     ],
 )
@@ -77,14 +77,10 @@ def test_wrong_usage_ends_before_any_work(files, monkeypatch, capsys, options, w
     monkeypatch.chdir(files)
     before = contents(files)
 
-    assert main(["lod", "scene.ply", "--cameras", "cameras.json", *options]) == 2
+    cameras = ["--cameras", "cameras.json"] if word != "no cameras" else []
+    assert main(["lod", "scene.ply", *cameras, *options]) == 2
     assert word in capsys.readouterr().err
     assert contents(files) == before
-
-
-def test_without_cameras_there_are_no_levels(files, capsys):
-    assert main(["lod", str(files / "scene.ply"), "-o", str(files / "out")]) == 2
-    assert "no cameras" in capsys.readouterr().err
 
 
 def test_files_that_exist_are_replaced_when_told_alone_and_none_is_taken_away(files, capsys):
@@ -117,6 +113,30 @@ def test_ctrl_c_leaves_what_was_there(files, stops, capsys):
     assert contents(files) == before
 
 
+def test_places_of_levels_that_cannot_be_and_one_that_is_a_source(files, capsys):
+    """Two levels that are one file by a link; names of 256 bytes, the source's 251 and .lod1.
+
+    No empty folder is left, nor the one above it. A level may be the source of a new run: it stays.
+    """
+    out, cameras = files / "out", ["--cameras", str(files), *QUICK, "--levels", ".5,.1"]
+    long = files / f"{'x' * 247}.ply"
+    long.write_bytes((files / "scene.ply").read_bytes())
+    assert main(["lod", str(long), "-o", str(files / "a/new"), *cameras]) == 1
+    assert "cannot be written (File name too long)" in capsys.readouterr().err
+    assert not (files / "a").exists()
+
+    out.mkdir()
+    (out / "scene.lod2.ply").symlink_to("scene.lod1.ply")
+    assert call(files, "lod", "-o", out, "--overwrite", *QUICK) == 1
+    assert "by a link" in capsys.readouterr().err
+    (out / "scene.lod2.ply").unlink()
+
+    assert call(files, "lod", "-o", out, *QUICK, "--levels", ".5") == 0
+    assert main(["lod", str(out / "scene.lod1.ply"), "-o", str(out), "--overwrite", *cameras]) == 0
+    made_of_it = {"scene.lod1.lod1.ply": 145, "scene.lod1.lod2.ply": 29}
+    assert made(out) == {**made_of_it, "scene.lod1.ply": 289}
+
+
 def test_levels_that_would_be_equal_are_made_once(files, capsys):
     """Of 577, .999 are all (576.4); .002 and .0019 are both 2 (1.2 and 1.1)."""
     options = ["--levels", ".999,.5,.002,.0019", "-o", files / "out", *QUICK]
@@ -142,37 +162,6 @@ def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):
     assert "note: level 1: the estimate ends at 95% removed" in said
 
 
-def test_levels_with_names_that_are_too_long_leave_no_empty_folder(files, capsys):
-    """The source's 251 bytes and .lod1 are 256; neither the folder nor the one above it is left."""
-    long = files / f"{'x' * 247}.ply"
-    (files / "scene.ply").rename(long)
-
-    code = main(["lod", str(long), "--cameras", str(files), "-o", str(files / "a/new"), *QUICK])
-
-    assert code == 1
-    assert "cannot be written (File name too long)" in capsys.readouterr().err
-    assert not (files / "a").exists()
-
-
-def test_a_level_can_be_the_source_of_a_new_run(files):
-    """It is in the folder: it stays."""
-    out = files / "out"
-    assert call(files, "lod", "-o", out, "--levels", ".5", *QUICK) == 0
-    words = ["lod", out / "scene.lod1.ply", "--cameras", files, "-o", out, "--overwrite", *QUICK]
-
-    assert main([str(word) for word in [*words, "--levels", ".5"]]) == 0
-
-    assert made(out) == {"scene.lod1.lod1.ply": 145, "scene.lod1.ply": 289}
-
-
-def test_levels_that_are_one_file_by_a_link_are_refused(files, capsys):
-    (files / "out").mkdir()
-    (files / "out/scene.lod2.ply").symlink_to("scene.lod1.ply")
-
-    assert call(files, "lod", "-o", files / "out", "--overwrite", *QUICK) == 1
-    assert "by a link" in capsys.readouterr().err
-
-
 @pytest.fixture
 def streamed(files):
     """Return the index of a streamed SOG to be made, and the command that makes it."""
@@ -182,51 +171,36 @@ def streamed(files):
 
 
 def test_a_streamed_sog_has_all_levels_and_the_source(files, streamed, capsys):
-    """577 splats as level 0, 289 and 58; positions to 16 bits, of the levels that files have."""
+    """577 splats as level 0, 289 and 58; positions to 16 bits, of the levels that files have.
+
+    What must go is in none of them: a viewer shows level 0, too.
+    """
     path, run = streamed
     assert call(files, "lod", "--levels", ".5,.1", "-o", files / "out", *QUICK) == 0
     capsys.readouterr()
 
     assert call(files, *run) == 0
 
+    said = capsys.readouterr().out
     sources = [files / "scene.ply", *sorted((files / "out").iterdir())]
     for level, source in enumerate(sources):
         splats, wanted = read_splats(path, level=level).splats(), read_splats(source).splats()
         assert len(splats) == len(wanted) == (577, 289, 58)[level]
         near = np.linalg.norm(splats.means[:, None] - wanted.means, axis=2)
         assert max(near.min(axis=0).max(), near.min(axis=1).max()) < 1e-3
-    said = capsys.readouterr().out
     assert "2 levels of 577 splats, by 2 of 6 views, " in said
     assert "  1_*/meta.json: 289 splats, " in said
     assert "note: .sog holds positions in 16 bits" in said
 
-
-def test_a_streamed_sog_is_replaced_when_told_alone(files, streamed, capsys):
-    """As a file is; nothing is left of what the run before had more."""
-    path, run = streamed
-    assert call(files, *run) == 0
-    assert call(files, *run) == 1
-    assert "lod-meta.json: exists already" in capsys.readouterr().err
-
-    assert call(files, *run, "--overwrite", "--levels", ".3") == 0
-
-    names = sorted(entry.name for entry in path.parent.iterdir())
-    assert names == ["0_1", "1_1", "lod-meta.json"]  # beside the old ones until these go
-    assert len(read_splats(path, level=1)) == 174
-
-
-def test_what_must_go_is_in_no_level_of_a_streamed_sog(files, streamed):
-    """Nor in level 0: a viewer shows that, too."""
-    path, run = streamed
-    everything = read_splats(files / "scene.ply").splats().means
-    inside = (np.abs(everything[:, :2]) < 1).all(axis=1)
-
-    assert call(files, *run, "--remove-inside", "box:-1,-1,0,1,1,99") == 0
-
+    inside = (np.abs(read_splats(sources[0]).splats().means[:, :2]) < 1).all(axis=1)
+    assert call(files, *run, "--overwrite", "--remove-inside", "box:-1,-1,0,1,1,99") == 0
     assert len(read_splats(path)) == 577 - inside.sum() < 577
 
 
-def test_a_streamed_sog_that_is_stopped_leaves_what_was_there(files, streamed, stops):
+def test_a_streamed_sog_is_replaced_when_told_alone_and_stays_where_that_stops(
+    files, streamed, stops, capsys
+):
+    """As a file is; nothing is left of what the run before had more."""
     path, run = streamed
     stops.add(2)
     assert call(files, *run) == 130
@@ -234,10 +208,18 @@ def test_a_streamed_sog_that_is_stopped_leaves_what_was_there(files, streamed, s
     stops.clear()
     assert call(files, *run) == 0
     before = contents(files)
-
+    assert call(files, *run) == 1
+    assert "lod-meta.json: exists already" in capsys.readouterr().err
     stops.add(2)
     assert call(files, *run, "--overwrite") == 130
     assert contents(files) == before
+    stops.clear()
+
+    assert call(files, *run, "--overwrite", "--levels", ".3") == 0
+
+    names = sorted(entry.name for entry in path.parent.iterdir())
+    assert names == ["0_1", "1_1", "lod-meta.json"]  # beside the old ones until these go
+    assert len(read_splats(path, level=1)) == 174
 
 
 def test_a_library_that_is_missing_is_told_before_the_work(files, streamed, monkeypatch, capsys):

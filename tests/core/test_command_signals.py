@@ -43,7 +43,6 @@ def folder(tmp_path, monkeypatch):
 
 
 def outputs(folder):
-    """Return the names of what stands in the folder beside the input."""
     return sorted(path.name for path in folder.iterdir() if path.name != "in.ply")
 
 
@@ -270,54 +269,46 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_python_tidies_up_comes_too_late(folder, number):
+def test_a_signal_while_python_tidies_up_comes_too_late(folder):
     """All is written and said: the code is 0."""
     with start("-c", LEAVING, *PRUNE, "--quiet", stdin=subprocess.PIPE) as process:
         assert process.stdout.readline() == b"leaving\n"
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         said = process.communicate(b"\n", timeout=SECONDS)
 
     assert (process.returncode, *said) == (0, b"", b"")
     assert outputs(folder) == ["out.ply"]
 
 
-def handlers():
-    return [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
-
-
-@pytest.fixture
-def _none_ignored():
-    """Ignore no signal: ``nohup make test`` does, and what is ignored is not listened to."""
-    before = {n: signal.signal(n, signal.SIG_DFL) for n in (signal.SIGTERM, signal.SIGHUP)}
-    before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("_none_ignored")
 @pytest.mark.parametrize("outcome", [0, KeyboardInterrupt(), ValueError("a fault of ours")])
 def test_whoever_listened_before_listens_afterwards(monkeypatch, outcome):
-    """Blender and the tests call the command among other things; a fault passes through."""
-    before, during = handlers(), []
+    """Blender and the tests call the command among other things; a fault passes through.
+
+    What is ignored is not listened to, as under ``nohup make test``, so nothing is here.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    heard, during = [lambda *_: None for _ in numbers], []
+    before = [signal.signal(n, handler) for n, handler in zip(numbers, heard, strict=True)]
 
     def run(*_, **__):
-        during.extend(handlers())
+        during.extend(map(signal.getsignal, numbers))
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
 
     monkeypatch.setattr(subcommands, "run", run)
-
-    if isinstance(outcome, ValueError):
-        with pytest.raises(ValueError, match="a fault of ours"):
-            command.main([])
-    else:
-        assert command.main([]) == (130 if outcome else 0)
-
-    assert handlers() == before
-    assert all(now != then for now, then in zip(during, before, strict=True))
+    try:
+        if isinstance(outcome, ValueError):
+            with pytest.raises(ValueError, match="a fault of ours"):
+                command.main([])
+        else:
+            assert command.main([]) == (130 if outcome else 0)
+        assert [signal.getsignal(n) for n in numbers] == heard
+        assert not set(during) & set(heard)
+        assert len(during) == 3
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def test_the_command_runs_on_a_thread_where_signals_cannot_be_listened_to(capsys):

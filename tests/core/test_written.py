@@ -12,7 +12,7 @@ from refine_addon.core.affine import transformed
 from refine_addon.core.quality.psnr import psnr_against
 
 from .test_cleaning import cameras, wall
-from .test_command_clean import files, told, written  # noqa: F401 - a fixture
+from .test_command_clean import written
 
 
 @pytest.fixture(scope="module")
@@ -78,12 +78,3 @@ def test_a_file_in_another_frame_is_moved_to_that_of_the_views(source, tmp_path)
 
     assert psnr(matrix) == pytest.approx(told, abs=0.02)
     assert psnr(np.diag([1.0, 2.0, 1.0, 1.0])) is None
-
-
-@pytest.mark.slow
-def test_the_command_says_it(files, capsys):
-    """On the line of the quality, and in the report."""
-    options = ["--ratio", ".1", "--method", "occlusion", "-o", files / "out.splat"]
-
-    assert told(files, "prune", *options)["written_psnr"] > 0.0
-    assert "dB as written" in capsys.readouterr().out
