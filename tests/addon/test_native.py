@@ -18,16 +18,16 @@ COUNT = 9_939
 def assert_alike(core, got, expected, tolerance=1e-6):
     """Compare activated values: scales and opacities relative to their size."""
 
-    def unit(q):
-        q = core.splats.unit_quaternions(q)
+    def unit(splats):
+        q = core.splats.unit_quaternions(splats.quaternions)
         return q * np.sign(q[np.arange(len(q)), np.abs(q).argmax(axis=1)])[:, None]
 
-    for value in (core.splats.scales, core.splats.opacity):
-        name = "log_scales" if value == core.splats.scales else "opacity_logits"
-        pair = [value(getattr(splats, name)) for splats in (got, expected)]
-        np.testing.assert_allclose(*pair, rtol=tolerance)
-    pair = [unit(splats.quaternions) for splats in (got, expected)]
-    np.testing.assert_allclose(*pair, rtol=0, atol=tolerance)
+    for value in (
+        lambda splats: core.splats.scales(splats.log_scales),
+        lambda splats: core.splats.opacity(splats.opacity_logits),
+    ):
+        np.testing.assert_allclose(value(got), value(expected), rtol=tolerance)
+    np.testing.assert_allclose(unit(got), unit(expected), rtol=0, atol=tolerance)
     for name in ("means", "sh_dc", "sh_rest"):
         pair = [getattr(splats, name) for splats in (got, expected)]
         np.testing.assert_allclose(*pair, rtol=0, atol=tolerance if tolerance > 1e-6 else 0)
@@ -35,13 +35,12 @@ def assert_alike(core, got, expected, tolerance=1e-6):
 
 @pytest.fixture
 def file(addon, quarter_file):
-    """Read every fourth splat of the room."""
     return addon.core.read_ply(quarter_file)
 
 
 @pytest.fixture
 def cloud(file, empty_scene):
-    """Return them as Blender 5.3 would have imported them."""
+    """Return every fourth splat of the room as Blender 5.3 would have imported them."""
     return as_blender_imports(file.rows, "room")
 
 
@@ -63,9 +62,8 @@ def read(addon, obj, name):
 
 def contents(addon, obj):
     """Return all that an object's data holds, to the bit, and where the object stands."""
-    facts = {
-        a.name: read(addon, obj, a.name).tobytes() for a in obj.data.attributes if a.name[0] != "."
-    }
+    names = [a.name for a in obj.data.attributes if a.name[0] != "."]
+    facts = {name: read(addon, obj, name).tobytes() for name in names}
     facts |= {key: str(value) for key, value in obj.data.items()}
     return facts | {"matrix": [list(row) for row in obj.matrix_world], "type": obj.type}
 
@@ -271,18 +269,3 @@ def test_blenders_own_import_is_what_these_tests_build(core, file, quarter_file,
 
     assert native.data.type == "GAUSSIAN_SPLAT"
     assert kinds[0] == kinds[1]
-
-
-@pytest.mark.usefixtures("room_cameras")
-@pytest.mark.slow
-def test_levels_of_detail_of_native_splats_are_native(addon, cloud):
-    """Copies reduced by the same apply and refitted: points of .2 and .1 of 994, rounded up."""
-    addon.mesh.edit.delete_vertices(cloud, np.arange(COUNT) % 10 != 0)
-    settings = bpy.context.scene.refine
-    settings.levels, settings.method, settings.views = "0.2, 0.1", "refit", 2
-
-    assert bpy.ops.refine.levels() == {"FINISHED"}
-
-    levels = [bpy.data.objects[f"room_lod{number}"] for number in (1, 2)]
-    assert [level.type for level in levels] == ["POINTCLOUD", "POINTCLOUD"]
-    assert [len(level.data.points) for level in (cloud, *levels)] == [994, 199, 100]

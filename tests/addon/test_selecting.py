@@ -111,20 +111,19 @@ def test_what_cannot_be_is_refused_in_a_sentence(chosen, quarter, unchanged):
 
 @pytest.mark.usefixtures("room_cameras")
 def test_plans_and_demands_take_splats(addon, chosen, quarter):
-    """Each is what the attribute and the volumes say of the splats."""
+    """What the attribute and the volumes say of the splats."""
+    read = addon.mesh.attributes.read_attribute
     bpy.ops.refine.score()
     bpy.ops.refine.select_by(what="GOING")
-    read = addon.mesh.attributes.read_attribute
     assert chosen.read(quarter) == np.flatnonzero(read(quarter.data, "refine_remove")).tolist()
     bpy.ops.refine.add_volume(role="KEEP", shape="BOX")
     box = bpy.context.scene.refine.volumes[0].object
-    box.scale = [0.5 * size for size in box.scale]
+    box.scale *= 0.5
     bpy.context.view_layer.update()
     bpy.context.view_layer.objects.active = quarter
     bpy.ops.refine.select_by(what="OUTSIDE")
     places = read(quarter.data, "position") - np.array(box.location)
     outside = (np.abs(places) > np.array(box.scale)).any(axis=1)
-
     assert 0 < outside.sum() < COUNT
     assert abs(len(chosen.read(quarter)) - outside.sum()) < 3  # on a face, by rounding
 
@@ -192,15 +191,3 @@ def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, quarter):
     assert (facts["protected"], facts["removed_by_user"]) == (40, 60)
     bpy.ops.refine.delete(what="VOLUMES")
     assert addon.mesh.layout.splat_count(quarter.data) == COUNT - 60
-
-
-def test_tools_are_in_the_toolbar_of_both_modes(addon):
-    """Five in object mode, five in edit mode of meshes."""
-    from bl_ui.space_toolsystem_toolbar import VIEW3D_PT_tools_active
-
-    for mode in ("OBJECT", "EDIT_MESH"):
-        tools = VIEW3D_PT_tools_active.tools_from_context(bpy.context, mode)
-        names = [tool.idname for tool in VIEW3D_PT_tools_active._tools_flatten(tools) if tool]
-        ours = [name for name in names if name.startswith("refine.")]
-        shapes = ("brush", "lasso", "box", "sphere", "color")
-        assert ours == [f"refine.select_{shape}" for shape in shapes]

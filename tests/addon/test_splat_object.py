@@ -21,36 +21,24 @@ def views(addon, quarter, room_cameras):
     return addon.cameras.CameraChoice("VISIBLE").views(bpy.context)
 
 
-def test_a_dry_run_changes_nothing(addon, quarter_file, views, unchanged, tmp_path):
+def test_a_dry_run_and_what_is_refused_change_nothing(
+    addon, quarter_file, views, unchanged, tmp_path
+):
+    """A name that there is not, with those that are; an unsaved scene is no file to save to."""
+    core, prune_object = addon.core, addon.objects.splat_group.prune_object
     unchanged.start()
-    report = addon.objects.splat_group.prune_object(
-        "room",
-        views,
-        addon.core.Budget(keep=1000),
-        addon.core.ClosedForm(),
-        dry_run=True,
-        output=tmp_path / "out.ply",
-    )
-
+    budget, out = core.Budget(keep=1000), tmp_path / "out.ply"
+    report = prune_object("room", views, budget, core.ClosedForm(), dry_run=True, output=out)
     assert report["splats"]["kept"] == 1000
     assert report["files"]["input_bytes"] == quarter_file.stat().st_size
-    assert not (tmp_path / "out.ply").exists()
-    unchanged()
-
-
-def test_what_cannot_be_pruned_is_refused_before_the_work(addon, views, unchanged):
-    """A name that there is not, with those that are; an unsaved scene is no file to save to."""
-    unchanged.start()
+    assert not out.exists()
     for name, save, expected in (
         ("rooom", False, r"no object 'rooom'.*splat objects: room"),
-        ("rooom", True, r"no object 'rooom'.*splat objects: room"),
         ("room", True, "not saved in a"),
     ):
-        with pytest.raises(addon.core.RefineError, match=expected):
-            addon.objects.splat_group.prune_object(
-                name, views, addon.core.Budget(ratio=0.5), save=save
-            )
-        unchanged()
+        with pytest.raises(core.RefineError, match=expected):
+            prune_object(name, views, budget, save=save)
+    unchanged()
 
 
 def test_moving_splats_and_cameras_together_keeps_the_rows(addon, quarter, room_cameras, score):
@@ -152,16 +140,6 @@ def test_scores_of_another_mesh_are_not_stored(addon, quarter, room_views):
 
     with pytest.raises(addon.core.RefineError, match="9938 splats, was scored with 9939"):
         addon.mesh.scores.store(check(quarter), scores, method)
-
-
-def test_a_pruned_object_is_pruned_again_and_exported(addon, quarter, room_cameras, tmp_path):
-    """The header's count follows the mesh: what is exported after two prunes is a whole file."""
-    for _ in range(2):
-        bpy.ops.refine.score()
-        bpy.ops.refine.apply()
-    export(addon, addon.mesh.layout.check(quarter), tmp_path / "out.ply")
-
-    assert len(addon.core.read_ply(tmp_path / "out.ply")) == COUNT - 4969 - 2485
 
 
 def test_modifiers_that_could_move_splats_are_mentioned(addon, quarter):

@@ -69,10 +69,6 @@ def set_places(obj, places):
     bpy.context.view_layer.update()
 
 
-def positions(addon, obj):
-    return addon.mesh.attributes.read_attribute(obj.data, "position")
-
-
 def linked(name, data=None):
     obj = bpy.data.objects.new(name, data)
     bpy.context.scene.collection.objects.link(obj)
@@ -210,7 +206,7 @@ def test_a_turn_in_edit_mode_is_mended_and_a_move_is_not_mentioned(addon, import
     bpy.ops.object.mode_set(mode="OBJECT")
     assert told_of(addon, imported) == []
     rest = stand(imported, rows=~which)
-    places = positions(addon, imported)
+    places = addon.mesh.attributes.read_attribute(imported.data, "position")
     places[which] = before[0]
     set_places(imported, places)
 
@@ -227,7 +223,7 @@ def test_an_applied_mirror_is_mended(addon, imported, stand, merge):
 
     Blender's default *Merge* puts what is near the mirror into it; all other splats are as without.
     """
-    places = positions(addon, imported)
+    places = addon.mesh.attributes.read_attribute(imported.data, "position")
     places[:, 0] -= np.median(places[:, 0])
     set_places(imported, places)
     addon.mesh.drift.stamp(imported.data)
@@ -265,7 +261,8 @@ def test_splats_that_are_bent_are_named_and_a_few_that_are_moved_are_not(
     addon, imported, share, said
 ):
     """No map explains them; the click takes them as they are."""
-    places, checked = positions(addon, imported), addon.mesh.layout.check(imported)
+    checked = addon.mesh.layout.check(imported)
+    places = addon.mesh.attributes.read_attribute(imported.data, "position")
     which = np.arange(COUNT) < share * COUNT
     places[which] += np.sin(7.0 * places[which][:, ::-1])
     set_places(imported, places)
@@ -277,21 +274,6 @@ def test_splats_that_are_bent_are_named_and_a_few_that_are_moved_are_not(
     bpy.ops.refine.mend()
     assert told_of(addon, imported) == []
     assert addon.mesh.attributes.digest(checked) == before
-
-
-def test_splats_of_another_importer_are_noted_as_soon_as_they_are_seen(addon, room):
-    """So what is done to them later is noticed; what only looks like splats is left alone."""
-    other = bpy.data.meshes.new("other")
-    other.vertices.add(3)
-    for name in ("opacity", "f_dc_0"):
-        other.attributes.new(name, "FLOAT", "POINT")
-    linked("other", other)
-    assert not addon.mesh.drift.is_stamped(room.data)
-
-    addon.ui.transforms._note()
-
-    assert addon.mesh.drift.is_stamped(room.data)
-    assert not addon.mesh.drift.is_stamped(other)
 
 
 def test_who_changes_sizes_and_rotations_as_well_is_left_alone(addon, imported, room_cameras):
@@ -312,27 +294,24 @@ def test_who_changes_sizes_and_rotations_as_well_is_left_alone(addon, imported, 
     assert told_of(addon, imported) == []
 
 
-def test_score_apply_and_export_say_what_was_done(
+def test_score_apply_export_and_the_command_say_what_was_done(
     addon, imported, room_cameras, room_views, tmp_path, capfd
 ):
-    """None of them is silent about splats that Ctrl+A ruined; nor is the command."""
+    """None of them is silent about splats that Ctrl+A ruined."""
     imported.matrix_world = SOMEWHERE
     select(imported)
     bpy.ops.object.transform_apply()
-    for operator, options in (
-        (bpy.ops.refine.score, {}),
-        (bpy.ops.refine.apply, {}),
-        (bpy.ops.refine.export_ply, {"filepath": str(tmp_path / "out.ply")}),
-    ):
+    for name, options in (
+        ("score", {}), ("apply", {}), ("export_ply", {"filepath": str(tmp_path / "out.ply")})
+    ):  # fmt: skip
         capfd.readouterr()
-        assert operator(**options) == {"FINISHED"}
+        assert getattr(bpy.ops.refine, name)(**options) == {"FINISHED"}
         said = capfd.readouterr()
         assert "splats were transformed without" in said.out + said.err
     core = addon.core
     report = addon.objects.splat_group.prune_object(
         imported.name, room_views, core.Budget(ratio=0.5), core.ClosedForm(), dry_run=True
     )
-
     assert "Mend Splats in the panel" in " ".join(report["notes"])
 
 
