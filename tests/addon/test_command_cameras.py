@@ -40,21 +40,6 @@ def animated(quarter, room_cameras, tmp_path):
     return few
 
 
-def pruned_by_panel(folder):
-    """Save the scene; return what Score, Apply and Export make of it; open it as it was saved."""
-    made = folder / "panel.ply"
-    bpy.ops.wm.save_mainfile()
-    for operator, options in (
-        ("score", {}),
-        ("apply", {}),
-        ("export_ply", {"filepath": str(made)}),
-    ):
-        assert getattr(bpy.ops.refine, operator)(**options) == {"FINISHED"}
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    bpy.context.view_layer.objects.active = None  # the command goes by the name alone
-    return made.read_bytes()
-
-
 def pruned(addon, folder, *options):
     """Return the file that `prune --object room` makes, and what the report says of the cameras."""
     out, told = folder / "out.ply", folder / "report.json"
@@ -63,10 +48,14 @@ def pruned(addon, folder, *options):
     return out.read_bytes(), json.loads(told.read_text())["results"][0]["cameras"]
 
 
-SHOT = {"frames": {"first": 1, "last": 21, "step": 5}}
+SHOT = (
+    {"frames": {"first": 1, "last": 21, "step": 5}},
+    "the active one at frames 1 to 21, every 5",
+)
 CHOICES = {
     "collection:few": ({"collection": "few"}, "those in collection 'few'"),
-    "frames:1:21:5": (SHOT, "the active one at frames 1 to 21, every 5"),
+    "frames:1:21:5": SHOT,
+    "frames": SHOT,  # of the panel's range
     "active": ({}, "the active one"),
     "selected": ({}, "the selected ones"),
     "visible": ({}, "all visible ones"),
@@ -75,71 +64,54 @@ CHOICES = {
 
 @pytest.mark.parametrize("option", CHOICES)
 def test_panel_and_command_keep_the_same_set_of_a_saved_scene(addon, animated, tmp_path, option):
-    """To the byte, by the saved choice and by the same one as an option; another one differs."""
+    """To the byte, by the saved choice and by the same one as an option; another one differs.
+
+    Method and budget are the command's: half of the splats go, by closed form.
+    """
     (facts, words), source = CHOICES[option], option.split(":")[0]
-    settings = bpy.context.scene.refine
+    settings, made = bpy.context.scene.refine, tmp_path / "panel.ply"
     settings.source, settings.collection = source.upper(), animated
-    by_panel = pruned_by_panel(tmp_path)
+    bpy.ops.wm.save_mainfile()
+    for name, values in (("score", {}), ("apply", {}), ("export_ply", {"filepath": str(made)})):
+        assert getattr(bpy.ops.refine, name)(**values) == {"FINISHED"}
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    bpy.context.view_layer.objects.active = None  # the command goes by the name alone
+    settings = bpy.context.scene.refine
+    settings.method, settings.views, settings.budget, settings.keep = "occlusion", 2, "keep", 7
     saved, saved_facts = pruned(addon, tmp_path)
-    bpy.context.scene.refine.source = "COLLECTION" if source == "visible" else "VISIBLE"
+    settings.source = "COLLECTION" if source == "visible" else "VISIBLE"
     given, given_facts = pruned(addon, tmp_path, "--source", option)
 
-    assert saved == given == by_panel
-    assert pruned(addon, tmp_path)[0] != by_panel
+    assert saved == given == made.read_bytes()
+    assert pruned(addon, tmp_path)[0] != saved
     facts = {"source": source, **facts}
     assert saved_facts == {**facts, "words": f"{words}, as chosen in the panel"}
     assert given_facts == {**facts, "words": f"{words}, as the command line says"}
 
 
-def test_method_and_budget_of_the_panel_and_a_range_of_frames_do_not_count(
-    addon, animated, tmp_path
-):
-    """Half of the splats go, by closed form; `frames` is `frames:1:21:5`, as in the panel."""
-    settings = bpy.context.scene.refine
-    settings.source, settings.collection = "COLLECTION", animated
-    before, _ = pruned(addon, tmp_path)
-    settings.method, settings.views, settings.budget, settings.keep = "occlusion", 2, "keep", 7
-    assert pruned(addon, tmp_path)[0] == before
+def test_an_object_is_scored_as_its_file_is(addon, animated, quarter, quarter_file, tmp_path):
+    """By the cameras of the panel or named ones: equal bytes, and nothing is changed."""
+    attributes, told = sorted(quarter.data.attributes.keys()), tmp_path / "report.json"
+    of_file, made = ["score", str(quarter_file)], {}
+    for choice, options in (
+        ("panel", []), ("active", ["--source", "active"]), ("visible", ["--source", "visible"])
+    ):  # fmt: skip
+        out, expected = (tmp_path / f"{choice}{name}.ply" for name in ("", "-file"))
+        words = ["score", "--object", "room", "-o", str(out), *options, *CLOSED]
+        assert addon.command.main([*words, "--report", str(told), "--overwrite"], scene=True) == 0
+        cameras = options or ["--cameras", str(CAMERAS)]
+        words = [*of_file, "-o", str(expected), *cameras, *CLOSED]
+        assert addon.command.main(words, scene=True) == 0
+        made[choice] = out.read_bytes()
+        assert made[choice] == expected.read_bytes()
+        entry = json.loads(told.read_text())["results"][0]
+        assert entry["files"]["input"] == f"{bpy.data.filepath}#room"
+        assert addon.command.main(words, scene=True) == 1  # the file exists
 
-    short, facts = pruned(addon, tmp_path, "--source", "frames")
-    assert facts["frames"] == SHOT["frames"]
-    assert short == pruned(addon, tmp_path, "--source", "frames:1:21:5")[0]
-    assert short != pruned(addon, tmp_path, "--source", "frames:1:21")[0]
-
-
-def test_an_object_is_scored_as_its_file_is(addon, quarter, quarter_file, room_cameras, tmp_path):
-    """By the collection that holds the cameras of the file: equal bytes, and nothing is changed."""
-    assert bpy.context.scene.refine.collection == room_cameras
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-    attributes = sorted(quarter.data.attributes.keys())
-    told, out = tmp_path / "report.json", [tmp_path / f"{name}.ply" for name in ("a", "b")]
-    by_object = ["score", "--object", "room", "-o", str(out[0]), *CLOSED, "--report", str(told)]
-    by_file = ["score", str(quarter_file), "--cameras", str(CAMERAS), "-o", str(out[1]), *CLOSED]
-
-    assert addon.command.main(by_object, scene=True) == 0
-    assert addon.command.main(by_file) == 0
-    assert out[0].read_bytes() == out[1].read_bytes()
+    assert made["active"] != made["visible"] == made["panel"]
     assert sorted(quarter.data.attributes.keys()) == attributes
-    entry = json.loads(told.read_text())["results"][0]
-    assert entry["files"]["input"] == f"{bpy.data.filepath}#room"
-    assert entry["cameras"]["words"] == "those in collection 'cameras', as chosen in the panel"
-    assert addon.command.main(by_object, scene=True) == 1  # the file exists
-
-
-@pytest.mark.usefixtures("animated")
-def test_cameras_that_are_named_score_objects_and_files(addon, quarter_file, tmp_path):
-    """By one camera both score alike, and otherwise than by all; without a scene there is none."""
-    made = []
-    for choice in ("active", "visible"):
-        for source in (["--object", "room"], [str(quarter_file)]):
-            out = tmp_path / f"{len(made)}.ply"
-            words = ["score", *source, "-o", str(out), "--source", choice, *CLOSED]
-            assert addon.command.main(words, scene=True) == 0
-            made.append(out.read_bytes())
-
-    assert made[0] == made[1] != made[2] == made[3]
-    words = ["score", str(quarter_file), "-o", "x.ply", "--source", "active"]
-    assert addon.command.main(words) == 2
+    words = [*of_file, "-o", str(tmp_path / "out.ply"), "--source", "active"]
+    assert addon.command.main(words) == 2  # there is no scene
 
 
 def test_cameras_of_a_file_go_before_those_of_the_panel(addon, animated, tmp_path, capsys):

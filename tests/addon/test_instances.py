@@ -7,17 +7,11 @@ import numpy as np
 import pytest
 
 
-def collected(*objects):
-    """Return a collection of objects, which is in no scene itself."""
-    collection = bpy.data.collections.new("set")
+def instanced(*objects):
+    """Return an empty of the scene that instances a collection, which is in no scene itself."""
+    empty, collection = bpy.data.objects.new("instance", None), bpy.data.collections.new("set")
     for obj in objects:
         collection.objects.link(obj)
-    return collection
-
-
-def instanced(collection):
-    """Return an empty of the scene that instances a collection."""
-    empty = bpy.data.objects.new("instance", None)
     empty.instance_type, empty.instance_collection = "COLLECTION", collection
     bpy.context.scene.collection.objects.link(empty)
     bpy.context.view_layer.objects.active = empty
@@ -28,18 +22,16 @@ def instanced(collection):
 @pytest.fixture
 def instance(quarter, empty_scene):
     """Give an empty that instances the room, which stands at z = 5; the collection is offset."""
-    collection = collected(quarter)
-    collection.instance_offset = (1.0, 0.0, 0.0)
-    empty_scene.collection.objects.unlink(quarter)
     quarter.location.z = 5.0
-    empty = instanced(collection)
-    quarter.matrix_world = quarter.matrix_basis
+    bpy.context.view_layer.update()
+    empty_scene.collection.objects.unlink(quarter)
+    empty = instanced(quarter)
+    empty.instance_collection.instance_offset = (1.0, 0.0, 0.0)
     return empty
 
 
 @pytest.fixture
 def places(addon):
-    """Return a function that lists where instances stand."""
     return lambda *objects: list(addon.viewport.content.placings(objects))
 
 
@@ -60,14 +52,15 @@ def test_instances_are_followed_as_deep_as_blender_draws_them(quarter, instance,
 
     Two in a collection that two empties instance are four places, each with a key of its own.
     """
-    both = collected(instance.copy(), instance.copy())
-    four = places(instanced(both), instanced(both))
+    outer = [instanced(instance.copy(), instance.copy()), instanced()]
+    outer[1].instance_collection = outer[0].instance_collection
+    four = places(*outer)
     assert len({place.key for place in four}) == 4
     assert {place.key[1] for place in four} == {quarter.data.session_uid}
 
     empties = [instance]
     for _ in range(8):
-        empties.append(instanced(collected(empties[-1])))
+        empties.append(instanced(empties[-1]))
     assert [len(places(empty)) for empty in empties] == [1] * 8 + [0]
 
 
@@ -92,12 +85,13 @@ def test_an_instance_is_made_real_and_scored(quarter, instance, places):
 
 def test_a_linked_collection_is_made_real(quarter, tmp_path):
     """Its copy belongs to this file and can be changed."""
-    path = str(tmp_path / "set.blend")
-    bpy.data.libraries.write(path, {collected(quarter)}, fake_user=True)
+    empty, path = instanced(quarter), str(tmp_path / "set.blend")
+    bpy.data.libraries.write(path, {empty.instance_collection}, fake_user=True)
     bpy.data.objects.remove(quarter)
+    bpy.data.collections.remove(empty.instance_collection)
     with bpy.data.libraries.load(path, link=True) as (_, wanted):
         wanted.collections = ["set"]
-    instanced(wanted.collections[0])
+    empty.instance_collection = wanted.collections[0]
     bpy.ops.refine.make_real()
     bpy.ops.refine.select(action="ALL")
 

@@ -99,11 +99,9 @@ def test_a_text_file_comes_out_binary_with_the_same_values(make_splats, through)
     columns = make_splats(count=3)
     names = "".join(f"property float {name}\n" for name in columns)
     rows = "".join(" ".join(f"{v[i]:.9g}" for v in columns.values()) + "\n" for i in range(3))
-    text = (
-        "ply\nformat ascii 1.0\ncomment kept\nelement vertex 3\n"
-        f"{names}element extra 1\nproperty int a\nend_header\n{rows}7\n"
-    )
-    _, _, (note,), got = through(text.encode())
+    head = "ply\nformat ascii 1.0\ncomment kept\nelement vertex 3\n"
+    more = "element extra 1\nproperty int a\nend_header\n"
+    _, _, (note,), got = through(f"{head}{names}{more}{rows}7\n".encode())
 
     assert b"format binary_little_endian 1.0\ncomment kept\n" in got.header
     assert b"extra" not in got.header
@@ -140,21 +138,25 @@ def test_meshes_of_blenders_own_importer_and_of_kiri_are_read(addon, make_splats
         layout.check(obj)
 
 
-def test_attributes_that_are_wrong_are_named(addon, room):
-    """Object, attribute, what is there, what is expected."""
-    attributes = room.data.attributes
-    for kind, expected in (
-        (None, r"'room': has no attribute scale_1"),
+def test_what_is_no_splats_is_named(addon, room):
+    """An empty, triangles, no vertices, a wrong attribute: what is there, what is expected."""
+    mesh, attributes = bpy.data.meshes.new("triangles"), room.data.attributes
+    mesh.from_pydata([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [], [(0, 1, 2)])
+    others = [bpy.data.objects.new("none", None), _link(mesh), _link(bpy.data.meshes.new("bare"))]
+    expected = ["type EMPTY", "no attribute", "no vertices"]
+    for kind, sentence in (
         (("INT", "POINT"), r"'scale_1' is INT on POINT, expected FLOAT on POINT"),
         (("FLOAT", "CORNER"), "FLOAT on CORNER, expected FLOAT on POINT"),
+        (None, r"'room': has no attribute scale_1"),
     ):
         attributes.remove(attributes["scale_1"])
         if kind:
             attributes.new("scale_1", *kind)
-        with pytest.raises(addon.core.RefineError, match=expected):
+        with pytest.raises(addon.core.RefineError, match=sentence):
             addon.mesh.layout.check(room)
-        if not kind:
-            attributes.new("scale_1", "FLOAT", "POINT")
+    for obj, sentence in zip(others, expected, strict=True):
+        with pytest.raises(addon.core.RefineError, match=sentence):
+            addon.mesh.layout.check(obj)
 
 
 def test_a_damaged_layout_falls_back_to_the_standard_one(addon, room):
@@ -164,19 +166,6 @@ def test_a_damaged_layout_falls_back_to_the_standard_one(addon, room):
         columns = [column.name for column in addon.mesh.layout.check(room).layout.columns]
         assert columns[:7] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0"]
         assert len(columns) == 62
-
-
-def test_objects_that_are_no_splats_are_refused(addon):
-    """An empty, a mesh of triangles, a mesh without vertices: a sentence each."""
-    mesh = bpy.data.meshes.new("triangles")
-    mesh.from_pydata([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [], [(0, 1, 2)])
-    for obj, reason in (
-        (bpy.data.objects.new("nothing", None), "type EMPTY"),
-        (_link(mesh), "no attribute"),
-        (_link(bpy.data.meshes.new("bare")), "no vertices"),
-    ):
-        with pytest.raises(addon.core.RefineError, match=reason):
-            addon.mesh.layout.check(obj)
 
 
 def test_without_harmonics_only_their_finiteness_is_read(addon, make_splats, through):

@@ -125,37 +125,22 @@ def noted(addon, monkeypatch):
     return references
 
 
-def left(references):
-    """Return what of it still lives."""
-    gc.collect()
-    return [found for found in (reference() for reference in references) if found is not None]
-
-
-@pytest.mark.parametrize("name", ["score", "apply"])
-def test_the_history_of_operators_holds_no_splats(few, noted, name):
-    """Blender keeps the operator that ran."""
-    bpy.ops.refine.score()
-    noted.clear()
-    getattr(bpy.ops.refine, name)("EXEC_DEFAULT", True)  # with undo, as a click
-    history = [operator.bl_idname for operator in bpy.context.window_manager.operators]
-
-    assert history[-1] == f"REFINE_OT_{name}"
-    assert len(noted) == 2
-    assert left(noted) == []
-
-
 @pytest.mark.parametrize(
     ("name", "how"),
     [
-        *(("score", how) for how in ("done", "escape", "writing fails")),
-        *(("apply", how) for how in ("done", "cancelled", "work fails", "writing fails")),
+        *(("score", how) for how in ("at once", "done", "escape", "writing fails")),
+        *(
+            ("apply", how)
+            for how in ("at once", "done", "cancelled", "work fails", "writing fails")
+        ),
     ],
 )
-def test_an_operation_in_a_window_is_dropped_when_it_is_over(
-    addon, few, noted, monkeypatch, name, how
-):
-    """Done, cancelled by Esc or by Blender, failed on the thread or after: nothing lives on."""
-    operators = addon.ui.operators
+def test_an_operation_keeps_nothing_when_it_is_over(addon, few, noted, monkeypatch, name, how):
+    """Done, cancelled by Esc or by Blender, failed on the thread or after: nothing lives on.
+
+    Blender's history keeps the operator that ran.
+    """
+    operators, said = addon.ui.operators, []
     bpy.ops.refine.score()
     noted.clear()
     count = len(few.data.vertices)
@@ -168,10 +153,15 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(
     if how == "writing fails":
         monkeypatch.setattr(addon.mesh.scores, "store", refuse)
         monkeypatch.setattr(addon.objects.splat_group, "apply", refuse)
-    elif how != "done":
+    elif how in ("escape", "cancelled", "work fails"):
         monkeypatch.setattr(operators, {"score": "score", "apply": "prune"}[name], refuse)
-    operator, context, said = started_in_a_window(addon, getattr(operators, f"REFINE_OT_{name}"))
-    assert addon.ui.operator_bases.now().operator == f"refine.{name}"
+    if how == "at once":
+        getattr(bpy.ops.refine, name)("EXEC_DEFAULT", True)  # with undo, as a click
+        assert bpy.context.window_manager.operators[-1].bl_idname == f"REFINE_OT_{name}"
+    else:
+        cls = getattr(operators, f"REFINE_OT_{name}")
+        operator, context, said = started_in_a_window(addon, cls)
+        assert addon.ui.operator_bases.now().operator == f"refine.{name}"
     if how == "escape":
         operator.modal(context, event("ESC"))
     if how == "cancelled":
@@ -179,14 +169,15 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(
         for thread in threading.enumerate():
             if thread.name == "refine":
                 thread.join()
-    else:
+    elif how != "at once":
         answer = until_over(operator, context)
         assert answer == ({"FINISHED"} if how == "done" else {"CANCELLED"})
 
+    gc.collect()
     assert noted
-    assert left(noted) == []
+    assert [reference for reference in noted if reference() is not None] == []
     assert addon.ui.operator_bases.now() is None
     assert [text for text in said if "failed" in text] == ["failed"] * ("fail" in how)
     assert ("nothing was changed" in "".join(said)) == (how == "escape")
-    kept = count * 2 // 5 + 1 if (name, how) == ("apply", "done") else count
-    assert len(few.data.vertices) == kept
+    went = name == "apply" and how in ("at once", "done")
+    assert len(few.data.vertices) == (count * 2 // 5 + 1 if went else count)
