@@ -52,11 +52,8 @@ from refine_addon.core.formats.registry import FORMATS, SUFFIXES
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.visibility.measuring import Sampling
 
-MEMORY = 40_000_000
-"""Bytes that any of these small inputs may cost; NumPy and JSON need some of their own."""
-
-SECONDS = 5.0
-"""An input that takes longer is a crash too; of the processor, which others may be using."""
+MEMORY = 40_000_000  # bytes that any small input may cost; NumPy and JSON need some of their own
+SECONDS = 5.0  # of the processor; an input that takes longer is a crash too
 
 REQUIRED = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
 
@@ -125,21 +122,20 @@ def format_seeds(form: Any) -> list[Files]:
         seeds.append({f"in{form.suffix}": stream.getvalue()})
     if form.name == "SPZ":  # in the open, so that what is broken reaches what is inside
         seeds += [{"in.spz": gzip.decompress(seed["in.spz"])} for seed in seeds]
-        seeds += [{"in.spz": _spz_of_streams(seed["in.spz"])} for seed in seeds[2:]]
+        if find_spec("zstandard"):
+            seeds += [{"in.spz": _spz_of_streams(seed["in.spz"])} for seed in seeds[2:]]
     return seeds
 
 
 def _spz_of_streams(data: bytes) -> bytes:
-    """Return a file of version 4 of an unpacked one of version 3; that itself without zstandard."""
-    if not find_spec("zstandard"):
-        return data
+    """Return a file of version 4 of an unpacked one of version 3."""
     zstandard = import_module("zstandard")
-    count, degree = data[8], data[12]
     at, packed, table = 16, b"", b""
-    for width in filter(None, (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1))):
-        stream = zstandard.ZstdCompressor().compress(data[at : at + width * count])
-        table += struct.pack("<QQ", len(stream), width * count)
-        packed, at = packed + stream, at + width * count
+    for width in filter(None, (9, 1, 3, 3, 4, 3 * ((data[12] + 1) ** 2 - 1))):
+        end = at + width * data[8]
+        stream = zstandard.ZstdCompressor().compress(data[at:end])
+        table += struct.pack("<QQ", len(stream), end - at)
+        packed, at = packed + stream, end
     head = data[:4] + struct.pack("<I", 4) + data[8:15] + bytes([len(table) // 16])
     return head + struct.pack("<I12x", 32) + table + packed
 
@@ -147,11 +143,8 @@ def _spz_of_streams(data: bytes) -> bytes:
 def inria_seeds() -> list[Files]:
     """Return ``cameras.json`` as the reference implementation writes it."""
     camera = {"width": 640, "height": 480, "rotation": np.eye(3).tolist(), "fx": 500.0, "fy": 500.0}
-    cameras = [
-        {"id": index, "img_name": f"{index:03}", "position": [0.1 * index, 0.0, -4.0], **camera}
-        for index in range(2)
-    ]
-    return [{"cameras.json": json.dumps(cameras).encode()}]
+    own = [{"id": n, "img_name": f"{n:03}", "position": [0.1 * n, 0.0, -4.0]} for n in range(2)]
+    return [{"cameras.json": json.dumps([camera | each for each in own]).encode()}]
 
 
 def transforms_seeds() -> list[Files]:
@@ -159,16 +152,12 @@ def transforms_seeds() -> list[Files]:
     pose = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -4.0], [0, 0, 0, 1]]
     frame = {"file_path": "a.png", "transform_matrix": pose}
     lens = {"w": 640, "h": 480, "fl_x": 500.0, "fl_y": 500.0, "cx": 320.0, "cy": 240.0, "k1": 0.1}
-    more = {"camera_model": "OPENCV", "applied_transform": pose[:3], "frames": [frame]}
+    studio = {**lens, "camera_model": "OPENCV", "applied_transform": pose[:3], "frames": [frame]}
     ngp = {"camera_angle_x": 0.8, "w": 640.0, "h": 480.0, "aabb_scale": 4, "scale": 0.3}
-    studio = {"transforms.json": json.dumps(lens | more).encode()}
-    own = {**ngp, "frames": [{**frame, "fl_x": 400.0, "w": 320, "h": 200}]}
+    ngp["frames"] = [{**frame, "fl_x": 400.0, "w": 320, "h": 200}]
     beside = json.dumps({"transform": pose[:3], "scale": 0.5}).encode()
-    return [
-        studio,
-        {"transforms.json": json.dumps(own).encode()},
-        {**studio, "dataparser_transforms.json": beside},
-    ]
+    seeds = [{"transforms.json": json.dumps(content).encode()} for content in (studio, ngp)]
+    return [*seeds, {**seeds[0], "dataparser_transforms.json": beside}]
 
 
 def colmap_text_seeds() -> list[Files]:
@@ -183,11 +172,61 @@ def colmap_binary_seeds() -> list[Files]:
     """Return a binary model of two cameras and two images."""
     cameras = struct.pack("<QIiQQ4d", 2, 1, 1, 640, 480, 500.0, 500.0, 320.0, 240.0)
     cameras += struct.pack("<IiQQ4d", 2, 2, 64, 48, 50.0, 32.0, 24.0, 0.1)
-    images = struct.pack("<Q", 2)
+    images, pose = struct.pack("<Q", 2), (1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 4.0)
     for index, points in ((1, 2), (2, 0)):
-        images += struct.pack("<I7dI", index, 1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 4.0, index)
-        images += b"%d.png\0" % index + struct.pack("<Q", points) + bytes(24 * points)
+        images += struct.pack("<I7dI", index, *pose, index) + b"%d.png\0" % index
+        images += struct.pack("<Q", points) + bytes(24 * points)
     return [{"cameras.bin": cameras, "images.bin": images}]
+
+
+def sog_seeds() -> list[Files]:
+    """Return what is in SOG files, so that what is broken is not the archive alone."""
+    seeds = []
+    for seed in format_seeds(FORMATS[SUFFIXES.index(".sog") - 1]):
+        with zipfile.ZipFile(io.BytesIO(seed["in.sog"])) as archive:
+            seeds.append({name: archive.read(name) for name in archive.namelist()})
+    return seeds
+
+
+def version_1_of(files: Files) -> Files:
+    """Return the files of a SOG with what version 1 says in place of version 2."""
+    held = json.loads(files["meta.json"])
+    meta = {name: {"files": held[name]["files"]} for name in ("means", "scales", "quats", "sh0")}
+    meta["means"] |= {"shape": [held["count"], 3], "mins": [-1, -1, -1], "maxs": [1, 1, 1]}
+    meta["scales"] |= {"mins": [-9, -9, -9], "maxs": [-1, -1, -1]}
+    meta["sh0"] |= {"mins": [-2, -2, -2, -5], "maxs": [2, 2, 2, 5]}
+    if "shN" in held:
+        meta["shN"] = {"files": held["shN"]["files"], "mins": -1, "maxs": 1}
+    return {**files, "meta.json": json.dumps(meta).encode()}
+
+
+def streamed_seeds() -> list[Files]:
+    """Return a streamed SOG of two levels in one folder, whose files have names of their own."""
+    files: Files = {}
+    for number, unit in enumerate([*sog_seeds(), version_1_of(sog_seeds()[1])]):
+        text = unit.pop("meta.json").decode()
+        for name, data in unit.items():
+            text = text.replace(name, f"{number}_{name}")
+            files[f"{number}_{name}"] = data
+        files[f"{number}_meta.json"] = text.encode()
+    lods = {str(n): {"file": n, "offset": 0, "count": 5} for n in (0, 1)}
+    index = {
+        "version": 1, "lodLevels": 2, "counts": [5, 5], "environment": "2_meta.json",
+        "filenames": ["0_meta.json", "1_meta.json"],
+        "tree": {"children": [{"bound": {}, "lods": lods}]},
+    }  # fmt: skip
+    return [{**files, "lod-meta.json": json.dumps(index).encode()}]
+
+
+def ksplat_seeds() -> list[Files]:
+    """Return what files of the reference converter hold, without the zeros between."""
+    seeds = []
+    for name in ("level_0", "level_1", "level_2", "degree_1"):
+        data = (ROOT / f"tests/data/other_tools/{name}.ksplat").read_bytes()
+        starts = [4096 + 1024 * number for number in range(data[4])]
+        sections = {f"{1 + n}": data[at : at + 42] for n, at in enumerate(starts)}
+        seeds.append({"0": data[:44], **sections, "9": data[4096 + 1024 * data[4] :]})
+    return seeds
 
 
 # Broken files.
@@ -246,7 +285,7 @@ _WAYS = (_flip, _put, _put, _number, _splice)
 
 
 def _other_value(data: bytes, chance: random.Random) -> bytes:
-    """Replace, drop or nest one value of a JSON file."""
+    """Replace, drop, repeat or nest one value of a JSON file."""
     try:
         content = json.loads(data)
     except (ValueError, RecursionError):
@@ -262,17 +301,14 @@ def _other_value(data: bytes, chance: random.Random) -> bytes:
     if not places:
         return data
     node, key = chance.choice(places)
-    way, deep = chance.random(), 0
-    text = json.dumps(node[key])
-    if way < 0.7:
-        node[key] = chance.choice(VALUES)
-    elif way < 0.8:
+    text, deep = json.dumps(node[key]), chance.choice((3, 5000))
+    way, nested = chance.random(), "[" * deep + text + "]" * deep
+    if way < 0.1:
         del node[key]
-    elif way < 0.9:
-        node[key] = [node[key]] * chance.choice((1, 2, 1000))
+    elif way < 0.8:
+        node[key] = chance.choice(VALUES)
     else:
-        node[key], deep = "\0here\0", chance.choice((3, 5000))
-    nested = "[" * deep + text + "]" * deep
+        node[key] = [node[key]] * chance.choice((1, 2, 1000)) if way < 0.9 else "\0here\0"
     return json.dumps(content).replace('"\\u0000here\\u0000"', nested).encode()
 
 
@@ -312,15 +348,6 @@ def use_splats(folder: Path) -> None:
             raise
 
 
-def sog_seeds() -> list[Files]:
-    """Return what is in SOG files, so that what is broken is not the archive alone."""
-    seeds = []
-    for seed in format_seeds(FORMATS[SUFFIXES.index(".sog") - 1]):
-        with zipfile.ZipFile(io.BytesIO(seed["in.sog"])) as archive:
-            seeds.append({name: archive.read(name) for name in archive.namelist()})
-    return seeds
-
-
 def use_sog(folder: Path) -> None:
     """Put the files into an archive and use that."""
     files = list(folder.iterdir())
@@ -331,64 +358,12 @@ def use_sog(folder: Path) -> None:
     use_splats(folder)
 
 
-def version_1_of(files: Files) -> Files:
-    """Return the files of a SOG with what version 1 says in place of version 2."""
-    held = json.loads(files["meta.json"])
-    meta = {name: {"files": held[name]["files"]} for name in ("means", "scales", "quats", "sh0")}
-    meta["means"] |= {"shape": [held["count"], 3], "mins": [-1, -1, -1], "maxs": [1, 1, 1]}
-    meta["scales"] |= {"mins": [-9, -9, -9], "maxs": [-1, -1, -1]}
-    meta["sh0"] |= {"mins": [-2, -2, -2, -5], "maxs": [2, 2, 2, 5]}
-    if "shN" in held:
-        meta["shN"] = {"files": held["shN"]["files"], "mins": -1, "maxs": 1}
-    return {**files, "meta.json": json.dumps(meta).encode()}
-
-
-def streamed_seeds() -> list[Files]:
-    """Return a streamed SOG of two levels: an index, and SOG whose files have names of their own.
-
-    All lie in one folder, as files of other seeds do.
-    """
-    units = [*sog_seeds(), version_1_of(sog_seeds()[1])]
-    files: Files = {}
-    for number, unit in enumerate(units):
-        text = unit.pop("meta.json").decode()
-        for name in unit:
-            text = text.replace(name, f"{number}_{name}")
-        files |= {f"{number}_{name}": data for name, data in unit.items()}
-        files[f"{number}_meta.json"] = text.encode()
-    lods = {str(n): {"file": n, "offset": 0, "count": 5} for n in (0, 1)}
-    index = {
-        "version": 1, "lodLevels": 2, "counts": [5, 5], "environment": "2_meta.json",
-        "filenames": ["0_meta.json", "1_meta.json"],
-        "tree": {"children": [{"bound": {}, "lods": lods}]},
-    }  # fmt: skip
-    return [{**files, "lod-meta.json": json.dumps(index).encode()}]
-
-
-def use_streamed(folder: Path) -> None:
-    """Read both levels of a streamed SOG."""
-    for level in (0, 1):
-        _convert(folder / "lod-meta.json", level)
-
-
-def ksplat_seeds() -> list[Files]:
-    """Return what files of the reference converter hold, without the zeros between."""
-    seeds = []
-    for name in ("level_0", "level_1", "level_2", "degree_1"):
-        data = (ROOT / f"tests/data/other_tools/{name}.ksplat").read_bytes()
-        starts = [4096 + 1024 * number for number in range(data[4])]
-        sections = {f"{1 + n}": data[at : at + 42] for n, at in enumerate(starts)}
-        seeds.append({"0": data[:44], **sections, "9": data[4096 + 1024 * data[4] :]})
-    return seeds
-
-
 def use_ksplat(folder: Path) -> None:
     """Put header, sections and splats into a file and use that."""
     header, *sections, rest = (path.read_bytes() for path in sorted(folder.iterdir()))
     padded = b"".join(data[:1024].ljust(1024, b"\0") for data in sections)
-    path = folder / "in.ksplat"
-    path.write_bytes(header[:4096].ljust(4096, b"\0") + padded + rest)
-    _convert(path)
+    (folder / "in.ksplat").write_bytes(header[:4096].ljust(4096, b"\0") + padded + rest)
+    _convert(folder / "in.ksplat")
 
 
 def use_cameras(folder: Path) -> None:
@@ -397,22 +372,20 @@ def use_cameras(folder: Path) -> None:
     views = read_cameras(files[0])
     values = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32)
     splats = splats_from_columns(dict(zip(REQUIRED.split(), values.T, strict=True)))
-    for method in (ClosedForm(), None):
-        try:  # in this thread: NumPy's flags are raised in it alone
-            if method:
-                scores = score(splats, views, method, threads=1)
-            else:
-                coarse = Sampling(16.0, 1.0)
-                scores, *_ = occlusion.score_once(splats, views, sampling=coarse, threads=1)
-        except RefineError as error:
-            if "no camera sees the splats" not in str(error):
-                raise
-        else:
-            assert np.isfinite(scores.values).all(), "scores are not finite"
+    coarse = Sampling(16.0, 1.0)
+    try:  # in this thread: NumPy's flags are raised in it alone
+        both = (
+            score(splats, views, ClosedForm(), threads=1),
+            occlusion.score_once(splats, views, sampling=coarse, threads=1)[0],
+        )
+    except RefineError as error:
+        if "no camera sees the splats" not in str(error):
+            raise
+    else:
+        assert all(np.isfinite(each.values).all() for each in both), "scores are not finite"
 
 
-Target = tuple[Callable[[], list[Files]], Callable[[Path], Any]]
-TARGETS: dict[str, Target] = {
+TARGETS: dict[str, tuple[Callable[[], list[Files]], Callable[[Path], Any]]] = {
     "ply": (ply_seeds, use_ply),
     **{f.name: (partial(format_seeds, f), use_splats) for f in FORMATS if f.name != "SOG"},
     "SOG": (sog_seeds, use_sog),
@@ -420,7 +393,10 @@ TARGETS: dict[str, Target] = {
         lambda: [version_1_of(seed) for seed in sog_seeds()],
         lambda folder: _convert(folder / "meta.json"),
     ),
-    "streamed SOG": (streamed_seeds, use_streamed),
+    "streamed SOG": (
+        streamed_seeds,
+        lambda folder: [_convert(folder / "lod-meta.json", level) for level in (0, 1)],
+    ),
     ".ksplat": (ksplat_seeds, use_ksplat),
     "cameras.json": (inria_seeds, use_cameras),
     "transforms.json": (transforms_seeds, use_cameras),
