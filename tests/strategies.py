@@ -62,51 +62,46 @@ class PlyCase:
 @st.composite
 def ply_files(draw: st.DrawFn, *, least: int = 0, forms: tuple[str, ...] = tuple(ORDERS)):
     """Draw 3DGS PLY files in every shape that the format allows."""
-    form = draw(st.sampled_from(forms))
-    line_end = draw(st.sampled_from(LINE_ENDS))
-    random = np.random.default_rng(draw(st.integers(0, 2**32)))
-    kinds = _splat_kinds(draw, random)
-    count = draw(st.integers(least, 5))
+    form, end = draw(st.sampled_from(forms)), draw(st.sampled_from(LINE_ENDS)).encode()
+    count, random = draw(st.integers(least, 5)), np.random.default_rng(draw(st.integers(0, 2**32)))
+    kinds, text = _splat_kinds(random), form == "ascii"
     dtype = np.dtype([(name, ORDERS[form] + TYPES[kind]) for name, kind in kinds])
     rows = np.frombuffer(random.bytes(count * dtype.itemsize), dtype).copy()
     for name in dtype.names if count else ():
         if dtype[name].kind == "f" and random.random() < 0.2:
             rows[name][random.integers(count)] = random.choice(np.array(ODD_FLOATS, dtype[name]))
-    parts = _texts(random, rows) if form == "ascii" else [row.tobytes() for row in rows]
-    before, after = (_elements(draw, random, form, prefix) for prefix in ("lead", "tail"))
-    tail = b"".join(body for _, body in after)
-    if form == "ascii" and not tail and parts and draw(st.booleans()):
+    parts = _texts(random, rows) if text else [row.tobytes() for row in rows]
+    lead, before = _elements(random, form, "lead")
+    tail, after = _elements(random, form, "tail")
+    if text and not after and parts and random.random() < 0.5:
         parts[-1] = parts[-1].rstrip(b"\r\n")  # an editor's last line may lack its end
-    else:
-        trailing = (b"", b"one more line\n") if form == "ascii" else (b"", b"\x00\n\xffmore")
-        tail += draw(st.sampled_from(trailing))
-    spelled = draw(st.sampled_from([str(count), f"00{count}"]))
-    lead, rest = _header_lines(draw, form, (before, kinds, after))
-    end = line_end.encode()
-    head = (
-        end.join([*lead, b"element vertex "]),
-        spelled.encode(),
-        end + end.join([*rest, b"end_header", b""]),
-    )
-    body = b"".join(body for _, body in before)
-    return PlyCase(form, end, head, body, tail, rows, tuple(parts))
+    elif random.random() < 0.5:
+        after += b"one more line\n" if text else b"\x00\n\xffmore"
+    indent, remark = random.choice(["", " "]), lambda: REMARKS[random.integers(len(REMARKS))]
+    own = [f"{indent}property {kind} {name}" for name, kind in kinds]
+    first = ["ply", *remark(), f"format {form} 1.0", *remark(), *lead, "element vertex "]
+    rest = ["", *remark(), *own, *remark(), *tail, *remark(), "end_header", ""]
+    number = f"{random.choice(['', '00'])}{count}"
+    head = (end.join(map(str.encode, first)), number.encode(), end.join(map(str.encode, rest)))
+    return PlyCase(form, end, head, before, after, rows, tuple(parts))
 
 
-def _splat_kinds(draw: st.DrawFn, random: np.random.Generator) -> list[tuple[str, str]]:
-    """Draw the names and types of the vertex properties, in file order."""
-    names = splat_names(draw(st.integers(0, 4)), normals=draw(st.booleans()))
-    real = draw(st.sampled_from(["float", "float32", "double", "float64"]))
-    kinds = [(name, real) for name in names]
-    if draw(st.booleans()):  # some properties in another precision than the rest
-        other = {"float": "double", "float32": "float64"}.get(real, "float")
-        kinds = [(name, other if random.random() < 0.3 else kind) for name, kind in kinds]
-    extra = draw(st.lists(st.sampled_from(sorted(TYPES)), max_size=4))
-    for index, kind in enumerate(extra):
-        kinds.insert(random.integers(len(kinds) + 1), (f"extra_{index}", kind))
-    if draw(st.booleans()):
-        random.shuffle(kinds)
-        kinds = [(str(name), str(kind)) for name, kind in kinds]
-    return kinds
+REMARKS = (
+    *([], [], ["comment element vertex 7"], ["comment"], ["comment end_header"], [""]),
+    *(["obj_info num_cols 3"], ["comment gemacht für Zoë 🎈"]),
+)
+
+
+def _splat_kinds(random: np.random.Generator) -> list[tuple[str, str]]:
+    """Return the names and types of the vertex properties, in file order."""
+    names = splat_names(random.integers(5), normals=random.random() < 0.5)
+    reals = [["float", "double"], ["float32", "float64"], ["double", "float"]][random.integers(3)]
+    mixed = random.choice([0.0, 0.3])  # of properties in another precision than the rest
+    kinds = [(name, reals[int(random.random() < mixed)]) for name in names]
+    for index in range(random.integers(5)):
+        extra = f"extra_{index}", sorted(TYPES)[random.integers(len(TYPES))]
+        kinds.insert(random.integers(len(kinds) + 1), extra)
+    return [kinds[index] for index in random.permutation(len(kinds))] if mixed else kinds
 
 
 def _texts(random: np.random.Generator, rows: np.ndarray) -> list[bytes]:
@@ -119,53 +114,28 @@ def _texts(random: np.random.Generator, rows: np.ndarray) -> list[bytes]:
     return lines
 
 
-def _elements(
-    draw: st.DrawFn, random: np.random.Generator, form: str, prefix: str
-) -> list[tuple[list[bytes], bytes]]:
-    """Draw other elements, as their header lines and their body; lists only behind the splats."""
-    length = st.sampled_from(["", *(["uchar", "uint8", "int", "ushort"] * (prefix == "tail"))])
-    column = st.tuples(length, st.sampled_from(sorted(TYPES)))
-    elements = []
-    for number in range(draw(st.integers(0, 2))):
-        count, columns = draw(st.integers(0, 3)), draw(st.lists(column, min_size=1, max_size=3))
-        lines = [f"element {prefix}{number} {count}"]
-        for index, (length_kind, kind) in enumerate(columns):
-            listed = f"list {length_kind} " if length_kind else ""
+def _elements(random: np.random.Generator, form: str, prefix: str) -> tuple[list[str], bytes]:
+    """Return header lines and body of other elements; lists stand only behind the splats."""
+    lengths = ["", *(["uchar", "uint8", "int", "ushort"] * (prefix == "tail"))]
+    lines, body = [], b""
+    for number in range(random.integers(3)):
+        count, kinds = random.integers(4), random.choice(sorted(TYPES), 1 + random.integers(3))
+        columns = [(str(random.choice(lengths)), str(kind)) for kind in kinds]
+        lines.append(f"element {prefix}{number} {count}")
+        for index, (length, kind) in enumerate(columns):
+            listed = f"list {length} " if length else ""
             lines.append(f"property {listed}{kind} {prefix}_{index}")
-        body = b"".join(_element_row(random, form, columns) for _ in range(count))
-        elements.append(([line.encode() for line in lines], body))
-    return elements
-
-
-def _element_row(random: np.random.Generator, form: str, columns: list[tuple[str, str]]) -> bytes:
-    order, parts, words = ORDERS[form], [], []
-    for length, kind in columns:
-        size = int(random.integers(4)) if length else 1
-        values = random.integers(0, 100, size).astype(order + TYPES[kind])
-        if length:
-            parts.append(np.array(size, order + TYPES[length]).tobytes())
-            words.append(str(size))
-        parts.append(values.tobytes())
-        words += map(str, values)
-    return (" ".join(words) + "\n").encode() if form == "ascii" else b"".join(parts)
-
-
-REMARKS = (
-    *("comment element vertex 7", "comment", "comment end_header", "obj_info num_cols 3", ""),
-    "comment gemacht für Zoë 🎈",
-)
-
-
-def _header_lines(draw: st.DrawFn, form: str, elements: tuple) -> tuple[list[bytes], list[bytes]]:
-    """Return the header's lines ahead of the vertex element and behind it, comments among them."""
-    before, kinds, after = elements
-    remark = st.sampled_from([[], *([text.encode()] for text in REMARKS)])
-    lead = [b"ply", *draw(remark), b"format %s 1.0" % form.encode(), *draw(remark)]
-    lead += [line for lines, _ in before for line in lines]
-    rest = draw(remark) + [f"property {kind} {name}".encode() for name, kind in kinds]
-    rest += draw(remark) + [line for lines, _ in after for line in lines] + draw(remark)
-    indent = draw(st.sampled_from([b"", b" "]))
-    return lead, [indent + line if line.startswith(b"prop") else line for line in rest]
+        for _ in range(count):
+            row: list[tuple[str, np.ndarray]] = []
+            for length, kind in columns:
+                values = random.integers(0, 100, random.integers(4) if length else 1)
+                row += [(length, np.array([len(values)]))] if length else []
+                row.append((kind, values))
+            if form == "ascii":
+                body += " ".join(str(value) for _, some in row for value in some).encode() + b"\n"
+            else:
+                body += b"".join(some.astype(ORDERS[form] + TYPES[k]).tobytes() for k, some in row)
+    return lines, body
 
 
 def scores(least: int = 1, most: int = 40):

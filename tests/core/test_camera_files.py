@@ -66,9 +66,6 @@ def two(**keys):
     return {**LENS, "frames": [FRAME, {**FRAME, **keys}]}
 
 
-# One camera, derived by hand -------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ["cameras.json", "transforms.json", "colmap"])
 def test_every_format_gives_the_same_view(tmp_path, kind):
     """The camera stands at (1, 2, 3), looks along -X, and world Z is up in its picture.
@@ -110,9 +107,6 @@ def test_the_room_is_in_the_picture_of_every_camera():
         assert np.count_nonzero(inside) > 0.1 * len(means), view.name
 
 
-# Inria cameras.json ----------------------------------------------------------------------------
-
-
 def test_inria_cameras_keep_their_order_and_may_share_a_name(tmp_path):
     """One without a name is called by its index; half a surrogate pair could not be printed."""
     named = [{**INRIA, "img_name": name} for name in ("b", "a", "b", "\ud800ä")]
@@ -131,7 +125,6 @@ def test_a_rounded_rotation_is_made_exact(tmp_path):
     """
     c, s = round(math.cos(0.3), 4), round(math.sin(0.3), 4)
     tiny = {"rotation": [[1, 1e-200, 0], [-1e-200, 1, 0], [0, 5e-324, 1]]}
-
     rounded = {**INRIA, "rotation": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}
 
     view, other = read(tmp_path, [rounded, {**INRIA, **tiny, "position": [0, 0, 1e-310]}])
@@ -140,9 +133,6 @@ def test_a_rounded_rotation_is_made_exact(tmp_path):
     assert view.rotation[0, 1] == pytest.approx(math.sin(0.3), abs=1e-4)
     np.testing.assert_array_equal(other.rotation, np.eye(3))
     np.testing.assert_array_equal(other.center, [0, 0, 0])
-
-
-# The text around it ----------------------------------------------------------------------------
 
 
 def test_a_byte_order_mark_and_a_tilde_are_understood(tmp_path, monkeypatch):
@@ -176,9 +166,6 @@ def test_a_folder_that_may_not_be_entered_says_why():
                 read_cameras(path)
             expected = f"{folder / 'cameras.json'}: cannot be read (Permission denied)"
             assert str(caught.value) == expected
-
-
-# transforms.json -------------------------------------------------------------------------------
 
 
 def test_what_a_frame_says_comes_before_what_all_share(tmp_path):
@@ -411,8 +398,6 @@ def test_what_holds_no_cameras_or_not_all_of_them_is_refused(tmp_path, data, pro
     wrong(tmp_path, data, problem)
 
 
-# The image's own size --------------------------------------------------------------------------
-
 PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 300, 200) + b"\x08\x06\0\0\0"
 JPEG = b"\xff\xd8\xff\xe0" + struct.pack(">H", 16) + bytes(14)
 JPEG += b"\xff\xff\xc2" + struct.pack(">HBHHB", 17, 8, 200, 300, 3)  # fill byte, progressive frame
@@ -453,9 +438,6 @@ def test_an_image_that_does_not_tell_its_size_is_no_crash(tmp_path):
         wrong(tmp_path, SHORT, "frame 0")
     for name in ("", "nul\0", "x" * 5000, "/dev/zero", "."):
         wrong(tmp_path, {**SHORT, "frames": [{**FRAME, "file_path": name}]}, "frame 0: missing 'w'")
-
-
-# Folders ---------------------------------------------------------------------------------------
 
 
 def test_a_folder_prefers_some_names_and_notes_the_rest(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from refine_addon.core import RefineError, read_cameras
+from refine_addon.core import read_cameras
 from tests.hostile import refused
 
 POSE = (0.5, 0.5, 0.5, -0.5, -2, 3, 1)
@@ -52,7 +52,7 @@ def _loud_numpy():
 
 
 # Tiny writers: cameras as (id, model, width, height, parameters), images as
-# (id, pose, camera id, name, number of points) -------------------------------------------------
+# (id, pose, camera id, name, number of points).
 
 
 def binary_cameras(cameras):
@@ -101,8 +101,8 @@ def write(folder, suffix, cameras=(PINHOLE,), images=(IMAGE,)):
     return folder
 
 
-def wrong(folder, file, expected, memory=2e6):
-    return refused(folder, expected, read=read_cameras, file=folder / file, memory=memory)
+def wrong(folder, file, expected):
+    return refused(folder, expected, read=read_cameras, file=folder / file, memory=5e5)
 
 
 def project(view, point):
@@ -113,7 +113,7 @@ def project(view, point):
 both = pytest.mark.parametrize("suffix", WRITERS)
 
 
-# What is read ----------------------------------------------------------------------------------
+# What is read.
 
 
 @both
@@ -223,14 +223,7 @@ def test_the_line_of_points_may_be_empty_or_absent(tmp_path, images):
     assert view.name == "a.png"
 
 
-def test_empty_lines_take_no_memory(tmp_path):
-    """A place was made for each and kept: 250 bytes of memory for one of the file."""
-    write(tmp_path, ".txt", images=b"\n" * 20_000 + b"1 2 3")
-
-    wrong(tmp_path, "images.txt", "line 20001 image row 0", memory=500_000)
-
-
-# What is refused -------------------------------------------------------------------------------
+# What is refused.
 
 
 @both
@@ -245,29 +238,27 @@ def test_an_empty_or_missing_half_is_named(tmp_path, suffix, file):
 
 
 FINITE = "expected a finite number up to 1e18, got"
+NAN, INF = float("nan"), float("inf")
+FAR = (0.9238795325112867, 0, 0, 0.3826834323650898, 9e17, -9e17, 0)
+"""Turned by 45 degrees about z, t = (9e17, -9e17, 0) is sqrt(2) * 9e17 along one axis."""
 
 
 @both
 @pytest.mark.parametrize(
     ("pose", "camera", "problem"),
     [
-        ((float("nan"), *POSE[1:]), 1, f"QW: {FINITE} NaN"),
-        ((*POSE[:4], float("inf"), 3, 1), 1, f"TX: {FINITE} Infinity"),
+        ((NAN, *POSE[1:]), 1, f"QW: {FINITE} NaN"),
+        ((*POSE[:4], INF, 3, 1), 1, f"TX: {FINITE} Infinity"),
         ((*POSE[:6], -1e300), 1, f"TZ: {FINITE} -1e+300"),
         ((0, 0, 0, 0, 1, 2, 3), 1, "expected a quaternion (w, x, y, z)"),
-        # Turned by 45 degrees about z, t = (9e17, -9e17, 0) is sqrt(2) * 9e17 along one axis.
-        (
-            (0.9238795325112867, 0, 0, 0.3826834323650898, 9e17, -9e17, 0),
-            1,
-            "the camera's centre is farther than 1e18",
-        ),
+        (FAR, 1, "the camera's centre is farther than 1e18"),
         (POSE, 7, "refers to camera 7, expected one of the 1 in cameras"),
     ],
 )
 def test_a_wrong_pose_is_named_with_the_image(tmp_path, suffix, pose, camera, problem):
     write(tmp_path, suffix, images=[IMAGE, (2, pose, camera, "b", 0)])
 
-    assert "image row 1 " in wrong(tmp_path, f"images{suffix}", problem).replace(":", " ")
+    assert "image row 1" in wrong(tmp_path, f"images{suffix}", problem)
 
 
 @both
@@ -277,8 +268,8 @@ def test_a_wrong_pose_is_named_with_the_image(tmp_path, suffix, pose, camera, pr
         ((1, 1, 0, 48, (100, 120, 32, 24)), "width: expected a whole number of pixels"),
         ((1, 1, 64, 2**64 - 1, (100, 120, 32, 24)), f"height: {FINITE}"),
         ((1, 1, 64, 48, (100, 0.0, 32, 24)), "focal length: expected a positive focal length"),
-        ((1, 1, 64, 48, (100, 120, float("nan"), 24)), f"parameter 2: {FINITE}"),
-        ((1, 2, 64, 48, (100, 32, 24, float("inf"))), f"parameter 3: {FINITE}"),
+        ((1, 1, 64, 48, (100, 120, NAN, 24)), f"parameter 2: {FINITE}"),
+        ((1, 2, 64, 48, (100, 32, 24, INF)), f"parameter 3: {FINITE}"),
         ((9, 1, 64, 48, (100, 120, 32, 24)), "camera 9 is there twice"),
     ],
 )
@@ -290,40 +281,25 @@ def test_a_wrong_camera_is_named_with_its_place(tmp_path, suffix, camera, proble
     assert ("line 3" if suffix == ".txt" else "camera row 1 at byte 64") in message
 
 
-@pytest.mark.parametrize(
-    ("number", "problem"),
-    [
-        (17, "EQUIRECTANGULAR is a panorama"),
-        (-1, "camera row 1 at byte 64: unknown camera model -1, expected 0 to 17"),
-        (18, "camera row 1 at byte 64: unknown camera model 18, expected 0 to 17"),
-    ],
-)
-def test_a_model_that_is_no_pinhole_or_unknown_is_named(tmp_path, number, problem):
-    """Parameters of an unknown one cannot be counted, so nothing behind it can be read either."""
-    write(tmp_path, ".bin", [PINHOLE, (2, number, 64, 48, (1, 2))])
-
-    wrong(tmp_path, "cameras.bin", problem)
-
-
-@both
-def test_no_image_at_all_is_refused(tmp_path, suffix):
-    write(tmp_path, suffix, images=[])
-
-    wrong(tmp_path, f"images{suffix}", "no registered image, expected at least one")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["cameras", "images"])
 def test_a_binary_cut_off_at_any_byte_is_refused(tmp_path, file):
-    """The message tells the byte where the missing part should have started."""
-    write(tmp_path, ".bin", *TWO)
-    whole = (tmp_path / f"{file}.bin").read_bytes()
-    for length in range(1, len(whole)):
-        (tmp_path / f"{file}.bin").write_bytes(whole[:length])
+    """The message tells the byte where the missing part should have started.
 
-        message = wrong(tmp_path, f"{file}.bin", "truncated: ")
+    A count of 1 where two are there is refused too: nobody can tell which the count is wrong about.
+    """
+    path = write(tmp_path, ".bin", *TWO) / f"{file}.bin"
+    whole = path.read_bytes()
+    for length in range(1, len(whole)):
+        path.write_bytes(whole[:length])
+
+        message = wrong(tmp_path, path.name, "truncated: ")
 
         assert int(message.split(": byte ")[1].split(":")[0]) <= length
+    path.write_bytes(struct.pack("<Q", 1) + whole[8:])
+    first = {"cameras": 8 + 24 + 4 * 8, "images": 8 + 64 + 14}[file]
+    expected = f"byte {first}: expected the end of the file after 1 {file[:-1]}"
+    wrong(tmp_path, path.name, f"{expected}, got {len(whole) - first} more bytes")
 
 
 @pytest.mark.parametrize("count", [2, 2**32, 2**63, 2**64 - 1])
@@ -332,87 +308,59 @@ def test_a_count_that_the_file_does_not_back_allocates_nothing(tmp_path, count):
     for file in ("cameras", "images"):
         path = write(tmp_path, ".bin") / f"{file}.bin"
         path.write_bytes(number + path.read_bytes()[8:])
-        problem = f"truncated: number of {file}: {count} of at least "
-        wrong(tmp_path, path.name, problem)
+        wrong(tmp_path, path.name, f"truncated: number of {file}: {count} of at least ")
     write(tmp_path, ".bin", images=binary_images([IMAGE])[:-8] + number)
     wrong(tmp_path, "images.bin", f"truncated: {count} points of image row 0")
 
 
-@pytest.mark.parametrize(("file", "first"), [("cameras", 8 + 24 + 4 * 8), ("images", 8 + 64 + 14)])
-def test_a_count_below_what_the_file_holds_is_refused(tmp_path, file, first):
-    """Two are there and one is announced: nobody can tell which the count is wrong about."""
-    path = write(tmp_path, ".bin", *TWO) / f"{file}.bin"
-    whole = path.read_bytes()
-    path.write_bytes(struct.pack("<Q", 1) + whole[8:])
-
-    expected = f"byte {first}: expected the end of the file after 1 {file[:-1]}"
-    wrong(tmp_path, path.name, f"{expected}, got {len(whole) - first} more bytes")
+def only(model, *values):
+    """Return a second camera behind a good one, as it is in binary files."""
+    return binary_cameras([PINHOLE, (2, model, 64, 48, values)])
 
 
-def test_a_name_without_end_is_refused(tmp_path):
-    write(tmp_path, ".bin", images=binary_images([IMAGE])[: 8 + 64] + b"x" * 100)
-
-    expected = "byte 72: truncated: name of image row 0: expected a zero byte"
-    wrong(tmp_path, "images.bin", expected)
+UNKNOWN = "camera row 1 at byte 64: unknown camera model {}, expected 0 to 17"
+UNTERMINATED = binary_images([IMAGE])[: 8 + 64] + b"x" * 100
+NAMELESS = "byte 72: truncated: name of image row 0: expected a zero byte"
+CAMERA, LINES = "1 PINHOLE 64 48 100 120 32", "1 1 0 0 0 0 0 0 1 a\n"
+ID = "expected a whole number as id"
+FIELDS = "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
 
 
 @pytest.mark.parametrize(
-    ("line", "problem"),
+    ("file", "data", "problem"),
     [
-        ("1", "unknown camera model '', expected SIMPLE_PINHOLE, "),
-        ("1 LENS 64 48 1 2 3", "unknown camera model 'LENS'"),
-        ("1 PINHOLE 64 48 100 120 32", "4 parameters of PINHOLE, got 5 numbers"),
-        ("1 PINHOLE 64 48 100 120 32 24 0", "4 parameters of PINHOLE, got 7 numbers"),
-        ("1 PINHOLE 64 48 100 120 32 x", "expected a number, got 'x'"),
-        ("1.5 PINHOLE 64 48 100 120 32 24", "expected a whole number as id, got '1.5'"),
-        (f"{'9' * 5000} PINHOLE 64 48 100 120 32 24", "expected a whole number as id"),
-        ("1 PINHOLE 64.5 48 100 120 32 24", "width: expected a whole number of pixels"),
-        ("\xff", "unknown camera model ''"),
+        ("cameras.bin", only(17, 64, 48), "EQUIRECTANGULAR is a panorama"),
+        ("cameras.bin", only(-1), UNKNOWN.format(-1)),  # parameters cannot be counted
+        ("cameras.bin", only(18), UNKNOWN.format(18)),
+        ("images.bin", binary_images([]), "no registered image, expected at least one"),
+        ("images.bin", UNTERMINATED, NAMELESS),
+        ("cameras.txt", "1", "line 1: unknown camera model '', expected SIMPLE_PINHOLE, "),
+        ("cameras.txt", "#\n\n1 LENS 64 48 1 2 3", "line 3: unknown camera model 'LENS'"),
+        (
+            "cameras.txt",
+            CAMERA,
+            "line 1: expected width, height and 4 parameters of P",
+        ),
+        ("cameras.txt", f"{CAMERA} 24 0", "4 parameters of PINHOLE, got 7 numbers"),
+        ("cameras.txt", f"{CAMERA} x", "expected a number, got 'x'"),
+        ("cameras.txt", f"1.5{CAMERA[1:]} 24", f"{ID}, got '1.5'"),
+        ("cameras.txt", f"{'9' * 5000}{CAMERA[1:]} 24", ID),
+        ("cameras.txt", "1 PINHOLE 64.5 48 100 120 32 24", "width: expected a whole number of p"),
+        ("cameras.txt", "\xff", "unknown camera model ''"),
+        ("images.txt", "# nothing", "no registered image, expected at least one"),
+        ("images.txt", f"{LINES}\n1 1 0 0 0 0 0 0 1", f"line 3 image row 1: {FIELDS}"),
+        ("images.txt", f"a{LINES[1:]}", f"line 1 image row 0: {ID}, got 'a'"),
+        ("images.txt", "1 1 0 0 0 0 0 0 a a.png", f"{ID}, got 'a'"),
+        ("images.txt", "1 1 0 0 zero 0 0 0 1 a.png", "expected a number, got 'zero'"),
+        # Else every second image would be taken for the points of the one before, and vanish.
+        ("images.txt", LINES * 4, "line 2: expected the points of image row 0"),
+        # A place was made for each empty line and kept: 250 bytes of memory for one of the file.
+        ("images.txt", "\n" * 20_000 + "1 2 3", "line 20001 image row 0"),
     ],
+    ids=range(21),
 )
-def test_a_wrong_line_of_cameras_is_named(tmp_path, line, problem):
-    write(tmp_path, ".txt", cameras=f"# comment\n\n{line}\n".encode("latin-1"))
+def test_a_wrong_row_or_line_is_named(tmp_path, file, data, problem):
+    data = data if isinstance(data, bytes) else data.encode("latin-1")
+    write(tmp_path, file[-4:], **{file[:-4]: data})
 
-    assert "cameras.txt: line 3" in wrong(tmp_path, "cameras.txt", problem)
-
-
-@pytest.mark.parametrize(
-    ("line", "problem"),
-    [
-        ("1 1 0 0 0 0 0 0 1", "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"),
-        ("a 1 0 0 0 0 0 0 1 a.png", "expected a whole number as id, got 'a'"),
-        ("1 1 0 0 0 0 0 0 a a.png", "expected a whole number as id, got 'a'"),
-        ("1 1 0 0 zero 0 0 0 1 a.png", "expected a number, got 'zero'"),
-    ],
-)
-def test_a_wrong_line_of_images_is_named(tmp_path, line, problem):
-    write(tmp_path, ".txt", images=f"1 1 0 0 0 0 0 0 1 a\n\n{line}\n".encode())
-
-    wrong(tmp_path, "images.txt", f"line 3 image row 1: {problem}")
-
-
-def test_images_without_their_lines_of_points_are_told(tmp_path):
-    """Else every second image would be taken for the points of the one before, and vanish."""
-    write(tmp_path, ".txt", images=b"1 1 0 0 0 0 0 0 1 a\n" * 4)
-
-    wrong(tmp_path, "images.txt", "line 2: expected the points of image row 0")
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_any_damage_gives_views_or_a_located_error(tmp_path, data):
-    """Bytes are replaced, removed or inserted anywhere; there is no other exception."""
-    suffix = data.draw(st.sampled_from([".bin", ".txt"]))
-    stem = data.draw(st.sampled_from(["cameras", "images"]))
-    path = write(tmp_path, suffix, *TWO) / f"{stem}{suffix}"
-    content = path.read_bytes()
-    start = data.draw(st.integers(0, len(content)))
-    end = data.draw(st.integers(start, min(start + 12, len(content))))
-    path.write_bytes(content[:start] + data.draw(st.binary(max_size=12)) + content[end:])
-    try:
-        views = read_cameras(tmp_path)
-    except RefineError as error:
-        assert str(error).startswith(str(tmp_path))
-    else:
-        assert np.isfinite(views.rotations).all()
-        assert np.isfinite(views.centers).all()
+    wrong(tmp_path, file, problem)

@@ -74,42 +74,23 @@ def test_harmonics_are_found_by_their_names(tmp_path):
     assert [rows[name][0] * 32 + 127.5 for name in names] == [108.0 - index for index in range(9)]
 
 
+VERTEX, CHUNK = "element 'vertex': property", "element 'chunk'"
+LIST = ("float min_x", "list uchar float min_x")
+TURN, SIGNED = ("packed_rotation", "packed_turn"), ("uint packed_color", "int packed_color")
+REST = ("uchar f_rest_0", "float f_rest_0")
+
 FAULTS = [
-    (
-        ply(swap=("binary_little_endian", "ascii")),
-        "a compressed PLY in ASCII, expected a binary",
-    ),
+    (ply(swap=("binary_little_endian", "ascii")), "a compressed PLY in ASCII, expected a binary"),
     (ply(ONE * 256, count=257), "1 chunks, expected 2 for 257 splats"),
-    (ply(swap=("chunk", "lump")), "a compressed PLY without an element 'chunk'"),
-    (
-        ply(swap=("packed_rotation", "packed_turn")),
-        "element 'vertex': property 'packed_rotation' is none, expected u4",
-    ),
-    (
-        ply(swap=("uint packed_color", "int packed_color")),
-        "element 'vertex': property 'packed_color' is i4, expected u4",
-    ),
-    (ply(swap=("max_g", "green")), "element 'chunk': property 'max_g' is none, expected f4"),
-    (
-        ply(swap=("float min_x", "list uchar float min_x")),
-        "element 'chunk' has a list, expected numbers",
-    ),
-    (
-        ply(bytes(8), rest=8),
-        "element 'sh' has 1 rows of 8 properties, expected 1 rows of 9, 24, 45 or 72",
-    ),
-    (
-        ply(rest=9, swap=("element sh 1", "element sh 0")),
-        "element 'sh' has 0 rows of 9 properties, expected 1 rows of",
-    ),
-    (
-        ply(bytes(12), rest=9, swap=("uchar f_rest_0", "float f_rest_0")),
-        "element 'sh': property 'f_rest_0' is f4, expected u1",
-    ),
-    (
-        ply(count=2**40),
-        "truncated: the header announces 1099511627776 rows of 'vertex', at least ",
-    ),
+    (ply(swap=("chunk", "lump")), f"a compressed PLY without an {CHUNK}"),
+    (ply(swap=TURN), f"{VERTEX} 'packed_rotation' is none, expected u4"),
+    (ply(swap=SIGNED), f"{VERTEX} 'packed_color' is i4, expected u4"),
+    (ply(swap=("max_g", "green")), f"{CHUNK}: property 'max_g' is none, expected f4"),
+    (ply(swap=LIST), f"{CHUNK} has a list, expected numbers"),
+    (ply(bytes(8), rest=8), "'sh' has 1 rows of 8 properties, expected 1 rows of 9, 24, 45 or 72"),
+    (ply(rest=9, swap=("sh 1", "sh 0")), "'sh' has 0 rows of 9 properties, expected 1 rows of"),
+    (ply(bytes(12), rest=9, swap=REST), "element 'sh': property 'f_rest_0' is f4, expected u1"),
+    (ply(count=2**40), "the header announces 1099511627776 rows of 'vertex', at least "),
 ]
 
 

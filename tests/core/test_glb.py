@@ -110,7 +110,10 @@ def test_what_nodes_do_is_applied(read):
 
     (x, y, z) becomes 2 (x, -z, y) + (1, 0, 0) + (0, 0, 1), and that is turned half about z.
     The colour along the direction that the turns make of d is that of the untouched file along d.
+    A matrix stands column by column: one that moves by (7, 8, 9) has these last.
     """
+    moved = {"matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 7, 8, 9, 1]}
+    assert read(*document(), [moved]).means.tolist() == [[-8.0, -10.0, 12.0], [-11.0, -13.0, 15.0]]
     plain = read(*document())
     half = float(np.sqrt(0.5))
     child = {"rotation": [half, 0, 0, half], "scale": [2, 2, 2], "translation": [1, 0, 0]}
@@ -130,13 +133,6 @@ def test_what_nodes_do_is_applied(read):
         colors(along, plain.sh_dc, plain.sh_rest),
         atol=1e-6,
     )
-
-
-def test_a_matrix_stands_column_by_column(read):
-    """One that moves by (7, 8, 9) has these last; turned half about z that is (-7, -8, 9)."""
-    moved = {"matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 7, 8, 9, 1]}
-
-    assert read(*document(), [moved]).means.tolist() == [[-8.0, -10.0, 12.0], [-11.0, -13.0, 15.0]]
 
 
 def test_every_node_shows_its_primitives_where_it_stands(read):
@@ -160,14 +156,6 @@ def test_every_node_shows_its_primitives_where_it_stands(read):
     assert [part.any() for part in np.split(splats.sh_rest, 3)] == [True, False, True]
 
 
-def test_an_opacity_of_0_stays_0_in_float32(read):
-    """Its logit is -104, as that of Blender's splats: float32 has nothing that small."""
-    splats = read(*document({**VALUES, OPACITY: [[0.0], [-0.1]]}))
-
-    assert opacity(splats.opacity_logits).astype(np.float32).tolist() == [0.0, 0.0]
-    np.testing.assert_allclose(splats.opacity_logits, -104.0, rtol=1e-6)
-
-
 def test_normalized_integers_and_values_that_stand_apart_are_read(read):
     """Opacity 51 of 255 is .2; a rotation of 32767 is 1, and -32768 is -1 too.
 
@@ -187,23 +175,25 @@ def test_normalized_integers_and_values_that_stand_apart_are_read(read):
     assert splats.means.tolist()[1] == [-4.0, -5.0, 6.0]
 
 
-def test_negative_scales_are_logarithms(tmp_path):
-    """Drafts of the extension have them; they became NaN in every row, and nothing was said."""
+def test_values_that_no_splat_holds_are_taken_for_what_they_mean(tmp_path, read):
+    """Drafts of the extension have logarithms of scales; they became NaN, and nothing was said.
+
+    The logit of an opacity of 0 is -104, as that of Blender's splats: float32 has nothing that
+    small. 1e10 times 1e30 is beyond float32, which cannot be drawn.
+    """
     scales = [[-3.0, -2.0, 0.5], [-1.0] * 3]
-    (tmp_path / "a.glb").write_bytes(packed(*document({**VALUES, SCALE: scales})))
+    values = {**VALUES, SCALE: scales, OPACITY: [[0.0], [-0.1]]}
+    (tmp_path / "a.glb").write_bytes(packed(*document(values)))
 
     file = read_splats(tmp_path / "a.glb")
 
     assert file.splats().log_scales.tolist() == scales
-    assert registry.notes(file, None, np.ones(2, np.bool_)) == [
-        "a.glb has negative scales: its scales are read as logarithms"
-    ]
-
-
-def test_positions_that_a_node_moves_beyond_float32_are_infinite(read):
-    """Which cannot be drawn: 1e10 times 1e30 is beyond."""
+    note = "a.glb has negative scales: its scales are read as logarithms"
+    assert registry.notes(file, None, np.ones(2, np.bool_)) == [note]
+    logits = file.splats().opacity_logits
+    assert opacity(logits).astype(np.float32).tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(logits, -104.0, rtol=1e-6)
     far = document({**VALUES, "POSITION": [[1e10, 0.0, 0.0]] * 2})
-
     assert read(*far, [{"scale": [1e15] * 3}] * 2).means[:, 0].tolist() == [-np.inf, -np.inf]
 
 
@@ -229,7 +219,8 @@ CONTENT, BINARY = document()
 PART = ("meshes", 0, "primitives", 0)
 NAMED = (*PART, "attributes")
 NODE = ("nodes", 0)
-LESS = {name: index for index, name in enumerate(VALUES)}
+LESS = {name: index for index, name in enumerate(list(VALUES)[:-1])}
+KIND = (*PART, "extensions", SPLATTING)
 
 
 def inside(scale):
@@ -254,19 +245,10 @@ FAULTS = [
     ("nodes", inside(1e-30), "nodes[1]: the transform sc"),
     (*NODE, "translation", [float("inf"), 0, 0], "nodes[0] translation [0]: expected a finite"),
     (*PART, "mode", 4, f"{PLACE} mode: expected 0, got 4"),
-    (
-        *(*PART, "extensions", SPLATTING, "kernel", "cube"),
-        f'{PLACE}: splats of kernel "cube", expected "ellipse"',
-    ),
-    (
-        *(*PART, "extensions", SPLATTING, "extensions", {"X_spz": {}}),
-        f'{PLACE}: splats by "X_spz", expected plain accessors',
-    ),
+    (*KIND, "kernel", "cube", f'{PLACE}: splats of kernel "cube", expected "ellipse"'),
+    (*KIND, "extensions", {"X_spz": {}}, f'{PLACE}: splats by "X_spz", expected plain accessors'),
     (*NAMED, {"POSITION": 0}, f"{PLACE} attributes: no {ROTATION}"),
-    (
-        *(*NAMED, dict(list(LESS.items())[:-1])),
-        f"{PLACE} attributes: no {SPLATTING}:SH_DEGREE_1_COEF_2",
-    ),
+    (*NAMED, LESS, f"{PLACE} attributes: no {SPLATTING}:SH_DEGREE_1_COEF_2"),
     (*NAMED, [], f"{PLACE} attributes: expected an object, got a list of 0"),
     ("accessors", 0, "type", "VEC4", 'accessors[0]: "VEC4" of 5126, exp'),
     ("accessors", 0, "componentType", 5125, 'accessors[0]: "VEC3" of 5125, '),
