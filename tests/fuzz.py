@@ -27,7 +27,6 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -51,6 +50,8 @@ from refine_addon.core.formats.ply_columns import empty_rows, splats_from_column
 from refine_addon.core.formats.registry import FORMATS, SUFFIXES
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.visibility.measuring import Sampling
+from tests.core.test_camera_files import FRAME, INRIA, MATRIX, TRANSFORMS
+from tests.core.test_colmap import TWO, WRITERS
 
 MEMORY = 40_000_000  # bytes that any small input may cost; NumPy and JSON need some of their own
 SECONDS = 5.0  # of the processor; an input that takes longer is a crash too
@@ -122,61 +123,28 @@ def format_seeds(form: Any) -> list[Files]:
         seeds.append({f"in{form.suffix}": stream.getvalue()})
     if form.name == "SPZ":  # in the open, so that what is broken reaches what is inside
         seeds += [{"in.spz": gzip.decompress(seed["in.spz"])} for seed in seeds]
-        if find_spec("zstandard"):
-            seeds += [{"in.spz": _spz_of_streams(seed["in.spz"])} for seed in seeds[2:]]
     return seeds
 
 
-def _spz_of_streams(data: bytes) -> bytes:
-    """Return a file of version 4 of an unpacked one of version 3."""
-    zstandard = import_module("zstandard")
-    at, packed, table = 16, b"", b""
-    for width in filter(None, (9, 1, 3, 3, 4, 3 * ((data[12] + 1) ** 2 - 1))):
-        end = at + width * data[8]
-        stream = zstandard.ZstdCompressor().compress(data[at:end])
-        table += struct.pack("<QQ", len(stream), end - at)
-        packed, at = packed + stream, end
-    head = data[:4] + struct.pack("<I", 4) + data[8:15] + bytes([len(table) // 16])
-    return head + struct.pack("<I12x", 32) + table + packed
-
-
-def inria_seeds() -> list[Files]:
-    """Return ``cameras.json`` as the reference implementation writes it."""
-    camera = {"width": 640, "height": 480, "rotation": np.eye(3).tolist(), "fx": 500.0, "fy": 500.0}
-    own = [{"id": n, "img_name": f"{n:03}", "position": [0.1 * n, 0.0, -4.0]} for n in range(2)]
-    return [{"cameras.json": json.dumps([camera | each for each in own]).encode()}]
+def camera_seeds(name: str, *contents: Any) -> list[Files]:
+    """Return JSON files of cameras."""
+    return [{name: json.dumps(content).encode()} for content in contents]
 
 
 def transforms_seeds() -> list[Files]:
     """Return ``transforms.json`` of nerfstudio and of instant-ngp, and what lies beside it."""
-    pose = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -4.0], [0, 0, 0, 1]]
-    frame = {"file_path": "a.png", "transform_matrix": pose}
-    lens = {"w": 640, "h": 480, "fl_x": 500.0, "fl_y": 500.0, "cx": 320.0, "cy": 240.0, "k1": 0.1}
-    studio = {**lens, "camera_model": "OPENCV", "applied_transform": pose[:3], "frames": [frame]}
+    studio = {**TRANSFORMS, "camera_model": "OPENCV", "k1": 0.1, "applied_transform": MATRIX[:3]}
     ngp = {"camera_angle_x": 0.8, "w": 640.0, "h": 480.0, "aabb_scale": 4, "scale": 0.3}
-    ngp["frames"] = [{**frame, "fl_x": 400.0, "w": 320, "h": 200}]
-    beside = json.dumps({"transform": pose[:3], "scale": 0.5}).encode()
-    seeds = [{"transforms.json": json.dumps(content).encode()} for content in (studio, ngp)]
+    ngp["frames"] = [{**FRAME, "fl_x": 400.0, "w": 320, "h": 200}]
+    seeds = camera_seeds("transforms.json", studio, ngp)
+    beside = json.dumps({"transform": MATRIX[:3], "scale": 0.5}).encode()
     return [*seeds, {**seeds[0], "dataparser_transforms.json": beside}]
 
 
-def colmap_text_seeds() -> list[Files]:
-    """Return a text model of two cameras and two images."""
-    cameras = "# Cameras\n1 PINHOLE 640 480 500 500 320 240\n2 SIMPLE_RADIAL 64 48 50 32 24 .1\n"
-    images = "# Images\n1 1 0 0 0 0.0 0.0 4.0 1 a.png\n1.5 2.5 -1 3.5 4.5 7\n"
-    images += "2 0.9 0.1 0 0 0.1 0.0 4.0 2 b.png\n\n"
-    return [{"cameras.txt": cameras.encode(), "images.txt": images.encode()}]
-
-
-def colmap_binary_seeds() -> list[Files]:
-    """Return a binary model of two cameras and two images."""
-    cameras = struct.pack("<QIiQQ4d", 2, 1, 1, 640, 480, 500.0, 500.0, 320.0, 240.0)
-    cameras += struct.pack("<IiQQ4d", 2, 2, 64, 48, 50.0, 32.0, 24.0, 0.1)
-    images, pose = struct.pack("<Q", 2), (1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 4.0)
-    for index, points in ((1, 2), (2, 0)):
-        images += struct.pack("<I7dI", index, *pose, index) + b"%d.png\0" % index
-        images += struct.pack("<Q", points) + bytes(24 * points)
-    return [{"cameras.bin": cameras, "images.bin": images}]
+def colmap_seeds(suffix: str) -> list[Files]:
+    """Return a model of two cameras and two images."""
+    contents = zip(("cameras", "images"), TWO, WRITERS[suffix], strict=True)
+    return [{f"{stem}{suffix}": write(things) for stem, things, write in contents}]
 
 
 def sog_seeds() -> list[Files]:
@@ -371,6 +339,7 @@ def use_cameras(folder: Path) -> None:
     files = sorted(path for path in folder.iterdir() if path.name != "dataparser_transforms.json")
     views = read_cameras(files[0])
     values = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32)
+    values[:, :3] += (-3.0, 2.0, 3.0)  # what the good cameras look at
     splats = splats_from_columns(dict(zip(REQUIRED.split(), values.T, strict=True)))
     coarse = Sampling(16.0, 1.0)
     try:  # in this thread: NumPy's flags are raised in it alone
@@ -398,10 +367,10 @@ TARGETS: dict[str, tuple[Callable[[], list[Files]], Callable[[Path], Any]]] = {
         lambda folder: [_convert(folder / "lod-meta.json", level) for level in (0, 1)],
     ),
     ".ksplat": (ksplat_seeds, use_ksplat),
-    "cameras.json": (inria_seeds, use_cameras),
+    "cameras.json": (partial(camera_seeds, "cameras.json", [INRIA, INRIA]), use_cameras),
     "transforms.json": (transforms_seeds, use_cameras),
-    "colmap text": (colmap_text_seeds, use_cameras),
-    "colmap binary": (colmap_binary_seeds, use_cameras),
+    "colmap text": (partial(colmap_seeds, ".txt"), use_cameras),
+    "colmap binary": (partial(colmap_seeds, ".bin"), use_cameras),
 }
 if not find_spec("PIL"):
     TARGETS = {name: target for name, target in TARGETS.items() if "SOG" not in name}
