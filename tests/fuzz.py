@@ -168,24 +168,6 @@ def version_1_of(files: Files) -> Files:
     return {**files, "meta.json": json.dumps(meta).encode()}
 
 
-def streamed_seeds() -> list[Files]:
-    """Return a streamed SOG of two levels in one folder, whose files have names of their own."""
-    files: Files = {}
-    for number, unit in enumerate([*sog_seeds(), version_1_of(sog_seeds()[1])]):
-        text = unit.pop("meta.json").decode()
-        for name, data in unit.items():
-            text = text.replace(name, f"{number}_{name}")
-            files[f"{number}_{name}"] = data
-        files[f"{number}_meta.json"] = text.encode()
-    lods = {str(n): {"file": n, "offset": 0, "count": 5} for n in (0, 1)}
-    index = {
-        "version": 1, "lodLevels": 2, "counts": [5, 5], "environment": "2_meta.json",
-        "filenames": ["0_meta.json", "1_meta.json"],
-        "tree": {"children": [{"bound": {}, "lods": lods}]},
-    }  # fmt: skip
-    return [{**files, "lod-meta.json": json.dumps(index).encode()}]
-
-
 def ksplat_seeds() -> list[Files]:
     """Return what files of the reference converter hold, without the zeros between."""
     seeds = []
@@ -297,11 +279,11 @@ def use_ply(folder: Path) -> None:
     assert len(read_ply(again)) == int(keep.sum()), "pruned it holds another number of splats"
 
 
-def _convert(path: Path, level: int = 0) -> Any:
+def _convert(path: Path) -> Any:
     """Read and describe a file, and write it as a PLY."""
-    file = read_splats(path, level=level)
+    file = read_splats(path)
     describe(file)
-    file.write(path.with_name(f"out{level}.ply"))
+    file.write(path.with_name("out.ply"))
     return file
 
 
@@ -361,10 +343,6 @@ TARGETS: dict[str, tuple[Callable[[], list[Files]], Callable[[Path], Any]]] = {
     "SOG 1": (
         lambda: [version_1_of(seed) for seed in sog_seeds()],
         lambda folder: _convert(folder / "meta.json"),
-    ),
-    "streamed SOG": (
-        streamed_seeds,
-        lambda folder: [_convert(folder / "lod-meta.json", level) for level in (0, 1)],
     ),
     ".ksplat": (ksplat_seeds, use_ksplat),
     "cameras.json": (partial(camera_seeds, "cameras.json", [INRIA, INRIA]), use_cameras),

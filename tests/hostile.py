@@ -39,6 +39,7 @@ def refused(
     finally:
         tracemalloc.stop()
     message = str(caught.value)
+    del caught  # it holds this frame, and what was opened, until it is collected
     assert message.startswith(f"{file or path}: ")
     assert expected in message
     assert len(message) < 1000

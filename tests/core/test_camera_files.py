@@ -27,6 +27,7 @@ MATRIX = [[0, 0, 1, 1], [1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
 FRAME = {"file_path": "a.png", "transform_matrix": MATRIX}
 LENS = {"fl_x": 100, "fl_y": 120, "cx": 32, "cy": 24, "w": 64, "h": 48}
 TRANSFORMS = {**LENS, "frames": [FRAME]}
+BESIDE = "dataparser_transforms.json"
 SHORT = {"fl_x": 100, "frames": [FRAME]}
 
 
@@ -178,29 +179,25 @@ def test_what_a_frame_says_comes_before_what_all_share(tmp_path):
     assert (view.width, view.height, view.name) == (32, 48, "b.png")
 
 
-@pytest.mark.parametrize(
-    ("keys", "expected"),
-    [
-        ({"fl_x": 100}, (100, 100)),
-        ({"fl_y": 120}, (120, 120)),
-        ({"camera_angle_x": math.pi / 2}, (32, 32)),
-        ({"camera_angle_x": math.pi / 2, "camera_angle_y": math.pi / 2}, (32, 24)),
-        ({"x_fov": 90}, (32, 32)),
-        ({"fl_x": 100, "camera_angle_x": 1, "camera_angle_y": math.pi / 2}, (100, 24)),
-    ],
-)
-def test_focal_lengths_come_from_lengths_or_angles(tmp_path, keys, expected):
+def test_focal_lengths_come_from_lengths_or_angles(tmp_path):
     """A field of view of 90 degrees spans a side s at the focal length s / 2: 32 or 24 pixels.
 
     What instant-ngp does inside itself moves no camera; a missing principal point is the middle.
     """
     inside = {"scale": 0.33, "offset": [0.5, 0.5, 0.5], "aabb_scale": 16, "aabb": [[0] * 3] * 2}
-
-    (view,) = read(tmp_path, {"w": 64, "h": 48.0, **keys, **inside, "frames": [FRAME]})
-
-    assert (view.fx, view.fy) == pytest.approx(expected, rel=1e-12)
-    assert (view.cx, view.cy, view.height) == (32, 24, 48)
-    np.testing.assert_array_equal(view.center, [1, 2, 3])
+    quarter = math.pi / 2
+    for keys, expected in (
+        ({"fl_x": 100}, (100, 100)),
+        ({"fl_y": 120}, (120, 120)),
+        ({"camera_angle_x": quarter}, (32, 32)),
+        ({"camera_angle_x": quarter, "camera_angle_y": quarter}, (32, 24)),
+        ({"x_fov": 90}, (32, 32)),
+        ({"fl_x": 100, "camera_angle_x": 1, "camera_angle_y": quarter}, (100, 24)),
+    ):
+        (view,) = read(tmp_path, {"w": 64, "h": 48.0, **keys, **inside, "frames": [FRAME]})
+        assert (view.fx, view.fy) == pytest.approx(expected, rel=1e-12)
+        assert (view.cx, view.cy, view.height) == (32, 24, 48)
+        np.testing.assert_array_equal(view.center, [1, 2, 3])
 
 
 def test_dataparser_transforms_beside_it_lead_to_the_splats_of_ns_export(tmp_path):
@@ -219,12 +216,9 @@ def test_dataparser_transforms_beside_it_lead_to_the_splats_of_ns_export(tmp_pat
     assert views.note == "splats of ns-export need dataparser_transforms.json beside it"
     stored = [[0, 0, 1, 1], [-1, 0, 0, -4], [0, -1, 0, 1]]
     for before in (1, 4):
-        beside = {"transform": stored, "scale": 0.5 * before}
-        write(tmp_path / "dataparser_transforms.json", beside)
-        content = {**TRANSFORMS, "applied_transform": applied, "applied_scale": before}
-
-        views = read(tmp_path, content)
-
+        write(tmp_path / BESIDE, {"transform": stored, "scale": 0.5 * before})
+        own = {"applied_transform": applied, "applied_scale": before}
+        views = read(tmp_path, {**TRANSFORMS, **own})
         np.testing.assert_allclose(views[0].center, [1.5, 0, 2], atol=1e-12)
         assert pixel(views[0], np.array([1.75, 1, 1.875])) == pytest.approx([57, 39], abs=1e-9)
         assert views.note == "dataparser_transforms.json applied"
@@ -237,7 +231,7 @@ def test_older_colmap_projects_of_nerfstudio_have_a_transform_of_their_own(tmp_p
     """
     (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
     stored = {"transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "scale": 1}
-    write(tmp_path / "dataparser_transforms.json", stored)
+    write(tmp_path / BESIDE, stored)
 
     (view,) = read(tmp_path, TRANSFORMS)
 
@@ -245,20 +239,15 @@ def test_older_colmap_projects_of_nerfstudio_have_a_transform_of_their_own(tmp_p
     assert pixel(view, POINT) == pytest.approx([57, 39], abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("data", "problem"),
-    [
+def test_errors_of_dataparser_transforms_name_that_file(tmp_path):
+    path = write(tmp_path / "transforms.json", TRANSFORMS)
+    for data, problem in (
         ({"scale": 1}, "missing 'transform'"),
         ({"transform": MATRIX, "scale": 1}, "'transform': expected a 3 x 4 matrix"),
         ({"transform": MATRIX[:3], "scale": 0}, "'scale': expected a positive scale, got 0"),
         ([], "expected an object, got a list of 0"),
-    ],
-)
-def test_errors_of_dataparser_transforms_name_that_file(tmp_path, data, problem):
-    beside = write(tmp_path / "dataparser_transforms.json", data)
-    path = write(tmp_path / "transforms.json", TRANSFORMS)
-
-    refused(path, problem, read=read_cameras, file=beside)
+    ):
+        refused(path, problem, read=read_cameras, file=write(tmp_path / BESIDE, data))
 
 
 def test_scaled_and_mirrored_poses_are_read_and_noted(tmp_path):
@@ -282,9 +271,8 @@ def test_scaled_and_mirrored_poses_are_read_and_noted(tmp_path):
 FISHEYE = "1 frame (fisheye, OPENCV_FISHEYE) taken as pinhole: wrong away from the centre"
 
 
-@pytest.mark.parametrize(
-    ("keys", "note"),
-    [
+def test_lenses_that_are_no_pinholes_are_noted(tmp_path):
+    for keys, note in (
         ({"k1": 0, "k2": 0.0, "p1": 0}, ""),
         ({"k1": 0.1}, "distortion of 1 frame ignored (model OPENCV)"),
         ({"k4": 0.1, "camera_model": "PINHOLE"}, "distortion of 1 frame ignored (model PINHOLE)"),
@@ -292,12 +280,10 @@ FISHEYE = "1 frame (fisheye, OPENCV_FISHEYE) taken as pinhole: wrong away from t
         ({"camera_model": "OPENCV_FISHEYE"}, FISHEYE),
         ({"is_fisheye": True, "k1": 0.1}, FISHEYE),
         ({"is_fisheye": True, "k1": 0}, ""),
-    ],
-)
-def test_lenses_that_are_no_pinholes_are_noted(tmp_path, keys, note):
-    assert read(tmp_path, two(**keys)).note == note
-    shared = {**TRANSFORMS, **keys, "frames": [FRAME, FRAME]}
-    assert read(tmp_path, shared).note == note.replace("1 frame", "2 frames")
+    ):
+        assert read(tmp_path, two(**keys)).note == note
+        shared = {**TRANSFORMS, **keys, "frames": [FRAME, FRAME]}
+        assert read(tmp_path, shared).note == note.replace("1 frame", "2 frames")
 
 
 NUMBER = "expected a number, got"
@@ -310,53 +296,42 @@ X, Y = [1, 0, 0], [0, 1, 0]
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "problem"),
+    ("key", "values", "problem"),
     [
-        ("fx", "100", f': {NUMBER} "100"'),
-        ("fx", True, f": {NUMBER} true"),
-        ("fx", None, f": {NUMBER} null"),
-        ("fx", 0, f": {FOCAL} 0"),
-        ("fy", -120, f": {FOCAL} -120"),
-        ("fy", math.nan, f": {FINITE} NaN"),
-        ("fy", math.inf, f": {FINITE} Infinity"),
-        ("fy", 10**400, f": {FINITE} 1000000"),
-        ("cx", [], f": {NUMBER} a list of 0"),
-        ("width", 64.5, f": {PIXELS}"),
-        ("width", 0, f": {PIXELS}"),
-        ("height", 2**63, f": {FINITE}"),
-        ("height", 10**7, f": {PIXELS}"),
-        ("img_name", 3, ": expected a string, got 3"),
-        ("position", [1, 2], f": {THREE}"),
-        ("position", [1, 2, "3"], f' [2]: {NUMBER} "3"'),
-        ("position", [1, [2], 3], f" [1]: {NUMBER} a list of 1"),
-        ("position", {"x": 1}, f": {THREE}, got an object with 1 keys"),
-        ("position", [1, 2, 1e300], f" [2]: {FINITE}"),
-        ("rotation", [X, Y], ": expected a 3 x 3 matrix"),
-        ("rotation", X, f" row 0: {THREE}"),
-        ("rotation", [X, Y, [0, 0, 2]], f": {TURN}"),
-        ("rotation", [[0, 0, 0]] * 3, f": {TURN}"),
-        ("rotation", [[1e17] * 3] * 3, f": {TURN}"),
-        ("rotation", [X, Y, [0, 0, -1]], ": expected a rotation, got a reflection"),
-        ("fl_x", "100", f': {NUMBER} "100"'),
-        ("fl_y", 0, f": {FOCAL} 0"),
-        ("w", math.nan, f": {FINITE} NaN"),
-        ("h", -1, f": {PIXELS}"),
-        ("cy", True, f": {NUMBER} true"),
-        ("camera_model", 4, ": expected a string, got 4"),
-        ("camera_model", "LENS", ": unknown model 'LENS', expected one of"),
-        ("file_path", None, ": expected a string, got null"),
-        ("transform_matrix", MATRIX[:2], ": expected a 3 x 4 or 4 x 4"),
-        ("transform_matrix", [[1] * 3] * 4, " row 0: expected a list of 4"),
-        ("transform_matrix", [[0] * 4] * 3, f": {TURN}"),
-        ("transform_matrix", [[1e18] * 4] * 3, f": {TURN}"),
-        ("transform_matrix", [*MATRIX[:3], [0, 0, 0, 2]], " row 3: expected [0, 0, 0, 1]"),
+        ("fx", ["100", True, None, []], f": {NUMBER} "),
+        ("fx", [0, -120], f": {FOCAL} "),
+        ("fy", [math.nan, math.inf, 10**400], f": {FINITE} "),
+        ("cx", [[]], f": {NUMBER} a list of 0"),
+        ("width", [64.5, 0, 10**7], f": {PIXELS}"),
+        ("height", [2**63], f": {FINITE} 9223372036854775808"),
+        ("img_name", [3], ": expected a string, got 3"),
+        ("position", [[1, 2], {"x": 1}], f": {THREE}, got "),
+        ("position", [[1, 2, "3"], [1, 2, [3]]], f" [2]: {NUMBER} "),
+        ("position", [[1, 2, 1e300]], f" [2]: {FINITE} 1e+300"),
+        ("rotation", [[X, Y]], ": expected a 3 x 3 matrix"),
+        ("rotation", [X], f" row 0: {THREE}"),
+        ("rotation", [[X, Y, [0, 0, 2]], [[0] * 3] * 3, [[1e17] * 3] * 3], f": {TURN}"),
+        ("rotation", [[X, Y, [0, 0, -1]]], ": expected a rotation, got a reflection"),
+        ("fl_x", ["100"], f': {NUMBER} "100"'),
+        ("fl_y", [0], f": {FOCAL} 0"),
+        ("w", [math.nan], f": {FINITE} NaN"),
+        ("h", [-1], f": {PIXELS}"),
+        ("cy", [True], f": {NUMBER} true"),
+        ("camera_model", [4], ": expected a string, got 4"),
+        ("camera_model", ["LENS"], ": unknown model 'LENS', expected one of"),
+        ("file_path", [None], ": expected a string, got null"),
+        ("transform_matrix", [MATRIX[:2]], ": expected a 3 x 4 or 4 x 4"),
+        ("transform_matrix", [[[1] * 3] * 4], " row 0: expected a list of 4"),
+        ("transform_matrix", [[[0] * 4] * 3, [[1e18] * 4] * 3], f": {TURN}"),
+        ("transform_matrix", [[*MATRIX[:3], [0, 0, 0, 2]]], " row 3: expected [0, 0, 0, 1]"),
     ],
 )
-def test_a_wrong_value_is_named_with_its_camera_or_frame_and_key(tmp_path, key, value, problem):
-    if key in INRIA or key == "cx":
-        wrong(tmp_path, [INRIA, {**INRIA, key: value}], f": camera 1 '{key}'{problem}")
-    else:
-        wrong(tmp_path, two(**{key: value}), f": frame 1 '{key}'{problem}")
+def test_a_wrong_value_is_named_with_its_camera_or_frame_and_key(tmp_path, key, values, problem):
+    for value in values:
+        if key in INRIA or key == "cx":
+            wrong(tmp_path, [INRIA, {**INRIA, key: value}], f": camera 1 '{key}'{problem}")
+        else:
+            wrong(tmp_path, two(**{key: value}), f": frame 1 '{key}'{problem}")
 
 
 PANORAMA = "cameras are not pinholes, expected a perspective camera"
@@ -403,25 +378,20 @@ JPEG = b"\xff\xd8\xff\xe0" + struct.pack(">H", 16) + bytes(14)
 JPEG += b"\xff\xff\xc2" + struct.pack(">HBHHB", 17, 8, 200, 300, 3)  # fill byte, progressive frame
 
 
-@pytest.mark.parametrize(
-    ("file", "named", "data"),
-    [
+def test_an_image_tells_the_size_that_the_file_does_not(tmp_path):
+    """As in the NeRF synthetic scenes: f = 300 / 2 / tan(pi / 4) = 150."""
+    (tmp_path / "train").mkdir()
+    for file, named, data in (
         ("train/r_0.png", "./train/r_0", PNG),
         ("train/r_0.png", "train\\r_0.png", PNG),
         ("r_0.jpg", "r_0.jpg", JPEG),
         ("r.0.jpeg", "r.0", JPEG),
-    ],
-)
-def test_an_image_tells_the_size_that_the_file_does_not(tmp_path, file, named, data):
-    """As in the NeRF synthetic scenes: f = 300 / 2 / tan(pi / 4) = 150."""
-    (tmp_path / file).parent.mkdir(exist_ok=True)
-    (tmp_path / file).write_bytes(data)
-    frame = {"file_path": named, "transform_matrix": MATRIX}
-
-    (view,) = read(tmp_path, {"camera_angle_x": math.pi / 2, "frames": [frame]})
-
-    assert (view.width, view.height, view.name) == (300, 200, named)
-    assert view.fx == view.fy == pytest.approx(150)
+    ):
+        (tmp_path / file).write_bytes(data)
+        frame = {**FRAME, "file_path": named}
+        (view,) = read(tmp_path, {"camera_angle_x": math.pi / 2, "frames": [frame]})
+        assert (view.width, view.height, view.name) == (300, 200, named)
+        assert view.fx == view.fy == pytest.approx(150)
 
 
 def test_an_image_that_does_not_tell_its_size_is_no_crash(tmp_path):
@@ -464,15 +434,12 @@ def test_a_folder_prefers_some_names_and_notes_the_rest(tmp_path):
     assert (alone[0].name, alone.note) == ("train", "")
 
 
-@pytest.mark.parametrize("place", [".", "sparse/0", "sparse", "colmap/sparse/0"])
-def test_a_colmap_model_is_found_in_its_project(tmp_path, place):
-    write_colmap(tmp_path / place)
-
-    assert read_cameras(tmp_path)[0].name == "a.png"
-
-
-@pytest.mark.parametrize("lone", ["cameras.bin", "images.txt", "images.png"])
-def test_a_folder_without_cameras_says_what_was_looked_for(tmp_path, lone):
-    (tmp_path / lone).touch()
-
-    refused(tmp_path, "no cameras in this folder, expected cameras.json", read=read_cameras)
+def test_a_colmap_model_is_found_in_its_project(tmp_path):
+    """Half of one is none."""
+    for number, place in enumerate((".", "sparse/0", "sparse", "colmap/sparse/0")):
+        write_colmap(tmp_path / str(number) / place)
+        assert read_cameras(tmp_path / str(number))[0].name == "a.png"
+    for lone in ("cameras.bin", "images.txt", "images.png"):
+        (tmp_path / lone).touch()
+        refused(tmp_path, "no cameras in this folder, expected cameras.json", read=read_cameras)
+        (tmp_path / lone).unlink()

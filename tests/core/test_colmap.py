@@ -245,26 +245,14 @@ FAR = (0.9238795325112867, 0, 0, 0.3826834323650898, 9e17, -9e17, 0)
 
 @both
 @pytest.mark.parametrize(
-    ("pose", "camera", "problem"),
+    ("second", "problem"),
     [
-        ((NAN, *POSE[1:]), 1, f"QW: {FINITE} NaN"),
-        ((*POSE[:4], INF, 3, 1), 1, f"TX: {FINITE} Infinity"),
-        ((*POSE[:6], -1e300), 1, f"TZ: {FINITE} -1e+300"),
-        ((0, 0, 0, 0, 1, 2, 3), 1, "expected a quaternion (w, x, y, z)"),
-        (FAR, 1, "the camera's centre is farther than 1e18"),
-        (POSE, 7, "refers to camera 7, expected one of the 1 in cameras"),
-    ],
-)
-def test_a_wrong_pose_is_named_with_the_image(tmp_path, suffix, pose, camera, problem):
-    write(tmp_path, suffix, images=[IMAGE, (2, pose, camera, "b", 0)])
-
-    assert "image row 1" in wrong(tmp_path, f"images{suffix}", problem)
-
-
-@both
-@pytest.mark.parametrize(
-    ("camera", "problem"),
-    [
+        ((2, (NAN, *POSE[1:]), 1, "b", 0), f"QW: {FINITE} NaN"),
+        ((2, (*POSE[:4], INF, 3, 1), 1, "b", 0), f"TX: {FINITE} Infinity"),
+        ((2, (*POSE[:6], -1e300), 1, "b", 0), f"TZ: {FINITE} -1e+300"),
+        ((2, (0, 0, 0, 0, 1, 2, 3), 1, "b", 0), "expected a quaternion (w, x, y, z)"),
+        ((2, FAR, 1, "b", 0), "the camera's centre is farther than 1e18"),
+        ((2, POSE, 7, "b", 0), "refers to camera 7, expected one of the 1 in cameras"),
         ((1, 1, 0, 48, (100, 120, 32, 24)), "width: expected a whole number of pixels"),
         ((1, 1, 64, 2**64 - 1, (100, 120, 32, 24)), f"height: {FINITE}"),
         ((1, 1, 64, 48, (100, 0.0, 32, 24)), "focal length: expected a positive focal length"),
@@ -272,13 +260,16 @@ def test_a_wrong_pose_is_named_with_the_image(tmp_path, suffix, pose, camera, pr
         ((1, 2, 64, 48, (100, 32, 24, INF)), f"parameter 3: {FINITE}"),
         ((9, 1, 64, 48, (100, 120, 32, 24)), "camera 9 is there twice"),
     ],
+    ids=range(12),
 )
-def test_a_wrong_camera_is_named_with_its_place(tmp_path, suffix, camera, problem):
-    write(tmp_path, suffix, [(9, *PINHOLE[1:]), camera])
-
-    message = wrong(tmp_path, f"cameras{suffix}", problem)
-
-    assert ("line 3" if suffix == ".txt" else "camera row 1 at byte 64") in message
+def test_a_wrong_image_or_camera_is_named_with_its_place(tmp_path, suffix, second, problem):
+    if second[3] == "b":
+        write(tmp_path, suffix, images=[IMAGE, second])
+        assert "image row 1" in wrong(tmp_path, f"images{suffix}", problem)
+    else:
+        write(tmp_path, suffix, [(9, *PINHOLE[1:]), second])
+        place = "line 3" if suffix == ".txt" else "camera row 1 at byte 64"
+        assert place in wrong(tmp_path, f"cameras{suffix}", problem)
 
 
 @pytest.mark.slow
