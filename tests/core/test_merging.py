@@ -23,10 +23,10 @@ from refine_addon.core.splats import (
     Splats,
     drawable,
     opacity,
-    rotation_matrices,
 )
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility.scene import Scene, scene_of
+from tests.core.test_invariance import moved, rotation
 
 SCENE = Scene(np.zeros(3), 1.0, np.eye(3))
 
@@ -81,18 +81,14 @@ def cloud(count, seed=0, degree=1, spread=1.0):
     )
 
 
-def around(count=4, distance=6.0, matrix=None):
-    """Look from a circle towards the origin, or from where a similarity takes it."""
+def around(count=4, distance=6.0):
+    """Look from a circle towards the origin."""
     views = []
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
         forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
         right = np.array([-np.sin(angle), np.cos(angle), 0.0])
-        rotation, center = np.stack([right, np.cross(forward, right), forward]), -distance * forward
-        if matrix is not None:
-            scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
-            rotation = rotation @ (matrix[:3, :3] / scale).T
-            center = matrix[:3, :3] @ center + matrix[:3, 3]
-        views.append(View(rotation, center, 200.0, 200.0, 160.0, 120.0, 320, 240))
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        views.append(View(rotation, -distance * forward, 200.0, 200.0, 160.0, 120.0, 320, 240))
     return ViewSet(tuple(views))
 
 
@@ -117,22 +113,6 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-# Two splats
-
-
-def test_two_equal_faint_splats_merge_to_one_of_twice_the_opacity():
-    """Equal moments stay; A_m = 2 A - <f, f>, and <f, f> = alpha A / 2: alpha' = 2a - a^2 / 2."""
-    field = flat([0.1, 0.1], [[1.0, 2, 3]] * 2, [[0.04, 0.09, 0.01]] * 2)
-
-    pairs, merged = merged_of(field)
-
-    np.testing.assert_allclose(merged.means, [[1, 2, 3]], atol=1e-15)
-    np.testing.assert_allclose(merged.covariances, field.covariances[:1], rtol=1e-14)
-    np.testing.assert_allclose(merged.opacity, 0.2 - 0.005, rtol=1e-12)
-    # Only the overlap is lost: cost = tau |s|^2 (2 f - f_m)^2 = (alpha / 4)^2 of what f costs.
-    assert pairs.cost[0] <= (0.1 / 4) ** 2 * 4 * field.error[0] * (1 + 1e-9)
-
-
 def test_two_splats_apart_have_the_moments_of_their_mixture():
     """Masses 1 : 3, a step of 4 along x: mean 3/4 of the way; variance 1 + 3/16 16 = 4 along x.
 
@@ -150,20 +130,6 @@ def test_two_splats_apart_have_the_moments_of_their_mixture():
     np.testing.assert_allclose(merged.opacity, (0.4 - 0.03 * np.exp(-4) / 2) / 2, rtol=1e-12)
     np.testing.assert_allclose(np.abs(merged.direction), [[0, 0, 1]])
     np.testing.assert_allclose(np.abs(merged.deviation), [[0.5, 0, 0]])
-
-
-@pytest.mark.parametrize("stand_out", [0.0, 0.75])
-def test_black_and_white_on_grey_cost_what_both_are_seen_by(stand_out):
-    """|s|^2 = 3/4 each; grey has no contrast, so the merge loses both: it costs E_i + E_j.
-
-    Without contrast to what lies behind, colours are those of other places and cost nothing.
-    """
-    field = flat(
-        [0.5] * 2, [[0.0, 0, 0], [8, 0, 0]], np.ones((2, 3)), colors=[[0.0] * 3, [1.0] * 3]
-    )
-    field.error *= stand_out
-
-    np.testing.assert_allclose(merged_of(field)[0].cost, field.error.sum(), rtol=1e-6)
 
 
 def test_the_cost_is_the_squared_error_of_the_pictures():
@@ -251,25 +217,6 @@ def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
     assert merged.opacity.max() <= ALPHA_MAX * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1e-3, 1e-9, 0.0])
-def test_covariances_become_axes_and_back(ratio):
-    """Down to a flat disc; scales and rotation reproduce the matrix, and no axis is lost."""
-    rng = np.random.default_rng(3)
-    sizes = np.array([1.0, 0.3, 0.3 * ratio]) * np.exp(rng.normal(size=(500, 1)))
-    axes = rotation_matrices(rng.normal(size=(500, 4))) * sizes[:, None]
-    full = axes @ np.swapaxes(axes, 1, 2)
-
-    logs, vectors = merging.axes(full[:, *np.triu_indices(3)])
-
-    found = vectors * np.exp(logs)[:, None]
-    np.testing.assert_allclose(np.linalg.det(vectors), 1.0)
-    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), full, atol=1e-9 * sizes.max() ** 2)
-    assert np.isfinite(logs).all()
-
-
-# Many
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [550, 500, 499, 350, 50, 1])
 def test_as_many_survive_as_asked_and_the_unchanged_keep_their_bits(goal):
@@ -330,9 +277,6 @@ def test_a_kept_splat_has_the_colours_of_all_merged_into_it_by_what_is_seen_of_e
     np.testing.assert_allclose(result.splats.means[row], [1e-6, 0, 0], atol=1e-9)
 
 
-# From where splats are viewed
-
-
 def looking(at, center, **changes):
     """Return a view from `center` to `at`, 320 x 240 px."""
     forward = np.array(at, float) - center
@@ -377,9 +321,6 @@ def test_a_splat_is_viewed_along_the_mean_direction_of_what_sees_it(one, other, 
         np.testing.assert_allclose(field.blur, 0.3 * 8 / (200 * 250))
 
 
-# Laws
-
-
 @pytest.mark.parametrize("goal", [60, 0])
 def test_protected_splats_neither_vanish_nor_change_though_nobody_sees_or_can_draw_them(goal):
     """A third; if all others go, more than asked for stay, and what others merged into is deleted.
@@ -418,20 +359,6 @@ def test_where_nothing_is_seen_merging_is_deleting_the_lowest_errors():
 
     np.testing.assert_array_equal(result.keep, error >= 80)
     same(result.splats, splats.take(result.keep))
-
-
-def test_what_these_views_do_not_show_is_worth_what_another_may_see():
-    """Two alike, one hidden in all of four views: both get a fifth of what a view saw of each.
-
-    Of the two in four views 8 was seen, 1 a splat and view: the floor is 1 / (4 + 1).
-    """
-    splats = cloud(1).take(np.array([0, 0]))
-    seen = np.array([[8.0, 0.0], [4.0, 0.0]])
-
-    field = field_of(splats, around(), seen)
-
-    np.testing.assert_allclose(field.contribution, [8.2, 0.2], rtol=1e-12)
-    np.testing.assert_allclose(field.error, [4.1, 0.1], rtol=1e-12)
 
 
 def cheapest_first(field, penalty, goal):
@@ -554,18 +481,19 @@ def test_absurd_focal_lengths_do_no_harm_and_merging_can_be_cancelled(focal):
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_moved_turned_and_scaled_scenes_merge_alike(unit):
     """Splats and views under one similarity: the same kept splats, moved likewise."""
-    splats = cloud(400, degree=0)
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrices(np.array([0.3, -0.5, 0.7, 0.2])) * unit
+    splats, matrix = cloud(400, degree=0), np.eye(4)
+    matrix[:3, :3] = unit * rotation([3, -1, 2], 111.0)
     matrix[:3, 3] = np.array([10.0, -20.0, 5.0]) * unit
+    views = moved(splats, around(), matrix[:3, :3] / unit, matrix[:3, 3] / unit)[1]
+    views = ViewSet(tuple(replace(view, center=view.center * unit) for view in views))
 
     here = reduced_to(splats, around(), measure, 200)
-    there = reduced_to(transformed(splats, matrix), around(matrix=matrix), measure, 200)
+    there = reduced_to(transformed(splats, matrix), views, measure, 200)
 
+    both = here.keep & there.keep
     assert np.mean(here.keep == there.keep) > 0.98
-    both = (here.keep & there.keep)[here.keep], (here.keep & there.keep)[there.keep]
-    moved = transformed(here.splats.take(both[0]), matrix)
-    apart = np.abs(moved.means - there.splats.means[both[1]]).max(axis=1)
+    expected = transformed(here.splats.take(both[here.keep]), matrix).means
+    apart = np.abs(expected - there.splats.means[both[there.keep]]).max(axis=1)
     assert np.mean(apart < 1e-4 * unit) > 0.95
 
 

@@ -98,22 +98,17 @@ def test_surfaces_lie_where_a_ray_has_lost_its_light():
     Each takes 1 - a of the light, where a is nearly .5 only at centres; the reference sums along
     the rays, splat by splat.
     """
-    scene = splats(np.concatenate([wall(2.0 + 0.1 * k) for k in range(9)]), logit=0.0)
+    scene = splats(np.concatenate([wall(2.0 + 0.1 * k, edge=0.5) for k in range(9)]), logit=0.0)
     shown = seen(scene)
     footprints = shown.footprints
     depths = scene.means[shown.prepared.gaussians.index[footprints.index], 2]
     found = picking.surfaces(footprints, depths, view(), 10)
-    covariances = [
-        np.outer(a, a) + np.outer(b, b)
-        for a, b in zip(footprints.major.T, footprints.minor.T, strict=True)
-    ]
-    for row, column in ((2, 3), (5, 5)):
+    axes = np.stack([footprints.major.T, footprints.minor.T], axis=2)
+    inverse = np.linalg.inv(axes @ axes.transpose(0, 2, 1))
+    for row, column in ((4, 5), (5, 5)):
         away = np.array([[column * 10 + 5.5], [row * 10 + 5.5]]) - footprints.centers
-        inverse = np.linalg.inv(covariances)
-        squared = np.einsum("in,nij,jn->n", away, inverse, away)
-        alphas = 0.5 * np.exp(-squared / 2)
-        alphas[alphas < 1 / 255] = 0
-        left = np.cumprod(1 - alphas)
+        alphas = 0.5 * np.exp(-np.einsum("in,nij,jn->n", away, inverse, away) / 2)
+        left = np.cumprod(1 - np.where(alphas < 1 / 255, 0.0, alphas))
 
         assert found[row, column] == depths[np.argmax(left < 0.1)]
 

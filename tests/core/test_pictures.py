@@ -1,4 +1,4 @@
-"""Pictures of views: what is drawn, how close two of them are, and the files they become."""
+"""Pictures of views: what is drawn, alone or among other things, and the files they become."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ import pytest
 
 from refine_addon.core import RefineError, Splats
 from refine_addon.core.execute import Cancelled
+from refine_addon.core.images import read_exr
 from refine_addon.core.pictures import (
     AMPLIFIED,
     KINDS,
     PictureFiles,
     compare,
+    draw,
     fitted,
+    in_order,
     measured_in_words,
+    seen_from,
 )
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility import projection
@@ -123,44 +127,32 @@ def test_pictures_do_not_depend_on_threads_or_on_how_many_pairs_are_drawn_at_a_t
 
 def test_a_view_of_many_pixels_is_drawn_smaller_and_sees_the_same():
     """4000 x 3000 px becomes 960 x 720; a point stays at the same share of the image."""
-    view = replace(view_of(4000, 3000, 2000.0), cx=1500.0)
-
-    small = fitted(view)
+    small = fitted(replace(view_of(4000, 3000, 2000.0), cx=1500.0))
 
     assert (small.width, small.height) == (960, 720)
-    assert small.fx / 960 == pytest.approx(2000.0 / 4000)
-    assert small.cx / 960 == pytest.approx(1500.0 / 4000)
+    assert [small.fx / 960, small.cx / 960] == pytest.approx([2000.0 / 4000, 1500.0 / 4000])
     assert fitted(small) is small
 
 
-def test_both_pictures_begin_at_the_same_near_plane():
-    """It is a share of the scene's size, which pruning changes; what stays is drawn the same.
+def test_what_cannot_be_drawn_or_is_too_near_is_not_and_drawing_can_be_cancelled():
+    """The near plane is a share of the scene's size, which pruning changes: one for both pictures.
 
-    Two close splats and many far ones: without the latter the scene is far smaller, and so would
-    be its near plane.
+    Without far splats the scene is far smaller, and so would be its near plane.
     """
+    bad = replace(crowd(3), opacity_logits=np.full(3, np.nan))
     close = [((0.0, 0.0, 0.5), 0.05, 0.9, (1.0, 1.0, 1.0))]
     far = [((x, 0.0, 400.0), 1.0, 0.01, (0.5, 0.5, 0.5)) for x in (-90.0, 0.0, 90.0)]
-    splats = splats_of(*close, *far)
+    splats, views = splats_of(*close, *far), ViewSet((view_of(20, 10),))
 
-    (found,) = compare(splats, splats.take(np.array([0])), ViewSet((view_of(21, 21),)))
+    (black,) = compare(bad, bad, views)
+    (found,) = compare(splats, splats.take(np.array([0])), views)
 
-    assert found.before[10, 10].max() <= 4  # nearer than a hundredth of the scene's size
+    assert black.before.shape == (10, 20, 3)
+    assert not black.before.any()
+    assert found.before[5, 10].max() <= 4  # nearer than a hundredth of the scene's size
     assert not found.after.any()
-
-
-def test_drawing_can_be_cancelled_and_draws_nothing_of_what_cannot_be_drawn():
-    bad = replace(crowd(3), opacity_logits=np.full(3, np.nan))
-
-    (found,) = compare(bad, bad, ViewSet((view_of(20, 10),)))
-
-    assert found.before.shape == (10, 20, 3)
-    assert not found.before.any()
     with pytest.raises(Cancelled):
-        compare(
-            crowd(), crowd(), ViewSet((view_of(300, 300),)),
-            progress=lambda fraction, _what: fraction < 0.7,
-        )  # fmt: skip
+        compare(crowd(), crowd(), views, progress=lambda *_: False)
 
 
 def pixels_of(data):
@@ -212,3 +204,151 @@ def test_files_are_named_after_splats_and_camera_and_hold_the_pictures(tmp_path)
         pass
     with PictureFiles(tmp_path, "my/room", overwrite=True).opened(views):
         pass
+
+
+RED, GREEN, BLUE = np.eye(3)
+
+
+def layer_of(color, alpha, depth, size=9):
+    """Return the colours, alphas and depths of a layer that is the same in all pixels."""
+    plane = np.ones((size, size))
+    return alpha * np.asarray(color)[:, None, None] * plane, alpha * plane, depth * plane
+
+
+def two_splats():
+    """Return two wide splats before the view: red of opacity .8 at depth 2, green of .5 at 4."""
+    return splats_of(
+        ((0.0, 0.0, 2.0), 50.0, 0.8, tuple(RED)), ((0.0, 0.0, 4.0), 100.0, 0.5, tuple(GREEN))
+    )
+
+
+@pytest.mark.parametrize(
+    ("alpha", "depth", "expected"),
+    [
+        (1.0, 1.0, [0.0, 0.0, 1.0, 1.0]),
+        (1.0, 3.0, [0.8, 0.0, 0.2, 1.0]),
+        (1.0, 5.0, [0.8, 0.1, 0.1, 1.0]),
+        (0.4, 1.0, [0.6 * 0.8, 0.6 * 0.1, 0.4, 1.0 - 0.6 * 0.1]),
+        (0.4, 3.0, [0.8, 0.6 * 0.1, 0.2 * 0.4, 1.0 - 0.6 * 0.1]),
+        (0.4, 5.0, [0.8, 0.1, 0.1 * 0.4, 1.0 - 0.1 * 0.6]),
+        (0.0, 1.0, [0.8, 0.1, 0.0, 0.9]),
+    ],
+)
+def test_a_layer_hides_what_is_behind_it_by_its_alpha(alpha, depth, expected):
+    """Front to back: each shows what those before it let through, (1 - .8) = .2, then .2 * .5.
+
+    What is left of 1 is seen of a white background, which counts for no alpha.
+    """
+    layer = in_order([layer_of(BLUE, alpha, depth)])
+    lit = replace(layer, background=(1.0 - alpha) * np.ones((3, 9, 9)))
+
+    picture, light = (draw(two_splats(), view_of(9, 9), each)[:, 4, 4] for each in (layer, lit))
+
+    assert np.abs(picture - expected).max() < 2e-3  # a splat is not quite flat
+    left = 1.0 - expected[3]
+    assert np.abs(light - picture - [left, left, left, 0.0]).max() < 1e-3
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize(
+    ("near", "far", "expected", "over"),
+    [
+        # Blue glass of .4, a red splat of .8, a white wall that hides the green one.
+        ((BLUE, 0.4), (np.ones(3), 1.0), [0.6 * 0.8, 0.0, 0.4, 1.0], [0.6, 0.6, 1.0]),
+        # Grey panes of .5: half of the red, .2 * .5 of which is left, of that half of the green.
+        ((np.zeros(3), 0.5), (np.zeros(3), 0.5), [0.4, 0.025, 0.0, 0.975], [0.0] * 3),
+    ],
+)
+def test_splats_between_two_layers_are_seen_through_the_nearer_one(
+    near, far, expected, over, order
+):
+    """White, the wall adds the .6 * .2 that is left. Which layer is given first is all one."""
+    layers = in_order([layer_of(*near, 1.0), layer_of(*far, 3.0)][::order])
+
+    picture = draw(two_splats(), view_of(9, 9), layers)[:, 4, 4]
+
+    wall = 0.12 * far[0][0]
+    assert np.abs(picture - np.add(expected, [wall, wall, wall, 0.0])).max() < 2e-3
+    assert np.abs(layers.over_nothing()[:, 4, 4] - over).max() < 1e-12
+
+
+def test_a_layer_is_the_picture_over_it_and_cuts_it_in_depth():
+    """Behind all splats: in each pixel colours plus what their alpha lets through.
+
+    Opaque and black at depth 3: as if only nearer splats were there. No splats draw nothing.
+    """
+    splats, view = crowd(), view_of(60, 40, near=0.5)
+    plain, near = draw(splats, view), splats.take(splats.means[:, 2] < 3.0)
+    colors, opaque = np.random.default_rng(3).random((3, 40, 60)), np.ones((40, 60))
+
+    picture = draw(splats, view, in_order([(colors, opaque, 1e4 * opaque)]))
+    cut = draw(splats, view, in_order([(0.0 * colors, opaque, 3.0 * opaque)]))
+
+    assert np.abs(picture[:3] - plain[:3] - (1.0 - plain[3]) * colors).max() < 1e-9
+    assert (picture[3] == 1.0).all()
+    assert np.abs(cut[:3] - draw(near, view)[:3]).max() < 1e-5
+    assert not draw(splats.take(np.zeros(300, np.bool_)), view).any()
+
+
+def test_colours_seen_from_a_place_are_those_of_the_harmonics():
+    """Drawn from there, all splats look the same with colours of their own."""
+    splats, view = crowd(), view_of(60, 40, near=0.5)
+    view = replace(view, center=np.array([0.4, -0.3, 0.2]))
+
+    seen = seen_from(splats, view.center)
+
+    assert seen.sh_degree == 0
+    assert np.abs(draw(seen, view) - draw(splats, view)).max() < 1e-6
+
+
+def exr_of(channels, *, compression=0, version=2):
+    """Return an image of float32 channels (H, W), by hand."""
+    height, width = next(iter(channels.values())).shape
+    names = sorted(channels)
+    listed = b"".join(name.encode() + b"\0" + struct.pack("<4i", 2, 0, 1, 1) for name in names)
+    data = struct.pack("<II", 20000630, version)
+    for name, kind, value in (
+        (b"channels", b"chlist", listed + b"\0"),
+        (b"compression", b"compression", bytes([compression])),
+        (b"dataWindow", b"box2i", struct.pack("<4i", 0, 0, width - 1, height - 1)),
+    ):
+        data += name + b"\0" + kind + b"\0" + struct.pack("<i", len(value)) + value
+    data += b"\0" + bytes(8 * height)  # the table of lines
+    for row in range(height):
+        data += struct.pack("<ii", row, 4 * width * len(channels))
+        data += b"".join(channels[name][row].astype("<f4").tobytes() for name in names)
+    return data
+
+
+def test_an_exr_image_is_read_channel_by_channel(tmp_path):
+    rng = np.random.default_rng(0)
+    channels = {f"View.{name}": rng.normal(size=(5, 7)).astype("f4") for name in "RGBZ"}
+    (tmp_path / "in.exr").write_bytes(exr_of(channels))
+
+    found = read_exr(tmp_path / "in.exr")
+
+    assert list(found) == sorted(channels)
+    assert all(np.array_equal(found[name], values) for name, values in channels.items())
+
+
+FLAT = {"Z": np.zeros((2, 2))}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"PNG and more",
+        exr_of(FLAT)[:-3],
+        exr_of(FLAT, compression=3),
+        exr_of(FLAT, version=0x1002),
+    ],
+    ids=["empty", "another format", "truncated", "packed", "several parts"],
+)
+def test_what_is_no_such_image_is_named(tmp_path, data):
+    (tmp_path / "in.exr").write_bytes(data)
+
+    with pytest.raises(RefineError, match=r"in\.exr: expected an OpenEXR image in one part"):
+        read_exr(tmp_path / "in.exr")
+    with pytest.raises(RefineError, match=r"no\.exr: cannot be read"):
+        read_exr(tmp_path / "no.exr")

@@ -90,8 +90,8 @@ def squares(monkeypatch):
     monkeypatch.setattr(linear, "_trust", lambda errors: np.ones(errors.shape[1], np.float32))
 
 
-def linear_of(splats, view, count=12, *, pixels=(COLUMNS, ROWS)):
-    """Return what `linear` says of a view, of which the first splats are refitted."""
+def linear_of(splats, view, *, pixels=(COLUMNS, ROWS)):
+    """Return what `linear` says of a view."""
     gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
     footprints = projection.project(gaussians, scene, view)
     order = np.argsort(gaussians.index)  # as rows
@@ -99,7 +99,7 @@ def linear_of(splats, view, count=12, *, pixels=(COLUMNS, ROWS)):
     footprints = replace(footprints, index=rank[footprints.index])
     visible = cast(footprints, *pixels).visible()
     colors = round_rays.colors_of(splats, gaussians.index[visible[0].hit], view)
-    shapes = linear.Shapes.of(splats, gaussians.take(slice(count)), scene)
+    shapes = linear.Shapes.of(splats, gaussians, scene)
     black = np.zeros((3, visible[0].count), np.float32)
     found, mine = linear.linear_view(visible, footprints, black, colors, shapes, view)
     seen = found, found.backward(found.errors), found.diagonal(mine)
@@ -201,38 +201,6 @@ def test_backward_is_the_transpose_of_forward(model):
     means = squared[linear.DEGREE_1].reshape(3, 3).mean(axis=0)
     squared[linear.DEGREE_1] = np.tile(means, 3)
     np.testing.assert_allclose(found.diagonal[:, 3], squared, rtol=1e-3)
-
-
-def test_a_round_solves_its_damped_least_squares(monkeypatch):
-    """As a dense system in float64 does, with what the rounds before told and left.
-
-    Of these K counts as it is and what is left of J'r half; the diagonal is damped by k times
-    itself and its median over splats. What is left of J'r is what damping by k leaves.
-    """
-    monkeypatch.setattr(refit, "STEPS", 300)
-    found = linear_of(few(), ring()[0])
-    random, shape = np.random.default_rng(6), (linear.COUNT, 12)
-    told, left = (random.uniform(0.0, most, shape).astype(np.float32) for most in (5.0, 2.0))
-    movable = np.ones(shape, np.bool_)
-    movable[:, 3] = False
-    rows = found.shapes.gaussians.index
-
-    change, after = refit._solve(found, movable, 0.5, (told, left), progress=silent, threads=1)
-
-    units = np.eye(movable.size, dtype=np.float32).reshape(-1, *shape)
-    columns = [found.normal(unit, silent, 1).ravel() for unit in units]
-    diagonal = found.diagonal.astype(np.float64) * (rows != 3)
-    medians = [np.median(row[row > 0.0]) for row in diagonal]
-    prior = 0.5 * (diagonal + np.array(medians)[:, None])
-    matrix = np.array(columns, np.float64) + np.diag((prior + told[:, rows]).ravel())
-    right = (found.residual + 0.5 * left[:, rows]).ravel()
-    sought = np.flatnonzero(diagonal)
-    expected = np.linalg.solve(matrix[np.ix_(sought, sought)], right[sought])
-    np.testing.assert_allclose(change[:, rows].ravel()[sought], expected, atol=1e-4)
-    assert not change[:, 3].any()
-    np.testing.assert_allclose(after[0][:, rows], told[:, rows] + diagonal, rtol=1e-6)
-    damped = (prior * change[:, rows]).ravel()
-    np.testing.assert_allclose(after[1][:, rows].ravel()[sought], damped[sought], atol=2e-4)
 
 
 def test_harmonics_of_the_first_degree_are_learned_and_those_above_stay():
@@ -394,33 +362,6 @@ def test_colours_in_float32_are_those_in_float64(degree):
     found = spherical_harmonics.single_colors(along.T, harmonics)
 
     np.testing.assert_allclose(found.T, spherical_harmonics.colors(along, dc, rest), atol=1e-5)
-
-
-def test_large_errors_count_in_proportion_and_others_squared():
-    """Nine rays of error 1 and one of 10: their root mean square is sqrt(10.9) = 3.3.
-
-    The tenth has 10 / 6.6 times what counts squared, and its weight is the inverse.
-    """
-    errors, expected = np.ones((3, 10), np.float32), np.ones(10)
-    errors[:, 4], expected[4] = -10.0, linear.HUBER * np.sqrt(10.9) / 10.0
-
-    np.testing.assert_allclose(np.square(linear._trust(errors)), expected, rtol=1e-6)
-    np.testing.assert_array_equal(linear._trust(np.zeros((3, 2), np.float32)), 1.0)
-
-
-@pytest.mark.usefixtures("squares")
-def test_what_is_around_a_region_is_drawn_and_does_not_change():
-    """Of the last six splats of 12, colours and derivatives of the first six are the same."""
-    splats, view = few(), ring()[0]
-    every = linear_of(splats, view)
-
-    found = linear_of(splats, view, 6)
-
-    np.testing.assert_array_equal(found.views[0].errors, every.views[0].errors)
-    assert found.views[0].hit.max() < 6
-    change = np.random.default_rng(2).normal(size=(linear.COUNT, 12)).astype(np.float32)
-    change[:, 6:] = 0.0
-    np.testing.assert_allclose(forward(found, change[:, :6]), forward(every, change), atol=1e-5)
 
 
 TURN = rotation([3, -1, 2], 111.0)

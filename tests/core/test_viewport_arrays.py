@@ -113,18 +113,6 @@ def test_few_splats_are_those_of_the_highest_rank_or_the_largest_and_most_opaque
     assert [arrays.first_of_each([40, 20], most) for most in (30, 60)] == [[20, 10], [40, 20]]
 
 
-def test_a_texture_holds_a_value_after_the_other_in_rows_of_its_width():
-    """WIDTH + 1 values of 2 channels: a second row, of which one texel is not zero."""
-    values = np.arange(2 * (arrays.WIDTH + 1), dtype=np.float32).reshape(-1, 2)
-    texels = arrays.as_texture(values)
-
-    assert texels.shape == (2, 2 * arrays.WIDTH)
-    assert texels[0].tolist() == values[: arrays.WIDTH].ravel().tolist()
-    assert texels[1, :2].tolist() == values[-1].tolist()
-    assert not texels[1, 2:].any()
-    assert arrays.as_texture(np.empty(0)).shape == (1, arrays.WIDTH)
-
-
 def test_heat_goes_along_the_ramp_by_rank_and_a_tint_leaves_opacity_alone():
     """Ranks 0, 1/2 and 1 of a ramp of three; a rank that is no number counts as 0.
 
