@@ -80,21 +80,16 @@ def test_a_plain_camera_sees_what_can_be_worked_out_by_hand(addon):
     """50 mm on 36 mm over 240 px: f = 50 / 36 * 240 = 333.3; the centre is the image's.
 
     At the origin Blender looks along -z with y up: a point at (0, 1, -2) lies above the centre,
-    at y = 80 - 333.3 / 2 in pixels that count downward.
-    The percentage cuts the fraction: 241 x 161 at 50 % is 120 x 80.
+    at y = 80 - 333.3 / 2 in pixels that count downward. 241 x 161 at 50 % is 120 x 80.
     """
     camera = _camera()
     _set(camera.data, {"clip_start": 0.5, "clip_end": 8.0})
     view = _view(addon, camera)
-    x, y, depth = _project(view, np.array([[0.0, 1.0, -2.0]]))[0]
-
+    got = _project(view, np.array([[0.0, 1.0, -2.0]]))[0]
     assert math.isclose(view.fx, 50 / 36 * 240)
     assert (view.cx, view.cy, view.width, view.height) == (120, 80, 240, 160)
     assert (view.near, view.far) == (0.5, 8.0)
-    assert math.isclose(x, 0.5)
-    assert math.isclose(1 - y, (80 - view.fy / 2) / 160)
-    assert depth == 2.0
-
+    assert np.allclose(got, [0.5, 1 - (80 - 50 / 36 * 240 / 2) / 160, 2.0])
     half = {"resolution_x": 241, "resolution_y": 161, "resolution_percentage": 50}
     _set(bpy.context.scene.render, half)
     view = _view(addon, camera)
@@ -102,10 +97,7 @@ def test_a_plain_camera_sees_what_can_be_worked_out_by_hand(addon):
 
 
 def test_constraints_and_drivers_are_followed_unless_the_camera_is_disabled(addon):
-    """A constraint moves it to x = 3, a driver sets the lens to 85.
-
-    Blender does not evaluate a disabled one: placed by a parent it is clear, constrained not.
-    """
+    """Blender does not evaluate a disabled one: placed by a parent it is clear, constrained not."""
     camera, target = _camera(), _linked("target", location=(3.0, 0.0, 0.0))
     camera.constraints.new("COPY_LOCATION").target = target
     camera.data.driver_add("lens").driver.expression = "85.0"
@@ -160,15 +152,12 @@ def test_each_source_gives_its_cameras(addon):
     for camera in (first, second, third):
         camera.select_set(camera is second)
     third.hide_set(True)
-
-    def names(source, collection=None):
-        views = addon.cameras.CameraChoice(source, collection).views(bpy.context)
-        return sorted(view.name for view in views)
-
-    assert names("ACTIVE") == ["first"]
-    assert names("SELECTED") == ["second"]
-    assert names("VISIBLE") == ["first", "second"]
-    assert names("COLLECTION", outer) == ["second", "third"]
+    for source, expected in (
+        ("ACTIVE", ["first"]), ("SELECTED", ["second"]), ("VISIBLE", ["first", "second"]),
+        ("COLLECTION", ["second", "third"]),
+    ):  # fmt: skip
+        views = addon.cameras.CameraChoice(source, outer).views(bpy.context)
+        assert sorted(view.name for view in views) == expected
 
 
 def _animate(obj, path, values, index=-1):
@@ -182,42 +171,35 @@ def _animate(obj, path, values, index=-1):
 
 def test_a_shot_is_a_view_set_and_the_frame_is_put_back(addon):
     """X is 1 at frame 1 and 5 at frame 5; every second frame sees 1, 3 (eased, half way) and 5."""
-    scene = bpy.context.scene
+    scene, shot = bpy.context.scene, addon.cameras.views_from_frames
     scene.camera = _camera()
     _animate(scene.camera, "location", {1: 1.0, 5: 5.0}, index=0)
     _animate(scene.camera.data, "lens", {1: 50.0, 5: 100.0})
     scene.frame_set(4, subframe=0.25)
-    views = addon.cameras.views_from_frames(bpy.context, range(1, 6, 2))
-
+    views = shot(bpy.context, range(1, 6, 2))
     assert [round(view.center[0], 5) for view in views] == [1.0, 3.0, 5.0]
     assert math.isclose(views[2].fx, 2 * views[0].fx)
     assert (scene.frame_current, scene.frame_subframe) == (4, 0.25)
     assert [view.name for view in views] == [f"camera, frame {frame}" for frame in (1, 3, 5)]
     with pytest.raises(addon.core.RefineError, match="starts at 5 and ends at 4"):
-        addon.cameras.views_from_frames(bpy.context, range(5, 5))
+        shot(bpy.context, range(5, 5))
 
 
 def test_cameras_bound_to_markers_take_over(addon):
-    """Marker at frame 1 binds one camera, at frame 3 another; the active one is put back.
-
-    So are camera and frame where the second one is orthographic, in the midst of the shot.
-    """
-    scene = bpy.context.scene
+    """At frame 1 and at frame 3; frame and active camera are put back, also after a failure."""
+    scene, shot = bpy.context.scene, addon.cameras.views_from_frames
     first, second, other = (_camera(name) for name in ("first", "second", "other"))
     for frame, camera in ((1, first), (3, second)):
         scene.timeline_markers.new(camera.name, frame=frame).camera = camera
-    scene.camera = other
-    views = addon.cameras.views_from_frames(bpy.context, range(1, 5))
-    assert [view.name.split(",")[0] for view in views] == ["first", "first", "second", "second"]
-    assert scene.camera is other
-
-    second.data.type = "ORTHO"
     scene.frame_set(2)
     scene.camera = other
+    views = shot(bpy.context, range(1, 5))
+    assert [view.name.split(",")[0] for view in views] == ["first", "first", "second", "second"]
+    assert (scene.frame_current, scene.camera) == (2, other)
+    second.data.type = "ORTHO"
     with pytest.raises(addon.core.RefineError, match="'second' is orthographic"):
-        addon.cameras.views_from_frames(bpy.context, range(1, 5))
-    assert scene.frame_current == 2
-    assert scene.camera is other
+        shot(bpy.context, range(1, 5))
+    assert (scene.frame_current, scene.camera) == (2, other)
 
 
 def test_a_turntable_is_seen_from_all_sides(addon, room):
@@ -242,10 +224,7 @@ def test_a_turntable_is_seen_from_all_sides(addon, room):
 def test_imported_cameras_give_back_the_views_of_their_file(
     addon, core, quarter, room_cameras, room_views
 ):
-    """To the last digit, though Blender's matrices are float32 and the render size is another.
-
-    Without the note they agree at the file's resolution, to float32, and the same splats stay.
-    """
+    """To the last digit at any render size; without the note to float32, and the same stay."""
     source = addon.cameras.CameraChoice("COLLECTION", room_cameras)
     render = bpy.context.scene.render
 
@@ -273,23 +252,18 @@ def test_imported_cameras_give_back_the_views_of_their_file(
 
 
 def test_an_imported_camera_that_was_moved_or_changed_is_taken_as_it_is(addon, room_cameras):
-    """Only what was touched: pose, lens and clip distances each for itself; the size stays.
-
-    A damaged note is said by name: else views would be others than the user believes.
-    """
+    """Only what was touched: pose, lens and clip distances; a damaged note is said by name."""
     moved, zoomed, clipped = room_cameras.objects[:3]
     moved.location.x += 1.0
     zoomed.data.lens *= 2.0
     clipped.data.clip_end = 5.0
     noted = [json.loads(camera["refine_view"]) for camera in (moved, zoomed)]
     one, two, three = (_view(addon, camera) for camera in (moved, zoomed, clipped))
-
     assert math.isclose(one.center[0], noted[0]["center"][0] + 1.0, rel_tol=1e-6)
     assert one.fx == noted[0]["fx"]
     assert math.isclose(two.fx, 2 * noted[1]["fx"], rel_tol=1e-6)
     assert (two.width, two.center.tolist()) == (240, noted[1]["center"])
     assert three.far == 5.0
-
     for text in ("", "{}", "[1]", "null"):
         moved["refine_view"] = text
         with pytest.raises(addon.core.RefineError, match="refine_view is damaged"):

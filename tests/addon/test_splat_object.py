@@ -42,10 +42,9 @@ def test_a_dry_run_and_what_is_refused_change_nothing(
 
 
 def test_moving_splats_and_cameras_together_keeps_the_rows(addon, quarter, room_cameras, score):
-    """Both under one parent, moved, turned and scaled by 3: the default ranks by no unit.
+    """Below one parent, moved, turned and scaled by 3: the default ranks by no unit.
 
-    Blender's matrices are float32, so neighbours in rank may change places: at most a few rows in
-    ten thousand change sides of the middle.
+    Blender's matrices are float32: of ten thousand neighbours in rank a few may change places.
     """
 
     def low():
