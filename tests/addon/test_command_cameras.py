@@ -115,11 +115,9 @@ def test_an_object_is_scored_as_its_file_is(addon, animated, quarter, quarter_fi
 
 
 def test_cameras_of_a_file_go_before_those_of_the_panel(addon, animated, tmp_path, capsys):
-    """An empty collection is chosen, and --cameras still works; with --source it is wrong usage."""
-    settings = bpy.context.scene.refine
-    settings.source, settings.collection = "COLLECTION", bpy.data.collections.new("empty")
+    """Which are none, and --cameras still works; with --source it is wrong usage."""
     assert animated.objects
-
+    bpy.context.scene.refine.collection = bpy.data.collections.new("empty")
     facts = pruned(addon, tmp_path, "--cameras", str(CAMERAS))[1]
     assert facts == {"source": "file", "file": str(CAMERAS)}
     words = [*PRUNE, "--dry-run", "--source", "active", "--cameras", "c.json"]
@@ -128,10 +126,8 @@ def test_cameras_of_a_file_go_before_those_of_the_panel(addon, animated, tmp_pat
 
 
 @pytest.mark.usefixtures("animated")
-def test_a_choice_without_cameras_and_an_object_without_splats_are_refused(
-    addon, tmp_path, capsys, unchanged
-):
-    """Code 1, one sentence; it stands in the report too, and the scene is as it was."""
+def test_what_is_refused_and_a_dry_run_change_nothing(addon, tmp_path, capsys, unchanged):
+    """No cameras, no splats: code 1, one sentence, which stands in the report too."""
     scene, told = bpy.context.scene, tmp_path / "report.json"
     scene.timeline_markers.clear()
     scene.camera, scene.refine.collection = None, None
@@ -144,6 +140,7 @@ def test_a_choice_without_cameras_and_an_object_without_splats_are_refused(
         ("room", "COLLECTION", [], "room: no cameras: choose the collection"),
         ("room", "COLLECTION", ["--source", "collection:fwe"],
          r"room: no collection 'fwe' in the open \.blend \(collections: cameras, few\)"),
+        ("rooom", "VISIBLE", [], "no object 'rooom'.*splat objects: room"),
         ("empty", "VISIBLE", [], "empty.* of type EMPTY"),
         ("camera", "VISIBLE", [], "camera.* of type CAMERA"),
         ("camera", "VISIBLE", ["--protect", "statue"], "statue"),
@@ -158,3 +155,8 @@ def test_a_choice_without_cameras_and_an_object_without_splats_are_refused(
         assert error == f"refine: error: {entry['error']}\n"
         assert re.search(expected, error)
         unchanged()
+
+    words = [*PRUNE, "--dry-run", "-o", str(tmp_path / "out.ply"), *CLOSED]
+    assert addon.command.main(words, scene=True) == 0
+    assert not (tmp_path / "out.ply").exists()
+    unchanged()

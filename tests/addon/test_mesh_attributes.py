@@ -60,20 +60,18 @@ def test_the_room_comes_back_and_is_what_its_file_is(addon, core, room, tmp_path
     assert addon.mesh.layout.export_bytes(room) is None
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_every_degree_of_harmonics_comes_back(addon, make_splats, through, degree):
-    """3 ((d + 1)^2 - 1) coefficients: 0, 9, 24, 45, 72."""
-    obj, same, *_ = through(make_splats(degree=degree))
-    assert same
-    assert addon.mesh.layout.sh_degree(obj.data) == degree
+def test_every_degree_and_extra_properties_keep_name_type_place_and_value(
+    addon, make_splats, through
+):
+    """3 ((d + 1)^2 - 1) coefficients: 0, 9, 24, 45, 72. The extremes of each type.
 
-
-def test_extra_properties_keep_name_type_place_and_value(make_splats, through):
-    """The extremes of each type; u4 goes through int32 by its bits, doubles are rounded.
-
+    u4 goes through int32 by its bits; a double is rounded, but its column stays one.
     Blender's own names are stored under others; the layout knows the way back.
-    1/3 in float32 is 0.3333333432674408; the column stays a double.
     """
+    for degree in range(5):
+        obj, same, *_ = through(make_splats(degree=degree))
+        assert same
+        assert addon.mesh.layout.sh_degree(obj.data) == degree
     columns = make_splats()
     for kind in ("i1", "u1", "i2", "u2", "i4", "u4", "f4"):
         dtype = np.dtype(kind)
@@ -177,3 +175,61 @@ def test_without_harmonics_only_their_finiteness_is_read(addon, make_splats, thr
 
     assert splats.sh_rest.shape == (8, 1, 3)
     assert addon.core.splats.drawable(splats).tolist() == [i != 3 for i in range(8)]
+
+
+def test_an_unevenly_scaled_object_is_scored_and_exported_as_it_stands_in_the_world(
+    addon, core, make_splats, through, tmp_path
+):
+    """A scale of (1, 2, 1) on round splats of size s gives ellipsoids s, 2s, s at twice the y."""
+    columns = make_splats(count=50)
+    for axis in range(3):
+        columns[f"scale_{axis}"][:] = -3.0
+    obj = through(columns)[0]
+    obj.scale.y = 2.0
+    checked = addon.mesh.layout.check(obj)
+    splats = addon.objects.splat_group.gather([checked])
+    sizes = np.sort(splats.log_scales, axis=1)
+    assert np.allclose(splats.means[:, 1], 2 * columns["y"])
+    assert np.allclose(sizes, [-3.0, -3.0, np.log(2) - 3.0], atol=1e-5)
+
+    export(addon, checked, tmp_path / "moved.ply", apply_transform=True)
+    written = core.read_ply(tmp_path / "moved.ply").splats()
+    np.testing.assert_allclose(written.means, splats.means, rtol=1e-6)
+    np.testing.assert_allclose(written.log_scales, splats.log_scales, atol=1e-6)
+
+
+def test_an_export_with_the_transform_is_the_moved_splats(
+    addon, core, make_splats, through, tmp_path
+):
+    """As `core.affine.transformed` has it, which a matrix product may round otherwise.
+
+    A turn takes a normal (1, 0, 0) to its first column; a normal of zero stays zero.
+    """
+    columns = make_splats(count=50, degree=3)
+    for name in ("nx", "ny", "nz"):
+        columns[name][:] = 0.0
+    columns["nx"][0] = 1.0
+    obj, _, _, source = through(columns)
+    obj.location, obj.rotation_euler, obj.scale = (1, 2, 3), (0.1, 0.2, 0.8), (2, 2, 2)
+    bpy.context.view_layer.update()
+    checked, matrix = addon.mesh.layout.check(obj), np.array(obj.matrix_world, np.float64)
+    export(addon, checked, tmp_path / "moved.ply", apply_transform=True)
+    moved = core.read_ply(tmp_path / "moved.ply")
+    expected, got = core.affine.transformed(source.splats(), matrix), moved.splats()
+
+    for name in ("means", "log_scales", "quaternions", "sh_dc", "opacity_logits"):
+        assert np.array_equal(getattr(got, name), getattr(expected, name).astype(np.float32)), name
+    assert np.allclose(got.sh_rest, expected.sh_rest, rtol=1e-5, atol=1e-7)
+    assert np.abs(got.sh_rest - source.splats().sh_rest).max() > 0.1
+    normals = np.stack([moved.rows[name] for name in ("nx", "ny", "nz")], axis=1)
+    np.testing.assert_allclose(normals[0], matrix[:3, 0] / 2.0, atol=1e-6)
+    assert not normals[1:].any()
+
+
+def test_modifiers_that_could_move_splats_are_mentioned(addon, quarter):
+    """What is scored and exported is the mesh itself; KIRI's drawing moves none."""
+    quarter.modifiers.new("KIRI_3DGS_Render_GN", "NODES")
+    assert addon.objects.splat_group.modifier_notes(quarter) == []
+    quarter.modifiers.new("Wave", "WAVE")
+    (note,) = addon.objects.splat_group.modifier_notes(quarter)
+    assert "without its modifiers (Wave)" in note

@@ -81,6 +81,8 @@ def test_a_prune_in_the_blend_is_saved_whole_or_changes_nothing(addon, few, room
 
     blend, name = tmp_path / "blend" / "scene.blend", few.data.name
     blend.parent.mkdir()
+    with pytest.raises(addon.core.RefineError, match="not saved in a"):
+        pruned(tmp_path)
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     saved, before = blend.read_bytes(), bits(few)
     with pytest.raises(addon.core.RefineError, match="no folder"):
