@@ -7,8 +7,7 @@
 For a scene's folder see `evaluate`. Splats are merged by the views that score; each turn takes
 other pixels for the rays, and cells of the image that are up to 3 % larger, neither of which makes
 results better. PSNR is by 65,536 rays of the held-out views, always the same ones: what is left is
-how much the result itself varies. "Other rays" is what other rays of the held-out views say of the
-first turn.
+how much the result itself varies.
 """
 
 from __future__ import annotations
@@ -64,13 +63,12 @@ def other_cells(turn: int) -> AbstractContextManager[Any]:
     )
 
 
-def held_out(splats: Splats, views: ViewSet, turn: int) -> RaySample:
+def held_out(splats: Splats, views: ViewSet) -> RaySample:
     """Return rays of the held-out views."""
     gaussians, scene, _ = projection.prepare(splats, views)
     sample = RaySample(views.by_distance(), gaussians, splats)
     sample.share = RAYS / cast.VALIDATION_RAYS
-    with other_pixels(turn):
-        sample.cast_all(gaussians, scene, silent, None)
+    sample.cast_all(gaussians, scene, silent, None)
     return sample
 
 
@@ -78,25 +76,21 @@ def measure(folder: Path, ratios: Sequence[float], turns: int) -> None:
     """Print the PSNR of each ratio and turn of a scene, mean and standard deviation."""
     scene = read_scene(folder)
     used = scene.train.spread(DEFAULT.views)
-    samples = [held_out(scene.splats, scene.test, turn) for turn in range(2)]
+    sample = held_out(scene.splats, scene.test)
     found = np.zeros((turns, len(ratios)))
-    others = np.zeros(len(ratios))
     for turn in range(turns):
         with other_pixels(turn), other_cells(turn):
             known = occlusion.score_once(scene.splats, used, threads=1)
             for place, ratio in enumerate(ratios):
                 left = len(scene.splats) - int(ratio * len(scene.splats))
                 made = merge_down(scene.splats, used, left, known=known, threads=1).splats
-                found[turn, place] = psnr_against(samples[0], made, scene.test)
-                if turn == 0:
-                    others[place] = psnr_against(samples[1], made, scene.test)
+                found[turn, place] = psnr_against(sample, made, scene.test)
         print(f"{folder.name} turn {turn}:", *(f"{x:.2f}" for x in found[turn]), flush=True)
-    print(f"{folder.name} {'removed':>10} {'mean':>6} {'sd':>6} {'range':>6} {'other rays':>10}")
-    for ratio, column, other in zip(ratios, found.T, others, strict=True):
-        off = other - column[0]
+    print(f"{folder.name} {'removed':>10} {'mean':>6} {'sd':>6} {'range':>6}")
+    for ratio, column in zip(ratios, found.T, strict=True):
         print(
             f"{folder.name} {ratio:10.0%} {column.mean():6.2f} {column.std(ddof=1):6.2f} "
-            f"{np.ptp(column):6.2f} {off:+10.2f}",
+            f"{np.ptp(column):6.2f}",
             flush=True,
         )
 
