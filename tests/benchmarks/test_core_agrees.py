@@ -18,7 +18,6 @@ from benchmarks.renderer.footprints import (
     footprints_of,
     gaussians_of,
 )
-from benchmarks.tables.models import discs
 from refine_addon.core import Splats, View, ViewSet, read_cameras, read_splats
 from refine_addon.core.pictures import CAMERAS, compare, draw
 from refine_addon.core.splats import MODELS, rotation_matrices, scales, with_model
@@ -174,18 +173,3 @@ def test_a_disc_is_hit_where_the_ray_meets_its_plane():
                 assert disc_distance(row, x, y) == pytest.approx(expected, rel=1e-6)
                 checked += 1
     assert checked > 40
-
-
-def test_discs_lie_in_the_two_longest_axes():
-    splats = cloud(20)
-
-    flat = discs(splats)
-
-    covariances = []
-    for each in (flat, splats):
-        axes = rotation_matrices(each.quaternions) * scales(each.log_scales)[:, None, :]
-        covariances.append(axes @ np.swapaxes(axes, 1, 2))
-    shortest = np.argmin(splats.log_scales, axis=1)
-    thick = axes[np.arange(20), :, shortest]
-    expected = covariances[1] - thick[:, :, None] * thick[:, None, :]
-    np.testing.assert_allclose(covariances[0], expected, rtol=1e-5, atol=1e-8)

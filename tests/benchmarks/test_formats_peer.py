@@ -257,16 +257,3 @@ def test_what_is_said_of_how_splats_are_drawn_survives_both(tmp_path, suffix, mo
     expected = model if held else "default"
     assert read_splats(tmp_path / "back.ply").model == expected
     assert read_splats(theirs).model == expected
-
-
-def test_discs_without_a_third_scale_pass_through_splat_transform(tmp_path):
-    """They come back without it, and with the two that they have."""
-    rows = read_splats(room(tmp_path, 0)).rows
-    columns = {name: rows[name] for name in rows.dtype.names if name != "scale_2"}
-    (tmp_path / "discs.ply").write_bytes(ply_of(columns))
-
-    transformed(tmp_path / "discs.ply", tmp_path / "back.ply")
-
-    back = read_splats(tmp_path / "back.ply")
-    assert "scale_2" not in back.rows.dtype.names
-    np.testing.assert_allclose(back.rows["scale_1"], columns["scale_1"], rtol=1e-5)

@@ -15,7 +15,7 @@ pytest.importorskip("skimage")
 pytest.importorskip("matplotlib")
 
 from benchmarks.renderer import rasterizer
-from benchmarks.tables import estimate, evaluate, lod, methods, million, trade
+from benchmarks.tables import evaluate, lod, methods, million, trade
 from refine_addon.core import METHODS
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
@@ -133,19 +133,6 @@ def test_what_fails_is_said_and_what_leaves_another_number_is_told_apart(
     assert "- greedy left 759 splats at 50%, not 750" in text
     assert trade.main([str(tmp_path)]) == 1
     assert "cameras.json" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_of_few_views_the_estimate_between_comes_with_a_warning(capsys):
-    """Of 8 views of the room; the difference is that of the two columns before it."""
-    words = [str(ROOM), "--between", "--only", "delete", "--ratios", ".9", "--views", "8"]
-
-    assert estimate.main(words) == 0
-
-    row = capsys.readouterr().out.splitlines()[1]
-    _, _, _, between, held, _, off, *_ = row.split()
-    assert row.endswith("warned")
-    assert float(between) - float(held) == pytest.approx(float(off), abs=0.011)
 
 
 @pytest.mark.slow

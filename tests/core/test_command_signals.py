@@ -179,44 +179,50 @@ sys.exit(command.main(sys.argv[1:]))
 """
 
 
-@pytest.fixture
-def halfway(folder):
-    """Return a function that starts a run and waits until rows are in its temporary file."""
-
-    def begin(*words, **options):
-        process = start("-c", STOPPED, *PRUNE, *words, **options)
-        assert process.stdout.readline() == b"halfway\n"
-        return process
-
-    return begin
+def halfway(*words, **options):
+    """Start a run and wait until rows are in its temporary file."""
+    process = start("-c", STOPPED, *PRUNE, *words, **options)
+    assert process.stdout.readline() == b"halfway\n"
+    return process
 
 
 @pytest.mark.parametrize(
-    ("name", "reason", "before"),
+    ("sent", "ignored", "reason", "before"),
     [
-        ("SIGINT", "cancelled", b""),
-        ("SIGTERM", "terminated", b"old"),
-        ("SIGHUP", "hung up", b"old"),
+        (["SIGINT"], [], b"cancelled", b""),
+        (["SIGTERM"], [], b"terminated", b"old"),
+        (["SIGHUP"], [], b"hung up", b"old"),
+        (["SIGHUP", "SIGINT"], ["SIGHUP"], b"cancelled", b""),
     ],
 )
 def test_stopped_in_the_middle_of_a_write_it_leaves_what_was_there(
-    folder, halfway, name, reason, before
+    folder, sent, ignored, reason, before
 ):
-    """Code 128 + n as a shell has it: 130, 143, 129; no temporary file, one line."""
-    number = getattr(signal, name)
+    """Code 128 + n as a shell has it: 130, 143, 129; no temporary file, one line.
+
+    Signals that come while it cleans up change nothing: somebody holds the keys down. ``nohup``
+    ignores the closed terminal, and means it; Ctrl-C ends the run after all.
+    """
+    numbers = [getattr(signal, name) for name in sent]
     if before:
         (folder / "out.ply").write_bytes(before)
-    with halfway(*(["--overwrite"] if before else [])) as process:
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=SECONDS)
+    shut = tuple(getattr(signal, name) for name in ignored)
+    with halfway(*["--overwrite"] * bool(before), ignored=shut, stdin=subprocess.PIPE) as process:
+        for number in numbers:
+            process.send_signal(number)
+        assert process.stdout.readline() == b"cleaning\n"
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(b"\n", timeout=SECONDS)
 
-    assert process.returncode == 128 + number
-    assert errors.decode() == f"refine: error: {reason}; nothing was left half-written\n"
+    assert process.returncode == 128 + numbers[-1]
+    assert errors == CANCELLED.replace(b"cancelled", reason)
     assert outputs(folder) == (["out.ply"] if before else [])
     assert not before or (folder / "out.ply").read_bytes() == before
 
 
-def test_ctrl_c_wipes_away_the_progress_before_it_says_so(halfway):
+@pytest.mark.usefixtures("folder")
+def test_ctrl_c_wipes_away_the_progress_before_it_says_so():
     """On a pseudo-terminal: the last line drawn is the error, and the error alone."""
     pty = pytest.importorskip("pty")
     ours, theirs = pty.openpty()
@@ -224,36 +230,8 @@ def test_ctrl_c_wipes_away_the_progress_before_it_says_so(halfway):
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=SECONDS)
     os.close(theirs)
-    drawn = read_all(ours)
 
-    assert drawn.split(b"\r\x1b[K")[-1] == CANCELLED.replace(b"\n", b"\r\n")
-
-
-def test_a_second_ctrl_c_does_not_stop_the_cleaning_up(folder, halfway):
-    """Somebody who holds the keys down: the first is heeded, the others change nothing."""
-    with halfway(stdin=subprocess.PIPE) as process:
-        process.send_signal(signal.SIGINT)
-        assert process.stdout.readline() == b"cleaning\n"
-        process.send_signal(signal.SIGINT)
-        process.send_signal(signal.SIGTERM)
-        _, errors = process.communicate(b"\n", timeout=SECONDS)
-
-    assert (process.returncode, errors) == (130, CANCELLED)
-    assert outputs(folder) == []
-
-
-def test_a_signal_that_is_ignored_stays_ignored(folder, halfway):
-    """``nohup`` ignores the closed terminal, and means it; Ctrl-C ends the run after all.
-
-    Of two signals the first says the code, so it is 129 where the first is heeded.
-    """
-    with halfway(ignored=(signal.SIGHUP,)) as process:
-        process.send_signal(signal.SIGHUP)
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=SECONDS)
-
-    assert (process.returncode, errors) == (130, CANCELLED)
-    assert outputs(folder) == []
+    assert read_all(ours).split(b"\r\x1b[K")[-1] == CANCELLED.replace(b"\n", b"\r\n")
 
 
 LEAVING = """

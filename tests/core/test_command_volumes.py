@@ -8,7 +8,7 @@ import pytest
 from refine_addon.core import read_ply
 
 from .test_cleaning import SIDE
-from .test_command_clean import WHOLE, call, files, told  # noqa: F401 - a wall, a floater before it
+from .test_command_clean import call, files, told  # noqa: F401 - a wall, a floater before it
 
 HALF = "box:-inf,-inf,-inf,0,inf,inf"
 """All with x below 0; the wall is as wide to both sides."""
@@ -44,8 +44,9 @@ def test_volumes_of_a_kind_are_joined(scene):
     """Two spheres about splats of the wall keep these two."""
     folder, _, _, out = scene
     means = read_ply(folder / "scene.ply").splats().means
-    spheres = [f"sphere:{','.join(map(str, means[row].tolist()))},1e-3" for row in (0, 300)]
-    options = [word for sphere in spheres for word in ("--keep-inside", sphere)]
+    options = []
+    for row in (0, 300):
+        options += ["--keep-inside", f"sphere:{','.join(map(str, means[row].tolist()))},1e-3"]
 
     assert call(folder, "prune", *options, "--ratio", "0", "-o", out) == 0
     assert len(read_ply(out)) == 2
@@ -63,21 +64,6 @@ def test_clean_and_score_leave_out_what_must_go(scene, capsys):
     assert call(folder, "score", "--remove-inside", HALF, "-o", out, "--overwrite") == 0
     assert np.array_equal(read_ply(out).rows["refine_score"] == 0.0, x < 0.0)
     assert call(folder, "score", "--protect", HALF, "-o", out, "--overwrite") == 2
-
-
-@pytest.mark.slow
-def test_levels_leave_out_what_must_go(scene):
-    """Both levels lie in the right half; the report counts what went."""
-    folder, x, _, _ = scene
-    options = ["--levels", ".4,.2", "--method", "occlusion", "-o", folder / "lod"]
-
-    entry = told(folder, "lod", "--remove-inside", HALF, *options)
-
-    for each in entry["levels"]:
-        assert (read_ply(folder / "lod" / each["file"]).splats().means[:, 0] >= 0.0).all()
-    assert len(entry["levels"]) == 2
-    assert entry["splats"]["removed_by_user"] == (x < 0.0).sum()
-    assert entry["splats"]["before"] == WHOLE
 
 
 @pytest.mark.parametrize(

@@ -105,12 +105,3 @@ def test_lines_end_where_sentences_do(document):
     plain = [re.sub(r"`[^`]*`", "x", begun.sub("", line)) for line in lines]
 
     assert [line for line in plain if re.search(r'(?<!Eq)[.!?][)"*]* +["(*[]*[A-Z]', line)] == []
-
-
-def test_each_decision_is_dated():
-    """At the end of its heading."""
-    text = (ROOT / "docs/decisions.md").read_text(encoding="utf-8")
-    heads = re.findall(r"^### (.+)$", text, re.MULTILINE)
-
-    assert heads
-    assert [head for head in heads if not re.search(r" \(\d{4}-\d\d-\d\d\)$", head)] == []
