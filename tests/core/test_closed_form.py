@@ -160,9 +160,7 @@ def test_scores_equal_a_plain_reference_for_every_setting(seed, reading):
     expected = np.array(reference(splats, views, (middle, spread), **formula))
     if reading.get("local", True):
         expected = beside_their_neighbours(expected, splats.means.astype(float) - middle, spread)
-
     scores = closed_form.score(splats, views, **reading)
-
     np.testing.assert_allclose(scores.values, expected, rtol=1e-5)
 
 
@@ -203,8 +201,6 @@ def test_a_box_that_touches_an_edge_is_neither_left_out_nor_whole_for_certain():
     """Edges are inside, by sums that round: a point at the edge is decided by `project` alone."""
     cameras = ViewSet((view(),))
     edge = np.array([[1.0], [0.0], [1.0]])
-
     some, whole = Frustums(cameras, np.zeros(3), 0.01).classify(edge, edge, np.zeros(1) + 1e-9)
-
     assert some.all()
     assert not whole.any()

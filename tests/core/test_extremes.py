@@ -14,14 +14,12 @@ from .test_merging import around, cloud
 COUNT = 60
 
 
-def small(count=3, distance=6.0):
-    """Return views of 40 x 30 pixels, from a circle around the origin."""
-    return ViewSet(
-        tuple(
-            replace(view, fx=25.0, fy=25.0, cx=20.0, cy=15.0, width=40, height=30)
-            for view in around(count, distance)
-        )
-    )
+def with_lens(views, **lens):
+    return ViewSet(tuple(replace(view, **lens) for view in views))
+
+
+SMALL = {"fx": 25.0, "fy": 25.0, "cx": 20.0, "cy": 15.0, "width": 40, "height": 30}
+PIXEL = {"cx": 0.5, "cy": 0.5, "width": 1, "height": 1}
 
 
 def scaled(splats, views, factor, offset=0.0):
@@ -43,15 +41,10 @@ def with_logits(splats, value):
     return replace(splats, opacity_logits=logits)
 
 
-def of_a_pixel(views):
-    """Return the views as images of one pixel."""
-    return ViewSet(tuple(replace(view, width=1, height=1, cx=0.5, cy=0.5) for view in views))
-
-
 SCENES = {
-    "one view": lambda splats, _: (splats, small(1)),
+    "one view": lambda splats, views: (splats, views.take([0])),
     "one splat": lambda splats, views: (splats.take(np.arange(1)), views),
-    "images of a pixel": lambda splats, views: (splats, of_a_pixel(views)),
+    "images of a pixel": lambda splats, views: (splats, with_lens(views, **PIXEL)),
     "in one place": lambda splats, views: (replace(splats, means=np.zeros((COUNT, 3))), views),
     "the same": lambda splats, views: (splats.take(np.zeros(COUNT, np.int64)), views),
     "opacities of 0": lambda splats, views: (with_logits(splats, -np.inf), views),
@@ -67,7 +60,7 @@ SCENES = {
 @pytest.mark.parametrize("name", SCENES)
 def test_kept_splats_of_a_scene_at_an_edge_are_as_many_as_asked_for_and_numbers(name, method):
     """Half stay; none is NaN that was a number; refitting ends no lower than it began."""
-    splats, views = SCENES[name](cloud(COUNT), small())
+    splats, views = SCENES[name](cloud(COUNT), with_lens(around(3, 6.0), **SMALL))
 
     result = prune(splats, views, Budget(keep=max(len(splats) // 2, 1)), method())
 

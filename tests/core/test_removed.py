@@ -93,9 +93,7 @@ def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
 def test_protection_wins_over_force(splats, views):
     """The first hundred must go, the first ten stay: ninety must go."""
     stay, go = EVERY < 10, EVERY < 100
-
     found = prune(splats, views, Budget(ratio=0.9), Merge(), protected=stay, removed=go)
-
     assert found.keep[:10].all()
     assert not found.keep[10:100].any()
     assert not found.merged.changed[:10].any()
@@ -107,7 +105,6 @@ def test_protection_wins_over_force(splats, views):
 def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(splats, views, method):
     """As the panel does it: score without them, store, apply. They score 0 and no other does."""
     budget, scores = Budget(ratio=0.6), score(splats, views, method, removed=REMOVED)
-
     assert np.array_equal(scores.values == 0.0, REMOVED)
     expected = prune(splats, views, budget, method, removed=REMOVED)
     for given in (scores, replace(scores, ray_sample=None)):
@@ -115,25 +112,12 @@ def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(splats, 
         assert np.array_equal(later.keep, expected.keep)
 
 
-def test_the_curve_has_protected_splats_last_though_others_must_go(splats, views, scores):
-    """As where these have gone before; without protection it is another curve."""
-    protected = REST & (EVERY % 2 == 0)
-
-    found = score(splats, views, removed=REMOVED, protected=protected)
-
-    left = score(splats.take(REST), views, protected=protected[REST])
-    np.testing.assert_array_equal(found.quality.psnr, left.quality.psnr)
-    assert not np.array_equal(found.quality.psnr, scores.quality.psnr)
-
-
 def test_what_had_to_go_when_scored_and_need_not_now_has_no_score(scores):
     """It might be worth most: nothing tells. If more must go, scores tell of the others."""
     fewer, more = REMOVED & (EVERY > 100), REMOVED | (EVERY < 50)
-
     with pytest.raises(RefineError, match=r"splats had to go when the others were scored"):
         prune(None, None, Budget(ratio=0.6), Occlusion(), scores=scores, removed=fewer)
     found = prune(None, None, Budget(keep=100), Occlusion(), scores=scores, removed=more)
-
     assert not found.keep[more].any()
     assert found.keep.sum() == 100
     assert scores.values[found.keep].min() > scores.values[~found.keep & ~more].max()
@@ -161,7 +145,6 @@ def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats,
 def test_nothing_left_is_refused_but_what_is_protected_is_enough(splats, views):
     """In one sentence, before any work."""
     every, mine = np.ones(COUNT, bool), EVERY == 200
-
     with pytest.raises(RefineError, match=f"all {COUNT} splats lie where they must go"):
         prune(splats, views, Budget(ratio=0.5), removed=every)
     with pytest.raises(RefineError, match=f"all {COUNT} splats"):
@@ -169,7 +152,6 @@ def test_nothing_left_is_refused_but_what_is_protected_is_enough(splats, views):
     found = prune(
         splats, views, Budget(ratio=0.0), ClosedForm(), protected=mine, removed=every
     )  # fmt: skip
-
     assert np.array_equal(found.keep, mine)
 
 
@@ -199,11 +181,9 @@ def test_cleaning_takes_what_must_go_as_gone():
     splats = joined(wall(), FLOATER)
     walls = np.arange(len(splats)) < len(splats) - 1
     some = np.arange(len(splats)) < 5
-
     found = clean(splats, cameras(), removed=some)
     expected = clean(splats.take(~some), cameras())
     alone = clean(splats, cameras(), removed=walls)
-
     assert not found.keep[:5].any()
     assert np.array_equal(found.keep[5:], expected.keep)
     assert found.counts() == expected.counts()
