@@ -112,9 +112,7 @@ def test_inria_cameras_keep_their_order_and_may_share_a_name(tmp_path):
     """One without a name is called by its index; half a surrogate pair could not be printed."""
     named = [{**INRIA, "img_name": name} for name in ("b", "a", "b", "\ud800ä")]
     unnamed = {key: value for key, value in INRIA.items() if key != "img_name"}
-
     views = read(tmp_path, [*named, {**unnamed, "cx": 30.5, "cy": 20}])
-
     assert [view.name for view in views] == ["b", "a", "b", "?ä", "4"]
     assert (views[4].cx, views[4].cy) == (30.5, 20)
 
@@ -140,7 +138,6 @@ def test_a_byte_order_mark_and_a_tilde_are_understood(tmp_path, monkeypatch):
     (tmp_path / "cameras.json").write_bytes(b"\xef\xbb\xbf" + json.dumps([INRIA]).encode())
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
-
     assert len(read_cameras("~/cameras.json")) == 1
 
 
@@ -171,9 +168,7 @@ def test_a_folder_that_may_not_be_entered_says_why():
 
 def test_what_a_frame_says_comes_before_what_all_share(tmp_path):
     own = {"fl_x": 50, "cy": 20, "w": 32, "file_path": "b.png"}
-
     shared, view = read(tmp_path, two(**own))
-
     assert (shared.fx, shared.fy, shared.cy, shared.width) == (100, 120, 24, 64)
     assert (view.fx, view.fy, view.cx, view.cy) == (50, 120, 32, 20)
     assert (view.width, view.height, view.name) == (32, 48, "b.png")
@@ -232,9 +227,7 @@ def test_older_colmap_projects_of_nerfstudio_have_a_transform_of_their_own(tmp_p
     (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
     stored = {"transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "scale": 1}
     write(tmp_path / BESIDE, stored)
-
     (view,) = read(tmp_path, TRANSFORMS)
-
     np.testing.assert_allclose(view.center, [1, 2, 3], atol=1e-15)
     assert pixel(view, POINT) == pytest.approx([57, 39], abs=1e-12)
 

@@ -164,7 +164,6 @@ def test_a_quaternion_of_any_length_and_sign_is_the_same_rotation(tmp_path, suff
     """(57, 39), by the docstring of `test_every_format_gives_the_same_view`."""
     poses = [tuple(factor * value for value in POSE[:4]) + POSE[4:] for factor in (1, -3, 1e-8)]
     images = [(index, pose, 1, "a", 0) for index, pose in enumerate(poses)]
-
     for view in read_cameras(write(tmp_path, suffix, [PINHOLE], images)):
         assert project(view, POINT) == pytest.approx([57, 39], abs=1e-9)
 
@@ -218,7 +217,6 @@ LINE = b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png"
 )
 def test_the_line_of_points_may_be_empty_or_absent(tmp_path, images):
     (view,) = read_cameras(write(tmp_path, ".txt", images=images))
-
     assert project(view, POINT) == pytest.approx([57, 39], abs=1e-12)
     assert view.name == "a.png"
 
@@ -353,5 +351,4 @@ FIELDS = "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
 def test_a_wrong_row_or_line_is_named(tmp_path, file, data, problem):
     data = data if isinstance(data, bytes) else data.encode("latin-1")
     write(tmp_path, file[-4:], **{file[:-4]: data})
-
     wrong(tmp_path, file, problem)

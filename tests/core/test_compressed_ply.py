@@ -68,9 +68,7 @@ def test_harmonics_are_found_by_their_names(tmp_path):
     names = [f"f_rest_{index}" for index in range(9)]
     declared = ["".join(f"property uchar {name}\n" for name in names[::way]) for way in (1, -1)]
     (tmp_path / "a.ply").write_bytes(ply(bytes(range(100, 109)), rest=9, swap=declared))
-
     rows = read_splats(tmp_path / "a.ply").rows
-
     assert [rows[name][0] * 32 + 127.5 for name in names] == [108.0 - index for index in range(9)]
 
 
@@ -98,5 +96,4 @@ FAULTS = [
 def test_what_is_wrong_is_named_with_its_place(tmp_path, case):
     """The element, the property, what was found and what was expected."""
     data, expected = FAULTS[case]
-
     refused(tmp_path / "a.ply", expected, data)

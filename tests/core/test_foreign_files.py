@@ -57,20 +57,17 @@ FOREIGN = [
 def test_a_known_format_is_named_and_so_is_what_to_do(tmp_path, case):
     """By what the file holds; by its name only where nothing in it tells. As cameras, too."""
     file, data, expected = FOREIGN[case]
-
     refused(tmp_path / file, f": {expected}", data, read=read_ply)
     refused(tmp_path / file, f": not a camera file: {expected.split(':')[0]}", read=read_cameras)
 
 
 def test_a_ply_is_one_whatever_it_is_called(tmp_path):
     (tmp_path / "in.splat").write_bytes(plain_ply(3))
-
     assert len(read_ply(tmp_path / "in.splat")) == 3
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["in.ply", "in.splat", "cameras.json", "transforms.json", "cameras.bin", "images.txt"],
+    "name", ["in.ply", "in.splat", "cameras.json", "cameras.bin", "images.txt"]
 )
 def test_a_pointer_to_a_large_file_is_named(tmp_path, name):
     """A repository cloned without its large files holds these in their place."""
@@ -78,8 +75,6 @@ def test_a_pointer_to_a_large_file_is_named(tmp_path, name):
     for beside in ("cameras", "images"):
         (tmp_path / beside).with_suffix(path.suffix).write_bytes(POINTER)
     path.write_bytes(POINTER)
-    splats = name.startswith("in.")
+    read = read_ply if name.startswith("in.") else read_cameras
     file = path if path.suffix != ".txt" else tmp_path / "cameras.txt"
-    expected = ": a Git LFS pointer, not the file itself: 'git lfs pull'"
-
-    refused(path, expected, read=read_ply if splats else read_cameras, file=file)
+    refused(path, ": a Git LFS pointer, not the file itself: 'git lfs pull'", read=read, file=file)

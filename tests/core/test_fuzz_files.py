@@ -25,7 +25,6 @@ from .test_camera_files import INRIA
 def test_files_broken_by_chance_end_in_an_error_or_a_result(name):
     """The same on every run, some of each kind of end, or it tests little; or `make fuzz`."""
     tried, taken = fuzz(name, random.Random(0), lambda count: count < 80)
-
     assert tried == 80
     assert 1 < taken < 60
 
@@ -44,7 +43,6 @@ def test_the_fuzzer_notices_what_is_wrong(tmp_path):
 @pytest.mark.slow
 def test_the_longer_run_prints_how_many_inputs_it_tried(capsys, tmp_path):
     assert main(["--seconds", "0.1", "--seed", "1", "--keep", str(tmp_path / "kept")]) == 0
-
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(TARGETS) + 2
     assert re.fullmatch(r"\d+ inputs tried, 0 crashes", lines[-1])
@@ -103,7 +101,4 @@ def views(tmp_path_factory):
 )
 def test_json_that_is_deep_or_huge_is_refused(tmp_path, name, data):
     memory = 40 * len(data) + 1_000_000
-
-    message = refused(tmp_path / name, "", data, read=read_cameras, memory=memory)
-
-    assert len(message) < 500
+    assert len(refused(tmp_path / name, "", data, read=read_cameras, memory=memory)) < 500

@@ -267,7 +267,6 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, case):
     """By the path in the JSON, with memory that the file accounts for."""
     *change, expected = FAULTS[case]
     data = packed(with_value(CONTENT, *change), BINARY)
-
     refused(tmp_path / "a.glb", expected, data, memory=2.5e6)
 
 
@@ -275,9 +274,7 @@ def test_a_few_bytes_do_not_become_many_splats(tmp_path):
     """300 nodes that show one mesh of 100 splats are 30,000 in 16 KB, refused on the way."""
     content, binary = document({name: rows * 50 for name, rows in VALUES.items()})
     content |= {"nodes": [{"mesh": 0}] * 300, "scenes": [{"nodes": list(range(300))}]}
-
     message = refused(tmp_path / "a.glb", "its nodes show 16", packed(content, binary))
-
     assert "00 splats or more, expected at most 16" in message
 
 

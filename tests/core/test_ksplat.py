@@ -99,9 +99,7 @@ def test_sections_of_different_degrees_have_zeros(tmp_path):
     heads, rest = section(degree=1) + section(degree=0), bytes([0, 255] + [0] * 7)
     data = whole(heads, BUCKET, ROW, rest, BUCKET, ROW, sections=2, count=2, level=2)
     (tmp_path / "a.ksplat").write_bytes(data)
-
     splats = read_splats(tmp_path / "a.ksplat").splats()
-
     assert splats.sh_rest[0, :2, 0].tolist() == [-1.5, 1.5]
     assert not splats.sh_rest[1].any()
 

@@ -41,8 +41,7 @@ TWO = Levels((0.5, 0.25))
 QUICK = ClosedForm()
 
 
-@contextlib.contextmanager
-def merging():
+def _merging():
     """Let merging seem better: so few splats can be deleted as well."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(PRUNE, "deletion_will_do", lambda *_: False)
@@ -51,10 +50,7 @@ def merging():
         yield
 
 
-@pytest.fixture
-def merges():
-    with merging():
-        yield
+merges, merging = pytest.fixture(_merging), contextlib.contextmanager(_merging)
 
 
 def colourful():
@@ -84,12 +80,10 @@ def wall_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def merged():
     """Return three levels of merged splats, and what their progress told."""
-    told = []
+    told, levels = [], Levels((0.5, 0.25, 0.15))
     with merging():
-        levels = lod(
-            colourful(), cameras(), Levels((0.5, 0.25, 0.15)), progress=lambda f, _: told.append(f)
-        )
-        return list(levels), told
+        made = lod(colourful(), cameras(), levels, progress=lambda f, _: told.append(f))
+        return list(made), told
 
 
 @pytest.mark.slow
@@ -151,7 +145,6 @@ def test_each_level_is_merged_from_the_one_before(merges, merged):
 def test_protected_splats_are_in_all_levels_unchanged(merges, method):
     """60 of 576 are protected; the last level keeps 115 (115.2 rounds up to 116)."""
     splats, protected = colourful(), np.arange(576) % 10 == 3
-
     for level in lod(splats, cameras(2), Levels((0.5, 0.2)), method, protected=protected):
         assert level.result.keep[protected].all()
         found = level.result.splats.take(protected[level.result.keep])
@@ -168,17 +161,18 @@ def test_levels_by_psnr_lie_near_it(method):
     """
     splats, views = read_ply(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
     splats, views = splats.take(slice(0, None, 12)), views.take(range(0, 72, 9))
-
     levels = list(lod(splats, views, Levels(psnr=(34.0, 28.0)), method))
-
     assert levels[0].psnr == pytest.approx(34.0, abs=1.0)
     assert levels[1].psnr == pytest.approx(28.0, abs=1.0)
     assert len(levels[1].result.splats) < len(levels[0].result.splats) < len(splats)
 
 
-@pytest.mark.parametrize(
-    ("given", "word"),
-    [
+def test_levels_that_cannot_be_are_refused():
+    """Shares lie between 0 and 1, PSNR between 0 and 100 dB; both fall.
+
+    .001 of 5 splats are none, but a level without any is no level.
+    """
+    for given, word in (
         ({}, "got none"),
         ({"shares": (0.5,), "psnr": (40.0,)}, "got both"),
         ({"shares": (1.0,)}, "less than 1"),
@@ -189,15 +183,9 @@ def test_levels_by_psnr_lie_near_it(method):
         ({"psnr": (30.0, 40.0)}, "40.0 comes after 30.0"),
         ({"psnr": (100.0,)}, "less than 100 dB"),
         ({"shares": tuple(0.9**k for k in range(1, 18))}, "at most 16"),
-    ],
-)
-def test_levels_that_cannot_be_are_refused(given, word):
-    """Shares lie between 0 and 1, PSNR between 0 and 100 dB; both fall.
-
-    .001 of 5 splats are none, but a level without any is no level.
-    """
-    with pytest.raises(RefineError, match=word):
-        Levels(**given)
+    ):
+        with pytest.raises(RefineError, match=word):
+            Levels(**given)
     assert Levels((0.5, 0.001)).budgets(5) == [Budget(keep=3), Budget(keep=1)]
 
 
@@ -252,32 +240,27 @@ def test_no_file_is_replaced_unless_told(tmp_path, wall_file):
     """Said before any work, and nothing else is written."""
     path = tmp_path / "a.lod2.ply"
     path.write_text("mine")
-
     with pytest.raises(RefineError, match="exists already"):
         lod_file(wall_file, tmp_path, cameras(2), TWO, QUICK)
-
     assert list(tmp_path.iterdir()) == [path]
     lod_file(wall_file, tmp_path, cameras(2), TWO, QUICK, overwrite=True)
     assert len(read_ply(path)) == 144
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("error", [RefineError("no space"), KeyboardInterrupt()])
-def test_levels_that_were_written_go_where_a_later_one_fails(
-    tmp_path, wall_file, monkeypatch, error
-):
+def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, wall_file, monkeypatch):
     """The folder that was made for them goes too."""
-    whole, calls = SplatFile.write, []
+    whole, left = SplatFile.write, []
 
     def write(self, *rest, **named):
-        calls.append(1)
-        if len(calls) == 2:
+        left.pop()
+        if not left:
             raise error
         return whole(self, *rest, **named)
 
     monkeypatch.setattr(SplatFile, "write", write)
-
-    with pytest.raises(type(error)):
-        lod_file(wall_file, tmp_path / "out", cameras(2), TWO, QUICK)
-
-    assert list(tmp_path.iterdir()) == []
+    for error in (RefineError("no space"), KeyboardInterrupt()):
+        left[:] = [1, 2]
+        with pytest.raises(type(error)):
+            lod_file(wall_file, tmp_path / "out", cameras(2), TWO, QUICK)
+        assert list(tmp_path.iterdir()) == []

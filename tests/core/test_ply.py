@@ -214,10 +214,8 @@ def test_what_does_not_fit_the_rows_is_refused_before_anything_is_written(
 ):
     header = plain_header(3, [*splat_names(0), "tag"]).replace(b"float tag", b"uchar tag")
     file = opened(tmp_path, header + bytes(3 * 57))
-
     with pytest.raises(RefineError, match=re.escape(expected)):
         file.write(tmp_path / "out.ply", **given)
-
     assert [tmp_path / "in.ply"] == list(tmp_path.iterdir())
 
 
@@ -333,9 +331,7 @@ REFUSED = [
 @pytest.mark.parametrize("case", range(len(REFUSED)))
 def test_a_file_that_is_wrong_is_refused_with_its_name_and_the_place(tmp_path, case):
     data, expected = REFUSED[case]
-
     refused(tmp_path / "in.ply", expected, data, read=read_ply)
-
     assert data == (tmp_path / "in.ply").read_bytes()
 
 
@@ -361,7 +357,6 @@ def test_a_text_row_that_is_wrong_is_refused_with_its_number(tmp_path, old, new,
     for behind in (0, 1, 5):
         header = TEXT_HEADER.replace(b"vertex 2", b"vertex %d" % (4 + behind))
         data = header + good + TEXT_ROW.replace(old, new) + TEXT_ROW * behind
-
         assert ": vertex row 3: " in refused(tmp_path / "in.ply", expected, data, read=read_ply)
 
 
@@ -397,7 +392,6 @@ def test_a_header_line_of_a_hundred_megabytes_costs_one(tmp_path):
     with path.open("wb") as stream:
         stream.write(b"ply\nformat ascii 1.0\ncomment ")
         stream.truncate(100_000_000)
-
     refused(path, "no 'end_header' line in the first 1048576 bytes", read=read_ply, memory=4e6)
 
 

@@ -141,7 +141,6 @@ def test_what_follows_the_splats_is_read_once(tmp_path):
     extension = np.random.default_rng(0).bytes(12_000_000)
     data = gzip.compress(header(3) + bytes(29) + extension, compresslevel=0)
     (tmp_path / "a.spz").write_bytes(data)
-
     assert seconds(lambda: read_splats(tmp_path / "a.spz"), tries=1) < 1.0
 
 
@@ -172,7 +171,6 @@ def test_a_position_that_spz_cannot_hold_is_refused(tmp_path):
     """24 bits with a sign end at 2^23 - 1, and 8388607.5 is beyond; nothing is written."""
     (tmp_path / "in.ply").write_bytes(plain_ply(3))
     file = read_splats(tmp_path / "in.ply")
-
     for x, shown in ((1e7, "10000000"), (8388607.5, "8388607.5")):
         with pytest.raises(RefineError, match=f"a coordinate is {shown}: SPZ holds coordinates up"):
             write_splats(tmp_path / "a.spz", file, columns={"x": np.full(3, x, np.float32)})

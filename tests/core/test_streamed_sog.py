@@ -44,7 +44,6 @@ def test_a_level_is_read_with_the_environment(level, step, count):
     of three axes.
     """
     file = read_splats(OTHER, level=level)
-
     splats, source = file.splats(), room(265)
     assert file.format == f"streamed SOG, level {level}"
     assert len(splats) == count + 15
@@ -134,9 +133,7 @@ def test_splats_in_one_place_are_one_chunk_and_keep_their_model(tmp_path, monkey
     """No plane parts them. Each folder says the model."""
     monkeypatch.setattr(streamed_sog, "UNIT", 10)
     path = tmp_path / "lod-meta.json"
-
     write(path, replace(room(1000), means=np.ones((40, 3), np.float32), model="2dgs"))
-
     assert json.loads(path.read_text())["tree"]["lods"]["0"]["count"] == 40
     assert read_splats(path).model == read_splats(tmp_path / "0_0/meta.json").model == "2dgs"
 
@@ -232,7 +229,6 @@ def copied(tmp_path):
 @pytest.mark.parametrize("case", range(len(FAULTS)))
 def test_what_is_wrong_is_named_with_its_place(copied, case):
     *change, expected = FAULTS[case]
-
     refused(copied, expected, json.dumps(with_value(INDEX, *change)).encode())
 
 
@@ -261,18 +257,13 @@ def test_images_that_many_folders_share_count_once(tmp_path):
     refused(path, f"163840 splats, expected at most {size}, the bytes of all files together")
 
 
-def test_folders_of_two_models_are_refused(copied):
-    """What a viewer draws one way is not merged with what it draws another."""
-    around = copied.parent / "env/meta.json"
-    around.write_text(json.dumps({**json.loads(around.read_text()), "model": "antialiased"}))
-
-    refused(copied, "model antialiased, others have default", file=around)
-
-
-@pytest.mark.parametrize("level", [2, -1])
-def test_a_level_that_is_not_there_is_refused(level):
-    """Of two, 0 and 1 are."""
-    with pytest.raises(RefineError, match=f"no level {level}, expected 0 to 1"):
-        read_splats(OTHER, level=level)
+def test_levels_that_are_not_there_and_two_models_are_refused(copied):
+    """Of two levels, 0 and 1 are; what a viewer draws one way is not merged with another."""
+    for level in (2, -1):
+        with pytest.raises(RefineError, match=f"no level {level}, expected 0 to 1"):
+            read_splats(copied, level=level)
     with pytest.raises(RefineError, match=re.escape("has no level 1: only lod-meta.json has lev")):
         read_splats(ROOM, level=1)
+    around = copied.parent / "env/meta.json"
+    around.write_text(json.dumps({**json.loads(around.read_text()), "model": "antialiased"}))
+    refused(copied, "model antialiased, others have default", file=around)
