@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import gzip
 import io
+import itertools
 import json
 import random
 import re
@@ -52,11 +53,10 @@ from refine_addon.core.scoring import occlusion
 from refine_addon.core.visibility.measuring import Sampling
 from tests.core.test_camera_files import FRAME, INRIA, MATRIX, TRANSFORMS
 from tests.core.test_colmap import TWO, WRITERS
+from tests.strategies import LINE_ENDS, ORDERS, ply_case, splat_names
 
 MEMORY = 40_000_000  # bytes that any small input may cost; NumPy and JSON need some of their own
 SECONDS = 5.0  # of the processor; an input that takes longer is a crash too
-
-REQUIRED = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
 
 WORDS = (
     *(b"element vertex 3", b"element face 2", b"property float x", b"property list uchar int i"),
@@ -83,31 +83,8 @@ Files = dict[str, bytes]
 
 def ply_seeds() -> list[Files]:
     """Return PLY files in every encoding, with lists, text, doubles and comments."""
-    names = REQUIRED.split()
-    values = np.linspace(-1.0, 1.0, 3 * len(names)).reshape(3, -1)
-    plain = "element vertex 3\n" + "".join(f"property float {name}\n" for name in names)
-    rest = "".join(f"property double f_rest_{index}\n" for index in range(9))
-    other = "element other 2\nproperty uchar a\nproperty short b\n"
-    lists = "element face 2\nproperty list uchar int corners\n"
-    seeds = []
-    for form, order in (("binary_little_endian", "<"), ("binary_big_endian", ">")):
-        head = f"ply\nformat {form} 1.0\ncomment made\nobj_info here\n"
-        rows = values.astype(f"{order}f4").tobytes()
-        wide = b"".join(rows[at : at + 56] + bytes(72) for at in (0, 56, 112)) + b"trailing"
-        face = struct.pack(f"{order}B2iB1i", 2, 5, 6, 1, 7)
-        for text, body in (
-            (f"{head}{plain}", rows),
-            (f"{head}{other}{plain}".replace("\n", "\r\n"), bytes(6) + rows),
-            (f"{head}{plain}{lists}", rows + face),
-            (f"{head}{plain}{rest}", wide),
-        ):
-            end = "end_header\r\n" if "\r" in text else "end_header\n"
-            seeds.append((text + end).encode() + body)
-    lines = "".join(" ".join(f"{value:g}" for value in row) + " 7\n" for row in values)
-    text = f"ply\nformat ascii 1.0\n{plain}property uchar tag\n"
-    seeds.append(f"{text}{lists}end_header\n{lines}3 0 1 2\n1 7\n".encode())
-    seeds.append(f"{text}end_header\n{lines}".replace("\n", "\r").encode().rstrip())
-    return [{"in.ply": seed} for seed in seeds]
+    kinds = itertools.product(ORDERS, LINE_ENDS, range(3))
+    return [{"in.ply": ply_case(form, end.encode(), 3, seed).data} for form, end, seed in kinds]
 
 
 def format_seeds(form: Any) -> list[Files]:
@@ -322,7 +299,7 @@ def use_cameras(folder: Path) -> None:
     views = read_cameras(files[0])
     values = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32)
     values[:, :3] += (-3.0, 2.0, 3.0)  # what the good cameras look at
-    splats = splats_from_columns(dict(zip(REQUIRED.split(), values.T, strict=True)))
+    splats = splats_from_columns(dict(zip(splat_names(0), values.T, strict=True)))
     coarse = Sampling(16.0, 1.0)
     try:  # in this thread: NumPy's flags are raised in it alone
         both = (
@@ -355,11 +332,7 @@ if not find_spec("PIL"):
 
 
 class Crash(Exception):
-    """Something other than a result or an error for the user, and the files that led to it."""
-
-    def __init__(self, files: Files, why: str) -> None:
-        super().__init__(why)
-        self.files = files
+    """Files, and why they led to something other than a result or an error for the user."""
 
 
 def attempt(files: Files, use: Callable[[Path], Any], folder: Path) -> bool:
@@ -434,9 +407,10 @@ def main(arguments: list[str] | None = None) -> int:
             crashes += 1
             where = options.keep / name.replace(" ", "_")
             where.mkdir(parents=True, exist_ok=True)
-            for file, data in crash.files.items():
+            files, why = crash.args
+            for file, data in files.items():
                 (where / file).write_bytes(data)
-            print(f"{name}: CRASH, input kept in {where}\n{crash}")
+            print(f"{name}: CRASH, input kept in {where}\n{why}")
             continue
         total += tried
         print(f"{name}: {tried} inputs tried, {taken} taken, {tried - taken} refused, no crash")

@@ -63,7 +63,12 @@ class PlyCase:
 def ply_files(draw: st.DrawFn, *, least: int = 0, forms: tuple[str, ...] = tuple(ORDERS)):
     """Draw 3DGS PLY files in every shape that the format allows."""
     form, end = draw(st.sampled_from(forms)), draw(st.sampled_from(LINE_ENDS)).encode()
-    count, random = draw(st.integers(least, 5)), np.random.default_rng(draw(st.integers(0, 2**32)))
+    return ply_case(form, end, draw(st.integers(least, 5)), draw(st.integers(0, 2**32)))
+
+
+def ply_case(form: str, end: bytes, count: int, seed: int) -> PlyCase:
+    """Return a PLY file of so many splats; all but format and line end comes about by chance."""
+    random = np.random.default_rng(seed)
     kinds, text = _splat_kinds(random), form == "ascii"
     dtype = np.dtype([(name, ORDERS[form] + TYPES[kind]) for name, kind in kinds])
     rows = np.frombuffer(random.bytes(count * dtype.itemsize), dtype).copy()
