@@ -26,7 +26,7 @@ from refine_addon.core import (
 from refine_addon.core.formats import registry
 from refine_addon.core.formats.registry import SUFFIXES
 from refine_addon.core.pictures import PictureFiles
-from refine_addon.core.splats import base_color, opacity, opacity_logits, rotation_matrices
+from refine_addon.core.splats import base_color, opacity, rotation_matrices
 from tests.strategies import ply_of, splat_names
 from tests.users import own_folder
 
@@ -233,24 +233,6 @@ def test_a_size_is_kept_to_or_refused_where_only_writing_tells_it(tmp_path, suff
     assert path.stat().st_size <= planned["files"]["output_bytes"] <= budget.max_mb * 1e6
 
 
-def test_merged_splats_are_written_as_they_became(tmp_path, cameras):
-    """The same prune to a PLY and to a format: the same splats within the bounds."""
-    (tmp_path / "in.ply").write_bytes(ply_of(scene()))
-    prune_file(tmp_path / "in.ply", tmp_path / "out.ply", cameras, Budget(keep=300))
-    plain = read_splats(tmp_path / "out.ply").splats()
-    for suffix in SUFFIX:
-        path = tmp_path / f"out{suffix}"
-        prune_file(tmp_path / "in.ply", path, cameras, Budget(keep=300))
-
-        kept = read_splats(path).splats()
-
-        nearest = np.linalg.norm(kept.means[:, None] - plain.means, axis=2).argmin(axis=1)
-        found = differences(kept, plain.take(nearest))
-        assert len(kept) == len(plain) == 300
-        for name in ("opacity", "color"):
-            assert found[name] <= 2 * BOUNDS[suffix][name], (suffix, name)
-
-
 @pytest.mark.skipif(os.name != "posix", reason="needs permissions")
 def test_a_file_that_may_not_be_read_is_replaced(cameras):
     """The new one may not be read either: what it rounds is not told, where the run had failed.
@@ -302,13 +284,6 @@ def test_the_command_converts_by_the_suffix(tmp_path, capsys):
     for problem in (".ksplat is not written", ".json is not written", "only a .ply holds scores"):
         assert problem in said
     assert f"holds levels, which lod makes; expected one of {', '.join(SUFFIXES)}" in said
-
-
-def test_logits_of_opacities_are_clamped():
-    """The inverse of the logistic function; 0 and 1 count as 1e-6 and 1 - 1e-6."""
-    logits = opacity_logits(np.array([0.0, 0.25, 0.5, 1.0]))
-    ends = np.log(1e-6 / (1.0 - 1e-6))
-    np.testing.assert_allclose(logits, [ends, -np.log(3.0), 0.0, -ends], atol=1e-9)
 
 
 def test_a_splat_file_written_by_hand(tmp_path):

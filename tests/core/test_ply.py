@@ -98,21 +98,6 @@ def test_a_prune_holds_a_few_megabytes_of_a_file(tmp_path):
     assert peak < 10e6
 
 
-def test_the_home_folder_and_odd_names_are_found(tmp_path, monkeypatch):
-    """``~`` is the home folder; spaces, other scripts and links are names like any other."""
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("USERPROFILE", str(tmp_path))
-    data = plain_ply()
-    named = tmp_path / "mein Scan – 部屋 🎈.ply"
-    named.write_bytes(data)
-    (tmp_path / "link.ply").symlink_to(named)
-
-    for path in (f"~/{named.name}", "~/link.ply", str(named)):
-        read_ply(path).write("~/my out ü.ply", overwrite=True)
-
-        assert data == (tmp_path / "my out ü.ply").read_bytes()
-
-
 # What is written.
 
 
