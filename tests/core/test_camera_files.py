@@ -79,9 +79,7 @@ def test_every_format_gives_the_same_view(tmp_path, kind):
     write(tmp_path / "cameras.json", [INRIA])
     write(tmp_path / "transforms.json", TRANSFORMS)
     write_colmap(tmp_path / "colmap")
-
     (view,) = read_cameras(str(tmp_path / kind))
-
     assert pixel(view, POINT) == pytest.approx([57, 39], abs=1e-12)
     np.testing.assert_allclose(view.rotation, [[0, 1, 0], [0, 0, -1], [-1, 0, 0]], atol=1e-15)
     np.testing.assert_allclose(view.center, [1, 2, 3], atol=1e-15)
@@ -107,9 +105,7 @@ def test_a_rounded_rotation_is_made_exact(tmp_path):
     c, s = round(math.cos(0.3), 4), round(math.sin(0.3), 4)
     tiny = {"rotation": [[1, 1e-200, 0], [-1e-200, 1, 0], [0, 5e-324, 1]]}
     rounded = {**INRIA, "rotation": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}
-
     view, other = read(tmp_path, [rounded, {**INRIA, **tiny, "position": [0, 0, 1e-310]}])
-
     np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-14)
     assert view.rotation[0, 1] == pytest.approx(math.sin(0.3), abs=1e-4)
     np.testing.assert_array_equal(other.rotation, np.eye(3))
@@ -238,7 +234,6 @@ def test_scaled_and_mirrored_poses_are_read_and_noted(tmp_path):
         (mirrored, [7, 39], "mirrored pose (determinant -1) of 1 frame"),
     ):
         views = read(tmp_path, two(transform_matrix=matrix))
-
         assert pixel(views[1], POINT) == pytest.approx(expected, abs=1e-9)
         assert views.note == note
 

@@ -150,9 +150,7 @@ def test_views_are_sorted_by_name_and_id_whatever_the_order_of_the_file(tmp_path
     given = [(9, "c"), (3, "b/2.png"), (4, "c"), (2, "a 1.png")]
     images = [(key, (*POSE[:6], key), 1 + key % 2, name, key % 3) for key, name in given]
     cameras = [(1, 2, 64, 48, [9, 32, 24, 0.1]), (2, 4, 64, 48, [9, 9, 32, 24, 0, 0, 0, 1])]
-
     views = read_cameras(write(tmp_path, suffix, cameras, images))
-
     assert [view.name for view in views] == ["a 1.png", "b/2.png", "c", "c"]
     assert [(view.rotation @ -view.center)[2] for view in views] == pytest.approx([2, 3, 4, 9])
     one = "distortion of 1 camera ignored (model {})".format
@@ -277,9 +275,7 @@ def test_a_binary_cut_off_at_any_byte_is_refused(tmp_path, file):
     whole = path.read_bytes()
     for length in range(1, len(whole)):
         path.write_bytes(whole[:length])
-
         message = wrong(tmp_path, path.name, "truncated: ")
-
         assert int(message.split(": byte ")[1].split(":")[0]) <= length
     path.write_bytes(struct.pack("<Q", 1) + whole[8:])
     first = {"cameras": 8 + 24 + 4 * 8, "images": 8 + 64 + 14}[file]

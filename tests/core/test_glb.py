@@ -93,7 +93,6 @@ def test_values_are_activated_and_y_points_up(read):
     A scale of 2 is log 2, one of 0 minus infinity; an opacity of 1 is kept 2^-26 away from it.
     """
     splats = read(*document())
-
     assert splats.means.tolist() == [[-1.0, -2.0, 3.0], [-4.0, -5.0, 6.0]]
     np.testing.assert_allclose(splats.log_scales[0], np.log([1.0, 2.0, 4.0]), rtol=1e-6)
     assert splats.log_scales[1, 1] == -np.inf
@@ -167,9 +166,7 @@ def test_normalized_integers_and_values_that_stand_apart_are_read(read):
     view = {"buffer": 0, "byteOffset": len(binary), "byteLength": 40, "byteStride": 20}
     content["bufferViews"][0] = view
     rows = np.pad(np.array(VALUES["POSITION"], "<f4"), ((0, 0), (0, 2)))
-
     splats = read(content, binary + rows.tobytes())
-
     np.testing.assert_allclose(splats.opacity_logits[0], np.log(0.25), rtol=1e-6)
     assert splats.quaternions.tolist() == [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -1.0, 0.0]]
     assert splats.means.tolist()[1] == [-4.0, -5.0, 6.0]
@@ -209,7 +206,6 @@ def test_time_grows_with_the_file_and_not_with_nodes_times_accessors(read):
         accessor["count"] = 0
     crowd["meshes"][0]["primitives"] *= 20
     crowd |= {"nodes": [{"mesh": 0}] * 1000, "scenes": [{"nodes": list(range(1000))}]}
-
     assert seconds(lambda: read(crowd, binary), tries=1) < 1.0
     nodes = [{}] * 20_000 + [{"translation": [1.0, 0.0, 0.0]}]
     assert seconds(lambda: read(content, binary, nodes), tries=1) < 1.0

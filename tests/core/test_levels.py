@@ -194,7 +194,6 @@ def test_progress_only_rises_and_can_cancel(merged):
     """From 0 to 1, whatever the level; False ends it."""
     deleting = []
     list(lod(colourful(), cameras(2), TWO, Occlusion(), progress=lambda f, _: deleting.append(f)))
-
     for told in (merged[1], deleting):
         assert told == sorted(told)
         assert 0.0 <= told[0] < 0.05

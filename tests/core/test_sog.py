@@ -112,7 +112,6 @@ def test_version_1_by_hand(tmp_path):
     in steps of .01, 150 is 0 and 255 is 1.05.
     """
     file = read_splats(unbundled(tmp_path, VERSION_1))
-
     splats = file.splats()
     assert file.format == "SOG version 1"
     assert file.stored_bytes == sum(path.stat().st_size for path in tmp_path.iterdir())
@@ -142,9 +141,7 @@ def test_the_palette_tells_clumps_apart(tmp_path):
     rest = (clumps + random.normal(0.0, 0.1, clumps.shape)).astype(np.float32)
     columns = {f"f_rest_{axis}": rest[:, axis] for axis in range(3)}
     write_splats(tmp_path / "a.sog", file, columns=columns)
-
     splats = read_splats(tmp_path / "a.sog").splats()
-
     order = np.argmin(np.linalg.norm(splats.means[:, None] - file.splats().means, axis=2), axis=1)
     assert sorted(order) == list(range(8))
     assert np.abs(splats.sh_rest[:, :, 0] - rest[order]).max() < 0.5
@@ -245,7 +242,6 @@ def test_what_is_missing_is_said(made, monkeypatch):
 
     monkeypatch.setattr(importlib, "import_module", missing)
     source = read_splats(path.with_name("in.ply"))
-
     refused(path, "WebP images need a library: run this in Blen")
     with pytest.raises(RefineError, match="WebP images need a library: run this in Blender, or 'p"):
         write_splats(path.with_name("b.sog"), source)

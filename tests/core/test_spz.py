@@ -125,7 +125,6 @@ def test_streams_that_lie_are_refused(tmp_path):
     more = version_4([parts[0], b"\0" * 10**7, *parts[2:]], said=sizes)
     much = version_4([bytes(400_000 * size) for size in sizes], 400_000)
     assert len(much) < 2000
-
     for data, expected, memory in (
         (version_4([b"\0" * 10**6, *parts[1:]]), "stream 'mean' announces 1000000 bytes, exp", 5e6),
         (version_4([parts[0], b"", *parts[2:]]), "stream 'opacity' announces 0 bytes, exp", 5e6),
@@ -159,9 +158,7 @@ def test_the_steps_of_positions_follow_the_scene(tmp_path, scale, fraction):
     file = read_splats(tmp_path / "in.ply")
     columns = {axis: (file.rows[axis] / file.rows["z"].max() * scale) for axis in "xyz"}
     write_splats(tmp_path / "a.spz", file, columns=columns)
-
     means = read_splats(tmp_path / "a.spz").splats().means
-
     assert gzip.decompress((tmp_path / "a.spz").read_bytes())[13] == fraction
     expected = np.stack([columns[axis] for axis in "xyz"], axis=1)
     assert np.abs(means - expected).max() <= 0.5 / 2**fraction * 1.01
