@@ -44,6 +44,7 @@ def version_4(parts, count=1, said=None):
 
 
 TABLE = struct.pack("<I12x", 32)
+ZSTD = b"\x28\xb5\x2f\xfd"  # how a stream begins
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -128,6 +129,7 @@ def test_streams_that_lie_are_refused(tmp_path):
     for data, expected, memory in (
         (version_4([b"\0" * 10**6, *parts[1:]]), "stream 'mean' announces 1000000 bytes, exp", 5e6),
         (version_4([parts[0], b"", *parts[2:]]), "stream 'opacity' announces 0 bytes, exp", 5e6),
+        (version_4(parts).replace(ZSTD, bytes(4), 1), "stream 'mean' is damaged (", 5e6),
         (more, "stream 'opacity' holds more bytes, expected 1", 5e6),
         (much, "truncated: 400000 splats need 11600000 bytes unpacked", 1e6),
     ):
