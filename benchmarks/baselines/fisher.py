@@ -65,9 +65,6 @@ def fisher(
 ) -> NDArray[np.float64]:
     """Sum J' J over the pixels and channels of all views.
 
-    - near: As in `rasterizer.render`.
-    - background, (3,) float
-
     - returned, (N, 6, 6) float64: By the mean (3) and the logarithms of the scales (3).
     """
     scene = gaussians_of(splats)

@@ -85,8 +85,6 @@ def removed_in_rounds(
 
     POTR prunes so: what one removal costs depends on what else has gone.
 
-    - keep_count: How many stay.
-
     - returned, (keep_count,) int64: Which splats stay, ascending; of equal errors the first.
     """
     left = np.arange(len(splats))

@@ -70,9 +70,6 @@ def version() -> str:
 def command(source: Path, target: Path, flag: str, keep_count: int) -> list[str]:
     """Return the command line that writes `source`, decimated to `keep_count`, to `target`.
 
-    - source, target: 3DGS PLY files.
-    - flag: One of `FLAGS`.
-
     - RefineError: if it is not installed.
     """
     start = find()

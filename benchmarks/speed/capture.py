@@ -43,10 +43,7 @@ VAST = 0.06
 
 
 def make(count: int, degree: int = 3) -> Splats:
-    """Return a scene of `count` splats, always the same.
-
-    - degree: Of the harmonics.
-    """
+    """Return a scene of `count` splats, always the same."""
     random = np.random.default_rng(7)
     far, inside, floating, floor = (int(share * count) for share in (FAR, INSIDE, FLOATING, FLOOR))
     on_objects = count - far - inside - floating - floor

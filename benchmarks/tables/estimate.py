@@ -54,11 +54,8 @@ BETWEEN_HEADING = (
 class Estimated:
     """An estimate and the truth.
 
-    - way, {"delete", "merge", "refit"}
-    - removed: Share of the splats.
     - estimate, truth: PSNR, dB; the truth is the mean over all views that score.
     - expected: What a result of deleting says of merging, dB.
-    - seconds: Of the prune.
     - single, (V,) float64: By how much the estimates of single views exceed the truth, dB.
     """
 
@@ -120,7 +117,6 @@ def measure(
 class Between:
     """The estimate of the views between, and what held-out views see.
 
-    - way, {"delete", "merge", "refit"}
     - estimate: Of the views between, dB.
     - held, (H,) float64: PSNR of each held-out view, dB.
     - warned: Whether the report says that views from elsewhere may lose more.

@@ -49,7 +49,6 @@ FLIP_MISSING = "FLIP needs the package flip-evaluator: pip install flip-evaluato
 class Quality:
     """Each metric for each view; all of one length.
 
-    - names: The views.
     - values, dict of str to (V,) float64: Metric ("psnr", "ssim", "flip") -> its value in every
       view.
     """
@@ -65,11 +64,7 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What `Evaluator.evaluate` measures.
-
-    - renders: Against renders of the original splats.
-    - pictures: Against pictures, for the views that have one.
-    """
+    """What `Evaluator.evaluate` measures."""
 
     renders: Quality
     pictures: Quality | None
@@ -78,10 +73,7 @@ class Evaluation:
 class Evaluator:
     """Compares changed versions of one scene; the original is rendered once.
 
-    - views: The views to compare in.
     - pictures, mapping of str to (H, W, 3) floating, optional: Name of a view -> its picture, 0..1.
-    - metrics: Among `METRICS`.
-    - near: Near plane, world units.
     """
 
     def __init__(
@@ -144,7 +136,6 @@ def compare(
     """Compare two images.
 
     - image, reference, (H, W, 3) floating: 0..1, sRGB.
-    - metrics: Among `METRICS`.
 
     Examples
     --------
@@ -205,10 +196,7 @@ class Scene:
 
 
 def read_scene(folder: Path | str) -> Scene:
-    """Read a folder as the module's docstring describes it.
-
-    - RefineError: if a file is missing or not what it should be.
-    """
+    """Read a folder as the module's docstring describes it."""
     folder = Path(folder)
     views = read_cameras(folder / "cameras.json")
     train, test = _split(folder / "split.json", [view.name for view in views])

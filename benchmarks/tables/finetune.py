@@ -42,9 +42,7 @@ _C1, _C2 = 0.01**2, 0.03**2
 class Tuned:
     """What training won back for one method.
 
-    - ratio: Share removed.
     - before, after: PSNR against the held-out photos, dB.
-    - seconds: Of the training.
     """
 
     name: str
@@ -171,7 +169,6 @@ def loss(
 
     - image, photo, (H, W, 3) float64
 
-    - returned loss, float
     - returned gradient, (H, W, 3) float64: By the pixels of `image`.
     """
     share, slope = _ssim(image, photo)

@@ -147,7 +147,6 @@ def dirtied(
 ) -> tuple[Splats, NDArray[np.int64], tuple[str, ...]]:
     """Return a scene with floaters behind its own splats, the kind of each, (n,), and their names.
 
-    - folder: Of the scene.
     - splats, views: What it holds, and the views that place the floaters of `mixed`.
     - recipe: "none", "mixed", or one of `RECIPES`.
     """

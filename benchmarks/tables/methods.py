@@ -35,8 +35,6 @@ OURS, LITERATURE, EXTERNAL = "ours", "literature", "external"
 class Task:
     """What every method gets.
 
-    - splats: In memory.
-    - views: The views that decide.
     - file: The splats as a file, for other programs.
     """
 
@@ -49,8 +47,6 @@ class Task:
 class Method:
     """One way to get rid of splats; exactly one of the three functions is set.
 
-    - group, {"ours", "literature", "external"}
-    - about: What it is, in one line.
     - score: ``(task, statistics) -> Scores``.
     - reduce: ``(task, keep_count, ratio) -> Splats``.
     - run: ``(task, keep_count) -> (Splats, Run)``: another program, which is timed by itself.

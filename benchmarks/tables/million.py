@@ -45,7 +45,6 @@ class Command:
     """One command.
 
     - seconds, busy: From start to end, and of the processor, all cores together.
-    - megabytes: Most memory of its own.
     - psnr: Against renders of the million, mean of the views that are compared, dB.
     """
 
@@ -180,7 +179,6 @@ def commands(folder: Path, left: int) -> Mapping[str, Sequence[str | Path]]:
 def measure(splats: Splats, views: ViewSet, test: ViewSet, count: int = COUNT) -> Million:
     """Split the splats of a scene and run every command on them.
 
-    - views: Those that score.
     - test: Those that are compared, `COMPARED` of them.
     """
     many = split(splats, count)

@@ -74,7 +74,6 @@ class Curve:
     """Refitting at one ratio.
 
     - name: One of `STARTS` or of `CHEAPER`, which begin with "merged".
-    - ratio: Share removed.
     - start: Processor seconds until refitting begins, all threads together.
     - rounds, list of (float, float): Processor seconds since then and PSNR on held-out views
       against renders of the unpruned splats, dB: before the first round, and after each that
