@@ -78,9 +78,6 @@ Files = dict[str, bytes]
 """A file, or several that belong together, by name."""
 
 
-# Good files.
-
-
 def ply_seeds() -> list[Files]:
     """Return PLY files in every encoding, with lists, text, doubles and comments."""
     kinds = itertools.product(ORDERS, LINE_ENDS, range(2))
@@ -103,17 +100,12 @@ def format_seeds(form: Any) -> list[Files]:
     return seeds
 
 
-def camera_seeds(name: str, *contents: Any) -> list[Files]:
-    """Return JSON files of cameras."""
-    return [{name: json.dumps(content).encode()} for content in contents]
-
-
 def transforms_seeds() -> list[Files]:
     """Return ``transforms.json`` of nerfstudio and of instant-ngp, and what lies beside it."""
     studio = {**TRANSFORMS, "camera_model": "OPENCV", "k1": 0.1, "applied_transform": MATRIX[:3]}
     ngp = {"camera_angle_x": 0.8, "w": 640.0, "h": 480.0, "aabb_scale": 4, "scale": 0.3}
     ngp["frames"] = [{**FRAME, "fl_x": 400.0, "w": 320, "h": 200}]
-    seeds = camera_seeds("transforms.json", studio, ngp)
+    seeds = [{"transforms.json": json.dumps(content).encode()} for content in (studio, ngp)]
     beside = json.dumps({"transform": MATRIX[:3], "scale": 0.5}).encode()
     return [*seeds, {**seeds[0], "dataparser_transforms.json": beside}]
 
@@ -154,9 +146,6 @@ def ksplat_seeds() -> list[Files]:
         sections = {f"{1 + n}": data[at : at + 42] for n, at in enumerate(starts)}
         seeds.append({"0": data[:44], **sections, "9": data[4096 + 1024 * data[4] :]})
     return seeds
-
-
-# Broken files.
 
 
 def broken(files: Files, others: list[Files], chance: random.Random) -> Files:
@@ -239,9 +228,6 @@ def _other_value(data: bytes, chance: random.Random) -> bytes:
     return json.dumps(content).replace('"\\u0000here\\u0000"', nested).encode()
 
 
-# What must hold of them.
-
-
 def use_ply(folder: Path) -> None:
     """Read, describe, convert and rewrite a PLY file."""
     path, again = folder / "in.ply", folder / "out.ply"
@@ -322,7 +308,7 @@ TARGETS: dict[str, tuple[Callable[[], list[Files]], Callable[[Path], Any]]] = {
         lambda folder: _convert(folder / "meta.json"),
     ),
     ".ksplat": (ksplat_seeds, use_ksplat),
-    "cameras.json": (partial(camera_seeds, "cameras.json", [INRIA, INRIA]), use_cameras),
+    "cameras.json": (lambda: [{"cameras.json": json.dumps([INRIA] * 2).encode()}], use_cameras),
     "transforms.json": (transforms_seeds, use_cameras),
     "colmap text": (partial(colmap_seeds, ".txt"), use_cameras),
     "colmap binary": (partial(colmap_seeds, ".bin"), use_cameras),

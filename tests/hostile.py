@@ -24,10 +24,9 @@ def refused(
     file: Path | None = None,
     memory: float = 5e6,
 ) -> str:
-    """Read `path`, which may first be filled, and return the message.
+    """Return the message of `path`, or of `data` there: it names the file, or `file`, first.
 
-    It names the file (`file`, if that is another) and then what is expected, in a sentence, and
-    the reader took no memory beyond what small files account for.
+    The reader took no memory beyond what small files account for.
     """
     if data is not None:
         path.write_bytes(data)

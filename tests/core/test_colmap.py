@@ -113,9 +113,6 @@ def project(view, point):
 both = pytest.mark.parametrize("suffix", WRITERS)
 
 
-# What is read.
-
-
 @both
 @pytest.mark.parametrize(("name", "number", "layout"), MODELS)
 def test_every_camera_model_gives_its_pinhole(tmp_path, suffix, name, number, layout):
@@ -127,9 +124,7 @@ def test_every_camera_model_gives_its_pinhole(tmp_path, suffix, name, number, la
     fisheye = f"{{}} (fisheye, {name}) taken as pinhole: wrong away from the centre"
     values = [VALUES.get(key, 0) for key in layout.split()]
     images = [(1, POSE, 5, "a", 3), (2, POSE, 1, "b", 0)]
-
     views = read_cameras(write(tmp_path, suffix, [(5, number, 64, 48, values), PINHOLE], images))
-
     assert (views[0].fx, views[0].fy) == (100, 120 if "fy" in layout else 100)
     assert (views[0].cx, views[0].cy) == (30.5, 24)
     assert (views[1].cx, views[1].cy) == (32, 24)
@@ -177,7 +172,6 @@ def test_any_pose_survives_a_round_trip(tmp_path, quaternion, center, length):
     center = np.where(np.abs(center) < 1e-9, 0, center)
     turn = (length * value for value in (w, *axis))
     pose = [float(value) for value in (*turn, *(-rotation @ center))]
-
     for suffix in WRITERS:
         write(tmp_path, suffix, [PINHOLE], [(1, pose, 1, "a", 0)])
         (view,) = read_cameras(tmp_path / f"images{suffix}")
@@ -213,9 +207,6 @@ def test_the_line_of_points_may_be_empty_or_absent(tmp_path, images):
     (view,) = read_cameras(write(tmp_path, ".txt", images=images))
     assert project(view, POINT) == pytest.approx([57, 39], abs=1e-12)
     assert view.name == "a.png"
-
-
-# What is refused.
 
 
 @both

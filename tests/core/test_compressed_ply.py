@@ -48,9 +48,7 @@ def test_values_by_hand(tmp_path, color):
     """
     data = ply(bytes([0, 255, 128, *[127] * 6]), rest=9, color=color)
     (tmp_path / "a.ply").write_bytes(data)
-
     file = read_splats(tmp_path / "a.ply")
-
     splats = file.splats()
     assert file.format == "compressed PLY"
     np.testing.assert_allclose(splats.means, [[1.0, 33.0, 2046.0]], rtol=1e-6)

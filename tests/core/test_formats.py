@@ -128,10 +128,8 @@ def test_what_comes_back_lies_within_the_bounds(tmp_path, suffix, degree):
     path = written(tmp_path, suffix, scene(degree))
     size = path.stat().st_size
     other = path.rename(tmp_path / ("in.bin" if suffix != ".splat" else "IN.SPLAT"))
-
     file = read_splats(other)
     file.write(tmp_path / "plain.ply")
-
     found = differences(in_order(file.splats()), read_splats(tmp_path / "in.ply").splats())
     form = FORMATS[SUFFIX.index(suffix)]
     assert (len(file), file.splats().sh_degree) == (COUNT, min(degree, form.degree))
@@ -154,9 +152,7 @@ def test_what_a_format_cannot_hold_is_left_out_with_a_note(tmp_path, suffix):
     columns["y"][3], columns["opacity"][5] = np.nan, -np.inf
     columns["scale_1"][7] = -np.inf  # flat, which can be drawn
     columns["opacity"][9] = np.inf
-
     splats = read_splats(written(tmp_path, suffix, columns)).splats()
-
     source, form = read_splats(tmp_path / "in.ply"), FORMATS[SUFFIX.index(suffix)]
     notes = registry.notes(source, form, np.ones(40, np.bool_))
     assert (len(splats), splats.sh_degree) == (38, form.degree)
@@ -179,9 +175,7 @@ def test_one_colour_beyond_all_others_is_no_file_that_is_refused(tmp_path, suffi
     columns["f_dc_1"][7], columns["f_rest_4"][9] = 1e20, -1e30
     (tmp_path / "in.ply").write_bytes(ply_of(columns))
     output = tmp_path / f"p{suffix}"
-
     prune_file(tmp_path / "in.ply", output, cameras, Budget(ratio=0.0))
-
     splats = in_order(read_splats(output).splats())
     others = np.arange(COUNT) != 7
     assert len(splats) == COUNT
@@ -226,9 +220,7 @@ def test_a_size_is_kept_to_or_refused_where_only_writing_tells_it(tmp_path, suff
     budget = Budget(max_mb=(fixed + 300.5 * row) / 1e6)
     planned = prune_file(tmp_path / "in.ply", path, cameras, budget, dry_run=True).report
     assert not path.exists()
-
     report = prune_file(tmp_path / "in.ply", path, cameras, budget).report
-
     assert report["splats"]["kept"] == len(read_splats(path)) == 300
     assert 300 * row <= path.stat().st_size <= budget.max_mb * 1e6
     assert report["files"]["output_bytes"] == path.stat().st_size
@@ -247,9 +239,7 @@ def test_a_file_that_may_not_be_read_is_replaced(cameras):
         output.write_bytes(b"old")
         output.chmod(0o200)
         asked = {"overwrite": True, "pictures": pictures, "threads": 1}
-
         report = prune_file(folder / "in.ply", output, cameras, Budget(keep=300), **asked).report
-
         assert report["written_psnr"] is None
         assert len(report["pictures"]["views"]) == 2
         assert output.stat().st_mode & 0o777 == 0o200
@@ -270,11 +260,9 @@ def test_the_command_converts_by_the_suffix(tmp_path, capsys):
     """PLY to .splat and back. A .ksplat would hold a PLY; scores have no place but in a PLY."""
     (tmp_path / "in.ply").write_bytes(ply_of(scene()))
     source, there, back = (str(tmp_path / name) for name in ("in.ply", "a.splat", "b.ply"))
-
     assert main(["convert", source, there]) == 0
     assert main(["convert", there, back]) == 0
     assert main(["convert", there, back]) == 1
-
     said = capsys.readouterr()
     assert f"in.ply: 600 splats, 34.0 -> 19.2 kB -> {there}\n  note: .splat holds c" in said.out
     assert "exists already" in said.err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import re
 
@@ -17,7 +16,7 @@ from tests.fuzz import TARGETS, Crash, attempt, fuzz, main
 from tests.hostile import refused
 from tests.strategies import plain_ply, splat_names
 
-from .test_camera_files import INRIA
+from .test_formats import cameras  # noqa: F401 - a fixture
 
 
 @pytest.mark.slow
@@ -54,7 +53,7 @@ ANY_BITS = st.tuples(st.sampled_from(splat_names(1)), st.integers(0, 19), st.int
 @pytest.mark.slow
 @settings(max_examples=15)
 @given(cells=st.lists(ANY_BITS, max_size=40), wide=st.booleans())
-def test_splats_of_any_bits_are_pruned_without_a_warning(views, cells, wide):
+def test_splats_of_any_bits_are_pruned_without_a_warning(cameras, cells, wide):
     """Signalling NaN, denormals and infinities in any property, in floats and in doubles."""
     names = splat_names(1)
     data = plain_ply(20, 1)[-20 * 4 * len(names) :]
@@ -64,24 +63,14 @@ def test_splats_of_any_bits_are_pruned_without_a_warning(views, cells, wide):
     for name in names[1::2] if wide else ():  # as bits again: widening would quiet a NaN
         high = columns[name].view(np.uint32).astype(np.uint64) << np.uint64(32)
         columns[name] = high.view("<f8")
-
     with np.errstate(all="raise"):
         try:
-            result = prune(splats_from_columns(columns), views, Budget(keep=10))
+            result = prune(splats_from_columns(columns), cameras, Budget(keep=10))
         except RefineError as error:
             assert re.match(r"none of the 20 splats can be drawn|no camera sees", str(error))
         else:
             assert np.count_nonzero(result.keep) == 10
             assert np.isfinite(result.scores.values).all()
-
-
-@pytest.fixture(scope="module")
-def views(tmp_path_factory):
-    """Return two views of the splats of `plain_ply`."""
-    path = tmp_path_factory.mktemp("views") / "cameras.json"
-    camera = {**INRIA, "rotation": np.eye(3).tolist()}
-    path.write_text(json.dumps([{**camera, "position": [x, 0, 0]} for x in (0, 1)]))
-    return read_cameras(path)
 
 
 @pytest.mark.parametrize(

@@ -146,9 +146,7 @@ def test_every_node_shows_its_primitives_where_it_stands(read):
     content["meshes"].append({"primitives": [short]})
     moved = [{"mesh": 0, "translation": [x, 0, 0]} for x in (5, 7)]
     content |= {"nodes": [*moved, {"mesh": 1}], "scenes": [{"nodes": [0, 2, 1]}]}
-
     splats = read(content, binary)
-
     assert splats.means[:, 0].tolist() == [-6.0, -9.0, -1.0, -4.0, -8.0, -11.0]
     assert (splats.sh_dc[:2] == splats.sh_dc[4:]).all()
     assert splats.sh_rest.shape == (6, 3, 3)
@@ -181,9 +179,7 @@ def test_values_that_no_splat_holds_are_taken_for_what_they_mean(tmp_path, read)
     scales = [[-3.0, -2.0, 0.5], [-1.0] * 3]
     values = {**VALUES, SCALE: scales, OPACITY: [[0.0], [-0.1]]}
     (tmp_path / "a.glb").write_bytes(packed(*document(values)))
-
     file = read_splats(tmp_path / "a.glb")
-
     assert file.splats().log_scales.tolist() == scales
     note = "a.glb has negative scales: its scales are read as logarithms"
     assert registry.notes(file, None, np.ones(2, np.bool_)) == [note]

@@ -38,9 +38,7 @@ def test_what_the_reference_converter_writes_is_the_source(name):
         splats.take(np.lexsort((splats.means[:, 1].round(3), splats.means[:, 0].round(3))))
         for splats in (file.splats(), source)
     )
-
     found = differences(*ordered)
-
     level = 2 if name == "degree_1" else name[-1]
     assert file.format == f".ksplat level {level}"
     assert file.stored_bytes == file.path.stat().st_size

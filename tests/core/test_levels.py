@@ -93,9 +93,7 @@ def test_deleting_keeps_rows_of_the_level_before_as_they_were():
     One ranking decides, that of a prune by the same method: the kept sets are the same ones.
     """
     splats, views = colourful(), cameras(2)
-
     levels = list(lod(splats, views, Levels((0.5, 0.3, 0.1)), QUICK))
-
     assert [len(level.result.splats) for level in levels] == [288, 173, 58]
     assert [level.number for level in levels] == [1, 2, 3]
     before = np.ones(576, np.bool_)

@@ -49,9 +49,6 @@ def rewritten(folder, file, *given, **named):
     return written
 
 
-# What is read.
-
-
 @given(case=ply_files())
 def test_every_number_is_read_as_it_stands(folder, case):
     """Binary rows are the file's bytes, NaN payloads included; text reads back as its numbers.
@@ -96,9 +93,6 @@ def test_a_prune_holds_a_few_megabytes_of_a_file(tmp_path):
     assert peak < 10e6
 
 
-# What is written.
-
-
 @given(case=ply_files(forms=BINARY), data=st.data(), kind=st.sampled_from(["f4", "f8", "u1", "i2"]))
 def test_a_pruned_file_is_the_kept_rows_and_another_count(folder, case, data, kind):
     """All else stays to the byte: byte order, comments, the count's spelling, what trails.
@@ -135,7 +129,6 @@ def test_text_is_written_as_the_binary_file_of_its_splats(folder, case, data):
     keep = data.draw(masks(len(case.rows)))
     file = opened(folder, case.data)
     written = rewritten(folder, file, keep)
-
     again = read_ply(folder / "out.ply")
     assert case.rows.dtype == again.rows.dtype
     for name in case.rows.dtype.names:
@@ -165,16 +158,13 @@ def test_odd_headers_are_read_and_kept(tmp_path):
     assert b"\ncomment made here\n" in rewritten(tmp_path, file, columns={"more": 2 * tag})
     again = read_ply(tmp_path / "out.ply").rows
     assert (again["t:ag"].tolist(), again["more"].tolist()) == ([0, 1, 2], [0, 2, 4])
-
     header, row = plain_header(1, NAMES).replace(b"\n", b"\r"), b"\n" + bytes(range(1, 56))
     assert row == opened(tmp_path, header + row).rows.tobytes()
-
     header = plain_header(1, ["first", *NAMES], "binary_big_endian")
     header = header.replace(b"float first", b"uchar first")
     file = opened(tmp_path, header + b"\x07" + bytes(56))
     written = rewritten(tmp_path, file, columns={"s": np.ones(1, "f4")})
     assert written.endswith(b"\x07" + bytes(56) + b"\x3f\x80\x00\x00")
-
     odd = b"  element \t vertex   0002  "
     header, rows = plain_header(2, NAMES).replace(b"element vertex 2", odd), bytes(range(112))
     written = rewritten(tmp_path, opened(tmp_path, header + rows), np.array([False, True]))
@@ -201,8 +191,6 @@ def test_what_does_not_fit_the_rows_is_refused_before_anything_is_written(
         file.write(tmp_path / "out.ply", **given)
     assert [tmp_path / "in.ply"] == list(tmp_path.iterdir())
 
-
-# What is refused.
 
 PLAIN = plain_ply()
 

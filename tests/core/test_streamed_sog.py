@@ -145,9 +145,7 @@ def test_only_what_an_index_names_is_replaced(written):
     (folder / "0_5").mkdir()
     with pytest.raises(RefineError, match="exists already"):
         write(written, room(400))
-
     write(written, room(400), overwrite=True)
-
     assert sorted(path.name for path in folder.iterdir()) == ["0_0", "0_1", "0_5", "lod-meta.json"]
     assert [path.name for path in (folder / "0_0").iterdir()] == ["notes.txt"]
     assert not list((folder / "0_5").iterdir())
@@ -252,7 +250,6 @@ def test_images_that_many_folders_share_count_once(tmp_path):
     path, index = tmp_path / "lod-meta.json", {"lodLevels": 1, "filenames": names, "tree": tree}
     path.write_text(json.dumps(index))
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
-
     assert len(read_splats(tmp_path / names[0])) == 4096 < size / 20
     refused(path, f"163840 splats, expected at most {size}, the bytes of all files together")
 
