@@ -26,7 +26,6 @@ pytestmark = [
 ]
 
 COUNT = 700
-OTHER_TOOLS = Path(__file__).parents[1] / "data/other_tools"
 
 BOUNDS = {
     # suffix: (mean, log scale, opacity, colour, entry of the rotation matrix, harmonics)
@@ -141,15 +140,6 @@ def test_we_read_both_versions_of_spz_that_it_writes(tmp_path, version):
     compare(file.splats(), read_splats(source).splats(), BOUNDS[".spz"])
 
 
-@pytest.mark.parametrize("name", ["level_0", "level_1", "level_2", "degree_1"])
-def test_of_a_ksplat_both_read_the_same(tmp_path, name):
-    """Files of the reference converter; it leaves rotations of float16 as long as they are."""
-    made, back = OTHER_TOOLS / f"{name}.ksplat", tmp_path / "back.ply"
-    transformed(made, back)
-
-    compare(read_splats(made).splats(), read_splats(back).splats(), (1e-6,) * 6, 151)
-
-
 def test_of_a_sog_in_a_folder_and_of_version_1_both_read_the_same(tmp_path):
     """Version 1 is one of version 2 with ends in place of tables: no tool at hand writes it."""
     source, back = room(tmp_path, 1), tmp_path / "back.ply"
@@ -184,19 +174,6 @@ def test_of_a_streamed_sog_of_ours_it_reads_every_level(tmp_path, level, monkeyp
 
     compare(theirs, levels[level], BOUNDS[".sog"], count)
     compare(theirs, read_splats(path, level=level).splats(), EXACT[".sog"], count)
-
-
-@pytest.mark.parametrize("level", [0, 1])
-def test_of_a_streamed_sog_of_its_own_both_read_the_same(tmp_path, level):
-    """But for the environment, which it leaves out of a single level."""
-    path, back = OTHER_TOOLS / "streamed/lod-meta.json", tmp_path / "back.ply"
-    transformed(path, back, before=("-L", str(level)))
-
-    theirs, count = read_splats(back).splats(), (151, 76)[level]
-
-    ours = read_splats(path, level=level).splats()
-    assert len(ours) == count + 15
-    compare(theirs, ours.take(slice(count)), EXACT[".sog"], count)
 
 
 def test_we_read_the_glb_that_it_writes(tmp_path):
