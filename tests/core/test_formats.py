@@ -42,16 +42,12 @@ COUNT = 600
 def scene(degree: int = 0, count: int = COUNT) -> dict[str, np.ndarray]:
     """Return columns of splats in the order of x, each .01 from the next."""
     random = np.random.default_rng(5)
-    columns = {
-        name: random.normal(0.0, 0.5, count).astype(np.float32) for name in splat_names(degree)
-    }
+    columns = {n: random.normal(0.0, 0.5, count).astype(np.float32) for n in splat_names(degree)}
     columns["x"] = (np.arange(count) * 0.01 - 2.0).astype(np.float32)
-    for name in ("scale_0", "scale_1", "scale_2"):
-        columns[name] -= 4.0
     columns["opacity"] *= 4.0
     for name in columns:
-        if name.startswith("f_rest_"):
-            columns[name] *= 0.3
+        columns[name] -= 4.0 * name.startswith("scale_")
+        columns[name] *= 0.3 if name.startswith("f_rest_") else 1.0
     return columns
 
 
@@ -59,8 +55,7 @@ def written(folder: Path, suffix: str, columns: dict[str, np.ndarray]) -> Path:
     """Write columns as a plain PLY and then in a format; return the path of that."""
     (folder / "in.ply").write_bytes(ply_of(columns))
     path = folder / f"made{suffix}"
-    file = read_splats(folder / "in.ply")
-    write_splats(path, file, overwrite=True)
+    write_splats(path, read_splats(folder / "in.ply"), overwrite=True)
     return path
 
 

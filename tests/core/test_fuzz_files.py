@@ -77,16 +77,13 @@ def test_splats_of_any_bits_are_pruned_without_a_warning(cameras, cells, wide):
     ("name", "data"),
     [
         ("cameras.json", b"[" * 100_000),
-        ("cameras.json", b'{"a":' * 100_000),
         ("transforms.json", b'{"frames": ' + b"[" * 50_000 + b"]" * 50_000 + b"}"),
         ("cameras.json", b"[" + b"9" * 100_000 + b"]"),
         ("cameras.json", b"[" + b"0," * 20_000 + b"0]"),
         ("cameras.json", b'["' + b"\\ud800" * 100_000 + b'"]'),
-        ("cameras.json", b"\0" * 1_000_000),
-        ("cameras.json", b"\xef\xbb\xbf" * 1000),
         ("transforms.json", b"{" + b'"frames": [], ' * 10_000 + b'"w": 1}'),
     ],
-    ids=range(9),
+    ids=range(6),
 )
 def test_json_that_is_deep_or_huge_is_refused(tmp_path, name, data):
     memory = 40 * len(data) + 1_000_000

@@ -28,22 +28,18 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("ply")
 
 
-@pytest.fixture(autouse=True)
-def _strict_numbers():
-    with np.errstate(all="raise"):
-        yield
-
-
 def opened(folder, data):
     path = folder / "in.ply"
     path.unlink(missing_ok=True)  # never cut short what an earlier example may still map
     path.write_bytes(data)
-    return read_ply(path)
+    with np.errstate(all="raise"):
+        return read_ply(path)
 
 
 def rewritten(folder, file, *given, **named):
     """Return what `file` writes, which it knew the length of."""
-    file.write(folder / "out.ply", *given, **named, overwrite=True)
+    with np.errstate(all="raise"):
+        file.write(folder / "out.ply", *given, **named, overwrite=True)
     written = (folder / "out.ply").read_bytes()
     assert len(written) == file.size(*given, **named)
     return written
@@ -243,8 +239,6 @@ REFUSED = [
     (PLAIN[:100], "header without end: no 'end_header' line in the first 100 bytes"),
     (declared(b"ply\n", b"ply\r\n"), f"no 'end_header' line in the first {len(PLAIN) + 1} bytes"),
     (declared(b"little_endian 1", b"middle 1"), "line 2: don't understand format"),
-    (declared(b"n 1.0", b"n 2.0"), "line 2: expected version '1.0'"),
-    (declared(VERTEX, b"elements vertex 3\n"), "line 3: expected one of {element"),
     (declared(b"float y\n", b"float\n"), "line 5: bad 'property' line"),
     (more(b"end_header now"), "unexpected data after 'end_header'"),
     (declared(b"float y", b"float\x1cy"), r"line 5: expected ASCII text, got b'property float\x1c"),
@@ -287,7 +281,6 @@ REFUSED = [
     (declared(b"float rot_3", b"float " + LONG), ""),
     (declared(b"element vertex", b"element " + LONG), ""),
     (more(b"property list uchar int " + LONG), ""),
-    (more(b"property float f_rest_" + LONG), ""),
     (more(b"element %s 1\nproperty double a" % LONG), ""),
     (more(b"element %s 7" % LONG), ""),
     (ahead(LIST.replace(b"face", LONG) % b"float"), ""),
