@@ -71,6 +71,7 @@ def test_a_floater_is_judged_as_its_model_draws_it(model, goes):
     assert clean(splats, cameras()).counts()["front"] == goes
 
 
+@pytest.mark.slow
 def test_switches_and_protection_spare():
     """A reason that is off takes nothing, and a protected splat has no reason."""
     splats = joined(wall(), FLOATER)
@@ -180,6 +181,7 @@ def test_floaters_in_a_veil_are_found_once_it_is_gone():
     assert cleaned.counts() == {"front": 1, "isolated": 0, "giant": 1, "needle": 0}
 
 
+@pytest.mark.slow
 def test_faint_splats_near_a_camera_are_haze_and_stay_unless_asked():
     """Each changes a pixel by .006 x .1, .15 of 255, less than the .22 that six views ask for.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
+from dataclasses import replace
 
 import mpmath
 import numpy as np
@@ -15,27 +16,21 @@ from refine_addon.core.scoring import closed_form
 from refine_addon.core.visibility.frustum import Frustums
 from refine_addon.core.visibility.scene import principal_axes
 
-from .test_occlusion import splats_of
+from .test_occlusion import cloud, splats_of
 from .test_views import view
 
-READINGS = [
-    {},
-    {"depth": "distance"},
-    {"frustum": False},
-    {"local": False},
-    {"depth": "distance", "frustum": False, "local": False},
-]
+FLOOR = {"depth": "distance", "frustum": False, "local": False}
+"""As the floor of occlusion reads it."""
+
+READINGS = [{}, {"depth": "distance"}, {"frustum": False}, {"local": False}, FLOOR]
 
 
 def random_scene(seed: int, count: int = 300) -> tuple[Splats, ViewSet]:
-    rng = np.random.default_rng(seed)
-    splats = Splats(
-        means=rng.normal(size=(count, 3)).astype(np.float32) * 2,
-        log_scales=rng.normal(-3, 1.5, size=(count, 3)).astype(np.float32),
-        quaternions=rng.normal(size=(count, 4)).astype(np.float32),
-        opacity_logits=rng.normal(0, 3, size=count).astype(np.float32),
-        sh_dc=rng.normal(size=(count, 3)).astype(np.float32),
-        sh_rest=rng.normal(size=(count, 3, 3)).astype(np.float32),
+    splats, rng = cloud(count, seed), np.random.default_rng(seed)
+    splats = replace(
+        splats,
+        means=(2.0 * splats.means).astype(np.float32),
+        log_scales=(1.5 * splats.log_scales).astype(np.float32),
     )
     views = [
         view(
@@ -52,8 +47,7 @@ def random_scene(seed: int, count: int = 300) -> tuple[Splats, ViewSet]:
         )
         for index in range(4)
     ]
-    # The last sees nearly all, so that no scene is unseen.
-    return splats, ViewSet((*views, view([0, 0, -6])))
+    return splats, ViewSet((*views, view([0, 0, -6])))  # which sees nearly all
 
 
 def middle_of(views: ViewSet) -> tuple[np.ndarray, float]:
@@ -188,9 +182,7 @@ def test_chunks_threads_and_view_blocks_change_nothing(monkeypatch, chunk, threa
     monkeypatch.setattr(closed_form, "_VIEW_BLOCK", block)
     monkeypatch.setattr(closed_form, "_RUN", 1 + chunk // 5)
     monkeypatch.setattr(closed_form, "ROWS", 100)
-
     scores = closed_form.score(splats, views, threads=threads)
-
     np.testing.assert_allclose(scores.values, expected.values, rtol=1e-6)
     np.testing.assert_array_equal(scores.seen, expected.seen)
     alone = closed_form.score(splats, views, threads=1)

@@ -23,7 +23,6 @@ PIXEL = {"cx": 0.5, "cy": 0.5, "width": 1, "height": 1}
 
 
 def scaled(splats, views, factor, offset=0.0):
-    """Return the same scene in another unit, and moved."""
     return (
         replace(
             splats,

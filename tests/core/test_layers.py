@@ -49,7 +49,6 @@ for _name, _others in IMPORTS.items():
 
 @pytest.mark.parametrize("graph", [IMPORTS, ROOMS], ids=["modules", "rooms"])
 def test_imports_have_no_circle(graph):
-    """So each module, and each room, is understood from those below it alone."""
     assert len(graph) > 1
     TopologicalSorter(graph).prepare()  # else it raises, and names the circle
 

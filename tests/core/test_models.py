@@ -10,7 +10,6 @@ import pytest
 from refine_addon.core import (
     Levels,
     RefineError,
-    Splats,
     View,
     ViewSet,
     convert_files,
@@ -34,18 +33,12 @@ from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import hits
 from tests.strategies import ply_of
 
+from .test_numerics import cloud as random_splats
 
-def cloud(count, seed=0):
-    """Return splats of all shapes; all numbers are floats of single precision."""
-    random = np.random.default_rng(seed)
-    return Splats(
-        means=random.normal(size=(count, 3)).astype(np.float32),
-        log_scales=random.uniform(-5.0, -2.0, (count, 3)).astype(np.float32),
-        quaternions=random.normal(size=(count, 4)).astype(np.float32),
-        opacity_logits=random.normal(size=count).astype(np.float32),
-        sh_dc=random.normal(size=(count, 3)).astype(np.float32),
-        sh_rest=np.zeros((count, 0, 3), np.float32),
-    )
+
+def cloud(count):
+    """Return splats of all shapes, of degree 0."""
+    return replace(random_splats(count), sh_rest=np.zeros((count, 0, 3), np.float32))
 
 
 def write(path, splats, comments=()):
@@ -137,7 +130,6 @@ VIEW = View(np.eye(3), np.zeros(3), 100.0, 110.0, 60.3, 41.7, 120, 80, near=0.2)
 
 
 def footprints_of(splats):
-    """Return the footprints in `VIEW`, and the Gaussians."""
     gaussians, scene, _ = projection.prepare(splats, ViewSet((VIEW,)))
     return projection.project(gaussians, scene, VIEW), gaussians
 

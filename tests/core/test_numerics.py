@@ -32,7 +32,7 @@ from refine_addon.core.scoring.closed_form import lambdas
 from refine_addon.core.splats import ARRAYS, drawable
 from refine_addon.core.visibility import points, projection
 
-from .test_closed_form import reference
+from .test_closed_form import FLOOR, reference
 from .test_views import view
 
 EXTREME = [
@@ -40,13 +40,7 @@ EXTREME = [
     *(88.0, -88.0, 1e3, -1e3, 1e20, 1e30, -1e30, 3.4e38, -3.4e38),
 ]
 DOUBLES = [1e-320, -1e-310, 1e-200, 1e100, -1e200, 1e308]
-METHODS = {
-    "closed form": ClosedForm(),
-    "occlusion": Occlusion(),
-}
-FLOOR = {"depth": "distance", "frustum": False, "local": False}
-"""The closed form as the floor of occlusion reads it."""
-
+METHODS = {"closed form": ClosedForm(), "occlusion": Occlusion()}
 TWO = ViewSet((view(), view([0.1, 0, 0])))
 by_method = pytest.mark.parametrize("settings", METHODS.values(), ids=METHODS)
 by_method_and_floor = pytest.mark.parametrize(
@@ -203,7 +197,6 @@ def test_identical_splats_tie():
     scores 1: three terms, each over its mean, its own, weighted by lambda; or the first of one.
     """
     splats = cloud(1).take(np.zeros(50, int))
-
     for settings in METHODS.values():
         alone = scored(splats.take(slice(1)), ViewSet((view(),)), settings)
         assert alone.values == pytest.approx([1.0])

@@ -159,9 +159,7 @@ def test_the_error_of_each_veil_comes_from_its_contrast_to_what_lies_behind_it()
     cover = alphas - CUT
     behind = [cover[1] * 0.5 + (1 - cover[1]) * cover[2] * 0.25, cover[2] * 0.25, 0.0]
     passed = np.cumprod([1.0, *(1.0 - cover[:2])])  # what is as wide leaves no gaps
-
     found = measured(splats_of([[0, 0, z] for z in (1, 2, 3)], alphas, 1000.0, grays), square())
-
     for index, (alpha, gray) in enumerate(zip(alphas, grays, strict=True)):
         alone = measured(splats_of([[0, 0, 1]], alpha, 1000.0, gray), square())
         expected = (passed[index] * (gray - behind[index]) / gray) ** 2

@@ -38,7 +38,6 @@ def some_rays(count: int = 40, splats: int = 30) -> tuple[Rays, np.ndarray]:
 
 
 def drawn(rays: Rays, colors: np.ndarray, without: int = -1) -> np.ndarray:
-    """Return the colour of each ray, one after the other, (P, 3)."""
     picture, left = np.zeros((rays.count, 3)), np.ones(rays.count)
     for ray, owner, alpha in zip(rays.ray, rays.owner, rays.alpha, strict=True):
         if owner != without:

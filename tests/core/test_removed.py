@@ -8,21 +8,27 @@ import numpy as np
 import pytest
 
 from refine_addon.core import (
+    Box,
     Budget,
+    Cleaning,
     ClosedForm,
     Levels,
     Merge,
     Occlusion,
     RefineError,
+    Zone,
     clean,
     lod,
     prune,
+    prune_file,
+    read_ply,
     score,
 )
 from tests.core.test_cleaning import FLOATER, cameras, joined, wall
 from tests.core.test_levels import cameras as level_cameras
 from tests.core.test_levels import (
     colourful,
+    file_of,
     merges,  # noqa: F401 - a fixture
 )
 
@@ -42,7 +48,6 @@ MERGED = [Budget(ratio=0.5), Budget(keep=1), Budget(psnr=35.0)]
 
 @pytest.fixture(scope="module")
 def splats():
-    """Make half of a wall in many colours."""
     return colourful().take(slice(COUNT))
 
 
@@ -53,7 +58,6 @@ def views():
 
 @pytest.fixture(scope="module")
 def scores(splats, views):
-    """Score them without those that must go."""
     return score(splats, views, removed=REMOVED)
 
 
@@ -134,7 +138,6 @@ def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats,
     settings = ClosedForm()
     best = np.argmax(score(splats, views, settings).values) == EVERY
     scores = score(splats, views, settings, removed=best)
-
     for removed in (EVERY == 5, None):
         with pytest.raises(RefineError, match=r"^1 splats had to go when the others were scored"):
             prune(None, None, Budget(ratio=0.5), settings, scores=scores, removed=removed)
@@ -163,10 +166,8 @@ def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(merges, splats, vie
     """
     shares = (143.5 / REST.sum(), 28.5 / REST.sum())  # rounded up
     expected = list(lod(splats.take(REST), views, Levels(shares), method))
-
     found = list(lod(splats, views, Levels((0.5, 0.1)), method, removed=REMOVED))
     spared = lod(splats, views, Levels((0.5, 0.4)), method, protected=REMOVED, removed=REMOVED)
-
     for one, other in zip(found, expected, strict=True):
         assert np.array_equal(one.result.keep[REST], other.result.keep)
         assert not one.result.keep[REMOVED].any()
@@ -188,3 +189,23 @@ def test_cleaning_takes_what_must_go_as_gone():
     assert np.array_equal(found.keep[5:], expected.keep)
     assert found.counts() == expected.counts()
     assert alone.counts()["front"] == 0
+
+
+def test_a_file_is_cleaned_and_pruned_by_volumes_as_by_masks(splats, views, tmp_path):
+    """What must go is no evidence of what floats; the share is one of what is left of both."""
+    path, budget = file_of(joined(splats, FLOATER), tmp_path / "in.ply"), Budget(ratio=0.8)
+    zones = (
+        Zone("protect", "edge", Box((-9, -9, -9), (-2, 9, 9))),
+        Zone("remove", "lower", Box((-9, -9, -9), (9, -1, 9))),
+    )
+    loaded = read_ply(path).splats()
+    x, y, _ = loaded.means.T
+    stay, go = x < -2, (y < -1) & (x >= -2)
+
+    found = prune_file(path, tmp_path / "out.ply", views, budget, zones=zones, cleaning=Cleaning())
+
+    left = clean(loaded, views, protected=stay, removed=go).keep | go
+    rest = prune(loaded.take(left), views, budget, protected=stay[left], removed=go[left])
+    assert np.flatnonzero(~left).tolist() == [COUNT]
+    assert np.array_equal(found.keep[left], rest.keep)
+    assert not found.keep[COUNT]

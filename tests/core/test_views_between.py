@@ -27,7 +27,6 @@ from tests.core.test_views import ring, view
 
 
 def line(*places: float) -> ViewSet:
-    """Return views side by side that look along z."""
     return ViewSet(tuple(view([x, 0.0, 0.0], name=f"at {x}") for x in places))
 
 
