@@ -13,18 +13,13 @@ from refine_addon.core.affine import affine_moves, baked, quaternion, transforme
 from refine_addon.core.spherical_harmonics import basis, colors, rotate, stretched
 from refine_addon.core.splats import rotation_matrices
 
+from .test_merging import cloud
+
 RNG = np.random.default_rng(7)
 
 
-def some(count: int = 50, coefficients: int = 15) -> Splats:
-    return Splats(
-        means=RNG.normal(size=(count, 3)).astype(np.float32),
-        log_scales=RNG.normal(-2, 1, size=(count, 3)).astype(np.float32),
-        quaternions=RNG.normal(size=(count, 4)).astype(np.float32),
-        opacity_logits=RNG.normal(size=count).astype(np.float32),
-        sh_dc=RNG.normal(size=(count, 3)).astype(np.float32),
-        sh_rest=RNG.normal(size=(count, coefficients, 3)).astype(np.float32),
-    )
+def some(count: int = 50, degree: int = 3) -> Splats:
+    return cloud(count, degree=degree)
 
 
 def covariances(splats: Splats) -> np.ndarray:
@@ -68,7 +63,6 @@ def test_the_basis_is_orthonormal_over_the_sphere_with_the_signs_of_the_referenc
     second = [x * y, y * z, 2 * z * z - x * x - y * y, x * z, x * x - y * y]
     constants = [1.0925484305920792, -1.0925484305920792, 0.31539156525252005,
                  -1.0925484305920792, 0.5462742152960396]  # fmt: skip
-
     gram = values.T @ (np.repeat(weight * 2 * np.pi / 24, 24)[:, None] * values)
 
     np.testing.assert_allclose(gram, np.eye(25), atol=1e-14)
@@ -81,7 +75,6 @@ def test_colours_do_not_depend_on_how_harmonics_lie_in_memory():
     """Files hold them channel by channel, what was joined does not; colours agree to the bit."""
     splats, along = some(), directions(50)
     expected = colors(along, splats.sh_dc, splats.sh_rest)
-
     for order in ((0, 2, 1), (2, 1, 0)):
         rest = np.ascontiguousarray(splats.sh_rest.transpose(order)).transpose(order)
         np.testing.assert_array_equal(colors(along, splats.sh_dc, rest), expected)
@@ -94,9 +87,7 @@ def test_rotated_harmonics_show_the_old_colour_along_the_rotated_direction(matri
     rest = RNG.normal(size=(5, (degree + 1) ** 2 - 1, 3))
     where = directions()
     expected = np.einsum("dk,nkc->ndc", basis(where, degree)[:, 1:], rest)
-
     turned = rotate(rest, matrix)
-
     there = np.einsum("dk,nkc->ndc", basis(where @ matrix.T, degree)[:, 1:], turned)
     np.testing.assert_allclose(there, expected, atol=1e-12)
 
@@ -112,7 +103,6 @@ def test_a_transform_moves_means_covariances_and_colours(linear):
     """
     splats, matrix = some(), affine(linear, [1, -2, 3])
     stretch = linear is STRETCH
-
     moved = transformed(splats, matrix, rotate_sh=not stretch)
 
     np.testing.assert_allclose(moved.means, splats.means @ linear.T + [1, -2, 3], rtol=1e-9)
@@ -136,11 +126,9 @@ def test_a_stretch_keeps_splats_of_extreme_size(log):
     """Scales are stretched relative to the longest axis, so nothing leaves the range."""
     logs = np.tile(np.array([log, 0.0, 88.0 if log > 0 else -1.0], np.float32), (4, 1))
     upright = np.tile(np.float32([1, 0, 0, 0]), (4, 1))
-    splats = replace(some(4, 0), log_scales=logs, quaternions=upright)
-
+    splats = replace(some(4), log_scales=logs, quaternions=upright)
     with np.errstate(all="raise"):
         moved = transformed(splats, affine(np.diag([2.0, 1.0, 1.0])), rotate_sh=False)
-
     expected = np.sort(logs[0] + np.array([math.log(2), 0, 0]))[::-1]
     if log > -100:
         np.testing.assert_allclose(moved.log_scales[0], expected, atol=1e-4)
@@ -161,7 +149,6 @@ def test_a_matrix_that_cannot_be_applied_is_refused(matrix):
 def test_the_quaternion_of_a_rotation_gives_it_back_even_at_half_a_turn():
     """Signs differ, matrices do not."""
     turns = [ROTATION * np.linalg.det(ROTATION), np.diag([1.0, -1, -1]), np.diag([-1.0, -1, 1])]
-
     matrices = rotation_matrices(quaternion(np.array(turns)))
 
     np.testing.assert_allclose(matrices, turns, atol=1e-14)
@@ -171,13 +158,11 @@ def test_the_quaternion_of_a_rotation_gives_it_back_even_at_half_a_turn():
 def test_no_other_harmonics_are_nearer_to_stretched_colours(degree):
     """Of least squares over the sphere: what is left is orthogonal to every harmonic."""
     linear = np.diag([1.0, 1.5, 0.8]) @ ROTATION
-    splats = some(5, (degree + 1) ** 2 - 1)
+    splats = some(5, degree)
     where = directions(50_000)
     before = where @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=1, keepdims=True)
-
     moved = baked(splats, affine(linear))
-
     left = seen(moved, where, degree) - seen(splats, before, degree)
     inner = np.einsum("dk,dnc->nkc", basis(where, degree), left) / len(where)
     assert np.abs(inner).max() < 0.02 * np.abs(seen(splats, before, degree)).mean()
@@ -204,9 +189,7 @@ def test_what_was_moved_alike_or_not_at_all_is_not_turned():
     before = points()
     after = before.copy()
     after[1000:] += np.float32([100.0, 0.0, 0.0])
-
     still, shifted = affine_moves(before, after)
-
     for move in (still, shifted):
         np.testing.assert_array_equal(move.matrix[:3, :3], np.eye(3))
     np.testing.assert_array_equal(still.rows, np.arange(1000))
@@ -225,7 +208,6 @@ def test_several_maps_are_told_apart(order, seed):
     after = before.copy()
     for number, linear in enumerate(linears[1:], 1):
         after[part == number] = mapped(before[part == number], linear, [number, 0.0, 0.0])
-
     moves = affine_moves(before, after)
 
     assert len(moves) == 4
@@ -249,9 +231,7 @@ def test_points_that_are_moved_one_by_one_or_into_a_plane_have_no_map(linear):
     after[::200] += points(20, 1.0, seed=1)
     after[7] = np.nan
     after[1001:1100] = mapped(mapped(before[1001:1100], np.diag([0.0, 1.0, 1.0])), TURN)
-
     (move,) = affine_moves(before, after)
-
     lost = [*range(0, 4000, 200), 7, *range(1001, 1100)]
     np.testing.assert_array_equal(move.rows, np.setdiff1d(np.arange(4000), lost))
     np.testing.assert_allclose(move.matrix[:3, :3], linear, atol=1e-6)
@@ -266,7 +246,6 @@ def test_a_plane_is_turned_and_scaled_as_a_whole_but_a_line_or_four_points_are_n
     """
     plane, line, few = points(), points(100), points(4)
     plane[:, 2], line[:, 1:] = 1.0, 0.0
-
     (move,) = affine_moves(plane, mapped(plane, 3.0 * TURN))
 
     np.testing.assert_allclose(move.matrix[:3, :3], 3.0 * TURN, atol=2e-6)

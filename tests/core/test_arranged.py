@@ -47,9 +47,7 @@ def test_files_are_merged_in_their_order(files, capsys):
     assert call(files, "a.ply", "b.ply", "a.ply") == 1
     assert len(read_splats(files / "a.ply")) == 20
     capsys.readouterr()
-
     assert call(files, "a.ply", "b.ply", "a.ply", "--overwrite", "--report", str(told)) == 0
-
     both = read_splats(files / "a.ply").splats()
     padded = np.pad(one.sh_rest, ((0, 0), (0, 5), (0, 0)))
     for name in ARRAYS:
@@ -68,9 +66,7 @@ def test_each_input_is_moved_by_its_own(files):
     moves = Move((1, 0, -2)), Move((1, 0, -2), (0, 0, 180), 2)
     inputs = [files / "a.ply", files / "b.ply"]
     one, two = (read_splats(path).splats() for path in inputs)
-
     convert_files(inputs, files / "out.ply", moves=moves)
-
     both = read_splats(files / "out.ply").splats()
     np.testing.assert_allclose(both.means[:20], one.means + np.array([1, 0, -2]), atol=1e-6)
     np.testing.assert_allclose(both.means[20:], two.means * [-2, -2, 2] + [1, 0, -2], atol=1e-5)
@@ -111,9 +107,7 @@ def test_a_curve_puts_nearby_order(tmp_path):
         columns[name] = (columns[name] * 0.001 + 9 * (clump >> axis & 1)).astype(np.float32)
     columns["y"][0] = np.nan
     (tmp_path / "in.ply").write_bytes(ply_of(columns))
-
     convert_files([tmp_path / "in.ply"], tmp_path / "out.ply", morton=True)
-
     means = read_splats(tmp_path / "out.ply").splats().means
     assert np.isnan(means[-1, 1])
     steps = np.abs(np.diff(means[:-1], axis=0)).max(axis=1)
@@ -125,7 +119,6 @@ def test_a_single_file_of_which_nothing_is_asked_stays_as_it_is(tmp_path):
     """To the byte, with properties that no splat needs; else they are named and left out."""
     data = ply_of({**scene(1, 9), "mine": np.arange(9, dtype=np.float32)})
     (tmp_path / "in.ply").write_bytes(data)
-
     kept = convert_files([tmp_path / "in.ply"], tmp_path / "same.ply")
     less = convert_files([tmp_path / "in.ply"], tmp_path / "out.ply", degree=0)
 
@@ -161,7 +154,6 @@ def test_a_level_of_a_streamed_sog_is_converted(tmp_path):
     source = f"{__file__.rpartition('/core/')[0]}/data/other_tools/streamed/lod-meta.json"
     plain, out = str(tmp_path / "in.ply"), str(tmp_path / "out.ply")
     (tmp_path / "in.ply").write_bytes(plain_ply(3, 1))
-
     convert_files([source, plain], out, level=1)
     assert len(read_splats(out)) == 76 + 15 + 3
     with pytest.raises(RefineError, match=r"only lod-meta\.json has levels"):

@@ -120,7 +120,6 @@ def test_two_splats_apart_have_the_moments_of_their_mixture():
     """
     field = flat([0.1, 0.3], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
     field.direction[:], field.deviation[:] = [[0, 0, 1], [0, 0, -1]], [[0.5, 0, 0], [-0.5, 0, 0]]
-
     pairs, merged = merged_of(field)
 
     np.testing.assert_allclose(pairs.position, [0.25])
@@ -153,9 +152,7 @@ def test_the_cost_is_the_squared_error_of_the_pictures():
     shapes = flat(alphas, means, variances).covariances
     before = [picture(*each) for each in zip(alphas, means, shapes, colors, strict=True)]
     error = [squared(image) for image in before]
-
     pairs, merged = merged_of(flat(alphas, means, variances, colors=colors, error=error))
-
     after = picture(merged.opacity[0], merged.means[0], merged.covariances[0], merged.color[0])
     np.testing.assert_allclose(pairs.cost[0], squared(sum(before) - after), rtol=1e-9)
     np.testing.assert_allclose(pairs.error[0], squared(after), rtol=1e-9)
@@ -167,7 +164,6 @@ def test_a_merge_along_the_viewing_direction_costs_what_views_from_aside_see():
     turned = flat([0.01, 0.01], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
     field.deviation[:] = [1e9, 0, 0]
     pair = np.array([0]), np.array([1])
-
     front, aside = (merging.price(field, *pair, tilt).cost for tilt in (0.0, 1.0))
 
     assert front < 1e-4 * aside
@@ -186,7 +182,6 @@ def test_costs_in_float32_are_those_in_float64_whatever_the_unit(model, unit):
     )  # fmt: skip
     one, other = np.arange(500), nearest(splats.means.astype(float), 1)[:, 0]
     exact = sum(0.5 * merging.price(known, one, other, tilt).cost for tilt in (-1.0, 1.0))
-
     found = merging.costs(field, one, other, np.inf)
     alone = [merging.costs(field, one[[k]], other[[k]], np.inf)[0] for k in range(0, 500, 7)]
 
@@ -228,9 +223,7 @@ def test_as_many_survive_as_asked_and_the_unchanged_keep_their_bits(goal):
     splats = replace(splats, sh_rest=np.repeat(splats.sh_dc[:, None], 3, axis=1))
     for name in FIELDS:
         getattr(splats, name).flags.writeable = False
-
     result = reduced_to(splats, around(), measure, goal)
-
     keep_count = min(goal, 500)
     assert len(result.splats) == keep_count == result.keep.sum() == len(result.changed)
     assert result.merged + result.deleted == 500 - keep_count
@@ -257,7 +250,6 @@ def test_a_kept_splat_has_the_colours_of_all_merged_into_it_by_what_is_seen_of_e
     splats.sh_rest[:] = np.arange(5)[:, None, None] * 0.1
     contribution = np.array([1.0, 2, 5, 9, 9])
     seen = np.array([contribution, contribution * 0.005])
-
     result = reduced_to(splats.take(np.array(order)), around(), lambda *_: seen[:, order], 3)
 
     assert (result.merged, result.deleted) == (2, 0)
@@ -309,9 +301,7 @@ NEAR_BY = {"at": [0, 0, 1], "center": [0, 0, 0]}
 def test_a_splat_is_viewed_along_the_mean_direction_of_what_sees_it(one, other, point, expected):
     """But for 1e-4 where a view sees as good as nothing."""
     splats = replace(cloud(1), means=np.array([point], float))
-
     field, *_ = measured_from(splats, ViewSet((one, other)), measure(splats))
-
     near = 1e-4 if other is FAR_OFF else 1e-12
     np.testing.assert_allclose(field.direction, [expected / np.linalg.norm(expected)], atol=near)
     color = colors(field.direction, splats.sh_dc, splats.sh_rest).clip(0.0)
@@ -391,9 +381,7 @@ def test_the_cheapest_of_all_operations_is_next_each_time(seed, penalty, monkeyp
     )  # fmt: skip
     field.error *= rng.uniform(0.02, 1.0, 7)
     graph = MergeGraph(field.take(np.arange(7)), SCENE, penalty)
-
     graph.reduce(2)
-
     expected = cheapest_first(field, penalty, 2)
     merges = [(gone[0], into[0]) for into, gone, _ in graph.merges if len(into)]
     assert merges == [(gone, into) for gone, into in expected if into is not None]
@@ -421,7 +409,6 @@ def test_copies_of_a_splat_do_not_merge_one_by_one(places, each, hidden):
     seen = (1.0 - hidden) ** np.tile(np.arange(each), places)
     field = replace(field, contribution=field.contribution * seen, error=field.error * seen)
     graph = Counting(field, SCENE, 1.0)
-
     graph.reduce(1000)
 
     assert np.count_nonzero(graph.alive) == 1000
@@ -439,9 +426,7 @@ def test_splats_of_unknown_error_go_last_and_exactly_as_many_as_asked_stay(unkno
     places = np.outer(np.arange(6) * apart, [1, 0, 0])
     error = [unknown, 0.02, unknown, 0.01, unknown, unknown]
     graph = MergeGraph(flat([0.5] * 6, places, np.ones((6, 3)), error=error), SCENE, 1.0)
-
     graph.reduce(goal)
-
     left = np.flatnonzero(graph.alive).tolist()
     assert len(left) == goal
     assert graph.deleted >= 4 - goal
@@ -452,7 +437,6 @@ def test_splats_of_unknown_error_go_last_and_exactly_as_many_as_asked_stay(unkno
 def test_the_order_of_splats_and_of_views_and_threads_do_not_matter():
     splats, views = cloud(400), around(7)
     order = np.random.default_rng(6).permutation(400)
-
     one = reduced_to(splats, views, measure, 150, threads=1)
     other = reduced_to(splats.take(order), views.take([3, 0, 6, 2, 5, 1, 4]), measure, 150)
 
@@ -468,7 +452,6 @@ def test_the_order_of_splats_and_of_views_and_threads_do_not_matter():
 def test_absurd_focal_lengths_do_no_harm_and_merging_can_be_cancelled(focal):
     """Those whose square leaves float64 count as 1e-9 or 1e9 px: 50 of 100 survive."""
     views = ViewSet((*around(), replace(around()[0], fx=focal, fy=focal)))
-
     merged = reduced_to(cloud(100), views, measure, 50)
 
     assert len(merged.splats) == 50
@@ -486,10 +469,8 @@ def test_moved_turned_and_scaled_scenes_merge_alike(unit):
     matrix[:3, 3] = np.array([10.0, -20.0, 5.0]) * unit
     views = moved(splats, around(), matrix[:3, :3] / unit, matrix[:3, 3] / unit)[1]
     views = ViewSet(tuple(replace(view, center=view.center * unit) for view in views))
-
     here = reduced_to(splats, around(), measure, 200)
     there = reduced_to(transformed(splats, matrix), views, measure, 200)
-
     both = here.keep & there.keep
     assert np.mean(here.keep == there.keep) > 0.98
     expected = transformed(here.splats.take(both[here.keep]), matrix).means
@@ -514,7 +495,6 @@ def test_extreme_splats_raise_no_warning_and_stay_drawable():
     with np.errstate(all="raise"):
         for seen in (wild, lambda left, *_: np.ones((2, len(left)))):
             result = reduced_to(splats, around(), seen, 150)
-
             changed = result.splats.take(result.changed)
             assert all(np.isfinite(getattr(changed, name)).all() for name in FIELDS)
             assert (opacity(changed.opacity_logits) < 1.0).all()

@@ -109,7 +109,6 @@ def test_surfaces_lie_where_a_ray_has_lost_its_light():
         away = np.array([[column * 10 + 5.5], [row * 10 + 5.5]]) - footprints.centers
         alphas = 0.5 * np.exp(-np.einsum("in,nij,jn->n", away, inverse, away) / 2)
         left = np.cumprod(1 - np.where(alphas < 1 / 255, 0.0, alphas))
-
         assert found[row, column] == depths[np.argmax(left < 0.1)]
 
 
@@ -159,7 +158,6 @@ def test_a_polygon_holds_the_pixels_that_angles_say_it_holds():
         x, y = np.meshgrid(np.arange(20) + 0.5, np.arange(15) + 0.5)
         to = corners[:, 0, None, None] - x + 1j * (corners[:, 1, None, None] - y)
         turns = np.angle(np.roll(to, -1, axis=0) / to).sum(axis=0) / (2 * np.pi)
-
         assert np.array_equal(area, np.rint(turns).astype(int) % 2 == 1)
 
 
@@ -212,7 +210,6 @@ def test_the_view_of_opengls_matrices_is_the_one_they_were_made_of():
     lens[1, [1, 2]] = 2 * 90 / 100, 2 * 45 / 100 - 1
     lens[2, [2, 3]] = -(far + 0.01) / (far - 0.01), -2 * far * 0.01 / (far - 0.01)
     lens[3, 2] = -1
-
     found = pinhole(pose, lens, (120, 100), np.zeros((1, 3)))
 
     np.testing.assert_allclose(found.rotation, camera.rotation, atol=1e-12)
@@ -233,7 +230,6 @@ def test_without_perspective_centres_lie_where_parallel_rays_meet_them():
     found = pinhole(matrix, projected, (200, 200), points)
     shown = seen(splats(points), found)
     expected = [[100, 100], [150, 50], [50, 125], [125, 75]]
-
     local = (points - found.center) @ found.rotation.T
     across = found.fx * local[:, 0] / local[:, 2] + found.cx
     down = found.fy * local[:, 1] / local[:, 2] + found.cy

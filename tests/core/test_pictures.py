@@ -73,9 +73,7 @@ def test_a_splat_is_a_gaussian_of_its_size_and_the_low_pass():
     is (.9, .5, .1) times alpha, on black, in steps of 1 / 255.
     """
     splats = splats_of(((0.0, 0.0, 2.0), 0.1, 0.6, (0.9, 0.5, 0.1)))
-
     (found,) = compare(splats, splats, ViewSet((view_of(41, 31),)))
-
     for aside, down in itertools.product((0, 1, 4), (0, 2)):
         alpha = 0.6 * np.exp(-(aside**2 + down**2) / 2.0 / 6.55)
         expected = 255.0 * alpha * np.array([0.9, 0.5, 0.1])
@@ -95,9 +93,7 @@ def test_a_picture_is_what_the_lines_of_sight_through_all_its_pixels_see(size):
     for row in range(size[1]):
         rays = cast(footprints, np.arange(size[0]), np.array([row]))
         expected[:, row] = rays.colors(colors_from(splats, gaussians.index[rays.hit], view))
-
     (found,) = compare(splats, splats.take(slice(None, None, -1)), views)
-
     apart = np.abs(found.before.transpose(2, 0, 1) / 255.0 - expected)
     assert apart.max() <= 0.5 / 255.0 + 1e-5
     assert np.array_equal(found.after, found.before)
@@ -143,7 +139,6 @@ def test_what_cannot_be_drawn_or_is_too_near_is_not_and_drawing_can_be_cancelled
     close = [((0.0, 0.0, 0.5), 0.05, 0.9, (1.0, 1.0, 1.0))]
     far = [((x, 0.0, 400.0), 1.0, 0.01, (0.5, 0.5, 0.5)) for x in (-90.0, 0.0, 90.0)]
     splats, views = splats_of(*close, *far), ViewSet((view_of(20, 10),))
-
     (black,) = compare(bad, bad, views)
     (found,) = compare(splats, splats.take(np.array([0])), views)
 
@@ -185,9 +180,7 @@ def test_files_are_named_after_splats_and_camera_and_hold_the_pictures(tmp_path)
     ))  # fmt: skip
     splats = crowd(50)
     half = splats.take(np.arange(25))
-
     facts = PictureFiles(tmp_path, "my/room").write(splats, half, views)
-
     stems = ["my_room-left_0", "my_room-left_0_2", "my_room-Camera_ A.001"]
     expected = {f"{stem}-{kind}.png" for stem in stems for kind in KINDS}
     assert {path.name for path in tmp_path.iterdir()} == expected
@@ -241,7 +234,6 @@ def test_a_layer_hides_what_is_behind_it_by_its_alpha(alpha, depth, expected):
     """
     layer = in_order([layer_of(BLUE, alpha, depth)])
     lit = replace(layer, background=(1.0 - alpha) * np.ones((3, 9, 9)))
-
     picture, light = (draw(two_splats(), view_of(9, 9), each)[:, 4, 4] for each in (layer, lit))
 
     assert np.abs(picture - expected).max() < 2e-3  # a splat is not quite flat
@@ -264,9 +256,7 @@ def test_splats_between_two_layers_are_seen_through_the_nearer_one(
 ):
     """White, the wall adds the .6 * .2 that is left. Which layer is given first is all one."""
     layers = in_order([layer_of(*near, 1.0), layer_of(*far, 3.0)][::order])
-
     picture = draw(two_splats(), view_of(9, 9), layers)[:, 4, 4]
-
     wall = 0.12 * far[0][0]
     assert np.abs(picture - np.add(expected, [wall, wall, wall, 0.0])).max() < 2e-3
     assert np.abs(layers.over_nothing()[:, 4, 4] - over).max() < 1e-12
@@ -280,7 +270,6 @@ def test_a_layer_is_the_picture_over_it_and_cuts_it_in_depth():
     splats, view = crowd(), view_of(60, 40, near=0.5)
     plain, near = draw(splats, view), splats.take(splats.means[:, 2] < 3.0)
     colors, opaque = np.random.default_rng(3).random((3, 40, 60)), np.ones((40, 60))
-
     picture = draw(splats, view, in_order([(colors, opaque, 1e4 * opaque)]))
     cut = draw(splats, view, in_order([(0.0 * colors, opaque, 3.0 * opaque)]))
 
@@ -294,7 +283,6 @@ def test_colours_seen_from_a_place_are_those_of_the_harmonics():
     """Drawn from there, all splats look the same with colours of their own."""
     splats, view = crowd(), view_of(60, 40, near=0.5)
     view = replace(view, center=np.array([0.4, -0.3, 0.2]))
-
     seen = seen_from(splats, view.center)
 
     assert seen.sh_degree == 0
@@ -324,7 +312,6 @@ def test_an_exr_image_is_read_channel_by_channel(tmp_path):
     rng = np.random.default_rng(0)
     channels = {f"View.{name}": rng.normal(size=(5, 7)).astype("f4") for name in "RGBZ"}
     (tmp_path / "in.exr").write_bytes(exr_of(channels))
-
     found = read_exr(tmp_path / "in.exr")
 
     assert list(found) == sorted(channels)

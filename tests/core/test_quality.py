@@ -59,9 +59,7 @@ def test_rays_tell_the_psnr_of_the_picture(monkeypatch, rays, within):
     """
     splats, views, keep = cloud(), ring(), half(300)
     monkeypatch.setattr(cast, "VALIDATION_RAYS", rays)
-
     found = validation_rays(splats, views)
-
     count = sum(len(rays.columns) * len(rays.rows) for rays in found.rays)
     assert count == 24_000 if rays > 24_000 else count < 8800
     assert psnr_kept(found, keep) == pytest.approx(psnr(splats, keep, views), abs=within)
@@ -78,7 +76,6 @@ def test_few_rays_are_right_on_average():
     view = look_along_z(width=1000, height=1000)
     even = np.linspace(0.0, 2e-4, 50)
     true = -10 * math.log10(np.mean(errors))
-
     *found, rising = [
         psnr_of(np.sqrt(row) * np.ones((3, 1)), np.zeros((3, 50)), view) for row in [*errors, even]
     ]
@@ -100,9 +97,7 @@ def test_a_splat_behind_others_counts_by_what_shows_through(monkeypatch):
     found = validation_rays(splats, views)
     monkeypatch.setattr(cast, "MAX_VALIDATION_HITS", 300 * 500)
     (dense,) = validation_rays(splats.take(np.zeros(300, np.int64)), views).rays
-
     result = prune(splats_of([[0, 0, 2.0]] * 4, scales=0.02), views, Budget(keep=2), Occlusion())
-
     for keep in ([True, False], [False, True]):
         assert psnr_kept(found, np.array(keep)) == pytest.approx(-20 * math.log10(0.125), abs=0.01)
     assert len(dense.ray) == pytest.approx(300 * 500, rel=0.1)
@@ -142,7 +137,6 @@ def test_a_view_whose_splats_stay_is_not_changed():
     means[10:, 0] += 40.0
     splats = splats_of(means, gray=0.9, scales=0.2)
     views = ViewSet((replace(look_along_z(), name="a"), look_along_z((40.0, 0, 0), name="b")))
-
     curve = quality_curve(validation_rays(splats, views), np.arange(20, dtype=np.float32))
 
     assert curve.of_views(0.5) == {"a": pytest.approx(curve.views["a"][4]), "b": PSNR_CAP}
@@ -159,7 +153,6 @@ def test_the_estimate_depends_on_nothing_but_the_scene(method):
     splats, views = cloud(), ring()
     order = np.random.default_rng(1).permutation(len(splats))
     there = moved(splats.take(order), tuple(views)[::-1], *MOTIONS["a turn and a move"])
-
     one = score(splats, views, method, quality=True, threads=1)
     other = score(*there, method, quality=True, threads=3)
     without = score(splats, views, method, quality=False)
@@ -194,7 +187,6 @@ def test_merging_is_expected_to_be_better_and_never_worse():
     From 40,000 splats on it is the same; 10,000 are two halvings, of .4 dB each at half removed.
     """
     psnr, half, two = np.linspace(80.0, 10.0, len(SHARES)), SHARES.index(0.5), np.full(4, 2.0)
-
     found, few = merged_from(psnr, two, 10**6), merged_from(psnr, two, 10_000)
 
     assert found[[0, half]] == pytest.approx(psnr[[0, half]] + [0.0, 5.6])
@@ -216,7 +208,6 @@ def test_on_a_ray_the_nearest_kept_hit_stands_in(keep, expected):
     """Red, green, blue, one behind the other, alpha .5; as near as another, the one behind."""
     line, half, three = np.zeros(3, np.int32), np.full(3, 0.5), np.arange(3)
     rays = Rays(np.arange(1), np.arange(1), line, three, half, np.log1p(-half), three)
-
     seen = rays.colors_by_nearest_kept(np.eye(3), np.array(keep))[:, 0]
 
     assert seen.tolist() == pytest.approx(expected)
@@ -246,7 +237,6 @@ def test_every_method_reaches_a_psnr(method, goal):
     protected = np.arange(300) % 3 == 0
     for shield, near in ((None, 0.6), (protected, 1.0)):
         result = prune(cloud(), ring(), Budget(psnr=goal), method, protected=shield)
-
         assert result.report["estimated_psnr"] == pytest.approx(goal, abs=near)
         assert result.report["budget"] == {"psnr": goal}
         assert not result.keep.all()
@@ -271,7 +261,6 @@ def test_the_report_has_the_estimate_and_the_curve():
     done, plain = (
         prune(cloud(), ring(), Budget(ratio=0.5), method).report for method in (Occlusion(), FAST)
     )
-
     at = done["quality"]["shares"].index(0.5)
     assert done["estimated_psnr"] == pytest.approx(done["quality"]["psnr"][at], abs=0.01)
     expected = {"delete": done["estimated_psnr"], "merge": None, "refit": None}
@@ -289,7 +278,6 @@ def test_what_merging_would_reach_is_told_of_many_splats_alone(merges):
     """With few it was off by up to 7 dB. What it did reach is always told."""
     few = score(cloud(), ring(), Occlusion())
     many = replace(few, quality=replace(few.quality, foretold=True))
-
     few_told, many_told = (
         prune(None, None, Budget(ratio=0.5), Occlusion(), scores=scores).report["method"]
         for scores in (few, many)
@@ -321,7 +309,6 @@ def test_merged_splats_are_compared_with_the_original():
 def test_estimating_can_be_cancelled():
     found, values = validation_rays(cloud(), ring()), np.arange(300, dtype=np.float32)
     stop = {"progress": lambda _fraction, _what: False}
-
     for work, *given in ((validation_rays, cloud(), ring()), (quality_curve, found, values),
                          (psnr_against, found, cloud(), ring())):  # fmt: skip
         with pytest.raises(Cancelled):
@@ -337,7 +324,6 @@ def test_extreme_splats_make_no_warning():
     splats.opacity_logits[40:60], splats.opacity_logits[60:80] = np.inf, -5.54
     splats.sh_dc[80:100] = 1e6
     splats.means[100:120] *= 1e5
-
     found = score(splats, ring(), quality=True).quality
 
     assert found is not None
@@ -368,7 +354,6 @@ def test_cameras_of_another_up_axis_are_told_with_the_turn_that_helps(room, rota
     """
     splats, views = room
     given = ViewSet(tuple(view.turned(rotation) for view in views))
-
     found = alignment(splats, given, given)
 
     assert (found.turn, found.known, found.far) == (turn, False, ())
@@ -381,7 +366,6 @@ def test_cameras_of_another_up_axis_are_told_with_the_turn_that_helps(room, rota
 def test_what_is_known_of_the_views_is_not_measured(turn, sentences):
     """Views that know their turn say so, whatever the pictures look like."""
     views = replace(within(), turn=turn)
-
     found = alignment(cloud(), views, views)
 
     assert (found.turn, found.known, found.fineness) == (turn, True, ())
@@ -394,7 +378,6 @@ def test_views_that_see_all_or_look_one_way_are_not_judged():
     A ring around the whole cloud would look at all of it from another side.
     """
     aside = ViewSet(tuple(look_along_z((x, 0.0, -5.0)) for x in range(3)))
-
     for views in (ring(1), aside, ring()):
         assert alignment(cloud(), views, views) == Alignment()
     assert alignment(cloud(), within(), within()).fineness != ()
@@ -408,7 +391,6 @@ def test_a_cloud_that_is_alike_from_all_sides_has_no_up_axis():
     splats = cloud(3000)
     small = replace(splats, log_scales=splats.log_scales - 2.5)
     large = splats_of(splats.means[:500], alphas=0.9, scales=1.0)
-
     found = alignment(small, within(), within())
 
     assert found.turn == 0
@@ -432,7 +414,6 @@ def test_cameras_far_away_are_named():
     weightless = replace(at(-500)[0], weight=0.0, name="weightless")
     heights = np.linspace(-1.0, 1.0, 30)
     mast = splats_of(np.stack([0.01 * heights, heights, 0.0 * heights], axis=1))
-
     found = alignment(splats, ViewSet((*at(-5, -500, 500), weightless)))
 
     assert found.far == ("-500",)
@@ -447,7 +428,6 @@ def test_absurd_splats_are_measured_without_a_warning(value):
     splats = cloud()
     splats.means[::2] = value
     splats.log_scales[::3] = value
-
     found = alignment(splats, within(), within())
 
     assert len(found.fineness) == 3
@@ -461,7 +441,6 @@ def test_a_signalling_nan_is_no_place_and_makes_no_warning():
     means = cloud().means.astype(np.float32)
     means.view(np.uint32)[::7, 0] = 0x7FA00000
     quiet = replace(cloud(), means=np.where(np.isnan(means), np.nan, means))
-
     with np.errstate(all="raise"):
         found = alignment(replace(cloud(), means=means), ring(20))
 
@@ -473,7 +452,6 @@ def test_it_comes_back_from_json_and_tells_what_to_do():
     measured = Alignment(1, fineness=(0.1, 0.25, 0.05), far=("a", "b"))
     for found in (Alignment(), KNOWN, measured):
         assert Alignment.from_facts(json.loads(json.dumps(found.facts()))) == found
-
     facts = measured.facts()
     for wrong in (None, {}, 3, "x", {"turn": "x"}, {"fineness": 1}, {"far": 2}):
         assert Alignment.from_facts(wrong) == Alignment()

@@ -40,7 +40,6 @@ def test_the_lowest_scores_go_and_the_first_of_equal_ones(values, data):
     stay = data.draw(st.one_of(st.integers(1, count + 3), st.just(10**400)))
     kind = data.draw(st.sampled_from([int, float, np.int64, np.float32])) if stay < 1e300 else int
     shield = np.zeros(count, np.bool_) if protected is None else protected
-
     keep = select(scored(values), Budget(keep=kind(stay)), protected=protected)
 
     assert slow_keep(values, max(count - stay, 0), shield) == keep.tolist()
@@ -62,7 +61,6 @@ def test_where_no_scores_are_equal_the_order_in_the_file_is_nothing(values, orde
     values = np.unique(values)
     shuffle = np.array(order.sample(range(len(values)), len(values)))
     budget = Budget(ratio=0.5)
-
     expected = select(scored(values), budget)[shuffle]
 
     np.testing.assert_array_equal(expected, select(scored(values[shuffle]), budget))
@@ -100,7 +98,6 @@ def test_a_size_is_met_by_as_many_splats_as_fit(megabytes, row, fixed, count):
         with pytest.raises(RefineError, match="too small for one splat"):
             budget.removals(count, row, fixed)
         return
-
     kept = count - budget.removals(count, row, fixed)
 
     assert fixed + kept * row <= size
@@ -140,7 +137,6 @@ def test_a_threshold_removes_what_scores_below_it():
 def test_splats_in_too_few_views_go(percent, views, least):
     """Fewer than that share: the least number that stays is its ceiling."""
     seen = np.arange(views + 1)
-
     keep = select(scored(np.ones(views + 1), seen, views), Budget(min_seen=percent))
 
     assert least == int(np.argmax(keep))
@@ -181,7 +177,6 @@ def test_a_budget_that_cannot_be_is_refused_with_its_name(name, values, expected
 def test_the_rank_is_the_place_in_the_order_of_removal(values):
     """0 goes first, 1 last, evenly; equal scores by their place in the file."""
     order = sorted(range(len(values)), key=lambda i: (values[i], i))
-
     ranks = rank(values)
 
     assert np.float64 == ranks.dtype
@@ -205,7 +200,6 @@ def test_ranks_of_more_splats_than_float32_can_tell_apart_are_distinct():
     ranks = rank(np.arange(MANY, dtype=np.float32))  # neighbours tie, and go by row
     places = np.arange(1, MANY + 1)
     quotients = (places / MANY).astype(np.float32)
-
     shares = shares_gone(places, MANY)
 
     assert (np.diff(ranks) > 0.0).all()
@@ -223,6 +217,5 @@ def test_a_round_of_a_very_large_scene_scores_as_all_rounds_at_once():
     for start in (1, count // 4, count // 2 - 500, 3 * count // 4, count - 999):
         places = np.arange(start, start + 1000)
         shares = shares_gone(places, count)
-
         assert (np.diff(shares) > 0.0).all()
         np.testing.assert_array_equal(shares[600:], shares_gone(places[600:], count))

@@ -70,7 +70,6 @@ def test_logits_and_log_scales_of_what_is_stored_give_it_back_to_the_bit():
     """
     stored = single([0.0, 1e-45, 1e-38, 1e-7, 0.25, 0.5, 1.0 - 2.0**-24, 1.0])
     sizes = np.append(stored, np.float32(3e38))
-
     with np.errstate(all="raise", under="ignore"):
         logits, logs = single_logits(stored), single_log_scales(sizes)
 
@@ -93,7 +92,6 @@ def test_no_number_of_a_file_changes_by_a_millionth_on_the_way_through_float32()
     the 6e-8 by which the first one moved it.
     """
     values = single(np.random.default_rng(0).uniform(-80.0, 80.0, 100_000))
-
     again = opacity(single(single_logits(single(opacity(values)))))
     sizes = scales(single(single_log_scales(single(scales(values)))))
 
@@ -106,7 +104,6 @@ def test_quaternions_become_unit_and_stay_where_they_are():
     stored = single(np.random.default_rng(0).normal(size=(1000, 4)))
     stored = single(stored / np.linalg.norm(stored.astype(float), axis=1, keepdims=True))
     odd = single([[0, 3, 0, 4], [0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1], [1e38] * 4])
-
     with np.errstate(all="raise"):
         got = single_unit_quaternions(odd)
 
@@ -146,7 +143,6 @@ def test_a_value_that_is_not_finite_makes_a_splat_undrawable(name, value):
     values = getattr(one(), name).copy()
     values.flat[-1] = value
     fine = (name, value) in (("opacity_logits", np.inf), ("log_scales", -np.inf))
-
     with np.errstate(all="raise"):
         assert drawable(one(**{name: values})).tolist() == [fine]
 
@@ -168,6 +164,5 @@ def test_a_value_that_is_not_finite_makes_a_splat_undrawable(name, value):
 def test_what_leaves_the_range_of_float32_cannot_be_drawn(changes, expected):
     """Renderers compute in float32; doubles in a file may hold more."""
     arrays = {name: np.array(value, float) for name, value in changes.items()}
-
     with np.errstate(all="raise"):
         assert drawable(replace(one(), **arrays)).tolist() == [expected]

@@ -6,21 +6,10 @@ import numpy as np
 import pytest
 
 from refine_addon.core import spherical_harmonics
-from refine_addon.core.splats import Splats
 from refine_addon.viewport import arrays
 from refine_addon.viewport.arrays import Eye
 
-
-def _splats(count=50, degree=3, seed=0):
-    rng = np.random.default_rng(seed)
-    return Splats(
-        means=rng.normal(size=(count, 3)).astype(np.float32),
-        log_scales=rng.normal(size=(count, 3)).astype(np.float32) - 2.0,
-        quaternions=rng.normal(size=(count, 4)).astype(np.float32),
-        opacity_logits=rng.normal(size=count).astype(np.float32),
-        sh_dc=rng.normal(size=(count, 3)).astype(np.float32),
-        sh_rest=rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)).astype(np.float32) * 0.3,
-    )
+from .test_merging import cloud
 
 
 def _eye(place=(0.0, 0.0, -5.0), *, perspective=True):
@@ -36,12 +25,11 @@ def test_colours_are_those_of_the_harmonics_along_the_line_from_the_eye(degree):
     Without perspective the eye's place is the direction of view, of any length. Without an eye
     they are ``1/2 + SH_C0 f_dc``, at least 0 and not cut at 1: blending does that.
     """
-    splats = _splats(degree=degree)
+    splats = cloud(50, degree=degree)
     packed = arrays.pack(splats)
     away = splats.means - [0.0, 0.0, -5.0]
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     along = np.broadcast_to([0.0, 0.6, 0.8], (50, 3))
-
     for direction, eye in ((away, _eye()), (along, _eye((0.0, 3.0, 4.0), perspective=False))):
         found = arrays.colors(packed, eye)
         expected = spherical_harmonics.colors(direction, splats.sh_dc, splats.sh_rest).clip(0.0)
@@ -57,11 +45,10 @@ def test_what_cannot_be_drawn_is_not_packed_and_the_rest_is_of_half_precision():
     The largest number of half precision is 65504. Scales 3, 2, 1 turned a quarter about z by a
     quaternion of any length are 2 along x, 3 along y: variances 4, 9, 1.
     """
-    splats = _splats(5)
+    splats = cloud(5)
     splats.means[1, 0], splats.opacity_logits[3] = np.nan, -5.6
     splats.sh_rest[0, 0, 0], splats.sh_rest[2, 1, 1] = 1e9, -1e9
     splats.log_scales[4], splats.quaternions[4] = np.log([3.0, 2.0, 1.0]), [0.5, 0.0, 0.0, 0.5]
-
     packed = arrays.pack(splats)
 
     assert packed.vertices.tolist() == [0, 2, 4]
@@ -103,7 +90,7 @@ def test_few_splats_are_those_of_the_highest_rank_or_the_largest_and_most_opaque
 
     30 of 60 is half of each of two objects; where all fit, all.
     """
-    splats = _splats(3)
+    splats = cloud(3)
     splats.log_scales[:] = np.array([-2.0, 0.0, -1.0], np.float32)[:, None]
     splats.opacity_logits[:] = 0.0
     packed = arrays.pack(splats)
@@ -118,7 +105,7 @@ def test_heat_goes_along_the_ramp_by_rank_and_a_tint_leaves_opacity_alone():
 
     A quarter of red in a grey of .4: .55, .3, .3; above white counts as white.
     """
-    packed = arrays.pack(_splats(4))
+    packed = arrays.pack(cloud(4))
     ramp = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0]])
     found = arrays.heat(packed, np.array([0.0, 0.5, 1.0, np.nan]), ramp)
     rgba = np.array([[0.4, 0.4, 0.4, 0.7], [3.0, 0.0, 0.0, 0.1]], np.float32)
@@ -139,3 +126,13 @@ def test_tints_are_seen_on_black_grey_and_white(mode, mark, ground):
 
     assert np.abs(arrays.marked(rgba, np.array([mark]), mode) - rgba).max() > 0.15
     assert np.abs(selected - rgba).max() > 0.25
+
+
+def test_a_texture_holds_a_value_after_the_other_in_rows_of_its_width():
+    """WIDTH + 1 values of 2 channels: a second row, of which one texel is not zero."""
+    values = np.arange(1.0, 2 * arrays.WIDTH + 3, dtype=np.float32).reshape(-1, 2)
+    texels = arrays.as_texture(values)
+
+    assert texels.shape == (2, 2 * arrays.WIDTH)
+    assert np.array_equal(texels.ravel()[: values.size], values.ravel())
+    assert not texels[1, 2:].any()

@@ -53,7 +53,6 @@ def test_the_inside_is_where_the_winding_number_is_not_0():
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     points = rng.uniform(low, high, (3000, 3))
     solid = Solid(vertices, triangles)
-
     expected = [abs(angles(solid.vertices, solid.triangles, point)) > 0.5 for point in points]
 
     assert 200 < sum(expected) < 2800
@@ -118,7 +117,6 @@ def test_many_points_fall_in_by_groups_as_one_by_one():
     steps, solid = np.linspace(-1.0, 1.0, 21), Solid(*globe(16, 8))
     lattice = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
     order = np.concatenate([np.arange(start, len(lattice), 463) for start in range(463)])
-
     found = Solid(*globe(70, 71)).inside(points)
     each = np.concatenate([solid.inside(lattice[start::463]) for start in range(463)])
 
@@ -215,7 +213,6 @@ def test_zones_of_a_kind_are_joined_and_protection_wins():
     ]
     zones = [Zone(role, role, Box((low, -1, -1), (high, 1, 1))) for role, low, high in ranges]
     two, marked = np.arange(10) == 2, np.isin(np.arange(10), [4, 5])
-
     found, more = forced(zones, LINE), forced(zones, LINE, two, marked)
 
     assert np.flatnonzero(found.removed).tolist() == [2, 3, 5, 8]
