@@ -19,7 +19,6 @@ from refine_addon.core import (
     RefineError,
     Splats,
     ViewSet,
-    prune,
     score,
     select,
 )
@@ -116,18 +115,6 @@ def test_one_extreme_splat_spoils_neither_itself_nor_the_others(name, settings):
             assert np.argsort(rest).tolist() == np.argsort(expected).tolist()
             if not once:
                 np.testing.assert_allclose(rest / rest[0], expected / expected[0], rtol=1e-6)
-
-
-@by_method
-def test_splats_that_cannot_be_drawn_go_first_and_are_counted(settings):
-    """Five of twenty: they go before all others, and report and notes say so."""
-    splats = cloud()
-    broken = [3, 4, 9, 15, 19]
-    splats.means[broken] = np.nan
-    result = prune(splats, TWO, Budget(keep=15), settings, threads=1)
-    assert np.flatnonzero(~result.keep).tolist() == broken
-    assert result.report["splats"]["undrawable"] == 5
-    assert "5 splats cannot be drawn; they rank lowest" in result.report["notes"]
 
 
 @by_method
