@@ -17,10 +17,7 @@ PRUNE = ["prune", "--object", "room"]
 
 @pytest.fixture
 def animated(quarter, room_cameras, tmp_path):
-    """Bind three cameras to markers and turn the room, which has a collection of five as well.
-
-    All 72 are visible; the first is active, the second is selected.
-    """
+    """Turn the room; markers bind three cameras, one is active, one selected, five collected."""
     scene = bpy.context.scene
     few = bpy.data.collections.new("few")
     scene.collection.children.link(few)
@@ -64,10 +61,7 @@ CHOICES = {
 
 @pytest.mark.parametrize("option", CHOICES)
 def test_panel_and_command_keep_the_same_set_of_a_saved_scene(addon, animated, tmp_path, option):
-    """To the byte, by the saved choice and by the same one as an option; another one differs.
-
-    Method and budget are the command's: half of the splats go, by closed form.
-    """
+    """To the byte, by the choice saved or given; method and budget are the command's."""
     (facts, words), source = CHOICES[option], option.split(":")[0]
     settings, made = bpy.context.scene.refine, tmp_path / "panel.ply"
     settings.source, settings.collection = source.upper(), animated
@@ -81,7 +75,6 @@ def test_panel_and_command_keep_the_same_set_of_a_saved_scene(addon, animated, t
     saved, saved_facts = pruned(addon, tmp_path)
     settings.source = "COLLECTION" if source == "visible" else "VISIBLE"
     given, given_facts = pruned(addon, tmp_path, "--source", option)
-
     assert saved == given == made.read_bytes()
     assert pruned(addon, tmp_path)[0] != saved
     facts = {"source": source, **facts}
@@ -107,16 +100,15 @@ def test_an_object_is_scored_as_its_file_is(addon, animated, quarter, quarter_fi
         entry = json.loads(told.read_text())["results"][0]
         assert entry["files"]["input"] == f"{bpy.data.filepath}#room"
         assert addon.command.main(words, scene=True) == 1  # the file exists
-
     assert made["active"] != made["visible"] == made["panel"]
     assert sorted(quarter.data.attributes.keys()) == attributes
     words = [*of_file, "-o", str(tmp_path / "out.ply"), "--source", "active"]
     assert addon.command.main(words) == 2  # there is no scene
 
 
-def test_cameras_of_a_file_go_before_those_of_the_panel(addon, animated, tmp_path, capsys):
+@pytest.mark.usefixtures("animated")
+def test_cameras_of_a_file_go_before_those_of_the_panel(addon, tmp_path, capsys):
     """Which are none, and --cameras still works; with --source it is wrong usage."""
-    assert animated.objects
     bpy.context.scene.refine.collection = bpy.data.collections.new("empty")
     facts = pruned(addon, tmp_path, "--cameras", str(CAMERAS))[1]
     assert facts == {"source": "file", "file": str(CAMERAS)}

@@ -40,18 +40,15 @@ def test_an_instance_stands_where_its_empty_puts_it(addon, quarter, instance, pl
     instance.scale = (2.0, 2.0, 2.0)
     bpy.context.view_layer.update()
     (place,) = places(instance)
-
     assert place.obj == quarter
-    np.testing.assert_allclose(place.matrix[:3, 3], [-2.0, 0.0, 10.0])
-    np.testing.assert_allclose(place.matrix[:3, :3], 2.0 * np.eye(3))
+    np.testing.assert_allclose(
+        place.matrix, [[2, 0, 0, -2], [0, 2, 0, 0], [0, 0, 2, 10], [0, 0, 0, 1]]
+    )
     assert addon.viewport.content.instanced([instance]) == {quarter}
 
 
 def test_instances_are_followed_as_deep_as_blender_draws_them(quarter, instance, places):
-    """Eight in each other; the ninth, with one more around it, is not looked at.
-
-    Two in a collection that two empties instance are four places, each with a key of its own.
-    """
+    """Eight in each other, not the ninth; two in a collection that two instance are four places."""
     outer = [instanced(instance.copy(), instance.copy()), instanced()]
     outer[1].instance_collection = outer[0].instance_collection
     four = places(*outer)
@@ -73,7 +70,6 @@ def test_an_instance_is_made_real_and_scored(quarter, instance, places):
     bpy.ops.refine.make_real()
     real = bpy.context.object
     bpy.ops.refine.score()
-
     assert real != quarter
     assert real.data != quarter.data
     np.testing.assert_allclose(np.array(real.matrix_world), np.eye(4))
@@ -94,7 +90,6 @@ def test_a_linked_collection_is_made_real(quarter, tmp_path):
     empty.instance_collection = wanted.collections[0]
     bpy.ops.refine.make_real()
     bpy.ops.refine.select(action="ALL")
-
     assert bpy.context.object.library is None
     assert bpy.context.object.data.library is None
     assert len(bpy.context.object.data.vertices) == 9_939

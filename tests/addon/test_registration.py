@@ -13,5 +13,4 @@ def test_every_button_and_setting_explains_itself(addon):
         properties = [p for p in cls.bl_rna.properties if not p.is_readonly and not p.is_hidden]
         own = [p for p in properties if p.identifier in getattr(cls, "__annotations__", {})]
         silent += [f"{cls.__name__}.{p.identifier}" for p in own if not p.description]
-
     assert silent == []

@@ -28,9 +28,7 @@ def halves(addon, quarter, room_cameras):
 
 
 def read(addon, objects, name):
-    """Return an attribute of all splats of objects."""
-    found = [addon.mesh.attributes.read_attribute(obj.data, name) for obj in objects]
-    return np.concatenate(found)
+    return np.concatenate([addon.mesh.attributes.read_attribute(o.data, name) for o in objects])
 
 
 @pytest.mark.parametrize(
@@ -45,11 +43,7 @@ def read(addon, objects, name):
 def test_both_halves_keep_what_the_whole_room_keeps(
     addon, halves, quarter_file, room_views, method, cloud
 ):
-    """80 % of 9,939 are 7,951 by one order of removal; 1,988 stay, unevenly in both objects.
-
-    The pictures' quality was estimated for both: one alone has no curve of its own.
-    Blender's own splats are activated values, whose roundings may change a neighbour's place.
-    """
+    """floor(.8 * 9939) = 7951 go by one order; activated values of Blender's own are rounded."""
     settings, group, core = bpy.context.scene.refine, addon.objects.splat_group, addon.core
     settings.method, settings.views, settings.ratio = method, 4, 0.8
     splats = core.read_ply(quarter_file).splats()
@@ -77,10 +71,7 @@ def test_both_halves_keep_what_the_whole_room_keeps(
 
 
 def test_marks_and_sentence_are_those_of_the_selection(addon, halves):
-    """Together 4,969 of 9,939 are marked; of the second alone floor(4,939 / 2) = 2,469.
-
-    An active object that is not selected is the only one that is meant.
-    """
+    """Together 4,969 of 9,939 are marked; of the second alone floor(4,939 / 2) = 2,469."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     bpy.ops.refine.score()
     assert read(addon, halves, "refine_remove").sum() == 4_969
@@ -98,10 +89,10 @@ def test_marks_and_sentence_are_those_of_the_selection(addon, halves):
 
 def test_objects_that_cannot_be_scored_together_are_named(halves):
     """The one that is not the active one, scaled to nothing; two that share their data."""
-    halves[0].scale = (0.0, 0.0, 0.0)
+    halves[0].scale.x = 0.0
     with pytest.raises(RuntimeError, match="object 'a': the transform is flat"):
         bpy.ops.refine.score()
-    halves[0].scale = (1.0, 1.0, 1.0)
+    halves[0].scale.x = 1.0
     twin = halves[0].copy()
     bpy.context.scene.collection.objects.link(twin)
     twin.select_set(True)
@@ -110,8 +101,7 @@ def test_objects_that_cannot_be_scored_together_are_named(halves):
 
 
 def test_where_one_cannot_be_changed_none_is(addon, halves, unchanged, monkeypatch):
-    """Blender fails at the second one; shape keys hold every vertex again."""
-    bpy.ops.refine.score()
+    """Shape keys hold every vertex again; Blender fails at the second one."""
     delete, calls = addon.mesh.edit.delete_vertices, []
 
     def fails_once(obj, remove):
@@ -120,25 +110,19 @@ def test_where_one_cannot_be_changed_none_is(addon, halves, unchanged, monkeypat
             raise addon.core.RefineError("no second time")
         delete(obj, remove)
 
-    unchanged.start()
+    bpy.ops.refine.score()
     monkeypatch.setattr(addon.mesh.edit, "delete_vertices", fails_once)
-    with pytest.raises(RuntimeError, match="no second time"):
-        bpy.ops.refine.apply()
-    assert calls == ["a", "b"]
-    unchanged()
-
-    halves[1].shape_key_add(name="key")
-    unchanged.start()
-    with pytest.raises(RuntimeError, match="object 'b': has shape keys"):
-        bpy.ops.refine.apply()
-    unchanged()
+    for words in ("no second time", "object 'b': has shape keys"):
+        unchanged.start()
+        with pytest.raises(RuntimeError, match=words):
+            bpy.ops.refine.apply()
+        assert calls == ["a", "b"]
+        unchanged()
+        halves[1].shape_key_add(name="key")
 
 
 def test_scores_of_each_and_an_object_that_would_be_empty_are_refused(halves, unchanged):
-    """Scored each by itself their scores are places in two orders.
-
-    Far above all cameras the first object's 5,000 splats are the lowest half.
-    """
+    """Scores of each are two orders; far above all cameras 5,000 splats are the lowest half."""
     halves[0].location.z = -30.0
     bpy.context.scene.refine.ratio = 0.6
     bpy.ops.refine.score()
@@ -167,7 +151,6 @@ def test_a_group_that_one_object_has_protects_there(halves):
     bpy.ops.refine.score()
     settings.protect, settings.ratio = "keep", 0.4
     bpy.ops.refine.apply()
-
     assert [len(obj.data.vertices) for obj in halves] == [FIRST, COUNT - FIRST - 3_975]
     settings.protect = "none"
     with pytest.raises(RuntimeError, match="nothing to protect is named 'none'"):

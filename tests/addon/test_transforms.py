@@ -110,7 +110,6 @@ def test_bake_transform_keeps_splats_children_and_scores(addon, imported, stand,
     before = stand(imported)
     place = child.matrix_world.copy()
     bpy.ops.refine.score()
-
     assert bpy.ops.refine.bake_transform(location=location) == {"FINISHED"}
 
     expected = NOWHERE if location else mathutils.Matrix.Translation((1.0, -2.0, 0.5))
@@ -129,7 +128,6 @@ def test_an_uneven_scale_is_baked_as_near_as_harmonics_come(addon, imported):
     assert group.export_notes(checked) == []
     notes = group.export_notes(checked, apply_transform=True)
     (note,) = addon.objects.transforms.bake([checked])
-
     assert notes == [note]
     assert note.endswith("became the nearest")
     after = group.gather([checked])
@@ -169,9 +167,7 @@ def test_join_of_blender_is_named_and_mended(addon, make_splats, tmp_path, stand
     select(one, two)
     bpy.ops.object.join()
     told = told_of(addon, one)
-
     assert bpy.ops.refine.mend() == {"FINISHED"}
-
     assert "200 splats were joined without their sizes, rotations and colours" in told[0]
     assert ("another SH degree" in " ".join(told)) == (degrees[0] != degrees[1])
     assert_alike(stand(one), expected)
@@ -196,10 +192,7 @@ def test_a_turn_of_some_splats_is_mended_and_a_move_is_not_mentioned(addon, impo
 
 @pytest.mark.parametrize("merge", ["", "merge", "merge at a turned plane"])
 def test_an_applied_mirror_is_mended(addon, imported, stand, merge):
-    """The mirrored half is that of an object that was mirrored as a whole.
-
-    Blender's default *Merge* puts what is near the mirror into it; all other splats are as without.
-    """
+    """*Merge* moves what is near the mirror; all else is as an object mirrored as a whole."""
     places = addon.mesh.attributes.read_attribute(imported.data, "position")
     places[:, 0] -= np.median(places[:, 0])
     set_places(imported, places)
@@ -235,10 +228,7 @@ def test_an_applied_mirror_is_mended(addon, imported, stand, merge):
 
 
 def test_splats_that_are_bent_and_what_is_no_splat_are_named(addon, imported):
-    """No map explains them; the click takes them as they are, but for a joined cube of 8 corners.
-
-    A few that are moved are not mentioned.
-    """
+    """No map explains them, and the click takes them; a few that are moved are not mentioned."""
     checked = addon.mesh.layout.check(imported)
     places = addon.mesh.attributes.read_attribute(imported.data, "position")
     for share, said in ((0.005, []), (0.5, ["4,970 splats were moved each by itself"])):
@@ -259,21 +249,22 @@ def test_splats_that_are_bent_and_what_is_no_splat_are_named(addon, imported):
     assert not addon.ui.transforms.of(imported).mendable
 
 
-def test_who_changes_sizes_and_rotations_as_well_is_left_alone(addon, imported, room_cameras):
-    """Another add-on that transforms all of a splat; merging, by which splats move and grow."""
+def test_who_changes_all_of_a_splat_is_left_alone(addon, imported, room_cameras, capfd):
+    """Merging, by which splats move and grow; another add-on that transforms sizes as well."""
+    addon.mesh.edit.delete_vertices(imported, np.arange(COUNT) % 3 > 0)
+    settings = bpy.context.scene.refine
+    settings.method, settings.ratio, settings.views = "merge", 0.6, 4
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply()
+    assert "were merged" in capfd.readouterr().out
+    assert told_of(addon, imported) == []
+
     checked = addon.mesh.layout.check(imported)
     splats = addon.objects.splat_group.gather([checked], whole=True)
     turned = addon.core.affine.transformed(splats, np.array(SOMEWHERE))
     values = addon.core.formats.ply_columns.values_by_name(turned)
     columns = {name: column.astype(np.float32) for name, column in values.items()}
     addon.mesh.attributes.write_columns(checked, columns)
-    assert told_of(addon, imported) == []
-
-    addon.mesh.edit.delete_vertices(imported, np.arange(COUNT) % 4 > 0)
-    settings = bpy.context.scene.refine
-    settings.method, settings.views = "merge", 2
-    bpy.ops.refine.score()
-    bpy.ops.refine.apply()
     assert told_of(addon, imported) == []
 
 

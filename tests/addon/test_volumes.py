@@ -20,12 +20,15 @@ CORNERS = list(itertools.product((-1.0, 1.0), repeat=3))
 FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 
 
+def world(addon, obj):
+    return addon.objects.splat_group.gather([addon.mesh.layout.check(obj)], whole=True)
+
+
 def means(addon, obj):
-    return addon.objects.splat_group.gather([addon.mesh.layout.check(obj)]).means
+    return world(addon, obj).means
 
 
-def middle(addon, obj):
-    """Return the medians of the splats, and from there to the quartiles above."""
+def middle(addon, obj):  # and from there to the quartiles above
     center, upper = np.quantile(means(addon, obj), (0.5, 0.75), axis=0)
     return center, upper - center
 
@@ -95,11 +98,11 @@ def crop(addon, quarter, room_cameras):
     for obj, role in ((outer, "KEEP"), (inner, "REMOVE"), (core, "PROTECT")):
         volume(obj, role)
     bpy.context.view_layer.update()
-    world = means(addon, quarter)
-    offset = (world - center) / half
+    points = means(addon, quarter)
+    offset = (points - center) / half
     ball, box = (offset**2).sum(axis=1) <= 1.0, (np.abs(offset) < 0.3).all(axis=1)
-    solid = addon.objects.demands.zone("keep", outer).volume.inside(world)
-    turned = (world - center) @ np.array(outer.matrix_world)[:3, :3] / ((2.0 * half) ** 2)
+    solid = addon.objects.demands.zone("keep", outer).volume.inside(points)
+    turned = (points - center) @ np.array(outer.matrix_points)[:3, :3] / ((2.0 * half) ** 2)
     cut_off = (np.abs(turned) <= 1.0).all(axis=1) ^ solid  # by the bevel
     assert 0 < cut_off.sum() == (cut_off & ~solid).sum()
     return box, (ball | ~solid) & ~box
@@ -109,10 +112,7 @@ def crop(addon, quarter, room_cameras):
 def test_the_panel_removes_what_volumes_say_and_keeps_what_they_protect(
     addon, quarter, crop, tmp_path, kind
 ):
-    """Before scoring they are marked; the share counts them; no level has any of it.
-
-    Where the budget takes fewer, all that must go goes; the command scores as the panel does.
-    """
+    """All that must go goes, also where the budget takes fewer; no level has any of it."""
     (protected, removed), obj = crop, quarter if kind == "MESH" else as_cloud(addon, quarter)
     settings, out = bpy.context.scene.refine, tmp_path / "out.ply"
     addon.ui.plans.refresh(bpy.context)
@@ -138,10 +138,10 @@ def test_the_panel_removes_what_volumes_say_and_keeps_what_they_protect(
     settings.levels, settings.views = "0.2", 4
     bpy.ops.refine.levels()
     kept = {tuple(row) for row in means(addon, bpy.data.objects["room_lod1"])}
-    world = means(addon, obj)
+    gone, stay = ({tuple(row) for row in means(addon, obj)[rows]} for rows in (removed, protected))
     assert len(kept) == 1988  # .2 of 9939, rounded up
-    assert not kept & {tuple(row) for row in world[removed]}
-    assert {tuple(row) for row in world[protected]} <= kept
+    assert not kept & gone
+    assert kept >= stay
     bpy.ops.refine.find_floaters()
     assert not (mask(addon, obj, "refine_floats") > 0)[removed | protected].any()
     bpy.ops.refine.apply()
@@ -155,12 +155,9 @@ def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp
     settings = bpy.context.scene.refine
     settings.ratio, settings.method, settings.views = 0.8, method, 4
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-    views = addon.ui.operators.chosen_views(bpy.context)
-    by_api = core.prune(
-        addon.objects.splat_group.gather([addon.mesh.layout.check(quarter)], whole=True), views,
-        core.Budget(ratio=0.8), core.METHODS[method](4),
-        protected=protected, removed=removed,
-    )  # fmt: skip
+    splats, views = world(addon, quarter), addon.ui.operators.chosen_views(bpy.context)
+    masks = {"protected": protected, "removed": removed}
+    by_api = core.prune(splats, views, core.Budget(ratio=0.8), core.METHODS[method](4), **masks)
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     bpy.ops.refine.export_ply(filepath=str(tmp_path / "panel.ply"))
@@ -199,7 +196,6 @@ def test_marks_by_hand_protect_without_being_named_and_stay_in_the_file(
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     assert command(addon, [*PRUNE, "--keep", "500", "-o", str(out), *CLOSED]) == 0
-
     assert not goes[lowest].any()
     assert goes.sum() == COUNT - 500
     rows = addon.core.read_ply(out).rows
@@ -255,11 +251,7 @@ def test_a_volume_that_changed_asks_for_new_scores(addon, quarter, crop):
 
 
 def test_the_best_splat_is_not_deleted_unscored_when_its_volume_moves(addon, quarter, room_cameras):
-    """Removed at scoring it has no score; then the volume moves to one that cannot be drawn.
-
-    Now as many scores are 0 as there are splats that cannot be drawn, but not those.
-    Where the volume protects, all are scored: nothing is out of date, and the plan follows.
-    """
+    """It has no score then; the volume moves to one that cannot be drawn, whose score is 0 too."""
     opacity = mask(addon, quarter, "opacity")
     opacity[5] = np.nan
     addon.mesh.attributes.write_attribute(quarter.data, "opacity", "FLOAT", opacity)
@@ -284,10 +276,7 @@ def test_the_best_splat_is_not_deleted_unscored_when_its_volume_moves(addon, qua
 
 
 def test_a_quality_counts_what_is_protected(addon, core, quarter, room_cameras, tmp_path):
-    """The curve is of sets with the box: the command keeps the same, a moved box asks for scores.
-
-    A plan to merge keeps no fewer than are protected, though at 1 dB 95% could go by the curve.
-    """
+    """The command keeps the same; a plan to merge keeps all of it, though 1 dB needs less."""
     settings, out = bpy.context.scene.refine, tmp_path / "out.ply"
     settings.method, settings.views, settings.budget, settings.psnr = "occlusion", 4, "psnr", 35.0
     center, half = middle(addon, quarter)
@@ -312,10 +301,7 @@ def test_a_quality_counts_what_is_protected(addon, core, quarter, room_cameras, 
 
 
 def test_a_volume_that_moves_marks_all_splats_anew(addon, quarter, room_cameras):
-    """Those of the active object, of one selected too, and of one that was marked before.
-
-    The plan of another place of the volume no longer holds.
-    """
+    """Of the active object, of one selected too, and of one marked before; no old plan holds."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     others = [place(name, (0, 0, 0), (1, 1, 1), quarter.data.copy()) for name in "ab"]
     box = empty(middle(addon, quarter)[0], (0.5, 0.5, 0.5))
@@ -339,8 +325,8 @@ def test_a_volume_that_moves_marks_all_splats_anew(addon, quarter, room_cameras)
     assert plans.stored(quarter, settings) is not None
 
 
-def test_a_new_volume_lies_about_the_splats_and_can_be_moved(addon, quarter):
-    """It is selected alone and the splats stay active; it holds a part of them, or nearly all."""
+def test_volumes_are_added_dropped_and_deleted(addon, quarter):
+    """What must go is deleted without scores; a volume in no scene counts no more."""
     volumes = bpy.context.scene.refine.volumes
     for shape, kind, role, least, most in (
         ("BOX", "CUBE", "PROTECT", 250, 7500), ("SPHERE", "SPHERE", "REMOVE", 250, 7500),
@@ -355,21 +341,15 @@ def test_a_new_volume_lies_about_the_splats_and_can_be_moved(addon, quarter):
         assert len(volumes) == 0
         assert not {"refine_force", "refine_remove"} & set(quarter.data.attributes.keys())
 
-
-def test_selected_objects_become_volumes_until_they_are_deleted(addon, quarter):
-    """Two meshes at once, each listed once; the list holds on to one that is in no scene.
-
-    What must go is deleted without scores, and nothing else; a volume that is empty is no fault.
-    """
+    obj.select_set(False)
     center, half = middle(addon, quarter)
     objects = [cube(center + k, half, f"Cube{k}") for k in range(2)]
     for obj in objects:
         obj.select_set(True)
     bpy.ops.refine.add_volume(shape="SELECTED", role="REMOVE")
-    assert [item.object for item in bpy.context.scene.refine.volumes] == objects
+    assert [item.object for item in volumes] == objects
     with pytest.raises(RuntimeError, match="no volume: select closed meshes or empties"):
         bpy.ops.refine.add_volume(shape="SELECTED", role="REMOVE")
-
     bpy.context.scene.collection.objects.unlink(objects[0])
     inside = (np.abs(means(addon, quarter) - center - 1.0) < half).all(axis=1)
     opacity = mask(addon, quarter, "opacity")
@@ -427,10 +407,7 @@ def test_what_is_no_volume_is_refused_by_name(addon, quarter, room_cameras, caps
 def test_the_command_takes_groups_objects_and_boxes(
     addon, quarter, quarter_file, room_cameras, capsys
 ):
-    """Boxes and objects lie in the world, where a file's coordinates are taken as they stand.
-
-    A name that there is not is refused with the objects that would do.
-    """
+    """Volumes lie in the world, where a file's coordinates are taken as they stand."""
     box = cube(*middle(addon, quarter))
     inside = (np.abs(means(addon, quarter) - box.location) < box.scale).all(axis=1)
     quarter.vertex_groups.new(name="mine").add(list(range(100)), 1.0, "REPLACE")
