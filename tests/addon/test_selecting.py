@@ -26,6 +26,7 @@ def test_the_selection_is_blenders_own_and_grows_by_neighbours(addon, quarter):
     choose(addon, quarter, [3, 5])
     bpy.ops.object.mode_set(mode="EDIT")
     assert (chosen(addon, quarter), quarter.data.total_vert_sel) == ([3, 5], 2)
+    assert not bpy.ops.refine.protect.poll()
     choose(addon, quarter, [7])
     bpy.ops.object.mode_set(mode="OBJECT")
     assert chosen(addon, quarter) == [7]
