@@ -30,9 +30,7 @@ def cameras():
 @pytest.mark.parametrize("upright", [False, True])
 def test_one_import_brings_the_cameras_that_lie_above(addon, capture, upright):
     """The file's 72, which decide from now on and stand as the splats do: no turn is needed.
-
-    Scripts get no cameras, no image size and nothing upright unasked.
-    """
+    Scripts get no cameras, no image size and nothing upright unasked."""
     module, scene = addon.ui.import_operators, bpy.context.scene
     scene.render.resolution_x = 1000
     bpy.ops.refine.import_ply(filepath=str(capture), upright=upright)

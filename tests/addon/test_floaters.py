@@ -27,9 +27,7 @@ def polluted(addon, few, room_views):
 
 def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
     """The same verdict, marked and counted by reason; none deleted, and none for a group to keep.
-
-    Nothing is looked for again where the strength changes: each goes for reasons of its own.
-    """
+    Nothing is looked for again where the strength changes: each goes for reasons of its own."""
     obj, moved = polluted
     settings, views = bpy.context.scene.refine, addon.ui.operators.chosen_views(bpy.context)
     expected = addon.core.clean(splats_of(addon, obj), views, addon.core.Cleaning(views=24))
@@ -54,9 +52,7 @@ def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
 
 def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     """But for those that were marked to stay since; where all are, scores and findings stay.
-
-    Scores are of all splats together, floaters included: without these they do not hold.
-    """
+    Scores are of all splats together, floaters included: without these they do not hold."""
     obj, _ = polluted
     scores, delete = addon.mesh.scores, bpy.ops.refine.delete
     bpy.ops.refine.score()

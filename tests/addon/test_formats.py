@@ -36,9 +36,7 @@ def test_every_format_is_exported_and_imported(addon, few, few_file, tmp_path):
 
 def test_the_file_name_follows_the_format_that_is_chosen(addon):
     """The suffix of another format is replaced, also one with two dots; one that is typed chooses.
-
-    `check` is what the file browser calls when an option or the name changes.
-    """
+    `check` is what the file browser calls when an option or the name changes."""
     check = addon.ui.export_operators.REFINE_OT_export_ply.check
     browser = SimpleNamespace(filepath="a.compressed.ply", suffix=".spz", settled=".ply")
     assert [check(browser, None), browser.filepath, check(browser, None)] == [True, "a.spz", False]
@@ -135,9 +133,7 @@ def test_the_tag_of_a_file_goes_with_the_object_to_the_file(addon, make_splats, 
 
 def test_discs_go_through_an_object_as_they_are(addon, make_splats, tmp_path, room_views):
     """Without a third scale, in a mesh and in a point cloud of Blender's own splats.
-
-    A turn of the object, baked into the file, and merging leave discs.
-    """
+    A turn of the object, baked into the file, and merging leave discs."""
     columns, core = make_splats(40, degree=1), addon.core
     del columns["scale_2"]
     obj = imported(columns, tmp_path / "in.ply")

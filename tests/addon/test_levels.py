@@ -12,10 +12,8 @@ from .conftest import read, splats_of
 
 def test_levels_are_objects_beside_the_original(addon, few, room_views):
     """3976 splats: 1988 and 398, those that core keeps, in a collection of their own.
-
     They are hidden, in renders too, so that they do not stand on top of each other. Of 100 that
-    are protected the last level has all.
-    """
+    are protected the last level has all."""
     core, mask = addon.core, np.arange(3976) % 40 == 0
     addon.mesh.attributes.write_attribute(few.data, "mine", "BOOLEAN", mask)
     settings = bpy.context.scene.refine

@@ -33,9 +33,7 @@ def in_core(addon, obj, views, method="merge"):
 @BOTH
 def test_panel_and_command_leave_what_core_says(addon, obj, room_views, capfd, tmp_path, method):
     """Kept splats, changed or not, equal to the last bit; the command leaves the object alone.
-
-    The sentences are those of the report: of refitting its own, and into how many others.
-    """
+    The sentences are those of the report: of refitting its own, and into how many others."""
     bpy.context.scene.refine.method, out = method, tmp_path / "out.ply"
     expected, core = in_core(addon, obj, room_views, method), addon.core
     told = addon.objects.splat_group.prune_object(
@@ -106,9 +104,7 @@ def test_nothing_is_saved_over_where_refitting_was_stopped(
 @pytest.mark.parametrize("rounds", [0, 1])
 def test_esc_while_refitting_keeps_what_that_has_reached(addon, obj, monkeypatch, rounds):
     """Merged, or refitted in a round: as many splats as asked for, and the sentence says which.
-
-    The bar says so beforehand; what ends the work is told by core, at once.
-    """
+    The bar says so beforehand; what ends the work is told by core, at once."""
     bpy.context.scene.refine.method = "refit"
     bpy.ops.refine.score()
     done, measured = [], addon.core.refit.round_rays.RoundRays.psnr
@@ -138,9 +134,7 @@ def test_esc_while_refitting_keeps_what_that_has_reached(addon, obj, monkeypatch
 
 def test_an_object_moved_while_apply_works_keeps_its_splats_together(addon, obj, room_views):
     """The data is what it is without the move: splats are in the frame of their object.
-
-    In edit mode nothing can be written; whoever presses Esc there gets nothing.
-    """
+    In edit mode nothing can be written; whoever presses Esc there gets nothing."""
     expected = in_core(addon, obj, room_views).merged.splats.means
     bpy.ops.refine.score()
     operator, context, said = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)

@@ -33,9 +33,7 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
     addon, few_file, room_views, tmp_path, method
 ):
     """A quarter turn of splats and cameras, which is not in the data: the file is the same.
-
-    The panel starts with the method and the budget that core starts with.
-    """
+    The panel starts with the method and the budget that core starts with."""
     bpy.ops.refine.import_ply(filepath=str(few_file), upright=True)
     obj = bpy.context.object
     addon.mesh.attributes.write_attribute(obj.data, "row", "INT", np.arange(3976, dtype=np.int32))
@@ -133,24 +131,21 @@ def test_undo_and_redo_of_apply_give_bit_equal_attributes(addon, few):
         assert "UNDO" in getattr(bpy.types, f"REFINE_OT_{name}").bl_options
 
 
-@pytest.mark.parametrize(
-    ("kind", "reason"),
-    [("max_mb", "too small for one splat"), ("psnr", "score again with a PSNR as budget")],
-)
-def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
-    addon, few, unchanged, kind, reason
-):
+def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(addon, few, unchanged):
     """Not one splat fits into so small a file; the closed form told nothing of the pictures."""
-    settings = bpy.context.scene.refine
+    settings, plans = bpy.context.scene.refine, addon.ui.plans
     bpy.ops.refine.score()
-    settings.budget, settings.max_mb = kind, 1e-6
-    addon.ui.plans.refresh(bpy.context)
     unchanged.start()
-
-    assert reason in addon.ui.plans.stored(few, settings)["error"]
-    with pytest.raises(RuntimeError, match=reason):
-        bpy.ops.refine.apply()
-    unchanged()
+    for kind, value, reason in (
+        ("max_mb", 1e-6, "too small for one splat"),
+        ("psnr", 38.0, "score again with a PSNR as budget"),
+    ):
+        settings.budget = kind
+        setattr(settings, kind, value)
+        assert reason in plans.stored(few, settings)["error"]
+        with pytest.raises(RuntimeError, match=reason):
+            bpy.ops.refine.apply()
+        unchanged()
 
 
 def test_several_files_are_imported_at_once_and_a_bad_one_is_reported(
@@ -177,9 +172,7 @@ def test_an_export_that_cannot_be_leaves_the_file_that_is_there(
     addon, few_file, tmp_path, monkeypatch
 ):
     """It is not overwritten unasked: the file browser asks by itself.
-
-    Too little memory is a sentence: NumPy says how much it was, Python itself nothing at all.
-    """
+    Too little memory is a sentence: NumPy says how much it was, Python itself nothing at all."""
     target, export = tmp_path / "out.ply", bpy.ops.refine.export_ply
     target.write_bytes(b"mine")
     with pytest.raises(RuntimeError, match="exists already"):

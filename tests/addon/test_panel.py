@@ -98,9 +98,7 @@ def test_an_empty_scene_says_what_to_do_first(draw, empty_scene):
 
 def test_each_step_shows_what_came_of_it(addon, draw, few, room_cameras):
     """3976 splats of 248 bytes, of which half go; a point cloud of the same shows the same.
-
-    A plan of another budget, changed while nothing was active, is not shown: a timer makes one.
-    """
+    A plan of another budget, changed while nothing was active, is not shown: a timer makes one."""
     settings, layer = bpy.context.scene.refine, bpy.context.view_layer
     imported = draw()
     bpy.ops.refine.score()
@@ -174,9 +172,7 @@ def test_the_cameras_that_say_most_are_listed(draw, addon, few, room_cameras, ro
 @pytest.mark.parametrize("method", ["closed-form", "occlusion", "merge"])
 def test_what_a_plan_keeps_is_what_is_marked_and_what_apply_leaves(addon, few, method, capfd):
     """For every budget, of files of 248 bytes a row; also where merging is foretold to need more.
-
-    A success is said without a warning.
-    """
+    A success is said without a warning."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     settings.method, settings.views, settings.budget = method, 8, "psnr"
     bpy.ops.refine.score()
@@ -218,9 +214,7 @@ def test_a_share_is_set_in_per_cent_and_kept_as_a_share(addon, few):
 
 def test_each_method_has_its_price(addon):
     """A straight curve, 50 dB with 20 % removed, 30 with 80 %, of which merging gains 6 dB.
-
-    Estimates above 60 dB are all the same; without an estimate there is no price.
-    """
+    Estimates above 60 dB are all the same; without an estimate there is no price."""
     price, psnr = addon.ui.plans.price, np.array([50.0, 40.0, 30.0])
     curve = addon.core.quality.curve.Quality(np.array([0.2, 0.5, 0.8]), psnr, psnr + 6.0)
     between = replace(curve, between=curve.psnr - 2.0)
@@ -240,9 +234,7 @@ def test_each_method_has_its_price(addon):
 
 def test_a_quality_out_of_reach_is_said(addon, few):
     """Beyond 95 % nothing is estimated; above what removing one splat leaves, none can go.
-
-    The closed form makes no estimate unless Quality was the budget.
-    """
+    The closed form makes no estimate unless Quality was the budget."""
     settings, plans = bpy.context.scene.refine, addon.ui.plans
     bpy.ops.refine.score()
     none = plans.stored(few, settings)

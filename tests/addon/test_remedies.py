@@ -51,10 +51,8 @@ def cameras(addon):
 
 def test_the_list_tells_how_close_each_picture_stays(addon, room, room_cameras):
     """What the curve says of each view that scored, at the budget of the moment; lowest first.
-
     Eight of the 72 views score; of the others nothing is known. A larger share brings all down,
-    and by merging each gains what all of them gain on average. The closed form tells nothing.
-    """
+    and by merging each gains what all of them gain on average. The closed form tells nothing."""
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
     assert {camera.psnr for camera in cameras(addon).values()} == {None}
@@ -85,9 +83,7 @@ def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
     addon, imported, warned, capfd, splats, cameras, turn_back
 ):
     """Known from the imports, before anything is scored; the command notes it too.
-
-    A turn drops scores, price and warning; then the scores are those of imports that are alike.
-    """
+    A turn drops scores, price and warning; then the scores are those of imports that are alike."""
     obj, core = imported(splats=splats, cameras=cameras), addon.core
     settings = bpy.context.scene.refine
     assert "do not share an up axis" in capfd.readouterr().out

@@ -28,9 +28,7 @@ class Packing:
 
 def test_splats_are_drawn_as_they_are_packed(addon, few, monkeypatch):
     """100 splats deleted: the old ones are drawn meanwhile, with as many ranks as they are.
-
-    New ranks of the same splats are drawn anew, or *Heat* would not be coloured again.
-    """
+    New ranks of the same splats are drawn anew, or *Heat* would not be coloured again."""
     monkeypatch.setattr(addon.viewport.content.shader, "texture", lambda *_: None)
     content, packing = addon.viewport.content.Content(), Packing()  # there is no graphics card
     content.pool = packing
