@@ -62,12 +62,10 @@ def export(addon, checked, path, **options):
 
 
 def read(addon, obj, name):
-    """Return a point attribute."""
     return addon.mesh.attributes.read_attribute(obj.data, name)
 
 
 def splats_of(addon, obj):
-    """Return an object's splats in the world."""
     return addon.objects.splat_group.gather([addon.mesh.layout.check(obj)], whole=True)
 
 

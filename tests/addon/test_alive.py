@@ -16,7 +16,6 @@ from .conftest import read
 
 @pytest.fixture
 def obj(few):
-    """Every tenth splat of the room, to be scored by four views with what hides what."""
     settings = bpy.context.scene.refine
     settings.method, settings.views = "occlusion", 4
     return few
@@ -51,12 +50,10 @@ def gate(addon, monkeypatch):
 
 
 def noted(addon, obj):
-    """Return the note of an object's scores."""
     return addon.mesh.scores.record(obj.data)
 
 
 def scores(addon, obj):
-    """Return the scores and their note."""
     return read(addon, obj, "refine_score").tobytes(), noted(addon, obj)
 
 

@@ -23,7 +23,6 @@ def capture(tmp_path, few_file):
 
 
 def cameras():
-    """Return the cameras of the scene."""
     return [obj for obj in bpy.context.scene.objects if obj.type == "CAMERA"]
 
 

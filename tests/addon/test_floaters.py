@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import bpy
 import numpy as np
 import pytest
@@ -48,6 +46,14 @@ def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
     settings.protect = "mine"
     bpy.ops.refine.find_floaters()
     assert not read(addon, obj, "refine_remove")[moved].any()
+    scores = addon.mesh.scores
+    obj.data.vertices.add(1)  # the note says of how many splats it is; a damaged one counts as none
+    assert scores.floater_counts(obj.data) is None
+    with pytest.raises(addon.core.RefineError, match="look for floaters first"):
+        scores.floater_mask(addon.mesh.layout.check(obj), ("front",))
+    for text in ("", "{", "[]", '{"splats": 3977}'):
+        obj.data[scores.FOUND] = text
+        assert scores.floater_counts(obj.data) is None
 
 
 def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
@@ -74,18 +80,3 @@ def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     assert scores.floater_counts(obj.data) is None
     with pytest.raises(RuntimeError, match="look for floaters first"):
         delete(what="FLOATERS")
-
-
-def test_what_was_found_is_of_no_use_once_splats_were_added(addon, polluted):
-    """The note says of how many splats it is; a damaged one counts as none."""
-    obj, _ = polluted
-    scores = addon.mesh.scores
-    bpy.ops.refine.find_floaters()
-    obj.data.vertices.add(1)
-
-    assert scores.floater_counts(obj.data) is None
-    with pytest.raises(addon.core.RefineError, match="look for floaters first"):
-        scores.floater_mask(addon.mesh.layout.check(obj), ("front",))
-    for text in ("", "{", "[]", json.dumps({"splats": 3977})):
-        obj.data[scores.FOUND] = text
-        assert scores.floater_counts(obj.data) is None

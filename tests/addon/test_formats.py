@@ -111,7 +111,6 @@ def test_the_images_of_blender_are_those_of_pillow(addon):
 
 
 def imported(columns, path, *comments):
-    """Import a file with these comments; return the object."""
     path.write_bytes(ply_of(columns, comments=comments))
     bpy.ops.refine.import_ply(filepath=str(path))
     return bpy.context.object

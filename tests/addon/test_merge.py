@@ -22,15 +22,12 @@ def obj(few):
     return few
 
 
-BOTH = pytest.mark.parametrize("method", ["merge", "refit"])
-
-
 def in_core(addon, obj, views, method="merge"):
     asked = addon.core.Budget(ratio=0.6), addon.core.METHODS[method](4)
     return addon.core.prune(splats_of(addon, obj), views, *asked)
 
 
-@BOTH
+@pytest.mark.parametrize("method", ["merge", "refit"])
 def test_panel_and_command_leave_what_core_says(addon, obj, room_views, capfd, tmp_path, method):
     """Kept splats, changed or not, equal to the last bit; the command leaves the object alone.
     The sentences are those of the report: of refitting its own, and into how many others."""

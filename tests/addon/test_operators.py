@@ -203,11 +203,6 @@ def _away(scene, kind="PERSP"):
     scene.refine.source = "ACTIVE"
 
 
-def _flat(scene):
-    _away(scene)
-    bpy.data.objects["room"].scale = (1.0, 1.0, 0.0)
-
-
 @pytest.mark.parametrize(
     ("prepare", "reason"),
     [
@@ -217,7 +212,7 @@ def _flat(scene):
         (lambda scene: setattr(scene.refine, "collection", None), "choose the collection"),
         (_away, "no camera sees the splats"),
         (lambda scene: _away(scene, "ORTHO"), "'away' is orthographic"),
-        (_flat, "flat"),
+        (lambda _scene: setattr(bpy.data.objects["room"], "scale", (1, 1, 0)), "flat"),
     ],
 )
 @pytest.mark.usefixtures("few")
@@ -234,7 +229,7 @@ def test_scoring_that_cannot_be_done_is_explained(room_cameras, unchanged, prepa
 
 
 def _shared(obj):
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new("other", obj.data))
+    bpy.context.collection.objects.link(bpy.data.objects.new("other", obj.data))
 
 
 @pytest.mark.parametrize(
@@ -268,19 +263,16 @@ def test_splats_added_after_scoring_are_never_deleted_unscored(few):
     assert len(few.data.vertices) == 4000
 
 
-@pytest.mark.parametrize("how", ["hide_set", "hide_viewport", "exclude"])
-def test_hidden_objects_are_scored_and_pruned_like_others(addon, few, room_views, score, how):
+def test_hidden_objects_are_scored_and_pruned_like_others(addon, few, room_views, score):
     """By the eye, by the monitor icon, by excluding the collection; the command reaches all."""
     half, method = addon.core.Budget(ratio=0.5), addon.core.ClosedForm()
     expected = addon.core.prune(splats_of(addon, few), room_views, half, method)
-    few.hide_set(how == "hide_set")
-    few.hide_viewport = how == "hide_viewport"
-    if how == "exclude":
-        collection = bpy.data.collections.new("excluded")
-        bpy.context.scene.collection.children.link(collection)
-        collection.objects.link(few)
-        bpy.context.scene.collection.objects.unlink(few)
-        bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
+    few.hide_set(True)
+    few.hide_viewport = True
+    bpy.context.scene.collection.objects.unlink(few)
+    bpy.data.collections.new("excluded").objects.link(few)
+    bpy.context.scene.collection.children.link(bpy.data.collections["excluded"])
+    bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
     score(few, room_views)
 
     assert np.array_equal(keep_mask(addon, few, half), expected.keep)

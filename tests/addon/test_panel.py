@@ -267,13 +267,20 @@ def pixels(name):
 def test_the_pictures_are_those_of_what_apply_leaves(addon, few, room_cameras, method):
     """Before: the splats as they are; after: once *Apply* was clicked; by the same camera."""
     scene = bpy.context.scene
-    scene.camera = room_cameras.objects[24]
-    scene.refine.ratio, scene.refine.method, scene.refine.views = 0.7, method, 16
+    scene.refine.method, scene.refine.views = method, 16
+    assert not bpy.ops.refine.compare.poll()
     bpy.ops.refine.score()
-    before = splats_of(addon, few)
+    with pytest.raises(RuntimeError, match="has no active camera"):
+        bpy.ops.refine.compare()
+    scene.camera, measured = room_cameras.objects[24], addon.ui.operators.measured
+    before, told = splats_of(addon, few), measured(few, scene.refine)
     mine = bpy.data.images.new(PICTURES[0], 4, 4)
-    for _ in range(2):  # the second one replaces the first
+    for ratio in (0.3, 0.7):  # the second one replaces the first, of which nothing is told then
+        scene.refine.ratio = ratio
+        assert measured(few, scene.refine) == told == ""
         assert bpy.ops.refine.compare() == {"FINISHED"}
+    told = measured(few, scene.refine)
+    assert re.fullmatch(rf"Measured in '{scene.camera.name}': \d\d\.\d dB", told)
 
     assert len(few.data.vertices) == 3976
     bpy.ops.refine.apply()
@@ -291,24 +298,3 @@ def test_the_pictures_are_those_of_what_apply_leaves(addon, few, room_cameras, m
     for name, wanted in zip(made, ("before", "after", "difference"), strict=True):
         apart = np.abs(pixels(name).astype(int) - getattr(expected, wanted))
         assert apart.max() <= (8 if wanted == "difference" else 1)  # what is merged is float32 then
-
-
-def test_what_was_measured_stays_in_the_panel_while_the_plan_is_the_same(addon, few, room_cameras):
-    """Another share, or other scores, and it is no longer shown; without a camera it says so."""
-    scene, measured = bpy.context.scene, addon.ui.operators.measured
-    assert not bpy.ops.refine.compare.poll()
-    bpy.ops.refine.score()
-    with pytest.raises(RuntimeError, match="has no active camera"):
-        bpy.ops.refine.compare()
-    assert not bpy.data.images
-    scene.camera = room_cameras.objects[24]
-    assert measured(few, scene.refine) == ""
-    bpy.ops.refine.compare()
-    shown = measured(few, scene.refine)
-    assert re.fullmatch(rf"Measured in '{scene.camera.name}': \d\d\.\d dB", shown)
-    scene.refine.ratio = 0.7
-    assert measured(few, scene.refine) == ""
-    bpy.ops.refine.compare()
-    scene.refine.views = 8
-    bpy.ops.refine.score()
-    assert measured(few, scene.refine) == ""

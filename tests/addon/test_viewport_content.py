@@ -15,12 +15,10 @@ class Packing:
         self.waiting = []
 
     def submit(self, *call):
-        """Take a call; it is not run before `run`."""
         self.waiting.append((Future(), call))
         return self.waiting[-1][0]
 
     def run(self):
-        """Do what was taken."""
         for future, (work, *values) in self.waiting:
             future.set_result(work(*values))
         self.waiting.clear()
