@@ -269,3 +269,10 @@ def test_an_answer_just_after_the_time_out_is_no_time_out(addon, monkeypatch):
     answered.set()
 
     assert worker.result() == 7
+    worker = addon.ui.operator_bases.Worker(
+        lambda _progress: addon.main_thread.call(lambda: 1 // 0)
+    )
+    while worker.running():
+        addon.main_thread.serve()
+    with pytest.raises(ZeroDivisionError):
+        worker.result()

@@ -94,6 +94,18 @@ def test_a_json_file_that_is_dropped_is_one_of_splats_by_its_name(addon, monkeyp
     assert (answer == {"ASKED"}) == (not expected)
 
 
+@pytest.mark.usefixtures("few")
+def test_an_object_is_pruned_to_a_size_in_another_format(addon, room_views, tmp_path):
+    """3,200 bytes hold 100 splats of a .splat; the size of a .spz does not follow from them."""
+    core, prune = addon.core, addon.objects.splat_group.prune_object
+    asked = "room", room_views, core.Budget(max_mb=0.0032), core.ClosedForm()
+    report = prune(*asked, output=tmp_path / "a.splat")
+
+    assert len(core.read_splats(tmp_path / "a.splat")) == report["splats"]["kept"] == 100
+    with pytest.raises(core.RefineError, match=r"a size cannot be kept to in \.spz"):
+        prune(*asked, output=tmp_path / "a.spz")
+
+
 def test_the_images_of_blender_are_those_of_pillow(addon):
     """What one writes the other reads, to the bit: any bytes, where alpha is not 0."""
     pixels = np.random.default_rng(0).integers(0, 256, (12, 20, 4), np.uint8)

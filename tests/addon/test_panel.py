@@ -127,6 +127,23 @@ def test_each_step_shows_what_came_of_it(addon, draw, few, room_cameras):
     assert "1 camera" in draw()
 
 
+def test_floaters_and_what_cameras_and_curve_say_are_drawn(addon, draw, few):
+    """How many float and how sure that is, the mean over what goes; scores without an estimate."""
+    settings, scores = bpy.context.scene.refine, addon.mesh.scores
+    bpy.ops.refine.score()
+    settings.budget = "psnr"
+    assert "score again with a PSNR as budget" in " ".join(draw())
+    bpy.ops.refine.score()
+    bpy.ops.refine.find_floaters()
+    drawn, counts, sure = draw(), scores.floater_counts(few.data), scores.floater_surety(few.data)
+    reasons = settings.to_reasons()
+    total = sum(counts[name] for name in reasons)
+    known = sum(counts[name] * sure.get(name, 0.0) for name in reasons) / total
+    assert f"{total:,} of 3,976 float, {100.0 * known:.0f} % sure" in drawn
+    assert "chart" in drawn
+    assert any(re.match(r"\d+: [\d,]+, about \d+ dB", text) for text in drawn)
+
+
 def test_scores_older_than_a_change_ask_to_be_made_again(draw, few):
     bpy.ops.refine.score()
     fresh = draw()

@@ -174,3 +174,21 @@ def test_a_ring_sees_all_and_joins_the_collection_that_decides(addon, few, room_
     assert min(seen[camera.name] for camera in ring) > 0.9 * 3976
     assert not told(found, "One camera decides")
     assert not told(found, "in no view")
+    places = np.full((3976, 3), np.inf, np.float32)
+    addon.mesh.attributes.write_attribute(few.data, "position", "FLOAT_VECTOR", places)
+    with pytest.raises(RuntimeError, match="has no splat at a finite place"):
+        bpy.ops.refine.add_ring()
+
+
+@pytest.mark.parametrize("source", ["ACTIVE", "FRAMES", "VISIBLE"])
+def test_a_ring_decides_with_the_camera_that_did(room_cameras, few, source):
+    """Those of a shot are no more asked."""
+    scene, camera = bpy.context.scene, room_cameras.objects[0]
+    scene.camera, scene.refine.source = camera, source
+    bpy.ops.refine.add_ring(count=3)
+    settings, ring = scene.refine, set(bpy.data.collections["Ring of Cameras"].objects)
+
+    assert settings.source == ("VISIBLE" if source == "VISIBLE" else "COLLECTION")
+    if source != "VISIBLE":
+        chosen = set(settings.collection.all_objects)
+        assert chosen == (ring if source == "FRAMES" else {camera, *ring})

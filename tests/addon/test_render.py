@@ -208,6 +208,21 @@ def test_an_orthographic_camera_sees_splats_at_one_scale(shot):
     assert abs(alphas[18, 30] - 0.9 * math.exp(-2.0 / 2.55)) < 0.01
 
 
+@pytest.mark.slow
+def test_a_movie_is_written_as_one_file(shot, tmp_path):
+    """Two frames, drawn one after another and then written by Blender."""
+    shot.frame_start, shot.frame_end, render = 1, 2, shot.render
+    if hasattr(render.image_settings, "media_type"):
+        render.image_settings.media_type = "VIDEO"
+    render.image_settings.file_format, render.use_file_extension = "FFMPEG", False
+    render.filepath = str(tmp_path / "movie.mkv")
+    before = settings(shot)
+    bpy.ops.refine.render(animation=True)
+
+    assert settings(shot) == before
+    assert bpy.data.movieclips.load(str(tmp_path / "movie.mkv")).frame_duration == 2
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
