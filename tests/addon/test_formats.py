@@ -34,23 +34,6 @@ def test_every_format_is_exported_and_imported(addon, few, few_file, tmp_path):
             assert np.array_equal(stored[name], read.rows[name]), name
 
 
-def test_the_file_name_follows_the_format_that_is_chosen(addon):
-    """The suffix of another format is replaced, also one with two dots; one that is typed chooses.
-    `check` is what the file browser calls when an option or the name changes."""
-    check = addon.ui.export_operators.REFINE_OT_export_ply.check
-    browser = SimpleNamespace(filepath="a.compressed.ply", suffix=".spz", settled=".ply")
-    assert [check(browser, None), browser.filepath, check(browser, None)] == [True, "a.spz", False]
-    browser.suffix = ".compressed.ply"
-    check(browser, None)
-    assert browser.filepath == "a.compressed.ply"
-    browser.filepath = "b.SPLAT"
-    check(browser, None)
-    assert (browser.filepath, browser.suffix) == ("b.splat", ".splat")
-    browser.filepath = "c"
-    check(browser, None)
-    assert browser.filepath == "c.splat"
-
-
 def test_all_formats_can_be_dropped_and_picked(addon):
     """The file handlers and browsers know every ending."""
     module, registry = addon.ui.import_operators, addon.core.formats.registry
