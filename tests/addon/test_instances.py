@@ -90,6 +90,6 @@ def test_a_linked_collection_is_made_real(quarter, tmp_path):
     empty.instance_collection = wanted.collections[0]
     bpy.ops.refine.make_real()
     bpy.ops.refine.select(action="ALL")
-    assert bpy.context.object.library is None
-    assert bpy.context.object.data.library is None
-    assert len(bpy.context.object.data.vertices) == 9_939
+    real = bpy.context.object
+    assert [real.library, real.data.library] == [None, None]
+    assert len(real.data.vertices) == 9_939

@@ -60,9 +60,7 @@ def test_the_room_comes_back_and_is_what_its_file_is(addon, core, room, tmp_path
     assert addon.mesh.layout.export_bytes(room) is None
 
 
-def test_every_degree_and_extra_properties_keep_name_type_place_and_value(
-    addon, make_splats, through
-):
+def test_every_degree_and_extra_property_comes_back(addon, make_splats, through):
     """3 ((d + 1)^2 - 1) coefficients; the extremes of each type; names that Blender keeps."""
     for degree in range(5):
         obj, same, *_ = through(make_splats(degree=degree))
@@ -180,9 +178,7 @@ def test_an_unevenly_scaled_object_is_scored_as_it_stands(addon, make_splats, th
     assert np.allclose(sizes, [-3.0, -3.0, np.log(2) - 3.0], atol=1e-5)
 
 
-def test_an_export_with_the_transform_is_the_moved_splats(
-    addon, core, make_splats, through, tmp_path
-):
+def test_an_export_is_moved_as_its_object(addon, core, make_splats, through, tmp_path):
     """A turn takes a normal (1, 0, 0) to its first column; a normal of zero stays zero."""
     columns = make_splats(count=50, degree=3)
     for name in ("nx", "ny", "nz"):

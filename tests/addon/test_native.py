@@ -83,9 +83,7 @@ def test_an_import_of_blenders_exports_the_splats_of_the_file(addon, core, file,
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3, 4])
-def test_extreme_values_of_every_degree_come_back(
-    addon, core, make_splats, tmp_path, exported, degree
-):
+def test_extreme_values_come_back(addon, core, make_splats, tmp_path, exported, degree):
     """Opacities next to 0 and 1, scales from 1e-37 to 1e37; ``sh_10`` comes after ``sh_9``."""
     columns = make_splats(count=400, degree=degree)
     ramp = np.linspace(-85.0, 85.0, 400).astype(np.float32)
@@ -107,7 +105,6 @@ def test_what_blender_can_store_and_no_file_says_is_stated(addon, cloud):
     store(cloud, "radiance:base", FOUR, np.float32([[0, 0, 0, a] for a in (0, 1, 0.5, np.nan)]))
     store(cloud, "scale", "FLOAT_VECTOR", np.float32([[0, 1, -1]] * 4))
     splats = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(cloud))
-
     logits = np.float32([-104.0, np.log(2.0**26 - 1.0), 0.0, np.nan])
     assert np.array_equal(splats.opacity_logits, logits, equal_nan=True)
     assert splats.log_scales.tolist() == [[-104.0, 0.0, 0.0]] * 4
@@ -211,17 +208,14 @@ def test_point_clouds_that_are_no_splats_are_refused_in_a_sentence(addon, core):
         bpy.data.objects.remove(obj)
 
 
-def test_a_point_cloud_with_the_names_of_a_file_holds_splats(
-    addon, quarter, quarter_file, exported
-):
+def test_points_with_the_names_of_a_file_are_splats(addon, quarter, quarter_file, exported):
     """What geometry nodes make of a splat mesh: a file's values on points, byte for byte."""
     obj = point_cloud(COUNT, "points")
     for attribute in quarter.data.attributes:
         if attribute.name[0] != ".":
-            values = read(addon, quarter, attribute.name)
-            addon.mesh.attributes.write_attribute(
-                obj.data, attribute.name, attribute.data_type, values
-            )
+            name, kind = attribute.name, attribute.data_type
+            values = read(addon, quarter, name)
+            addon.mesh.attributes.write_attribute(obj.data, name, kind, values)
     obj.data["refine_layout"] = quarter.data["refine_layout"]
     assert exported(obj).path.read_bytes() == quarter_file.read_bytes()
 

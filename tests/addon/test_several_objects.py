@@ -31,15 +31,11 @@ def read(addon, objects, name):
     return np.concatenate([addon.mesh.attributes.read_attribute(o.data, name) for o in objects])
 
 
-@pytest.mark.parametrize(
-    ("method", "cloud"),
-    [
-        ("closed-form", False),
-        ("closed-form", True),
-        pytest.param("occlusion", False, marks=pytest.mark.slow),
-        pytest.param("merge", False, marks=pytest.mark.slow),
-    ],
-)
+CASES = [("closed-form", False), ("closed-form", True), ("occlusion", False), ("merge", False)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "cloud"), CASES)
 def test_both_halves_keep_what_the_whole_room_keeps(
     addon, halves, quarter_file, room_views, method, cloud
 ):

@@ -15,9 +15,7 @@ def hints(addon, obj):
     return addon.ui.plans.stale(bpy.context, obj)
 
 
-def test_what_changed_since_scoring_is_said_until_it_is_put_back(
-    addon, quarter, room_cameras, tmp_path
-):
+def test_what_changed_since_scoring_is_said(addon, quarter, room_cameras, tmp_path):
     """One of 72 cameras, a hundredth of a unit, settings of the method; no budget, no name."""
     scene, settings = bpy.context.scene, bpy.context.scene.refine
     camera, plain = room_cameras.objects[30], room_cameras.objects[0]
@@ -95,9 +93,7 @@ def test_another_frame_of_a_scored_shot_is_no_change(addon, quarter):
 
 
 @pytest.mark.usefixtures("room_cameras")
-def test_scores_without_a_note_or_with_a_damaged_one_have_nothing_to_say(
-    addon, quarter, room_views, score
-):
+def test_scores_without_a_whole_note_say_nothing(addon, quarter, room_views, score):
     """Those of a script, and whatever else a custom property may hold."""
     score(quarter, room_views)
     quarter.location.x = 1.0

@@ -258,7 +258,6 @@ def test_who_changes_all_of_a_splat_is_left_alone(addon, imported, room_cameras,
     bpy.ops.refine.apply()
     assert "were merged" in capfd.readouterr().out
     assert told_of(addon, imported) == []
-
     checked = addon.mesh.layout.check(imported)
     splats = addon.objects.splat_group.gather([checked], whole=True)
     turned = addon.core.affine.transformed(splats, np.array(SOMEWHERE))

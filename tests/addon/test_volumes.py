@@ -109,9 +109,7 @@ def crop(addon, quarter, room_cameras):
 
 
 @pytest.mark.parametrize("kind", ["MESH", "POINTCLOUD"])
-def test_the_panel_removes_what_volumes_say_and_keeps_what_they_protect(
-    addon, quarter, crop, tmp_path, kind
-):
+def test_the_panel_does_what_volumes_say(addon, quarter, crop, tmp_path, kind):
     """All that must go goes, also where the budget takes fewer; no level has any of it."""
     (protected, removed), obj = crop, quarter if kind == "MESH" else as_cloud(addon, quarter)
     settings, out = bpy.context.scene.refine, tmp_path / "out.ply"
@@ -182,9 +180,7 @@ def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp
         assert np.array_equal(np.stack([rows[axis] for axis in "xyz"], axis=1), positions)
 
 
-def test_marks_by_hand_protect_without_being_named_and_stay_in_the_file(
-    addon, quarter, room_cameras, tmp_path
-):
+def test_marks_by_hand_protect_and_stay_in_the_file(addon, quarter, room_cameras, tmp_path):
     """The 100 lowest are selected and marked; of 500 that stay they are 100, saved or not."""
     settings, out = bpy.context.scene.refine, tmp_path / "out.ply"
     bpy.ops.refine.score()
@@ -399,9 +395,7 @@ def test_what_is_no_volume_is_refused_by_name(addon, quarter, room_cameras, caps
         bpy.ops.refine.score()
 
 
-def test_the_command_takes_groups_objects_and_boxes(
-    addon, quarter, quarter_file, room_cameras, capsys
-):
+def test_the_command_takes_names_and_boxes(addon, quarter, quarter_file, room_cameras, capsys):
     """Volumes lie in the world, where a file's coordinates are taken as they stand."""
     box = cube(*middle(addon, quarter))
     inside = (np.abs(means(addon, quarter) - box.location) < box.scale).all(axis=1)
