@@ -22,7 +22,9 @@ def main(
     Show(picture).call(bpy.ops.screen.screen_full_area)
     yield 1.0
     show, hand = Show(picture), Hand()  # the area of the whole window is another one
-    show.area.spaces.active.show_gizmo = False
+    space = show.area.spaces.active
+    space.show_gizmo = space.overlay.show_extras = space.overlay.show_floor = False
+    space.overlay.show_cursor = space.overlay.show_axis_x = space.overlay.show_axis_y = False
     yield from hand.open_tab()
     show.call(bpy.ops.refine.import_ply, filepath=cloud)
     splats = bpy.context.object
