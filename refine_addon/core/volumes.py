@@ -75,9 +75,8 @@ class Sphere:
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """See `Volume.inside`."""
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-            away: NDArray[np.float64] = points - np.asarray(self.center, np.float64)
-            squared = np.square(np.float64(self.radius))
-            return np.asarray(np.einsum("ij,ij->i", away, away) <= squared)
+            away = (points - np.asarray(self.center, np.float64)) / self.radius
+            return np.asarray(np.einsum("ij,ij->i", away, away) <= 1.0)
 
 
 class Solid:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -62,3 +64,16 @@ def test_nothing_in_core_imports_what_needs_blender():
         if room(name).startswith("core") and not room(other).startswith("core")
     }
     assert outside <= {"version"}
+
+
+def test_every_module_of_core_is_imported_where_there_is_no_blender():
+    """None in `sys.modules` makes an import fail, as where nothing is installed."""
+    code = """
+import importlib, sys
+sys.modules.update(dict.fromkeys(["bpy", "bmesh", "mathutils", "gpu", "gpu_extras", "blf"]))
+for name in sys.argv[1:]:
+    importlib.import_module("refine_addon." + name)
+"""
+    core = [name for name in MODULES if name.split(".")[0] == "core"]
+    assert len(core) > 50
+    subprocess.run([sys.executable, "-c", code, *core], check=True, cwd=PACKAGE.parent)

@@ -153,11 +153,12 @@ WILD = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, 0], [1e300, 0, 0],
         (Box((0, 0, 0), (1, 1, 1)), False),
         (Box((0, 0, 0), (1e9, 1, np.inf)), False),
         (parse("box:-inf,-inf,-inf,inf,inf,inf"), True),
+        (Sphere((0, 0, 0), 1e200), False),
         (Sphere((0.5, 0.5, 0.5), 0.1), False),
         (Solid(CORNERS, CUBE), False),
         (MovedVolume(Box((-1, -1, -1), (1, 1, 1)), np.eye(4)), False),
     ],
-    ids=["box", "half endless", "endless", "sphere", "solid", "placed"],
+    ids=["box", "half endless", "endless", "vast", "sphere", "solid", "placed"],
 )
 def test_what_is_not_finite_lies_in_no_volume(volume, far):
     """Nor does what is far away, unless it is as large; no warning of NumPy's is raised."""
