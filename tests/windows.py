@@ -7,35 +7,29 @@ from types import SimpleNamespace
 
 import bpy
 
+REGIONS = {"VIEW_3D": ("WINDOW", "UI", "HEADER"), "PROPERTIES": ("WINDOW",)}
+
 
 class Context:
     """Blender's context with such a window.
 
-    Attributes
-    ----------
-    drawn : list of str
-        Kinds of the regions that were to be drawn again, of a 3D view and of another area.
+    ``drawn``: kinds of the regions that were to be drawn again, of a 3D view and of another area.
     """
 
     def __init__(self):
-        self.drawn = []
-        regions = {"VIEW_3D": ("WINDOW", "UI", "HEADER"), "PROPERTIES": ("WINDOW",)}
+        self.drawn, self.said, self._timers = [], [], []
         areas = [
-            SimpleNamespace(type=area, regions=[self._region(f"{area} {kind}") for kind in kinds])
-            for area, kinds in regions.items()
+            SimpleNamespace(type=area, regions=[self._region(area, kind) for kind in kinds])
+            for area, kinds in REGIONS.items()
         ]
-        for region in (region for area in areas for region in area.regions):
-            region.type = region.name.split()[1]
         self.window = SimpleNamespace(screen=SimpleNamespace(areas=areas))
-        self.said = []
         self.workspace = SimpleNamespace(status_text_set=self.said.append)
         self.window_manager = SimpleNamespace(
             event_timer_add=self._add_timer,
             event_timer_remove=self._remove_timer,
-            modal_handler_add=lambda _operator: None,
+            modal_handler_add=lambda _: None,
             windows=[self.window],
         )
-        self._timers = []
 
     @property
     def timers(self):
@@ -50,8 +44,8 @@ class Context:
         self._timers.remove(timer)
         bpy.context.window_manager.event_timer_remove(timer)
 
-    def _region(self, name):
-        return SimpleNamespace(name=name, tag_redraw=lambda: self.drawn.append(name))
+    def _region(self, area, kind):
+        return SimpleNamespace(type=kind, tag_redraw=lambda: self.drawn.append(f"{area} {kind}"))
 
     def __getattr__(self, name):
         """Return what Blender has."""
@@ -87,6 +81,4 @@ def until(operator, context, is_so=lambda: False):
     raise AssertionError("it never ended")
 
 
-def until_over(operator, context):
-    """Send the timer's events until the operator ends; return its answer."""
-    return until(operator, context)
+until_over = until

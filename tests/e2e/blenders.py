@@ -13,6 +13,7 @@ import os
 import signal
 import subprocess
 import sys
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,14 @@ from made_once import UnavailableError
 
 PROJECT = Path(__file__).resolve().parents[2]
 DRIVER = Path(__file__).parent / "inside" / "run_step.py"
+MANIFEST = tomllib.loads((PROJECT / "blender_manifest.toml").read_text(encoding="utf-8"))
 
 MODULES = ("bpy-4.2.23", "bpy-4.5.15", "bpy-5.0.1")
 BINARIES = ("trixie", "sid")
 
 # Seconds. The slowest step is the window's: about 80 on two idle cores, far more on busy ones.
 # A step in Blender gives up by itself a minute before, and says where it was.
-PATIENCE = 600
-_TO_SAY_WHERE = 60
+PATIENCE, _TO_SAY_WHERE = 600, 60
 
 
 class StepError(AssertionError):
@@ -39,15 +40,7 @@ class StepError(AssertionError):
 
 @functools.cache
 def provide(name: str) -> tuple[Path | None, str]:
-    """Make sure of one of `MODULES` or `BINARIES`.
-
-    Returns
-    -------
-    Path or None
-        The interpreter or the root; None where it cannot be had on this machine.
-    str
-        Why not.
-    """
+    """Return the interpreter or root of one of `MODULES` or `BINARIES`, or None and why not."""
     try:
         if name in BINARIES:
             return blender_root.provide(name), ""
@@ -58,21 +51,7 @@ def provide(name: str) -> tuple[Path | None, str]:
 
 @dataclass(frozen=True)
 class Blender:
-    """One Blender and the folders it may write to.
-
-    Attributes
-    ----------
-    name : str
-        One of `MODULES` or `BINARIES`.
-    path : Path
-        What `provide` gave for it.
-    work : Path
-        Where its files go.
-    resources : Path
-        Its preferences and extensions (``BLENDER_USER_RESOURCES``).
-    patience : float
-        Seconds after which a step is ended.
-    """
+    """What `provide` gave for a name, and folders for its files, and for its preferences."""
 
     name: str
     path: Path
@@ -94,24 +73,9 @@ class Blender:
         raise NotImplementedError
 
     def step(self, name: str, /, **arguments: Any) -> Any:
-        """Run ``main(**arguments)`` of `inside/NAME.py` in Blender.
+        """Return what ``main(**arguments)`` of `inside/NAME.py` does in Blender, all as JSON.
 
-        Parameters
-        ----------
-        name : str
-            The file's name.
-        **arguments
-            JSON values, or paths.
-
-        Returns
-        -------
-        object
-            What `main` returned, by way of JSON.
-
-        Raises
-        ------
-        StepError
-            If it raised, Blender ended before it returned, or the extension raised meanwhile.
+        `StepError` if it raises, Blender ends before, or the extension raises meanwhile.
         """
         return self._result(name, arguments, self.python)
 
@@ -158,6 +122,12 @@ class Binary(Blender):
         """Run Blender in the background, with the preferences that the test has saved."""
         return self.run("blender", "--background", *words)
 
+    def refine(
+        self, *words: str | Path, blend: Path | None = None
+    ) -> subprocess.CompletedProcess[str]:
+        """Run the extension's command in Blender, with an open file."""
+        return self.blender(*([blend] if blend else []), "--command", "refine", *words)
+
     def python(self, *words: str) -> subprocess.CompletedProcess[str]:
         """Run a script in Blender as it is fresh from the factory."""
         return self.blender("--factory-startup", "--python-exit-code", "1", "--python", *words)
@@ -173,12 +143,11 @@ class Binary(Blender):
         factory: bool = True,
         **arguments: Any,
     ) -> Any:
-        """Run a step in a window of some pixels, on an open file or the default scene.
+        """Run a step in a window of some pixels, on an open file or the default scene; see `step`.
 
         The step's `main` is a generator; each value it yields is how many seconds to leave
         Blender to itself. Where it simulates events, Blender listens to no real ones; where it is
-        not fresh from the factory, it reads and keeps preferences. See `step` for the other
-        parameters, the result and the error.
+        not fresh from the factory, it reads and keeps preferences.
         """
 
         def window(*words: str) -> subprocess.CompletedProcess[str]:

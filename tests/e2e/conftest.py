@@ -19,16 +19,7 @@ import pytest
 # The harness and the tools it stands on are modules of the tests, not of the package.
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2] / ".ci")]
 
-from blenders import (
-    BINARIES,
-    MODULES,
-    PROJECT,
-    Binary,
-    Blender,
-    Module,
-    provide,
-    without_blender,
-)
+from blenders import BINARIES, MODULES, PROJECT, Binary, Blender, Module, provide, without_blender
 
 PICTURES = PROJECT / "build" / "e2e"
 SCENE = PROJECT / "tests" / "data" / "room_small"
@@ -73,53 +64,33 @@ def installed(extension_zip: Path, tmp_path_factory: pytest.TempPathFactory):
     return resources
 
 
-@pytest.fixture
+@pytest.fixture(params=BINARIES)
 def fresh_binary(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Blender]:
     """Give a real Blender without the extension."""
-    blender = have(request.param, tmp_path, tmp_path / "resources")
-    yield blender
-    keep_pictures(blender)
+    yield from ready(request.param, tmp_path)
 
 
-@pytest.fixture
+@pytest.fixture(params=MODULES + BINARIES)
 def blender(request: pytest.FixtureRequest, tmp_path: Path, installed) -> Iterator[Blender]:
     """Give a Blender of either kind with the extension installed and enabled."""
-    resources = tmp_path / "resources"
-    shutil.copytree(installed(request.param), resources)
-    blender = have(request.param, tmp_path, resources)
-    yield blender
-    keep_pictures(blender)
+    yield from ready(request.param, tmp_path, installed)
 
 
-def keep_pictures(blender: Blender) -> None:
+@pytest.fixture(params=BINARIES)
+def binary(request: pytest.FixtureRequest, tmp_path: Path, installed) -> Iterator[Blender]:
+    """Give a real Blender with the extension installed and enabled."""
+    yield from ready(request.param, tmp_path, installed)
+
+
+def ready(name: str, work: Path, installed=None) -> Iterator[Blender]:
     """Copy the pictures that a test took, failed or not, to where a person looks at them."""
+    if installed:
+        shutil.copytree(installed(name), work / "resources")
+    blender = have(name, work, work / "resources")
+    yield blender
     PICTURES.mkdir(parents=True, exist_ok=True)
     for picture in blender.work.glob("*.png"):
         shutil.copy(picture, PICTURES / f"{blender.name}-{picture.name}")
-
-
-@pytest.fixture
-def binary(blender: Blender) -> Blender:
-    """Give a real Blender with the extension installed and enabled."""
-    return blender
-
-
-@pytest.fixture
-def same_binary(blender: Blender) -> Blender:
-    """Give the real Blender that stays the same from day to day, for pictures of its window."""
-    return blender
-
-
-def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run each test on all Blenders of the kind that it asks for."""
-    if "fresh_binary" in metafunc.fixturenames:
-        metafunc.parametrize("fresh_binary", BINARIES, indirect=True)
-    elif "same_binary" in metafunc.fixturenames:
-        metafunc.parametrize("blender", BINARIES[:1], indirect=True)
-    elif "binary" in metafunc.fixturenames:
-        metafunc.parametrize("blender", BINARIES, indirect=True)
-    elif "blender" in metafunc.fixturenames:
-        metafunc.parametrize("blender", MODULES + BINARIES, indirect=True)
 
 
 @pytest.fixture(scope="session")
@@ -146,8 +117,8 @@ def pruned(cloud: Path, cameras: Path, tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.fixture
-def blend(blender: Blender, cloud: Path, cameras: Path) -> Path:
+def blend(binary: Blender, cloud: Path, cameras: Path) -> Path:
     """Save the room as a .blend: object "Splats" by Blender's own importer, and the cameras."""
-    path = blender.work / "room.blend"
-    blender.step("make_scene", cloud=cloud, cameras=cameras, blend=path)
+    path = binary.work / "room.blend"
+    binary.step("make_scene", cloud=cloud, cameras=cameras, blend=path)
     return path

@@ -1,260 +1,207 @@
-"""An artist's whole walk in one window, from dropping the zip to the saved scene."""
+"""An artist's walk in one window, from dropping the zip to the saved scene; then another's."""
 
 from __future__ import annotations
 
-import functools
-import threading
-from collections.abc import Generator
-from typing import Any
-
 import bpy
 import extension
-import numpy as np
-import xserver
-from selecting import NAME, Tools, count
-from view import Show
-from window import at_work, picture, price, until
+from hand import Hand, at_work, mask, price, until
 
-IMAGE = "Render with Splats"
+NAME = "point_cloud"
 AROUND = (0.42, 0.33), (0.6, 0.33), (0.6, 0.6), (0.42, 0.6)
 """Where a lasso goes over the view, as shares of its width and height."""
 
+FOUND = {}
+"""What there was after each step."""
 
-def main(
-    archive: str, cloud: str, pictures: str, blend: str
-) -> Generator[float, None, dict[str, Any]]:
-    """Do it; return what there was after each step.
 
-    Parameters
-    ----------
-    archive, cloud
-        Files to drop: the extension, and splats beside which cameras lie.
-    pictures
-        Folder for a picture of the whole screen after each step.
-    blend
-        Where to save the scene.
-
-    Yields
-    ------
-    float
-        Seconds to wait.
-    """
+def main(pictures, blend="", archive="", cloud="", cameras="", asset=""):
+    """Drop ``archive``, ``cloud`` and ``cameras`` and save ``blend``, or export ``asset``."""
     yield 1.0
-    walk = Walk(pictures)
-    yield from walk.install(archive)
-    yield from walk.bring_in(cloud)
-    yield from walk.score()
-    yield from walk.select()
-    yield from walk.crop()
-    yield from walk.apply()
-    yield from walk.render()
-    walk.show.call(bpy.ops.wm.save_as_mainfile, filepath=blend)
-    return walk.found
+    hand = Hand(pictures)
+    if asset:
+        FOUND["enabled"] = extension.is_enabled()  # by the preferences of the window before
+        yield from seen(hand, "20-reopened")
+        yield from hand.open_tab()
+        yield from hand.picture("21-panel", 1)
+        FOUND["numbers"] = hand.numbers()
+        hand.call(bpy.ops.refine.export_ply, filepath=asset)
+        return FOUND
+    yield from install(hand, archive)
+    yield from bring_in(hand, cloud, cameras)
+    yield from score(hand)
+    yield from select(hand)
+    yield from crop(hand)
+    yield from apply(hand)
+    hand.call(bpy.ops.wm.save_as_mainfile, filepath=blend)
+    return FOUND
 
 
-class Walk:
-    """The window, and what was found in it."""
+def seen(hand, name):
+    """Take two pictures: one of the screen, and one of nothing but splats to be compared."""
+    yield from hand.settle()
+    yield from hand.picture(name, 1)
+    overlay, space = hand.space.overlay, hand.space
+    before = overlay.show_overlays, space.show_gizmo
+    overlay.show_overlays = space.show_gizmo = False
+    yield from hand.shown(f"only-{name}")
+    overlay.show_overlays, space.show_gizmo = before
+    FOUND[name] = scene()
 
-    def __init__(self, pictures: str) -> None:
-        self.hand, self.pictures = Tools(), pictures
-        self.found: dict[str, Any] = {}
 
-    @functools.cached_property
-    def show(self) -> Show:
-        """The view with what is drawn in it, once the extension is there."""
-        return Show(f"{self.pictures}/{{}}.png")
+def drop(hand, path):
+    """Drop a file on the view, as the window manager tells Blender."""
+    yield from hand.over()
+    folder, _, name = path.rpartition("/")
+    how = {"directory": f"{folder}/", "files": [{"name": name}]}
+    hand.call(bpy.ops.wm.drop_import_file, "INVOKE_DEFAULT", **how)
+    yield 0.5
 
-    def look(self, name: str) -> Generator[float, None, None]:
-        """Take a picture of the screen for a person."""
-        yield from picture(self.pictures, name, 1.0)
 
-    def seen(self, name: str) -> Generator[float, None, None]:
-        """Take two pictures: one of the screen, and one of nothing but splats to be compared."""
-        yield from self.show.settle()
-        yield from self.look(name)
-        space = self.show.area.spaces.active
-        overlays, gizmos = space.overlay.show_overlays, space.show_gizmo
-        space.overlay.show_overlays = space.show_gizmo = False
-        yield from self.show.picture(f"only-{name}")
-        space.overlay.show_overlays, space.show_gizmo = overlays, gizmos
-        self.found[name] = splats()
+def install(hand, archive):
+    """Drop the zip and confirm; delete the cube that would stand in the room."""
+    yield from hand.press("ESC")  # the splash screen
+    yield from hand.over()
+    hand.call(bpy.ops.extensions.package_install_files, "INVOKE_DEFAULT", url=archive)
+    yield from hand.picture("01-zip", 1)
+    yield from hand.press("RET")
+    yield from until(extension.is_enabled, "it is installed")
+    yield 0.5
+    yield from hand.over()
+    yield from hand.press("DEL")
+    yield 0.5
+    yield from hand.press("RET")
+    yield from hand.open_tab()
+    yield from hand.picture("02-installed", 1)
+    FOUND["cube"] = "Cube" in bpy.data.objects
 
-    def over(self) -> Generator[float, None, None]:
-        """Bring the mouse over the view."""
-        yield from self.hand.move(*self.middle())
 
-    def middle(self) -> tuple[int, int]:
-        """Return a place of the window over the view."""
-        region = next(r for r in self.hand.area.regions if r.type == "WINDOW")
-        return region.x + region.width // 3, region.y + region.height // 2
+def bring_in(hand, cloud, cameras):
+    """Drop splats, which bring the cameras beside them; adjust that; drop cameras; look by one."""
+    yield from drop(hand, cloud)
+    yield from hand.press("S")  # of the two that import such files, ours
+    yield 0.5
+    yield from hand.picture("03-dialog", 1)
+    yield from hand.press("RET")
+    yield from until(lambda: not at_work() and NAME in bpy.data.objects, "it is imported")
+    yield from hand.settle()
+    yield from hand.picture("04-imported", 1)
+    FOUND["imported"] = scene()
+    for upright in (True, False):
+        yield from adjust(hand, upright)
+        FOUND[f"upright {upright}"] = scene()
+    yield from drop(hand, cameras)
+    yield from hand.press("RET")
+    wanted = FOUND["imported"]["cameras"] + 1
+    yield from until(lambda: not at_work() and scene()["cameras"] >= wanted, "they are imported")
+    yield 0.5
+    FOUND["dropped"] = scene(), bpy.context.window_manager.operators[-1].bl_idname
+    yield from hand.undo()
+    yield from hand.over()
+    yield from hand.press("NUMPAD_0")
+    space = hand.space
+    space.shading.background_type, space.shading.background_color = "VIEWPORT", (0, 0, 0)
+    bpy.context.scene.camera.data.show_passepartout = False
+    yield from seen(hand, "05-camera")
+    FOUND["numbers"] = hand.numbers()
 
-    def drop(self, path: str) -> Generator[float, None, None]:
-        """Drop a file on the view, as a file manager does."""
-        yield from self.over()
-        x, y = self.middle()
-        raised: list[Exception] = []
 
-        def dropped() -> None:
-            try:
-                xserver.drop(path, x, self.hand.window.height - y)
-            except Exception as error:
-                raised.append(error)
+def adjust(hand, upright):
+    """Have the last operation done again, otherwise, as its box (F9) does."""
+    bpy.context.window_manager.operators[-1].properties.upright = upright
+    hand.call(bpy.ops.ed.undo_redo, "EXEC_DEFAULT", True, kind="UI")  # with a step of its own
+    yield 0.5
 
-        thread = threading.Thread(target=dropped)
-        thread.start()
-        while thread.is_alive():
-            yield 0.1
-        if raised:
-            raise raised[0]
+
+def score(hand):
+    """Score, read the price, and look at the heat map."""
+    yield from hand.click("refine.score(")
+    yield 2.0
+    yield from hand.picture("06-scoring", 1)
+    yield from until(lambda: not at_work(), "there are scores")
+    yield from seen(hand, "07-scored")
+    yield from hand.scroll(down=True)
+    yield from until(lambda: price(splats())["sentence"], "there is a price")
+    yield from hand.picture("08-priced", 1)
+    FOUND["priced"] = price(splats())
+    yield from hand.scroll(down=False)
+    yield from hand.click("refine.view(mode='HEAT'")
+    yield from hand.settle()
+    yield from hand.picture("09-heat", 1)
+    yield from hand.click("refine.view(mode='SCENE'")
+
+
+def select(hand):
+    """Select with the lasso, delete what is selected, and take that back."""
+    lasso = yield from hand.drag("lasso", *AROUND)
+    FOUND["lasso"] = int(lasso.sum())
+    yield from hand.settle()
+    yield from hand.picture("10-selected", 1)
+    yield from hand.press("DEL")
+    yield 0.5
+    yield from hand.press("A", alt=True)
+    yield from seen(hand, "11-deleted")
+    yield from hand.undo()
+    yield from hand.undo()
+    yield from until(lambda: scene()["splats"] > FOUND["11-deleted"]["splats"], "it is undone")
+    FOUND["selected again"] = int(mask(splats()).sum())
+    yield from hand.press("A", alt=True)
+    yield from seen(hand, "12-back")
+
+
+def crop(hand):
+    """Keep what is in a box that is made smaller by hand, and delete the rest now."""
+    hand.do(bpy.ops.wm.tool_set_by_id, name="builtin.select_box")
+    hand.do(bpy.ops.refine.add_volume, role="KEEP", shape="BOX")
+    yield from hand.over()
+    yield from hand.press("S")
+    for key, text in (("ZERO", "0"), ("PERIOD", "."), ("NINE", "9")):
+        yield from hand.press(key, unicode=text)
+    yield from hand.press("RET")
+    yield 1.0
+    for number, panel in ((13, "protect"), (14, "select")):
+        x, _ = yield from hand.over()
+        hand.call(bpy.ops.wm.call_panel, name=f"REFINE_PT_{panel}", keep_open=True)
+        yield from hand.settle()
+        yield from hand.picture(f"{number}-{panel}", 1)
+        yield from hand.move(x, hand.region().y + 20)  # out of the panel
+        yield from hand.press("ESC")
         yield 0.5
-
-    def install(self, archive: str) -> Generator[float, None, None]:
-        """Drop the zip and confirm; delete the cube that would stand in the room."""
-        yield from self.hand.press("ESC")  # the splash screen
-        yield from self.drop(archive)
-        yield from self.look("01-zip")
-        yield from self.hand.press("RET")
-        yield from until(extension.is_enabled, "it is installed")
-        yield 0.5
-        yield from self.over()
-        yield from self.hand.press("DEL")
-        yield 0.5
-        yield from self.hand.press("RET")
-        yield from self.hand.open_tab()
-        yield from self.look("02-installed")
-        self.found["cube"] = "Cube" in bpy.data.objects
-
-    def bring_in(self, cloud: str) -> Generator[float, None, None]:
-        """Drop splats, which bring the cameras beside them, and look through the first camera."""
-        yield from self.drop(cloud)
-        yield from self.hand.press("S")  # of the two that import such files, ours
-        yield 0.5
-        yield from self.look("03-dialog")
-        yield from self.hand.press("RET")
-        yield from until(lambda: not at_work() and NAME in bpy.data.objects, "it is imported")
-        yield from self.show.settle()
-        yield from self.look("04-imported")
-        yield from self.over()
-        yield from self.hand.press("NUMPAD_0")
-        space = self.show.area.spaces.active
-        space.shading.background_type, space.shading.background_color = "VIEWPORT", (0, 0, 0)
-        bpy.context.scene.camera.data.show_passepartout = False
-        yield from self.seen("05-camera")
-        self.found["numbers"] = self.show.numbers()
-
-    def score(self) -> Generator[float, None, None]:
-        """Score, read the price, and look at the heat map."""
-        yield from self.hand.click("refine.score(")
-        yield 2.0
-        yield from self.look("06-scoring")
-        yield from until(lambda: not at_work(), "there are scores")
-        yield from self.seen("07-scored")
-        yield from self.hand.scroll(down=True)
-        yield from until(lambda: price(NAME)["rested"] and price(NAME)["chart"], "there is a price")
-        yield from self.look("08-priced")
-        self.found["priced"] = price(NAME)
-        yield from self.hand.scroll(down=False)
-        yield from self.hand.click("refine.view(mode='HEAT'")
-        yield from self.show.settle()
-        yield from self.look("09-heat")
-        yield from self.hand.click("refine.view(mode='SCENE'")
-
-    def select(self) -> Generator[float, None, None]:
-        """Select with the lasso, delete what is selected, and take that back."""
-        self.found["lasso"] = yield from self.hand.drag("lasso", *AROUND)
-        yield from self.show.settle()
-        yield from self.look("10-selected")
-        yield from self.hand.press("DEL")
-        yield 0.5
-        yield from self.hand.press("A", alt=True)
-        yield from self.seen("11-deleted")
-        yield from self.hand.undo()
-        yield from self.hand.undo()
-        yield from until(lambda: splats()["splats"] > self.found["11-deleted"]["splats"], "undone")
-        self.found["selected again"] = count()
-        yield from self.hand.press("A", alt=True)
-        yield from self.seen("12-back")
-
-    def crop(self) -> Generator[float, None, None]:
-        """Keep what is in a box that is made smaller by hand, and delete the rest now."""
-        self.call(bpy.ops.wm.tool_set_by_id, name="builtin.select_box")
-        self.call(bpy.ops.refine.add_volume, role="KEEP", shape="BOX")
-        yield from self.over()
-        yield from self.hand.press("S")
-        for key, text in (("ZERO", "0"), ("PERIOD", "."), ("NINE", "9")):
-            yield from self.hand.press(key, unicode=text)
-        yield from self.hand.press("RET")
-        yield 1.0
-        yield from self.over()
-        self.show.call(bpy.ops.wm.call_panel, name="REFINE_PT_protect", keep_open=True)
-        yield from self.show.settle()
-        yield from self.look("13-box")
-        region = self.show.region
-        yield from self.hand.move(region.x + region.width // 3, region.y + 20)  # out of the box
-        yield from self.hand.press("ESC")
-        yield 0.5
-        self.call(bpy.ops.refine.delete, what="VOLUMES")
-        for item in bpy.context.scene.refine.volumes:
-            item.object.hide_set(True)
-        yield from self.seen("14-cropped")
-
-    def apply(self) -> Generator[float, None, None]:
-        """Score again, apply, undo and redo."""
-        yield from self.hand.click("refine.score(")
-        yield 1.0
-        yield from until(lambda: not at_work(), "there are scores")
-        yield from self.hand.scroll(down=True)
-        yield from self.look("15-scored")
-        yield from self.hand.click("refine.apply(")
-        before = self.found["14-cropped"]["splats"]
-        yield from until(lambda: not at_work() and splats()["splats"] < before, "it is applied")
-        yield from self.seen("16-applied")
-        yield from self.hand.undo()
-        yield from until(lambda: splats()["splats"] == before, "it is undone")
-        yield from self.seen("17-undone")
-        yield from self.hand.press("Z", ctrl=True, shift=True)
-        yield from until(lambda: splats()["splats"] < before, "it is redone")
-        yield from self.seen("18-redone")
-
-    def render(self) -> Generator[float, None, None]:
-        """Render with splats, by the button."""
-        scene = bpy.context.scene
-        scene.render.engine = "CYCLES"  # without a graphics card EEVEE compiles for minutes
-        scene.cycles.samples, scene.cycles.use_denoising = 1, False
-        scene.render.film_transparent = True
-        yield from self.hand.scroll(down=True)
-        yield from self.hand.click("refine.render(")
-        yield from until(lambda: IMAGE in bpy.data.images and not rendering(), "it is rendered")
-        yield 1.0
-        yield from self.look("19-rendered")
-        image = bpy.data.images[IMAGE]
-        values = np.empty(len(image.pixels), np.float32)
-        image.pixels.foreach_get(values)
-        np.save(
-            f"{self.pictures}/rendered.npy", values.reshape(image.size[1], image.size[0], 4)[::-1]
-        )
-        for window in list(bpy.context.window_manager.windows)[1:]:
-            with bpy.context.temp_override(window=window):
-                bpy.ops.wm.window_close()
-        yield 0.5
-
-    def call(self, operator: Any, **values: Any) -> None:
-        """Call an operator in the view, as a step that can be undone."""
-        show = self.show
-        with bpy.context.temp_override(window=show.window, area=show.area, region=show.region):
-            operator("EXEC_DEFAULT", True, **values)
+    hand.do(bpy.ops.refine.delete, what="VOLUMES")
+    for item in bpy.context.scene.refine.volumes:
+        item.object.hide_set(True)
+    yield from seen(hand, "15-cropped")
 
 
-def rendering() -> bool:
-    """Tell whether a render is under way."""
-    return bpy.app.is_job_running("RENDER") or any("refine_render" in s for s in bpy.data.scenes)
+def apply(hand):
+    """Score again, apply, undo and redo."""
+    yield from hand.click("refine.score(")
+    yield 1.0
+    yield from until(lambda: not at_work(), "there are scores")
+    yield from hand.scroll(down=True)
+    yield from hand.picture("16-scored", 1)
+    before, drawn = FOUND["15-cropped"]["splats"], hand.draw.drawn(hand.region())
+    yield from hand.click("refine.apply(")
+    yield from until(lambda: not at_work() and scene()["splats"] < before, "it is applied")
+    yield from seen(hand, "17-applied")
+    yield from hand.undo()
+    yield from until(lambda: hand.draw.drawn(hand.region()) == drawn, "all are drawn again")
+    yield from seen(hand, "18-undone")
+    yield from hand.undo(redo=True)
+    yield from until(lambda: scene()["splats"] < before, "it is redone")
+    yield from seen(hand, "19-redone")
 
 
-def splats() -> dict[str, Any]:
+def splats():
+    """Return the object, which undo replaces."""
+    return bpy.data.objects[NAME]
+
+
+def scene():
     """Return what there is."""
-    scene, mesh = bpy.context.scene, bpy.data.objects[NAME].data
+    render = bpy.context.scene.render
     return {
-        "splats": len(mesh.vertices),
-        "cameras": sum(obj.type == "CAMERA" for obj in scene.objects),
-        "size": [scene.render.resolution_x, scene.render.resolution_y],
+        "splats": len(splats().data.vertices),
+        "cameras": sum(obj.type == "CAMERA" for obj in bpy.context.scene.objects),
+        "turned": round(splats().matrix_world[2][1]) == -1,
+        "size": [render.resolution_x, render.resolution_y],
     }

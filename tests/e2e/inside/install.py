@@ -1,4 +1,4 @@
-"""Install the extension from its zip and keep it enabled in the preferences."""
+"""Install the extension from its zip into the user's repository, and keep it enabled."""
 
 from __future__ import annotations
 
@@ -6,15 +6,8 @@ import bpy
 from extension import MODULE, is_enabled
 
 
-def main(archive: str) -> None:
-    """Install ``archive`` into the user's repository.
-
-    Raises
-    ------
-    RuntimeError
-        If the extension is not enabled afterwards.
-    """
-    # FINISHED says nothing: it is the result for a missing file, too.
+def main(archive):
+    """FINISHED says nothing: it is the result for a missing file, too."""
     bpy.ops.extensions.package_install_files(
         repo="user_default", filepath=archive, enable_on_install=True, overwrite=True
     )

@@ -6,20 +6,14 @@ waits. The processor time of one stretch is what the window would stand still fo
 
 from __future__ import annotations
 
-import importlib
 import time
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import bpy
 import extension
 
-_LEAST = 0.001
-"""Seconds; less is not told."""
-
-_POLL = 0.05
-"""Seconds between two looks at a thread, as in a window."""
+_LEAST = 0.001  # seconds; less is not told
+_POLL = 0.05  # seconds between two looks at a thread, as in a window
 
 
 class Clock:
@@ -29,11 +23,10 @@ class Clock:
     is blocked on a quiet machine. While a thread works that nobody waits for, both are the first.
     """
 
-    def __init__(self) -> None:
-        self.stretches: dict[str, list[tuple[float, float]]] = {}
-        self._name, self._since = "", (0.0, 0.0)
+    def __init__(self):
+        self.stretches, self._name, self._since = {}, "", (0.0, 0.0)
 
-    def cut(self, *, alone: bool = True) -> None:
+    def cut(self, *, alone=True):
         """End a stretch, in which no other thread worked: the window is alive for a moment."""
         now = time.thread_time(), time.process_time()
         own, all_of = (end - start for end, start in zip(now, self._since, strict=True))
@@ -41,7 +34,7 @@ class Clock:
             self.stretches[self._name].append((own, all_of if alone else own))
         self._since = now
 
-    def time(self, name: str, operator: Callable[..., set[str]], **options: Any) -> None:
+    def time(self, name, operator, **options):
         """Run an operator as a click does, with the undo step and the update that follow."""
         self._name, self._since = name, (time.thread_time(), time.process_time())
         self.stretches[name] = []
@@ -51,46 +44,33 @@ class Clock:
         print(name, self.stretches[name], flush=True)
 
 
-def main(
-    cloud: str,
-    folder: str,
-    views: int,
-    refit: bool,
-) -> dict[str, list[tuple[float, float]]]:
+def main(cloud, folder, views, refit):
     """Return the stretches of each operator, seconds: see `Clock`.
 
-    Parameters
-    ----------
-    cloud
-        A file of splats, beside its cameras.
-    folder
-        Where files are written to.
-    views
-        How many views score.
-    refit
-        Whether splats are refitted, too: minutes at a million of them.
+    ``cloud``: a file of splats, beside its cameras. ``folder``: for files. ``views``: how many
+    score. ``refit``: whether splats are refitted, too, minutes at a million of them.
     """
     extension.enable()
-    bases = importlib.import_module(f"{extension.MODULE}.ui.operator_bases")
+    job = extension.module("ui.operator_bases").Job
     clock, refine = Clock(), bpy.ops.refine
-    at_once = bases.Job.execute
-    bases.Job.execute = threaded = on_a_thread(clock)
+    at_once, threaded = job.execute, on_a_thread(clock)
+    job.execute = threaded
     bpy.data.batch_remove(bpy.data.objects)
     clock.time("import with cameras", refine.import_ply, filepath=cloud, cameras=True)
     settings = bpy.context.scene.refine
     settings.method, settings.views, settings.levels = "closed-form", views, "0.5, 0.25"
     clock.time("score", refine.score)
-    clock.time("slider", slide, ratio=0.6)
+    clock.time("slider", lambda *_: setattr(settings, "ratio", 0.6))
     settings.ratio = 0.5
     scored = Scored(bpy.context.object)
 
     selecting(clock, scored)
     changing(clock, scored, f"{folder}/out.ply")
     scored.again()
-    bases.Job.execute = at_once  # as in a window
+    job.execute = at_once  # as in a window
     clock.time("apply", refine.apply)
     clock.time("undo of apply", bpy.ops.ed.undo)
-    bases.Job.execute = threaded
+    job.execute = threaded
     for method in ("merge", "refit")[: 1 + refit]:
         scored.again()
         bpy.context.scene.refine.method = method
@@ -101,19 +81,22 @@ def main(
     return clock.stretches
 
 
-def selecting(clock: Clock, scored: Scored) -> None:
+def selecting(clock, scored):
     """Select, hide and protect splats, part and move them, and crop them."""
     refine = bpy.ops.refine
     scored.again()
-    clock.time("select by size", refine.select_by, what="LARGE")
-    clock.time("select what goes", refine.select_by, what="GOING")
-    clock.time("invert", refine.select, action="INVERT")
-    clock.time("grow", refine.grow_selection)
-    clock.time("shrink", refine.grow_selection, shrink=True)
-    clock.time("hide", refine.select, action="HIDE")
-    clock.time("reveal", refine.select, action="REVEAL")
-    clock.time("protect", refine.protect)
-    clock.time("separate", refine.separate_selected)
+    for name, operator, options in (
+        ("select by size", refine.select_by, {"what": "LARGE"}),
+        ("select what goes", refine.select_by, {"what": "GOING"}),
+        ("invert", refine.select, {"action": "INVERT"}),
+        ("grow", refine.grow_selection, {}),
+        ("shrink", refine.grow_selection, {"shrink": True}),
+        ("hide", refine.select, {"action": "HIDE"}),
+        ("reveal", refine.select, {"action": "REVEAL"}),
+        ("protect", refine.protect, {}),
+        ("separate", refine.separate_selected, {}),
+    ):
+        clock.time(name, operator, **options)
     bpy.context.view_layer.objects.active.location.x += 0.5
     clock.time("bake transform", refine.bake_transform)
     clock.time("undo of bake transform", bpy.ops.ed.undo)
@@ -126,17 +109,14 @@ def selecting(clock: Clock, scored: Scored) -> None:
     clock.time("find floaters", refine.find_floaters)
 
 
-def changing(clock: Clock, scored: Scored, path: str) -> None:
+def changing(clock, scored, path):
     """Export, bake and mend splats."""
-    refine = bpy.ops.refine
-    scored.again()
-    clock.time("export", refine.export_ply, filepath=path, overwrite=True)
+    refine, export = bpy.ops.refine, {"filepath": path, "overwrite": True}
     obj = scored.again()
+    clock.time("export", refine.export_ply, **export)
     obj.rotation_euler.x, obj.location.x = 0.3, 1.0
     bpy.context.view_layer.update()
-    clock.time(
-        "export moved", refine.export_ply, filepath=path, overwrite=True, apply_transform=True
-    )
+    clock.time("export moved", refine.export_ply, apply_transform=True, **export)
     clock.time("bake transform", refine.bake_transform)
     obj.rotation_euler.y = 0.3
     bpy.context.view_layer.update()
@@ -144,45 +124,36 @@ def changing(clock: Clock, scored: Scored, path: str) -> None:
     clock.time("mend after Ctrl+A", refine.mend)
 
 
-def on_a_thread(clock: Clock) -> Callable[..., set[str]]:
+def on_a_thread(clock):
     """Return what runs an operator as `Job` does in a window, and waits for its thread."""
-    main_thread = importlib.import_module(f"{extension.MODULE}.main_thread")
-    running = importlib.import_module(f"{extension.MODULE}.ui.operator_bases")
+    serve = extension.module("main_thread").serve
+    bases = extension.module("ui.operator_bases")
 
-    def waited(work: Callable[..., Any]) -> Any:
+    def execute(self, context):
+        group, job = self.gather(context)
+        targets = [bases.Target.of(each) for each in group]
         clock.cut()
-        worker = running.Worker(work)
+        worker = bases.Worker(partial(self.compute, job))
         while worker.running():
             time.sleep(_POLL)
-            main_thread.serve()
+            serve()
             clock.cut(alone=False)
-        return worker.result()
-
-    def execute(self: Any, context: bpy.types.Context) -> set[str]:
-        group, job = self.gather(context)
-        targets = [running.Target.of(each) for each in group]
-        result = waited(partial(self.compute, job))
-        for each, target in zip(group, targets, strict=True):
-            assert running.Target.of(each) == target
+        result = worker.result()
+        assert [bases.Target.of(each) for each in group] == targets
         self.put(context, group, job, result)
         return {"FINISHED"}
 
     return execute
 
 
-def slide(_how: str, _undo: bool, *, ratio: float) -> None:
-    """Move the slider of the budget."""
-    bpy.context.scene.refine.ratio = ratio
-
-
 class Scored:
     """An object of scored splats, to be there again as it was after each operator."""
 
-    def __init__(self, obj: bpy.types.Object) -> None:
+    def __init__(self, obj):
         self.name, self.mesh = obj.name, obj.data
         self.mesh.use_fake_user = True
 
-    def again(self) -> bpy.types.Object:
+    def again(self):
         """Return the object anew, alone of its kind, active and selected."""
         scene = bpy.context.scene
         for obj in list(scene.objects):

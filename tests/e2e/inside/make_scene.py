@@ -12,14 +12,8 @@ import bpy
 from mathutils import Matrix
 
 
-def main(cloud: str, cameras: str, blend: str) -> None:
+def main(cloud, cameras, blend):
     """Save ``blend`` with the object "Splats" and a camera for each entry of ``cameras``."""
-    make(cloud, cameras)
-    bpy.ops.wm.save_as_mainfile(filepath=blend)
-
-
-def make(cloud: str, cameras: str) -> bpy.types.Object:
-    """Fill an empty scene and return the splats' object."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     # The file is in Blender's own axes (z up), which the importer would turn otherwise.
     bpy.ops.wm.ply_import(filepath=cloud, forward_axis="Y", up_axis="Z", import_attributes=True)
@@ -34,10 +28,10 @@ def make(cloud: str, cameras: str) -> bpy.types.Object:
     bpy.context.scene.camera = bpy.data.objects["Camera.000"]
     bpy.context.view_layer.objects.active = splats
     splats.select_set(state=True)
-    return splats
+    bpy.ops.wm.save_as_mainfile(filepath=blend)
 
 
-def add_camera(name: str, entry: dict) -> None:
+def add_camera(name, entry):
     """Place one camera of a reference cameras.json in the scene.
 
     There ``rotation`` is camera to world and the camera looks along its +z with y down; Blender's

@@ -8,10 +8,10 @@ import bpy
 from extension import disable, enable
 
 
-def main() -> dict[str, list[str]]:
+def main():
     """Return what is registered before, and after each of the four switches."""
     # Blender has no list of its commands; count them in and out.
-    commands: dict[object, str] = {}
+    commands = {}
     register, unregister = bpy.utils.register_cli_command, bpy.utils.unregister_cli_command
 
     def register_counted(name, function):
@@ -23,24 +23,19 @@ def main() -> dict[str, list[str]]:
         unregister(handle)
         del commands[id(handle)]
 
-    with mock.patch.multiple(
-        bpy.utils,
-        register_cli_command=register_counted,
-        unregister_cli_command=unregister_counted,
-    ):
-        found = {"before": registered(commands)}
-        enable()
-        found["enabled"] = registered(commands)
-        disable()
-        found["disabled"] = registered(commands)
-        enable()
-        found["enabled again"] = registered(commands)
-        disable()
-        found["disabled again"] = registered(commands)
+    counted = {
+        "register_cli_command": register_counted,
+        "unregister_cli_command": unregister_counted,
+    }
+    found = [registered(commands)]
+    with mock.patch.multiple(bpy.utils, **counted):
+        for switch in (enable, disable) * 2:
+            switch()
+            found.append(registered(commands))
     return found
 
 
-def registered(commands: dict[object, str]) -> list[str]:
+def registered(commands):
     """Return a line for every class, property, handler, menu entry, key and command."""
     lines = [f"command {name}" for name in commands.values()]
     for name in dir(bpy.types):
@@ -49,10 +44,11 @@ def registered(commands: dict[object, str]) -> list[str]:
         if isinstance(kind, type) and issubclass(kind, bpy.types.ID):
             lines += [f"property {name}.{entry.identifier}" for entry in kind.bl_rna.properties]
         # A menu or panel that others append to keeps their functions here, and then its own.
-        for function in getattr(getattr(kind, "draw", None), "_draw_funcs", ()):
-            if function.__module__ == kind.__module__:
-                continue
-            lines.append(f"entry {name} {function.__module__}.{function.__qualname__}")
+        lines += [
+            f"entry {name} {function.__module__}.{function.__qualname__}"
+            for function in getattr(getattr(kind, "draw", None), "_draw_funcs", ())
+            if function.__module__ != kind.__module__
+        ]
     for module in dir(bpy.ops):
         lines += [f"operator {module}.{name}" for name in dir(getattr(bpy.ops, module))]
     for name in dir(bpy.app.handlers):

@@ -2,130 +2,122 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import time
-from collections.abc import Generator
 from pathlib import Path
-from typing import Any
 
 import bpy
 import extension
-import numpy as np
 import xserver
+from hand import IMAGE, Hand, rendering, save, until
 from mathutils import Vector
-from window import picture, until
-
-IMAGE = "Render with Splats"
 
 
-def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
-    """Render the open scene with a cube in front of its splats; return what is there afterwards.
-
-    Parameters
-    ----------
-    pictures
-        Folder for pictures of the whole screen, and the frames of an animation.
-
-    Yields
-    ------
-    float
-        Seconds to wait.
-    """
+def main(pictures):
+    """Render the open scene with a cube in front of its splats; return what is there afterwards."""
     extension.enable()
     yield 1.0
-    scene = bpy.context.scene
+    scene, hand = bpy.context.scene, Hand(pictures)
     prepare(scene)
     scene.render.filepath = f"{pictures}/frame_##"
-    found: dict[str, Any] = {"in_windows": []}
+    found = {"in_windows": [], "busy": []}
     bpy.app.handlers.render_init.append(lambda scene, *_: note_windows(found, scene))
     before = settings(scene)
 
-    invoke()
+    invoke(bpy.ops.refine.render)
     yield 2.0
-    running = importlib.import_module(f"{extension.MODULE}.ui.operator_bases")
-    found["refusal"], found["can export"] = running.idle(None), bpy.ops.refine.export_ply.poll()
+    running = extension.module("ui.operator_bases")
+    found["refusal"], found["can export"] = [running.idle(None)], bpy.ops.refine.export_ply.poll()
     found["scenes"] = [scene.name for scene in bpy.data.scenes if scene.name[0] != "."]
-    yield from picture(pictures, "during")
+    yield from hand.picture("during")
     yield from until(lambda: IMAGE in bpy.data.images and not rendering(), "it is rendered")
-    found["refusal"] = [found["refusal"], running.idle(None)]
-    yield from picture(pictures, "render")
+    found["refusal"].append(running.idle(None))
+    yield from hand.picture("render")
     found["size"] = list(bpy.data.images[IMAGE].size)
     found["alike"] = [settings(scene) == before]
     save(bpy.data.images[IMAGE], f"{pictures}/rendered.npy")
 
-    card = importlib.import_module(f"{extension.MODULE}.render.card")
+    card = extension.module("render.card")
     card.available, real = (lambda: True), card.available
-    name = bpy.data.images[IMAGE].session_uid
-    invoke()
+    first = bpy.data.images[IMAGE].session_uid
+    invoke(bpy.ops.refine.render)
     yield from until(
-        lambda: bpy.data.images[IMAGE].session_uid != name and not rendering(), "again"
+        lambda: bpy.data.images[IMAGE].session_uid != first and not rendering(), "again"
     )
     save(bpy.data.images[IMAGE], f"{pictures}/by_card.npy")
     card.available = real
 
     scene.frame_end = 2
     before = settings(scene)
-    invoke(animation=True)
+    invoke(bpy.ops.refine.render, animation=True)
     yield from until(lambda: not rendering(), "the animation is over")
     found["alike"].append(settings(scene) == before)
 
-    for number in range(3):  # 160,000 splats
-        copy = bpy.data.objects["Splats"].copy()
-        copy.location.z += 0.01 * number
-        scene.collection.objects.link(copy)
-    found["busy"] = []
-    scene.render.resolution_percentage = 400
-    for animation in (True, False):  # which take longer than until Esc
+    prolong(scene)
+    scene.render.filepath = f"{pictures}/stopped_##"
+    for animation in (True, False):
         bpy.data.objects["Cube"].hide_render = not animation  # else it is the splats that are drawn
-        scene.frame_end, scene.render.filepath = 99, f"{pictures}/stopped_##"
         yield 0.5
         before, shown = settings(scene), bpy.data.images[IMAGE].size[:]
-        yield from escape(found, animation=animation)
+        with Escape() as escape:
+            invoke(bpy.ops.refine.render, animation=animation)
+            yield 1.0
+            found["began"] = rendering()
+            found["busy"].append((yield from escape.seconds())[-1])
         found["alike"].append(settings(scene) == before)
     found["stopped"] = bpy.data.images[IMAGE].size[:] == shown
 
     scene.render.resolution_percentage = 100
-    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
-        bpy.ops.render.render("INVOKE_DEFAULT")
+    invoke(bpy.ops.render.render)
     yield 1.0
-    yield from picture(pictures, "f12")
+    yield from hand.picture("f12")
     yield from until(lambda: not rendering(), "F12 is over")  # Blender quits badly amid a render
-    notice = importlib.import_module(f"{extension.MODULE}.ui.render_operators")
-    found["notice"] = bool(notice._until)
+    found["notice"] = bool(extension.module("ui.render_operators")._until)
     return found
 
 
-def escape(found: dict[str, Any], *, animation: bool) -> Generator[float, None, None]:
-    """Begin a render, press Esc a second later, and note how busy Blender was until all is drawn.
+class Escape:
+    """Presses Esc amid a render, and counts what Blender still does."""
 
-    Until Blender hears of the key, after what it draws, its main thread counts alone: the render
-    goes on beside it.
-    """
-    operators = importlib.import_module(f"{extension.MODULE}.ui.render_operators")
-    heard: list[float] = []
+    def __enter__(self):
+        self.heard, self.cancelled = [], []
+        bpy.app.handlers.render_cancel.append(self.cancel)
+        self.watch = extension.module("ui.render_operators").REFINE_OT_watch_render
+        self.real = real = self.watch.modal
 
-    watch = operators.REFINE_OT_watch_render
-    real = watch.modal
+        def modal(operator, context, event):
+            if event.type == "ESC" and event.value == "PRESS":
+                self.heard.append((time.monotonic(), processor() - time.thread_time()))
+            return real(operator, context, event)
 
-    def modal(self, context, event):
-        if event.type == "ESC" and event.value == "PRESS":
-            heard.append(processor() - time.thread_time())
-        return real(self, context, event)
+        self.watch.modal = modal
+        return self
 
-    watch.modal = modal
-    invoke(animation=animation)
-    yield 1.0
-    found["began"] = rendering()
-    pressed = time.thread_time()
-    xserver.tap(xserver.ESCAPE)
-    yield from until(lambda: not rendering(), "it has stopped")
-    yield 1.0  # the scene is drawn
-    found["busy"].append(processor() - heard[0] - pressed)
-    watch.modal = real
+    def __exit__(self, *_):
+        bpy.app.handlers.render_cancel.remove(self.cancel)
+        self.watch.modal = self.real
+
+    def cancel(self, *_):
+        self.cancelled.append(time.monotonic())
+
+    def seconds(self):
+        """Press it; return seconds from then on, and what a busy machine does not lengthen.
+
+        Until Blender hears of the key, until its render ends (0 where none was under way), until
+        all is over; and seconds of the processor until the scene is drawn: of the main thread, and
+        of the others since Esc was heard, as a render goes on beside what it draws until then.
+        """
+        pressed, own = time.monotonic(), time.thread_time()
+        xserver.tap(xserver.ESCAPE)
+        yield from until(lambda: not rendering(), "it has stopped")
+        over = time.monotonic()
+        yield 1.0  # the scene is drawn
+        heard, others = self.heard[0]
+        times = heard, next(iter(self.cancelled), 0.0), over
+        return [*(max(when - pressed, 0.0) for when in times), processor() - others - own]
 
 
-def processor() -> float:
+def processor():
     """Return the seconds of processor that Blender has taken, but for its software renderer's."""
     ticks = 0
     for task in Path("/proc/self/task").iterdir():
@@ -135,7 +127,7 @@ def processor() -> float:
     return time.process_time() - ticks / os.sysconf("SC_CLK_TCK")
 
 
-def prepare(scene: bpy.types.Scene) -> None:
+def prepare(scene):
     """Put a red cube without shading in front of the splats, to the left."""
     place = scene.camera.matrix_world @ Vector((-0.15, 0.0, -0.5))
     bpy.ops.mesh.primitive_cube_add(size=0.12, location=place)
@@ -156,25 +148,29 @@ def prepare(scene: bpy.types.Scene) -> None:
     scene.world.node_tree.nodes.clear()
 
 
-def invoke(*, animation: bool = False) -> None:
-    """Start it as the button does."""
+def prolong(scene):
+    """Make renders take longer than until Esc: 160,000 splats, larger, and 99 frames."""
+    for number in range(3):
+        copy = bpy.data.objects["Splats"].copy()
+        copy.location.z += 0.01 * number
+        scene.collection.objects.link(copy)
+    scene.render.resolution_percentage, scene.frame_end = 400, 99
+
+
+def invoke(operator, *, animation=False):
+    """Start a render as its button does."""
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
-        bpy.ops.refine.render("INVOKE_DEFAULT", animation=animation)
+        operator("INVOKE_DEFAULT", animation=animation)
 
 
-def note_windows(found: dict[str, Any], scene: bpy.types.Scene) -> None:
+def note_windows(found, scene):
     """Note whether a window shows what Cycles renders; called on the thread that does."""
     if scene.render.engine == "CYCLES":
         windows = bpy.context.window_manager.windows
         found["in_windows"].append(any(window.scene == scene for window in windows))
 
 
-def rendering() -> bool:
-    """Tell whether a render is under way."""
-    return bpy.app.is_job_running("RENDER") or any("refine_render" in s for s in bpy.data.scenes)
-
-
-def settings(scene: bpy.types.Scene) -> list[str]:
+def settings(scene):
     """Return what a render must leave as it was."""
     groups = (scene, scene.render, scene.render.image_settings, scene.view_settings)
     groups += (*scene.view_layers, bpy.context.preferences.view)
@@ -187,10 +183,3 @@ def settings(scene: bpy.types.Scene) -> list[str]:
     told += [f"{obj.name} {obj.hide_render} {obj.is_holdout}" for obj in bpy.data.objects]
     told += {window.scene.name for window in bpy.context.window_manager.windows}
     return told + [scene.name for scene in bpy.data.scenes]
-
-
-def save(image: bpy.types.Image, path: str) -> None:
-    """Write the pixels of an image as they are, the top row first."""
-    values = np.empty(len(image.pixels), np.float32)
-    image.pixels.foreach_get(values)
-    np.save(path, values.reshape(image.size[1], image.size[0], 4)[::-1])

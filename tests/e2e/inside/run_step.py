@@ -23,23 +23,23 @@ import bpy
 PATIENCE, PATIENCE_TO_QUIT = float(os.environ["REFINE_PATIENCE"]), 60
 
 
-def answer_with(answer: str, value: object) -> None:
-    """Write the step's result."""
-    Path(answer).write_text(json.dumps(value), encoding="utf-8")
+def fail():
+    """Say what was raised, and end at once."""
+    traceback.print_exc()
+    sys.stderr.flush()
+    os._exit(1)
 
 
-def drive(steps, answer: str) -> None:
+def drive(steps, answer):
     """Let a generator run between Blender's own work; each value is a pause in seconds."""
 
-    def advance() -> float | None:
+    def advance():
         try:
             return next(steps)
         except StopIteration as end:
-            answer_with(answer, end.value)
+            answer.write_text(json.dumps(end.value), encoding="utf-8")
         except Exception:
-            traceback.print_exc()
-            sys.stderr.flush()
-            os._exit(1)
+            fail()
         faulthandler.dump_traceback_later(PATIENCE_TO_QUIT, exit=True)
         bpy.ops.wm.quit_blender()
         return None
@@ -48,21 +48,19 @@ def drive(steps, answer: str) -> None:
     bpy.app.timers.register(advance, first_interval=1.0, persistent=True)
 
 
-def run() -> None:
+def run():
     """Run the step that the command line names."""
     faulthandler.dump_traceback_later(PATIENCE, exit=True)
     name, arguments, answer = sys.argv[sys.argv.index("--") + 1 :]
     sys.path.insert(0, str(Path(__file__).parent))
     value = importlib.import_module(name).main(**json.loads(arguments))
     if inspect.isgenerator(value):
-        drive(value, answer)
+        drive(value, Path(answer))
     else:
-        answer_with(answer, value)
+        Path(answer).write_text(json.dumps(value), encoding="utf-8")
 
 
 try:
     run()
 except Exception:
-    traceback.print_exc()
-    sys.stderr.flush()
-    os._exit(1)
+    fail()

@@ -2,82 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from typing import Any
-
 import bpy
-import extension
-from view import Show
-from window import Hand
+from hand import begin_large
 
 
-def main(
-    cloud: str, cameras: str, output: str, picture: str
-) -> Generator[float, None, dict[str, int]]:
-    """Clean, score, look, apply and export; return how many splats each step left.
+def main(cloud, cameras, output, pictures):
+    """Clean, score, look, apply and export; return how many splats each step left."""
+    hand = yield from begin_large(pictures)
+    refine, settings, found = bpy.ops.refine, bpy.context.scene.refine, {}
 
-    Parameters
-    ----------
-    cloud, cameras, output
-        Files: the capture and its cameras, and where to write the asset.
-    picture
-        Where pictures of the whole screen go, with ``{}`` for their names.
-
-    Yields
-    ------
-    float
-        Seconds to wait.
-    """
-    extension.enable()
-    yield 1.0
-    hand = Hand()
-    yield from hand.press("ESC")  # the splash screen
-    bpy.data.batch_remove(bpy.data.objects)
-    show = Show(picture)
-    show.call(bpy.ops.screen.screen_full_area)
-    yield 1.0
-    show, hand = Show(picture), Hand()  # the area of the whole window is another one
-    show.area.spaces.active.show_gizmo = False
-    yield from hand.open_tab()
-    found: dict[str, int] = {}
-
-    show.call(bpy.ops.refine.import_ply, filepath=cloud)
-    name = bpy.context.object.name
-    splats = bpy.context.object
-    show.call(bpy.ops.refine.import_cameras, filepath=cameras)
-    show.call(bpy.ops.view3d.view_camera)
-    bpy.context.view_layer.objects.active = splats
-    settings = bpy.context.scene.refine
+    splats = hand.bring_in(cloud, cameras)
     yield from hand.scroll(down=False)
-    yield from show.picture("1-imported")
-    found["imported"] = size(name)
+    yield from hand.shown("1-imported")
+    found["imported"] = len(splats.data.vertices)
 
-    show.call(bpy.ops.refine.find_floaters)
-    show.call(bpy.ops.refine.view, mode="GOES")
-    yield from show.picture("2-floaters")
-    show.call(bpy.ops.refine.delete, what="FLOATERS")
-    found["cleaned"] = size(name)
+    hand.call(refine.find_floaters)
+    hand.call(refine.view, mode="GOES")
+    yield from hand.shown("2-floaters")
+    hand.call(refine.delete, what="FLOATERS")
+    found["cleaned"] = len(splats.data.vertices)
 
-    show.call(bpy.ops.refine.score)
-    show.call(bpy.ops.refine.view, mode="HEAT")
-    yield from show.picture("3-scored")
-
+    hand.call(refine.score)
+    hand.call(refine.view, mode="HEAT")
+    yield from hand.shown("3-scored")
     settings.percent = 70.0
     yield 2.0  # the marks follow when the slider rests
-    show.call(bpy.ops.refine.view, mode="STAYS")
+    hand.call(refine.view, mode="STAYS")
     yield from hand.scroll(down=True)
-    yield from show.picture("4-price")
+    yield from hand.shown("4-price")
 
-    show.call(bpy.ops.refine.apply)
-    show.call(bpy.ops.refine.view, mode="SCENE")
-    yield from show.picture("5-applied")
-    found["applied"] = size(name)
-
-    show.call(bpy.ops.refine.export_ply, filepath=output)
+    hand.call(refine.apply)
+    hand.call(refine.view, mode="SCENE")
+    yield from hand.shown("5-applied")
+    found["applied"] = len(splats.data.vertices)
+    hand.call(refine.export_ply, filepath=output)
     return found
-
-
-def size(name: str) -> int:
-    """Return how many splats an object holds."""
-    mesh: Any = bpy.data.objects[name].data
-    return len(mesh.vertices)

@@ -1,4 +1,4 @@
-"""What pictures of the screen show of a view, and how close they are to what they should be."""
+"""How close splats and pictures of the screen are to what they should be."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plyfile
 from PIL import Image
 
 from benchmarks.renderer.rasterizer import render
@@ -18,6 +19,16 @@ def fewer(cloud: Path, folder: Path) -> Path:
     file = read_ply(cloud)
     file.write(folder / "few.ply", np.arange(len(file)) % 4 == 0)
     return folder / "few.ply"
+
+
+def rows(path: Path) -> np.ndarray:
+    """Read the splats of a PLY file, a structured array with a field for each property."""
+    return plyfile.PlyData.read(path)["vertex"].data
+
+
+def rows_in(some: np.ndarray, all_of_them: np.ndarray) -> np.ndarray:
+    """Find the rows that stand in another array; (N,) bool for ``all_of_them``, by their bytes."""
+    return np.isin(all_of_them.view(f"V{all_of_them.itemsize}"), some.view(f"V{some.itemsize}"))
 
 
 def view_in(seen: dict[str, Any], picture: Path) -> np.ndarray:
