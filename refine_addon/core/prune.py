@@ -168,7 +168,8 @@ def prune(
     removed : (N,) bool, optional
         Removed first, and counted, unless protected. The others are scored without them, compared
         with pictures without them, and not merged with them.
-    scores : Scores, optional; merging measures anew and takes only what a threshold keeps
+    scores : Scores, optional; merging measures anew and takes only what a threshold or deletion
+        keeps by them, if they are of occlusion
     sizes : (float, int), optional; bytes of a splat and of the rest of the output, for `max_mb`
     origin : Origin, optional; the splats before an earlier merging prune, for comparing pictures
     reusable : bool, whether scores are to serve other budgets; else scoring ends at this one
@@ -295,9 +296,13 @@ class _Prune:
         views, goal = len(self.used), self.budget.psnr
         count = len(self.splats)
         refits = isinstance(self.method, Refit)
-        given = None if refits else self.scores  # these decide which splats are deleted instead
-        if given is not None and (given.settled is not None or (goal and not given.quality)):
-            given = None  # they were made for another budget
+        given = self.scores  # used where deletion is as good; whether it is, they do not decide
+        if given is not None and (
+            given.method == ClosedForm.name
+            or given.settled is not None
+            or (goal and not given.quality)
+        ):
+            given = None  # they were made for another method or budget
         gone = self.budget.removals(count, *self.sizes)
         left = count // 2 if gone is None else count - gone
         expected = sum(self._expected_seconds(left))
@@ -319,12 +324,9 @@ class _Prune:
         keep, plain = np.ones(count, np.bool_), None
         if not (refits and goal is not None):
             report(making, 0.0, "selecting")
-            rays = scores.ray_sample
-            keep, plain = self._select(scores if given is None else replace(given, ray_sample=rays))
+            keep, plain = self._select(scores)
             self.clock.lap("select_s")
-        by_formula = given is not None and given.method == ClosedForm.name
-        deletion = ClosedForm if by_formula else Occlusion
-        deletes = replace(self, method=deletion(self.method.views), scores=given)
+        deletes = replace(self, method=Occlusion(self.method.views), scores=given)
         will_do = not refits and (  # so that merging need not be tried
             deletion_will_do(plain) if goal is None
             else quality_of(scores).share(goal, "merge") <= PLAIN

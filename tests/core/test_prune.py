@@ -198,6 +198,18 @@ def test_known_scores_decide_where_merging_deletes(splats, views, budget):
 
 
 @pytest.mark.slow
+def test_known_scores_do_not_decide_whether_merging_deletes(file):
+    """At 27 dB both are about as good: deleting by all rounds of scoring, by one it is not."""
+    quarter = file.splats().take(np.arange(0, len(file), 4))
+    views = read_cameras(ROOM / "cameras.json")
+    scene = quarter, views, Budget(ratio=0.7), Merge(4)
+
+    at_once, later = prune(*scene), prune(*scene, scores=score(quarter, views, Merge(4)))
+
+    np.testing.assert_array_equal(at_once.keep, later.keep)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("demanding", [False, True])
 def test_scoring_for_one_budget_decides_what_scores_for_all_would(splats, views, demanding):
     """Scoring ends with the round that removes the last of its splats: the same report, too.
