@@ -53,7 +53,7 @@ def frames(scene: Path) -> list[Image.Image]:
             shutil.copy(scene / file.name, file)
         blender = Binary("trixie", path, work, work / "resources")
         blender.step("install", archive=shutil.copy(archive, work))
-        names = {"cloud": files[0], "cameras": files[1], "picture": work / "{}.png"}
+        names = {"cloud": files[0], "cameras": files[1], "pictures": work}
         blender.window_step("slider", size=SIZE, shares=SHARES, **names)
         return [Image.open(file).convert("RGB") for file in sorted(work.glob("*.png"))]
 
