@@ -1,6 +1,6 @@
 """Feed broken files to every reader, for as long as there is time.
 
-    python -m tests.fuzz [--seconds 300] [--seed N] [--only ply]
+    python -m tests.fuzz [--seconds 300] [--seed N]
 
 Good files of every format are broken by chance: bytes, words, numbers, lines, JSON values. Each
 must end in a `RefineError` that names the file, or in a result that holds together: a PLY must be
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import gzip
 import io
-import itertools
 import json
 import random
 import re
@@ -52,7 +51,7 @@ from refine_addon.core.formats.registry import FORMATS, SUFFIXES
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.visibility.measuring import Sampling
 from tests.core.test_camera_files import FRAME, INRIA, MATRIX, TRANSFORMS
-from tests.core.test_colmap import TWO, WRITERS
+from tests.core.test_colmap import HALVES, TWO, WRITERS
 from tests.strategies import LINE_ENDS, ORDERS, ply_case, splat_names
 
 MEMORY = 40_000_000  # bytes that any small input may cost; NumPy and JSON need some of their own
@@ -74,14 +73,9 @@ VALUES = (
 )
 """What a number, a list or a name in a JSON file is replaced with."""
 
+PLY_KINDS = [(f, end.encode(), 3, seed) for f in ORDERS for end in LINE_ENDS for seed in range(2)]
 Files = dict[str, bytes]
 """A file, or several that belong together, by name."""
-
-
-def ply_seeds() -> list[Files]:
-    """Return PLY files in every encoding, with lists, text, doubles and comments."""
-    kinds = itertools.product(ORDERS, LINE_ENDS, range(2))
-    return [{"in.ply": ply_case(form, end.encode(), 3, seed).data} for form, end, seed in kinds]
 
 
 def format_seeds(form: Any) -> list[Files]:
@@ -103,8 +97,8 @@ def format_seeds(form: Any) -> list[Files]:
 def transforms_seeds() -> list[Files]:
     """Return ``transforms.json`` of nerfstudio and of instant-ngp, and what lies beside it."""
     studio = {**TRANSFORMS, "camera_model": "OPENCV", "k1": 0.1, "applied_transform": MATRIX[:3]}
-    ngp = {"camera_angle_x": 0.8, "w": 640.0, "h": 480.0, "aabb_scale": 4, "scale": 0.3}
-    ngp["frames"] = [{**FRAME, "fl_x": 400.0, "w": 320, "h": 200}]
+    frames = [{**FRAME, "fl_x": 400.0, "w": 320, "h": 200}]
+    ngp = {"camera_angle_x": 0.8, "w": 640.0, "h": 480.0, "aabb_scale": 4, "frames": frames}
     seeds = [{"transforms.json": json.dumps(content).encode()} for content in (studio, ngp)]
     beside = json.dumps({"transform": MATRIX[:3], "scale": 0.5}).encode()
     return [*seeds, {**seeds[0], "dataparser_transforms.json": beside}]
@@ -112,8 +106,8 @@ def transforms_seeds() -> list[Files]:
 
 def colmap_seeds(suffix: str) -> list[Files]:
     """Return a model of two cameras and two images."""
-    contents = zip(("cameras", "images"), TWO, WRITERS[suffix], strict=True)
-    return [{f"{stem}{suffix}": write(things) for stem, things, write in contents}]
+    parts = zip(HALVES, TWO, WRITERS[suffix], strict=True)
+    return [{f"{stem}{suffix}": write(things) for stem, things, write in parts}]
 
 
 def sog_seeds() -> list[Files]:
@@ -185,11 +179,9 @@ def _put(data: bytes, other: bytes, chance: random.Random) -> bytes:
 
 
 def _number(data: bytes, _: bytes, chance: random.Random) -> bytes:
-    found = list(re.finditer(rb"-?[0-9.]+", data[:5000]))
-    if not found:
-        return data
-    place = chance.choice(found)
-    return data[: place.start()] + chance.choice(NUMBERS).encode() + data[place.end() :]
+    found = [match.span() for match in re.finditer(rb"-?[0-9.]+", data[:5000])] or [(0, 0)]
+    start, end = chance.choice(found)
+    return data[:start] + chance.choice(NUMBERS).encode() + data[end:]
 
 
 def _splice(data: bytes, other: bytes, chance: random.Random) -> bytes:
@@ -200,32 +192,24 @@ def _splice(data: bytes, other: bytes, chance: random.Random) -> bytes:
 _WAYS = (_flip, _put, _put, _number, _splice)
 
 
+def _places(node: Any) -> list[tuple[Any, Any]]:
+    """Return every value within, as what holds it and its key or index."""
+    keys = {list: lambda: range(len(node)), dict: lambda: list(node)}.get(type(node), tuple)()
+    return [(node, k) for k in keys] + [place for k in keys for place in _places(node[k])]
+
+
 def _other_value(data: bytes, chance: random.Random) -> bytes:
-    """Replace, drop, repeat or nest one value of a JSON file."""
+    """Replace, drop or repeat one value of a JSON file."""
     try:
         content = json.loads(data)
-    except (ValueError, RecursionError):
+        node, key = chance.choice(_places(content))
+    except (ValueError, RecursionError, IndexError):
         return data
-    places: list[tuple[dict | list, str | int]] = []
-    left = [content]
-    while left:
-        node = left.pop()
-        if isinstance(node, dict | list):
-            keys = list(node) if isinstance(node, dict) else range(len(node))
-            places += [(node, key) for key in keys]
-            left += [node[key] for key in keys]
-    if not places:
-        return data
-    node, key = chance.choice(places)
-    text, deep = json.dumps(node[key]), chance.choice((3, 5000))
-    way, nested = chance.random(), "[" * deep + text + "]" * deep
-    if way < 0.1:
+    other, many = chance.choice(VALUES), [node[key]] * chance.choice((1, 2, 1000))
+    node[key] = chance.choice((*[other] * 7, many, many))
+    if chance.random() < 0.1:
         del node[key]
-    elif way < 0.8:
-        node[key] = chance.choice(VALUES)
-    else:
-        node[key] = [node[key]] * chance.choice((1, 2, 1000)) if way < 0.9 else "\0here\0"
-    return json.dumps(content).replace('"\\u0000here\\u0000"', nested).encode()
+    return json.dumps(content).encode()
 
 
 def use_ply(folder: Path) -> None:
@@ -242,33 +226,17 @@ def use_ply(folder: Path) -> None:
     assert len(read_ply(again)) == int(keep.sum()), "pruned it holds another number of splats"
 
 
-def _convert(path: Path) -> Any:
-    """Read and describe a file, and write it as a PLY."""
+def use_splats(folder: Path, name: str = "in.*", suffix: str | None = None) -> None:
+    """Convert a file of another format, and write it in that format again, or in another."""
+    (path,) = folder.glob(name)
     file = read_splats(path)
     describe(file)
-    file.write(path.with_name("out.ply"))
-    return file
-
-
-def use_splats(folder: Path) -> None:
-    """Convert a file of another format, and write it in that format again."""
-    path = next(folder.iterdir())
-    file = _convert(path)
+    file.write(folder / "out.ply")
     try:
-        write_splats(path, file, overwrite=True)
+        write_splats(path.with_suffix(suffix or path.suffix), file, overwrite=True)
     except RefineError as error:
         if not re.search("can be drawn: nothing|coordinates up to", str(error)):
             raise
-
-
-def use_sog(folder: Path) -> None:
-    """Put the files into an archive and use that."""
-    files = list(folder.iterdir())
-    with zipfile.ZipFile(folder / "in.sog", "w") as archive:
-        for path in files:
-            archive.write(path, path.name)
-            path.unlink()
-    use_splats(folder)
 
 
 def use_ksplat(folder: Path) -> None:
@@ -276,7 +244,7 @@ def use_ksplat(folder: Path) -> None:
     header, *sections, rest = (path.read_bytes() for path in sorted(folder.iterdir()))
     padded = b"".join(data[:1024].ljust(1024, b"\0") for data in sections)
     (folder / "in.ksplat").write_bytes(header[:4096].ljust(4096, b"\0") + padded + rest)
-    _convert(folder / "in.ksplat")
+    use_splats(folder, "in.ksplat", ".splat")
 
 
 def use_cameras(folder: Path) -> None:
@@ -288,25 +256,21 @@ def use_cameras(folder: Path) -> None:
     splats = splats_from_columns(dict(zip(splat_names(0), values.T, strict=True)))
     coarse = Sampling(16.0, 1.0)
     try:  # in this thread: NumPy's flags are raised in it alone
-        both = (
-            score(splats, views, ClosedForm(), threads=1),
-            occlusion.score_once(splats, views, sampling=coarse, threads=1)[0],
-        )
+        first = score(splats, views, ClosedForm(), threads=1).values
+        second = occlusion.score_once(splats, views, sampling=coarse, threads=1)[0].values
     except RefineError as error:
         if "no camera sees the splats" not in str(error):
             raise
     else:
-        assert all(np.isfinite(each.values).all() for each in both), "scores are not finite"
+        assert np.isfinite([first, second]).all(), "scores are not finite"
 
 
+use_sog = partial(use_splats, name="meta.json", suffix=".sog")
 TARGETS: dict[str, tuple[Callable[[], list[Files]], Callable[[Path], Any]]] = {
-    "ply": (ply_seeds, use_ply),
+    "ply": (lambda: [{"in.ply": ply_case(*kind).data} for kind in PLY_KINDS], use_ply),
     **{f.name: (partial(format_seeds, f), use_splats) for f in FORMATS if f.name != "SOG"},
     "SOG": (sog_seeds, use_sog),
-    "SOG 1": (
-        lambda: [version_1_of(seed) for seed in sog_seeds()],
-        lambda folder: _convert(folder / "meta.json"),
-    ),
+    "SOG 1": (lambda: [version_1_of(seed) for seed in sog_seeds()], use_sog),
     ".ksplat": (ksplat_seeds, use_ksplat),
     "cameras.json": (lambda: [{"cameras.json": json.dumps([INRIA] * 2).encode()}], use_cameras),
     "transforms.json": (transforms_seeds, use_cameras),
@@ -330,7 +294,7 @@ def attempt(files: Files, use: Callable[[Path], Any], folder: Path) -> bool:
         old.unlink()
     for name, data in files.items():
         (folder / name).write_bytes(data)
-    start, message = time.process_time(), ""
+    start, message, why = time.process_time(), "", ""
     tracemalloc.reset_peak()
     try:
         with np.errstate(all="raise"):
@@ -338,16 +302,18 @@ def attempt(files: Files, use: Callable[[Path], Any], folder: Path) -> bool:
     except RefineError as error:
         message = str(error)
         if not message.startswith(str(folder)):
-            raise Crash(files, f"the error names no file: {message}") from error
-        if len(message) > 2000 or not message.isprintable():
-            raise Crash(files, f"the error is no sentence: {message[:300]!r}") from error
-    except Exception as error:
-        raise Crash(files, traceback.format_exc()) from error
+            why = f"the error names no file: {message}"
+        elif len(message) > 2000 or not message.isprintable():
+            why = f"the error is no sentence: {message[:300]!r}"
+    except Exception:
+        why = traceback.format_exc()
     took = time.process_time() - start
     if took > SECONDS:
-        raise Crash(files, f"took {took:.1f} s")
+        why = why or f"took {took:.1f} s"
     if tracemalloc.is_tracing() and tracemalloc.get_traced_memory()[1] > MEMORY:
-        raise Crash(files, f"took {tracemalloc.get_traced_memory()[1]} bytes of memory")
+        why = why or f"took {tracemalloc.get_traced_memory()[1]} bytes of memory"
+    if why:
+        raise Crash(files, why)
     return not message
 
 
@@ -376,33 +342,31 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Feed broken files to every reader.")
     parser.add_argument("--seconds", type=float, default=300.0, help="for all formats together")
     parser.add_argument("--seed", type=int, default=None, help="the same inputs again")
-    parser.add_argument("--only", choices=sorted(TARGETS), help="one format alone")
     parser.add_argument("--keep", type=Path, default=ROOT / "build/fuzz", help="for what crashes")
     options = parser.parse_args(arguments)
     seed = random.SystemRandom().randrange(2**32) if options.seed is None else options.seed
-    names = [options.only] if options.only else list(TARGETS)
     print(f"seed {seed}, {options.seconds:g} s")
     total = crashes = 0
     tracemalloc.start()
-    for name in names:
-        end = time.monotonic() + options.seconds / len(names)
+    for name in TARGETS:
+        end = time.monotonic() + options.seconds / len(TARGETS)
         try:
             chance = random.Random(f"{seed} {name}")
             tried, taken = fuzz(name, chance, lambda _, end=end: time.monotonic() < end)
         except Crash as crash:
             crashes += 1
+            files, why = crash.args
             where = options.keep / name.replace(" ", "_")
             where.mkdir(parents=True, exist_ok=True)
-            files, why = crash.args
             for file, data in files.items():
                 (where / file).write_bytes(data)
             print(f"{name}: CRASH, input kept in {where}\n{why}")
-            continue
-        total += tried
-        print(f"{name}: {tried} inputs tried, {taken} taken, {tried - taken} refused, no crash")
+        else:
+            total += tried
+            print(f"{name}: {tried} inputs tried, {taken} taken, {tried - taken} refused")
     tracemalloc.stop()
     print(f"{total} inputs tried, {crashes} crashes")
-    return 1 if crashes else 0
+    return int(crashes > 0)
 
 
 if __name__ == "__main__":

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,6 @@ from refine_addon.core import (
     ClosedForm,
     Merge,
     Occlusion,
-    prune,
     prune_file,
     read_cameras,
     read_ply,
@@ -44,13 +41,9 @@ def folder(tmp_path, monkeypatch):
     """Stand in a folder with a splat file and five cameras around it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "in.ply").write_bytes(plain_ply(COUNT, 1))
+    pose = {"rotation": np.eye(3).tolist(), "fx": 180.0, "fy": 180.0, "width": 40, "height": 30}
     views = [
-        {
-            "position": [offset, 0.1 * offset * offset, 0.0],
-            "rotation": np.eye(3).tolist(),
-            "img_name": str(offset),
-            **{"fx": 180.0, "fy": 180.0, "width": 40, "height": 30},
-        }
+        {**pose, "position": [offset, 0.1 * offset * offset, 0.0], "img_name": str(offset)}
         for offset in (-0.4, -0.2, 0.0, 0.2, 0.4)
     ]
     (tmp_path / "cameras.json").write_text(json.dumps(views))
@@ -73,17 +66,13 @@ def told(path="report.json"):
     return entry
 
 
-def run(*arguments: str, program: tuple[str, ...] = ("-m", "refine_addon"), **options):
+def run(*arguments, encoding="utf-8", **options):
     """Run the command in a process where warnings are errors, but of files left open at the end."""
-    if not {"stdout", "stderr"} & set(options):
-        options["capture_output"] = True
+    named = {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "", "PYTHONIOENCODING": encoding}
+    words = ["-B", "-W", "error", "-W", "ignore::ResourceWarning", "-m", "refine_addon", *arguments]
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
     return subprocess.run(
-        [sys.executable, "-W", "error", "-W", "ignore::ResourceWarning", *program, *arguments],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": ""}
-        | options.pop("environment", {}),
-        timeout=600,
-        check=False,
-        **options,
+        [sys.executable, *words], env={**os.environ, **named}, timeout=600, check=False, **options
     )
 
 
@@ -99,28 +88,19 @@ def run(*arguments: str, program: tuple[str, ...] = ("-m", "refine_addon"), **op
         (["--psnr", "30"], Budget(psnr=30), Occlusion()),
         (["--views", "2"], Budget(ratio=0.5), Occlusion(2)),
         (["--method", "closed-form"], Budget(ratio=0.5), ClosedForm()),
+        (["--method", "merge", "--ratio", ".7"], Budget(ratio=0.7), Merge()),
     ],
 )
-def test_every_budget_and_setting_keeps_the_rows_that_the_interface_keeps(
+def test_every_budget_and_setting_writes_the_file_that_python_writes(
     folder, options, budget, settings
 ):
-    """The file is the input's bytes of exactly those rows."""
-    file = read_ply("in.ply")
-    expected = prune(file, read_cameras("cameras.json"), budget, settings).keep
+    prune_file("in.ply", "api.ply", read_cameras("cameras.json"), budget, settings)
 
     assert command.main([*MADE, "--method", "occlusion", *options]) == 0
 
-    assert 0 < np.count_nonzero(expected) < COUNT
-    assert file.rows[expected].tobytes() == read_ply("out.ply").rows.tobytes()
-    assert names(folder) == {"out.ply"}
-
-
-def test_merged_splats_are_the_same_file_from_python_and_from_the_command(folder):
-    prune_file("in.ply", "api.ply", read_cameras("cameras.json"), Budget(ratio=0.7), Merge())
-
-    assert command.main([*MADE, "--ratio", ".7"]) == 0
-
+    assert 0 < len(read_ply("out.ply")) < COUNT
     assert (folder / "api.ply").read_bytes() == (folder / "out.ply").read_bytes()
+    assert names(folder) == {"api.ply", "out.ply"}
 
 
 @pytest.mark.slow
@@ -134,7 +114,6 @@ def test_scores_are_written_bit_for_bit_and_twice_alike(folder):
 
     written = read_ply("out.ply")
     assert expected.tobytes() == written.rows["refine_score"].tobytes()
-    assert np.dtype("<f4") == written.rows.dtype["refine_score"]
     for name in file.rows.dtype.names:
         assert file.rows[name].tobytes() == written.rows[name].tobytes()
     added = b"property float refine_score\nend_header\n"
@@ -143,19 +122,27 @@ def test_scores_are_written_bit_for_bit_and_twice_alike(folder):
 
 
 def test_info_says_what_is_in_a_file(folder, capsys):
-    """Two splats of degree 1, x from -1 to 2, one with NaN in a property of its own.
+    """Two splats of degree 1, x from -1 to 2, one with a signalling NaN in a property of its own.
 
-    14 + 9 properties and the extra one, of 4 bytes each: 96 bytes a splat.
+    14 + 9 properties and the extra one, of 4 bytes each: 96 bytes a splat. A row of text is as
+    long as the average; nothing to measure is no error; nothing warns.
     """
     properties = [*splat_names(1), "extra"]
     values = np.zeros((2, len(properties)), "<f4")
     values[:, 0] = -1.0, 2.0
-    values[1, -1] = np.nan
+    values.view(np.uint32)[1, -1] = 0x7F800001
     header = plain_header(2, properties)
     (folder / "two.ply").write_bytes(header + values.tobytes())
+    row = b"0 " * 13 + b"0\n"
+    text_header = plain_header(2, splat_names(0), "ascii")
+    (folder / "text.ply").write_bytes(text_header + row + b" " * 5 + row)
+    (folder / "none.ply").write_bytes(plain_header(0, splat_names(0)))
 
-    assert command.main(["info", "two.ply", "--report", "report.json"]) == 0
+    with np.errstate(all="raise"):
+        words = ["info", "two.ply", "text.ply", "none.ply", "--report", "report.json"]
+        assert command.main(words) == 0
 
+    two, text, none = json.loads((folder / "report.json").read_text())["results"]
     expected = {
         "splats": 2,
         "sh_degree": 1,
@@ -169,32 +156,13 @@ def test_info_says_what_is_in_a_file(folder, capsys):
         "undrawable": 0,
         "extra_properties": ["extra"],
     }
-    assert told() == {"status": "done", "input": "two.ply", **expected}
-    text = capsys.readouterr().out
+    assert two == {"status": "done", "input": "two.ply", **expected}
+    said = capsys.readouterr().out
     for name, value in expected.items():
         line = rf"^  {name.replace('_', ' ')} +{re.escape(str(value))}$"
-        assert re.search(line, text, re.MULTILINE)
-
-
-def test_info_of_text_of_no_splat_and_of_a_signalling_nan(folder, capsys):
-    """A row of text is as long as the average; nothing to measure is no error; nothing warns."""
-    row = b"0 " * 13 + b"0\n"
-    header = plain_header(2, splat_names(0), "ascii")
-    (folder / "text.ply").write_bytes(header + row + b" " * 5 + row)
-    (folder / "none.ply").write_bytes(plain_header(0, splat_names(0)))
-    rows = read_ply("in.ply").rows.copy()
-    rows["x"].view(np.uint32)[0] = 0x7F800001
-    replace(read_ply("in.ply"), rows=rows).write("snan.ply")
-    inputs = ["text.ply", "none.ply", "snan.ply"]
-
-    with np.errstate(all="raise"):
-        assert command.main(["info", *inputs, "--report", "report.json"]) == 0
-
-    text, none, broken = json.loads((folder / "report.json").read_text())["results"]
-    assert text["bytes_per_splat"] == (len(header) + 61) / 2
-    assert "text.ply is text; a PLY that is written of it is binary" in text["notes"]
+        assert re.search(line, said, re.MULTILINE)
+    assert text["bytes_per_splat"] == (len(text_header) + 61) / 2
     assert (none["splats"], none["extent_low"], none["extent_high"]) == (0, None, None)
-    assert broken["non_finite_rows"] == 1
 
 
 def test_the_input_can_be_its_own_output_if_asked_to(folder):
@@ -217,13 +185,11 @@ def test_one_bad_file_does_not_stop_the_others(folder, capsys):
 
     assert {"in.ply", "also.ply"} == {path.name for path in (folder / "made/here").iterdir()}
     assert len(read_ply("made/here/also.ply")) == 5
-    said = capsys.readouterr().err
-    assert said.count("refine: error: ") == 2
-    assert "refine: error: bad.ply: header without end" in said
-    assert "refine: error: none.ply: cannot be read (No such file or directory)" in said
+    bad, none = capsys.readouterr().err.splitlines()
+    assert none == "refine: error: none.ply: cannot be read (No such file or directory)"
     results = json.loads((folder / "report.json").read_text())["results"]
     assert [entry["status"] for entry in results] == ["done", "failed", "failed", "done"]
-    assert results[1]["error"].startswith("bad.ply: header without end")
+    assert bad == f"refine: error: {results[1]['error']}"
 
 
 @pytest.mark.slow
@@ -234,8 +200,8 @@ def test_a_batch_of_files_leaves_none_of_them_open_or_mapped(folder):
         return len(list(Path("/proc/self/fd").iterdir())), len(maps)
 
     inputs = [f"{index}.ply" for index in range(40)]
-    for index, name in enumerate(inputs):
-        (folder / name).write_bytes(plain_ply(20, seed=index))
+    for name in inputs:
+        (folder / name).write_bytes(plain_ply(20))
     command.main(["info", "--quiet", *inputs])
     before = held()
 
@@ -243,7 +209,6 @@ def test_a_batch_of_files_leaves_none_of_them_open_or_mapped(folder):
     assert command.main(words) == 0
 
     after = held()
-    assert len(list((folder / "out").iterdir())) == 40
     assert after[0] <= before[0]
     assert after[1] <= before[1] + 20
 
@@ -251,21 +216,13 @@ def test_a_batch_of_files_leaves_none_of_them_open_or_mapped(folder):
 # What is said.
 
 
-def numbers(value):
-    """Return every number in a report."""
-    if isinstance(value, dict | list):
-        inner = value.values() if isinstance(value, dict) else value
-        return [number for item in inner for number in numbers(item)]
-    return [value] if isinstance(value, float | int) else []
-
-
 def test_summary_and_report_of_a_prune_are_complete(folder, capsys):
     """Counts, settings, weights, timings, versions, notes, sizes; valid JSON without NaN."""
     words = [*MADE, "--method", "closed-form", "--keep", "9", "--report", "report.json"]
     assert command.main(words) == 0
 
-    report = json.loads((folder / "report.json").read_text())
-    entry = told()
+    report = json.loads((folder / "report.json").read_text(), parse_constant=pytest.fail)
+    (entry,) = report["results"]
     assert (VERSION, np.__version__) == (report["refine"], report["numpy"])
     assert (entry["status"], entry["budget"]) == ("done", {"keep": 9})
     assert entry["views"] == {"given": 5, "used": 5}
@@ -273,12 +230,10 @@ def test_summary_and_report_of_a_prune_are_complete(folder, capsys):
     assert counts == [COUNT, 9, COUNT - 9]
     sizes = [(folder / name).stat().st_size for name in ("in.ply", "out.ply")]
     assert [*entry["files"].values()] == ["in.ply", "out.ply", *sizes]
-    assert entry["settings"]["method"] == "closed-form"
-    assert math.isclose(1.0, sum(entry["weights"]["lambda"].values()))
+    assert sum(entry["weights"]["lambda"].values()) == pytest.approx(1.0)
     assert {"read_s", "score_s", "select_s", "write_s", "total_s"} == set(entry["timings"])
     assert 0 < entry["timings"]["total_s"] <= report["seconds"]
     assert entry["notes"] == []
-    assert all(map(math.isfinite, numbers(report)))
     said = capsys.readouterr()
     assert said.out.startswith("in.ply: kept 9 of 60 splats (85.0% removed), 6.1 -> 1.4 kB, by 5 o")
     assert f"\n  {entry['splats']['unseen']} of 60 splats lie in no view\n" in said.out
@@ -299,15 +254,12 @@ def test_quiet_is_silent_but_for_errors(folder, capsys, arguments):
 @pytest.mark.slow
 def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
     """Not even the folder of the outputs; a report is written where asked for."""
-    for options in ([], ["-o", "out.ply"], ["-o", "made"]):
+    for options in (["-o", "out.ply"], ["-o", "made"], ["--report", "report.json"]):
         assert command.main([*PRUNE, "--dry-run", *options]) == 0
-    assert names(folder) == set()
-
-    assert command.main([*PRUNE, "--dry-run", "--report", "report.json"]) == 0
 
     assert names(folder) == {"report.json"}
     assert (told()["files"]["output"], told()["splats"]["kept"]) == (None, 30)
-    assert capsys.readouterr().out.count("in.ply: would keep 30 of 60 splats (50.0% removed)") == 4
+    assert capsys.readouterr().out.count("in.ply: would keep 30 of 60 splats (50.0% removed)") == 3
 
 
 @pytest.mark.slow
@@ -318,16 +270,13 @@ def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
 
     drawn = told()["pictures"]
     assert [view["camera"] for view in drawn["views"]] == ["-0.4", "0.0", "0.4"]
-    assert names(folder / "shown") == {
-        f"in-{camera}-{kind}.png"
-        for camera in ("-0.4", "0.0", "0.4")
-        for kind in ("before", "after", "difference")
-    }
+    kinds = ("before", "after", "difference")
+    stems = ("in--0.4", "in-0.0", "in-0.4")
+    assert names(folder / "shown") == {f"{stem}-{kind}.png" for stem in stems for kind in kinds}
     views = read_cameras("cameras.json")
-    before = read_ply("in.ply").splats()
-    decided = prune(before, views, Budget(ratio=0.5)).splats
-    after = read_splats("out.splat").splats() if "-o" in options else decided
-    found = compare(before, after, views.spread(CAMERAS))
+    prune_file("in.ply", "api.ply", views, Budget(ratio=0.5))
+    after = read_splats("out.splat" if "-o" in options else "api.ply").splats()
+    found = compare(read_ply("in.ply").splats(), after, views.spread(CAMERAS))
     assert [view["psnr"] for view in drawn["views"]] == [round(one.psnr, 2) for one in found]
     for view, one in zip(drawn["views"], found, strict=True):
         assert (folder / view["after"]).read_bytes() == png(one.after)
@@ -335,16 +284,23 @@ def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
 
 
 def test_pictures_that_exist_are_left_alone_and_nothing_is_pruned(folder, capsys):
+    """Of a camera's name its last 80 bytes are in theirs, 26 characters of 3: systems take 255."""
+    cameras = json.loads((folder / "cameras.json").read_text())
+    for number, camera in enumerate(cameras):
+        camera["img_name"] = f"{'像' * 120}{number}.jpg"
+    (folder / "cameras.json").write_text(json.dumps(cameras))
     (folder / "shown").mkdir()
-    (folder / "shown/in-0.0-after.png").write_bytes(b"precious")
+    first, *more = [folder / f"shown/in-{'像' * 26}{number}-after.png" for number in (0, 2, 4)]
+    first.write_bytes(b"precious")
     before = contents(folder)
 
     assert command.main([*MADE, "--pictures", "shown"]) == 1
 
-    assert "in-0.0-after.png: exists already" in capsys.readouterr().err
+    assert f"{first.name}: exists already" in capsys.readouterr().err
     assert contents(folder) == before
     assert command.main([*MADE, "--pictures", "shown", "--overwrite"]) == 0
-    assert (folder / "shown/in-0.0-after.png").read_bytes().startswith(b"\x89PNG")
+    assert {first, *more} == set((folder / "shown").glob("*after.png"))
+    assert first.read_bytes().startswith(b"\x89PNG")
 
 
 def test_ctrl_c_while_pictures_are_drawn_says_that_the_file_is_written(folder, monkeypatch, capsys):
@@ -361,79 +317,38 @@ def test_ctrl_c_while_pictures_are_drawn_says_that_the_file_is_written(folder, m
     assert "out.ply is written, its pictures and report are not;" in capsys.readouterr().err
 
 
-def test_pictures_have_names_that_the_system_takes(folder):
-    """Of a camera's name its last 80 bytes: 26 characters of 3; systems take names of 255 bytes."""
-    cameras = json.loads((folder / "cameras.json").read_text())
-    for number, camera in enumerate(cameras):
-        camera["img_name"] = f"{'像' * 120}{number}.jpg"
-    (folder / "cameras.json").write_text(json.dumps(cameras))
-
-    assert command.main([*PRUNE, "--dry-run", "--pictures", "shown"]) == 0
-
-    assert {name for name in names(folder / "shown") if "after" in name} == {
-        f"in-{'像' * 26}{number}-after.png" for number in (0, 2, 4)
-    }
-
-
-@pytest.mark.slow
-def test_a_name_that_the_terminal_cannot_show_is_no_error(folder):
-    """As bytes that are no UTF-8, and on a terminal that knows ASCII alone."""
-    try:
-        (folder / "b\udcff ü.ply").write_bytes(plain_ply())
-    except (OSError, UnicodeError):
-        pytest.skip("this file system takes no such name")
-    for encoding in ("utf-8", "ascii"):
-        done = run("info", "b\udcff ü.ply", environment={"PYTHONIOENCODING": encoding})
-        assert (done.returncode, done.stderr) == (0, b"")
-        assert b"\\udcff" in done.stdout
-
-
 # What is refused.
 
 USAGE = {
     "nothing": [],
-    "unknown command": ["shrink", "in.ply"],
     "no input": ["prune", "--cameras", "cameras.json", "-o", "out.ply"],
     "no output": PRUNE,
-    "no cameras": ["prune", "in.ply", "-o", "out.ply"],
     "one picture twice": ["prune", "in.ply", "in.spz", *PRUNE[2:], "--dry-run", "--pictures", "p"],
+    "another input by a link": ["prune", "in.ply", "b.ply", *MADE[2:-1], "l", "--overwrite"],
     "one name twice": ["prune", "in.ply", "b/in.ply", *PRUNE[2:], "-o", "made"],
     "two budgets": [*MADE, "--ratio", ".5", "--keep", "3"],
-    "ratio that is none": [*MADE, "--ratio", "nan"],
-    "keep none": [*MADE, "--keep", "0"],
     "keep a part": [*MADE, "--keep", "1.5"],
-    "views below 0": [*MADE, "--views", "-1"],
     "rounds of nothing": [*MADE, "--rounds", "2"],
     "too many rounds": [*MADE, "--method", "refit", "--rounds", "1000000"],
-    "unknown method": [*MADE, "--method", "guess"],
     "a source that is none": [*MADE, "--source", "visble"],
-    "a collection without a name": [*MADE, "--source", "collection:"],
     "frames that end before they start": [*MADE, "--source", "frames:3:1"],
     "a source without Blender": ["prune", "in.ply", "-o", "out.ply", "--source", "frames:1:3"],
     "render without Blender": ["render"],
     "object without Blender": ["prune", "--object", "Splats", "-o", "out.ply", *PRUNE[2:]],
     "save without object": [*MADE, "--save"],
-    "object and input": [*MADE, "--object", "Splats"],
     "output of nobody": [*PRUNE, "-o", "~nobody-of-that-name/out.ply"],
-    "output named as compressed": [*PRUNE, "-o", "out.ply.gz"],
     "output to standard output": [*PRUNE, "-o", "-"],
-    "report to standard output": [*PRUNE, "--dry-run", "--report", "-"],
     "pictures to standard output": [*PRUNE, "--dry-run", "--pictures", "-"],
     "report over the input": [*MADE, "--report", "./in.ply", "--overwrite"],
     "report over the output": [*MADE, "--report", "out.ply"],
-    "report over an output": [*PRUNE, "-o", "made", "--report", "made/in.ply"],
     "report over other splats": [*PRUNE, "--dry-run", "--report", "b.ply", "--overwrite"],
     "report over other cameras": [*PRUNE, "--dry-run", "--report", "t.json", "--overwrite"],
     "report among the pictures": [*MADE, "--pictures", ".", "--report", "in-000-after.png"],
     "output that is not named as splats": ["prune", "in.dat", *PRUNE[2:], "-o", "m", "--overwrite"],
     "an option in part": [*MADE, "--rat", ".5"],
-    "no name of cameras": ["prune", "in.ply", "--cameras", "", "-o", "out.ply"],
-    "no name of an input": ["prune", "", *PRUNE[2:], "-o", "out.ply"],
     "no name of an output": [*PRUNE, "-o", ""],
-    "no name of a report": [*MADE, "--report", ""],
     "a name with a zero byte": [*PRUNE, "-o", "out\0.ply"],
     "score to another format": [*SCORE, "-o", "out.spz"],
-    "score to nowhere": SCORE,
     "info with a budget": ["info", "in.ply", "--ratio", ".5"],
 }
 
@@ -446,6 +361,8 @@ def test_wrong_usage_is_code_2_and_one_sentence(folder, capsys, name):
         (folder / place / "in.dat").write_bytes(b"notes")
     for path, content in (("b.ply", b"ply\n"), ("t.json", b'{"frames": []}'), ("in.dat", b"ply\n")):
         (folder / path).write_bytes(content)
+    (folder / "l").mkdir()
+    (folder / "l/in.ply").symlink_to(folder / "b.ply")
     before = contents(folder)
 
     assert command.main(USAGE[name]) == 2
@@ -468,44 +385,33 @@ def pruned(source="in.ply", cameras="cameras.json", output="out.ply"):
 
 FAILS = [
     (pruned("none.ply"), "none.ply: cannot be read"),
-    (pruned("folder"), "folder: is a folder, expected"),
-    (pruned("mesh.ply"), "mesh.ply: a point cloud, not"),
-    (pruned("cut.ply"), "cut.ply: truncated: the header"),
     (pruned("empty.ply"), "empty.ply: there are no splats to score"),
-    (pruned(LONG), f"{LONG}: cannot be read (File name too long)"),
-    (pruned(cameras="none.json"), "none.json: no such file or folder, expected cameras"),
     (pruned(cameras="in.ply"), "in.ply: not a camera file"),
     (pruned(cameras="away.json"), "in.ply: no camera sees the splats: none of 60 reaches into"),
-    (pruned(cameras=LONG), f"{LONG}: cannot be read (File name too long)"),
     (pruned(output="mesh.ply"), "mesh.ply: exists already; choose"),
-    ([*pruned(output="f.ply"), "--overwrite"], "f.ply: is a folder"),
     (pruned(output="none/out.ply"), "none/out.ply: cannot be written, there is no folder none"),
     (pruned(output="notes"), "notes: cannot be made ("),
-    (pruned(output=f"{LONG}.ply"), f"{LONG}.ply: cannot be "),
     (pruned(output=LONG), f"{LONG}: cannot be made (File name"),
     ([*pruned(output="cameras.json"), "--overwrite"], "cameras.json: cannot be made (File exists)"),
     ([*MADE, "--report", "mesh.ply"], "mesh.ply: exists already; choose another name, or set"),
-    ([*MADE, "--report", "none/r.json"], "none/r.json: cannot be written, there is no folder none"),
     ([*MADE, "--report", "folder", "--overwrite"], "folder: is a folder, expected"),
     ([*MADE, "--report", "link.json"], "link.json: cannot be written, there is no folder"),
     ([*MADE, "--report", LONG], f"{LONG}: cannot be written (File name too long); nothing was"),
     ([*MADE, "--max-mb", "1e-6"], "in.ply: max_mb is 1e-06"),
-    ([*SCORE, "-o", "mesh.ply"], "mesh.ply: exists already; choose another"),
     (["prune", "none.ply", *PRUNE[2:], "-o", "a/new"], "none.ply: cannot be read"),
     ([*pruned(LONGEST), "--pictures", "a/new"], "x" * 200),
 ]
 
 
-@pytest.mark.parametrize("case", range(len(FAILS)))
-def test_what_fails_is_code_1_and_one_sentence_that_names_the_file(folder, capsys, case):
+@pytest.mark.parametrize(("arguments", "expected"), FAILS, ids=range(len(FAILS)))
+def test_what_fails_is_code_1_and_one_sentence_that_names_the_file(
+    folder, capsys, arguments, expected
+):
     """No traceback, nothing written, no empty folder left, and every file as it was."""
-    arguments, expected = FAILS[case]
-    for name in ("folder", "f.ply"):
-        (folder / name).mkdir()
+    (folder / "folder").mkdir()
     (folder / "notes").write_bytes(b"mine")
     (folder / "link.json").symlink_to(folder / "none/report.json")
     (folder / "mesh.ply").write_bytes(plain_header(0, ["x", "y", "z"]))
-    (folder / "cut.ply").write_bytes(plain_ply(COUNT)[:-1])
     (folder / "empty.ply").write_bytes(plain_header(0, splat_names(0)))
     (folder / LONGEST).write_bytes(plain_ply(COUNT))
     away = json.loads((folder / "cameras.json").read_text())[:1]
@@ -519,13 +425,3 @@ def test_what_fails_is_code_1_and_one_sentence_that_names_the_file(folder, capsy
     assert said.err.startswith(f"refine: error: {expected}")
     assert said.err.count("\n") == 1
     assert before == contents(folder)
-
-
-def test_help_and_version_are_code_0_and_every_command_has_help(capsys):
-    assert command.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"refine {VERSION}\n"
-    for words in ([], ["prune"], ["score"], ["info"]):
-        assert command.main([*words, "--help"]) == 0
-        text = capsys.readouterr().out
-        assert ("--ratio B" in text) == (words == ["prune"])
-        assert ("--report FILE.json" in text) == bool(words)

@@ -77,11 +77,10 @@ def test_every_number_is_read_as_it_stands(folder, case):
 
 def test_a_prune_holds_a_few_megabytes_of_a_file(tmp_path):
     """80,000 splats of degree 3 are 19 MB; opening and writing half of them takes under 10 MB."""
-    path = tmp_path / "in.ply"
-    path.write_bytes(plain_ply(80_000, 3))
+    (tmp_path / "in.ply").write_bytes(plain_ply(80_000, 3))
     keep = np.arange(80_000) % 2 == 0
     tracemalloc.start()
-    file = read_ply(path)
+    file = read_ply(tmp_path / "in.ply")
     file.splats()
     file.write(tmp_path / "out.ply", keep, columns={"refine_score": np.zeros(80_000, np.float32)})
     peak = tracemalloc.get_traced_memory()[1]
@@ -167,24 +166,22 @@ def test_odd_headers_are_read_and_kept(tmp_path):
     assert header.replace(b"0002", b"1") + rows[56:] == written
 
 
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        ({"keep": np.ones(2, bool)}, "keep is bool (2,), expected one bool for each of 3 splats"),
-        ({"keep": np.ones(3)}, "keep is float64 (3,), expected one bool"),
-        ({"columns": {"s": np.zeros(2)}}, "column 's' has shape (2,), expected (3,)"),
-        ({"columns": {"s": np.zeros(3, "i8")}}, "column 's' of type int64 cannot be a property"),
-        ({"columns": {"my s": np.zeros(3)}}, "column 'my s' of type float64 cannot be a property"),
-        ({"columns": {"tag": np.zeros(3)}}, "'tag' is there already, of type uint8; expected one"),
-    ],
-)
-def test_what_does_not_fit_the_rows_is_refused_before_anything_is_written(
-    tmp_path, given, expected
-):
-    header = plain_header(3, [*splat_names(0), "tag"]).replace(b"float tag", b"uchar tag")
+UNFIT = [
+    ({"keep": np.ones(2, bool)}, "keep is bool (2,), expected one bool for each of 3 splats"),
+    ({"keep": np.ones(3)}, "keep is float64 (3,), expected one bool"),
+    ({"columns": {"s": np.zeros(2)}}, "column 's' has shape (2,), expected (3,)"),
+    ({"columns": {"s": np.zeros(3, "i8")}}, "column 's' of type int64 cannot be a property"),
+    ({"columns": {"my s": np.zeros(3)}}, "column 'my s' of type float64 cannot be a property"),
+    ({"columns": {"tag": np.zeros(3)}}, "'tag' is there already, of type uint8; expected one"),
+]
+
+
+def test_what_does_not_fit_the_rows_is_refused_before_anything_is_written(tmp_path):
+    header = plain_header(3, [*NAMES, "tag"]).replace(b"float tag", b"uchar tag")
     file = opened(tmp_path, header + bytes(3 * 57))
-    with pytest.raises(RefineError, match=re.escape(expected)):
-        file.write(tmp_path / "out.ply", **given)
+    for arguments, expected in UNFIT:
+        with pytest.raises(RefineError, match=re.escape(expected)):
+            file.write(tmp_path / "out.ply", **arguments)
     assert [tmp_path / "in.ply"] == list(tmp_path.iterdir())
 
 
@@ -213,8 +210,8 @@ def counted(count: object) -> bytes:
 
 
 VERTEX = b"element vertex 3\n"
-LIST = b"element face 2\nproperty list %s int corners\n"
 GAP = [f"f_rest_{index}" for index in range(1, 10)]
+LIST = b"element face 2\nproperty list %s int corners\n"
 BYTES = plain_header(0, splat_names(1)).replace(b"float f_rest_4", b"uchar f_rest_4")
 POSITIONS = b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
 CLOUD = b"ply\nformat ascii 1.0\n" + POSITIONS + b"end_header\n0 0 0\n"
@@ -225,96 +222,69 @@ PACKED = PACKED.replace(b"property float z\n", b"property uint packed_rotation\n
 LONG = b"n" * 5000
 ROWS = "expected a number of rows, got"
 
-TEXT_HEADER = plain_header(2, NAMES, "ascii").replace(
-    b"end_header", b"property uchar tag\nend_header"
-)
+TEXT_HEADER = plain_header(2, [*NAMES, "tag"], "ascii").replace(b"float tag", b"uchar tag")
 TEXT_ROW = b"0 0 0 0 0 0 0 0 0 0 1 0 0 0 7\n"
 LONG_ROW = TEXT_ROW.replace(b"\n", b" " * 40 + b"\n")
 
 REFUSED = [
     (b"", "the file is empty, expected a PLY"),
     (b"\x89PNG\r\n\x1a\n....", r"not a PLY: it starts with b'\x89PNG\r\n\x1a\n'"),
-    (b"ply", "not a PLY: it starts with b'ply', expected 'ply' and a line end"),
     (b"\xef\xbb\xbf" + PLAIN, "not a PLY: it starts with b'\\xef\\xbb\\xbfply"),
     (PLAIN[:100], "header without end: no 'end_header' line in the first 100 bytes"),
     (declared(b"ply\n", b"ply\r\n"), f"no 'end_header' line in the first {len(PLAIN) + 1} bytes"),
     (declared(b"little_endian 1", b"middle 1"), "line 2: don't understand format"),
-    (declared(b"float y\n", b"float\n"), "line 5: bad 'property' line"),
     (more(b"end_header now"), "unexpected data after 'end_header'"),
     (declared(b"float y", b"float\x1cy"), r"line 5: expected ASCII text, got b'property float\x1c"),
-    (declared(b"float y", "float ÿ".encode()), "header line 5: expected ASCII text"),
     (declared(b"float y", b"float x"), "line 5: 'x' is declared twice, expected once"),
     (more(VERTEX[:-1]), "header line 18: 'vertex' is declared twice, expected once"),
     (MESH, "a mesh, not splats: vertex lacks f_dc_0"),
-    (MESH.replace(b"element face", b"element other 7\nelement face"), "a mesh"),
-    (CLOUD, "a point cloud, not splats: vertex lacks f_dc_0"),
     (declared(VERTEX, b"element point 3\n"), "expected an element 'vertex', got point"),
     (b"ply\nformat ascii 1.0\nend_header\n", "expected an element 'vertex', got none"),
-    (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "rot_3 (it has no property)"),
     (PACKED, "a compressed splat PLY, which 'refine convert IN OUT.ply' makes a plain one of"),
     (declared(b"property float rot_3\n", b""), "incomplete splats: vertex lacks rot_3 (it has x"),
-    (
-        more(b"property float f_rest_0"),
-        "found 1 f_rest properties, expected f_rest_0 onward, 0,",
-    ),
+    (more(b"property float f_rest_0"), "found 1 f_rest properties, expected f_rest_0 onward, 0,"),
     (plain_header(0, [*NAMES, *GAP]), "found 9 f_rest properties, expected f_rest_0 onward"),
     (more(b"property list uchar int links"), "property 'links' is a list, expected one number a"),
     (declared(b"float y", b"int y"), "'y' is of type i4, expected float or double"),
     (BYTES, "property 'f_rest_4' is of type u1, expected float or double"),
     (counted(-1), f"header line 3: {ROWS} '-1'"),
-    (counted("many"), f"header line 3: {ROWS} 'many'"),
-    (counted("1_0"), f"header line 3: {ROWS} '1_0'"),
     (counted("9" * 5000), f"header line 3: {ROWS} '999"),
     (counted(2**63), "9223372036854775808 rows of 'vertex', at least 516508834063867445248 bytes"),
     (ahead(b"element a %d\nproperty uchar b\n" % 2**63), "9223372036854775808 rows of 'a'"),
     (more(b"element f %d\nproperty list uchar int a" % 2**63), "9223372036854775808 rows of 'f'"),
     (ahead(b"element other %d\n" % 10**12), "'other' has 1000000000000 rows and no property"),
     (counted(4), "truncated: the header announces 4 rows of 'vertex', at least 224 bytes"),
-    (
-        more(b"element a 1\nproperty double a"),
-        "1 rows of 'a', at least 176 bytes so far, but on",
-    ),
+    (more(b"element a 1\nproperty double a"), "1 rows of 'a', at least 176 bytes so far, but on"),
     (ahead(LIST % b"uchar"), "'face' has a list and stands before the splats, expected it behind"),
     # Two rows are announced and one is there, long enough to be two by its bytes.
     (TEXT_HEADER + LONG_ROW, "truncated: the file ends in row 1 of 2 of 'vertex'"),
     # Names that do not end do not flood the message: forty characters of each are shown.
     (declared(b"float rot_3", b"float " + LONG), ""),
-    (declared(b"element vertex", b"element " + LONG), ""),
-    (more(b"property list uchar int " + LONG), ""),
-    (more(b"element %s 1\nproperty double a" % LONG), ""),
-    (more(b"element %s 7" % LONG), ""),
-    (ahead(LIST.replace(b"face", LONG) % b"float"), ""),
     (ahead(LIST.replace(b"face", LONG) % b"uchar"), ""),
     (declared(b"property float x", b"property float x%s\nproperty float x%s" % (LONG, LONG)), ""),
-    (declared(b"property float x", b"property %s x" % LONG), ""),
-    (declared(b"property float x", b"%s float x" % LONG), ""),
     (declared(b"binary_little_endian", LONG), ""),
 ]
 
 
-@pytest.mark.parametrize("case", range(len(REFUSED)))
-def test_a_file_that_is_wrong_is_refused_with_its_name_and_the_place(tmp_path, case):
-    data, expected = REFUSED[case]
+@pytest.mark.parametrize(("data", "expected"), REFUSED, ids=range(len(REFUSED)))
+def test_a_file_that_is_wrong_is_refused_with_its_name_and_the_place(tmp_path, data, expected):
     refused(tmp_path / "in.ply", expected, data, read=read_ply)
     assert data == (tmp_path / "in.ply").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        (b"1", b"one", "property 'rot_0': expected a number of type float32"),
-        (b"7", b"300", "expected a number of type uint8, got '300'"),
-        (b"7", b"7.5", "expected a number of type uint8, got '7.5'"),
-        (b"7", b"-7", "expected a number of type uint8, got '-7'"),
-        (b" 7", b"", "expected 15 numbers, got 14"),
-        (b" 7", b" 7 7", "expected 15 numbers, got 16"),
-        (b"7", b"7 # 7", "expected 15 numbers, got 17"),
-        (b"7", b"\xff", r"of type uint8, got '\\xff'"),
-        (TEXT_ROW, b"\n" + TEXT_ROW, "expected 15 numbers, got 0"),
-        (b"1", b"1\x1d5", r"of type float32, got '1\x1d5'"),
-        (b" 7", b"\x1f7", "expected 15 numbers, got 14"),
-    ],
-)
+WRONG_ROWS = [
+    (b"1", b"one", "property 'rot_0': expected a number of type float32"),
+    (b"7", b"300", "expected a number of type uint8, got '300'"),
+    (b" 7", b"", "expected 15 numbers, got 14"),
+    (b"7", b"7 # 7", "expected 15 numbers, got 17"),
+    (b"7", b"\xff", r"of type uint8, got '\\xff'"),
+    (TEXT_ROW, b"\n" + TEXT_ROW, "expected 15 numbers, got 0"),
+    (b"1", b"1\x1d5", r"of type float32, got '1\x1d5'"),
+    (b" 7", b"\x1f7", "expected 15 numbers, got 14"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), WRONG_ROWS, ids=range(len(WRONG_ROWS)))
 def test_a_text_row_that_is_wrong_is_refused_with_its_number(tmp_path, old, new, expected):
     """Rows count from 0, as those of a binary file do; the fourth one is wrong here."""
     good = TEXT_ROW * 2 + TEXT_ROW.replace(b"\n", b"   \n")  # as long as if none lacked
@@ -360,11 +330,9 @@ def test_a_header_of_empty_lines_is_refused_in_time_that_grows_with_its_length(t
 
 
 def test_what_is_no_file_is_refused(tmp_path):
-    """A folder, nothing, a pipe, a name with a zero byte, a name too long, nobody's home."""
-    pipe = tmp_path / "pipe.ply"
     if hasattr(os, "mkfifo"):  # not on Windows
-        os.mkfifo(pipe)
-        refused(pipe, "is a device, expected a PLY file", read=read_ply)
+        os.mkfifo(tmp_path / "pipe.ply")
+        refused(tmp_path / "pipe.ply", "is a device, expected a PLY file", read=read_ply)
     for path, expected in {
         str(tmp_path): "is a folder, expected a PLY file",
         str(tmp_path / "none.ply"): "cannot be read (No such file or directory)",
