@@ -37,17 +37,11 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from refine_addon.command.subcommands import describe
-from refine_addon.core import (
-    ClosedForm,
-    RefineError,
-    read_cameras,
-    read_ply,
-    read_splats,
-    score,
-    write_splats,
-)
+from refine_addon.core import RefineError, read_cameras, read_ply, read_splats, write_splats
 from refine_addon.core.formats.ply_columns import empty_rows, splats_from_columns
 from refine_addon.core.formats.registry import FORMATS, SUFFIXES
+from refine_addon.core.methods import ClosedForm
+from refine_addon.core.prune import score
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.visibility.measuring import Sampling
 from tests.core.test_camera_files import FRAME, INRIA, MATRIX, TRANSFORMS
@@ -151,7 +145,7 @@ def broken(files: Files, others: list[Files], chance: random.Random) -> Files:
             data = _other_value(data, chance)
         else:
             other = chance.choice(others).get(name, data)
-            data = chance.choice(_WAYS)(data, other, chance)
+            data = chance.choice((_flip, _put, _put, _number, _splice))(data, other, chance)
     return {**files, name: data[:200_000]}
 
 
@@ -187,9 +181,6 @@ def _number(data: bytes, _: bytes, chance: random.Random) -> bytes:
 def _splice(data: bytes, other: bytes, chance: random.Random) -> bytes:
     rest = other[chance.randint(0, len(other)) :]
     return data[: chance.randint(0, len(data))] + chance.choice((b"", rest))
-
-
-_WAYS = (_flip, _put, _put, _number, _splice)
 
 
 def _places(node: Any) -> list[tuple[Any, Any]]:
@@ -327,13 +318,12 @@ def fuzz(name: str, chance: random.Random, going: Callable[[int], bool]) -> tupl
     tried = taken = 0
     with tempfile.TemporaryDirectory() as made, warnings.catch_warnings():
         warnings.simplefilter("error")
-        folder = Path(made)
         for seed in seeds:
-            if not attempt(seed, use, folder):
+            if not attempt(seed, use, Path(made)):
                 raise Crash(seed, "a good file is refused")
         while going(tried):
             tried += 1
-            taken += attempt(broken(chance.choice(seeds), seeds, chance), use, folder)
+            taken += attempt(broken(chance.choice(seeds), seeds, chance), use, Path(made))
     return tried, taken
 
 

@@ -63,9 +63,9 @@ def two(**keys):
 def test_every_format_gives_the_same_view(tmp_path, kind):
     """The camera stands at (1, 2, 3), looks along -X, and world Z is up in its picture.
 
-    So its x axis (right) is world (0, 1, 0), y (down) is (0, 0, -1), z (forward) is (-1, 0, 0);
-    x cross y is z, as it should. The point (-1, 2.5, 2.75) is the centre + 0.5 x + 0.25 y + 2 z,
-    and lands at u = 100 * 0.5 / 2 + 32 = 57, v = 120 * 0.25 / 2 + 24 = 39.
+    So its x axis (right) is world (0, 1, 0), y (down) is (0, 0, -1), z (forward) is (-1, 0, 0).
+    The point (-1, 2.5, 2.75) is the centre + 0.5 x + 0.25 y + 2 z, and lands at
+    u = 100 * 0.5 / 2 + 32 = 57, v = 120 * 0.25 / 2 + 24 = 39.
 
     Inria stores x, y, z as columns; OpenGL x, -y, -z. COLMAP stores R with rows x, y, z: its
     trace is 0, so qw = 1/2, qx = (R21 - R12) / 2 = 1/2, qy = (R02 - R20) / 2 = 1/2,
@@ -242,7 +242,6 @@ WRONG = [
     ("fy", [math.nan, math.inf, 10**400], f": {FINITE} "),
     ("cx", [[]], f": {NUMBER} a list of 0"),
     ("width", [64.5, 0, 10**7], f": {PIXELS}"),
-    ("img_name", [3], ": expected a string, got 3"),
     ("position", [[1, 2], {"x": 1}], f": {THREE}, got "),
     ("position", [[1, 2, "3"], [1, 2, [3]]], f" [2]: {NUMBER} "),
     ("rotation", [[X, Y]], ": expected a 3 x 3 matrix"),
@@ -281,7 +280,6 @@ NO_CAMERAS = [
         for key in ("position", "rotation", "fx", "fy", "width", "height")
     ),
     ({"frames": []}, "'frames': the list is empty, expected at least one frame"),
-    ({"frames": {}}, "'frames': expected a list, got an object with 0 keys"),
     (ANGLE, "frame 0: missing 'fl_x'"),
     ({**SHORT, "h": 48}, "frame 0: missing 'w', expected w and h"),
     (

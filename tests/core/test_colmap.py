@@ -193,7 +193,7 @@ def test_an_empty_or_missing_half_is_named(tmp_path, suffix, file):
 
 
 FINITE = "expected a finite number up to 1e18, got"
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 FAR = (0.9238795325112867, 0, 0, 0.3826834323650898, 9e17, -9e17, 0)
 """Turned by 45 degrees about z, t = (9e17, -9e17, 0) is sqrt(2) * 9e17 along one axis."""
 
@@ -209,10 +209,9 @@ FAR = (0.9238795325112867, 0, 0, 0.3826834323650898, 9e17, -9e17, 0)
         ((1, 1, 0, 48, (100, 120, 32, 24)), "width: expected a whole number of pixels"),
         ((1, 1, 64, 2**64 - 1, (100, 120, 32, 24)), f"height: {FINITE}"),
         ((1, 1, 64, 48, (100, 0.0, 32, 24)), "focal length: expected a positive focal length"),
-        ((1, 2, 64, 48, (100, 32, 24, INF)), f"parameter 3: {FINITE}"),
         ((9, 1, 64, 48, (100, 120, 32, 24)), "camera 9 is there twice"),
     ],
-    ids=range(9),
+    ids=range(8),
 )
 def test_a_wrong_image_or_camera_is_named_with_its_place(tmp_path, suffix, second, problem):
     if second[3] == "b":

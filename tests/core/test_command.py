@@ -60,9 +60,9 @@ def contents(folder):
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
-def told(path="report.json"):
-    """Return the only entry of a report."""
-    (entry,) = json.loads(Path(path).read_text())["results"]
+def told():
+    """Return the only entry of the report."""
+    (entry,) = json.loads(Path("report.json").read_text())["results"]
     return entry
 
 
@@ -74,9 +74,6 @@ def run(*arguments, encoding="utf-8", **options):
     return subprocess.run(
         [sys.executable, *words], env={**os.environ, **named}, timeout=600, check=False, **options
     )
-
-
-# What is done.
 
 
 @pytest.mark.parametrize(
@@ -114,8 +111,7 @@ def test_scores_are_written_bit_for_bit_and_twice_alike(folder):
 
     written = read_ply("out.ply")
     assert expected.tobytes() == written.rows["refine_score"].tobytes()
-    for name in file.rows.dtype.names:
-        assert file.rows[name].tobytes() == written.rows[name].tobytes()
+    assert written.rows[list(file.rows.dtype.names)].tolist() == file.rows.tolist()
     added = b"property float refine_score\nend_header\n"
     assert file.header.replace(b"end_header\n", added) == written.header
     assert (folder / "out.ply").read_bytes() == (folder / "twice.ply").read_bytes()
@@ -213,9 +209,6 @@ def test_a_batch_of_files_leaves_none_of_them_open_or_mapped(folder):
     assert after[1] <= before[1] + 20
 
 
-# What is said.
-
-
 def test_summary_and_report_of_a_prune_are_complete(folder, capsys):
     """Counts, settings, weights, timings, versions, notes, sizes; valid JSON without NaN."""
     words = [*MADE, "--method", "closed-form", "--keep", "9", "--report", "report.json"]
@@ -225,7 +218,6 @@ def test_summary_and_report_of_a_prune_are_complete(folder, capsys):
     (entry,) = report["results"]
     assert (VERSION, np.__version__) == (report["refine"], report["numpy"])
     assert (entry["status"], entry["budget"]) == ("done", {"keep": 9})
-    assert entry["views"] == {"given": 5, "used": 5}
     counts = [entry["splats"][name] for name in ("before", "kept", "removed")]
     assert counts == [COUNT, 9, COUNT - 9]
     sizes = [(folder / name).stat().st_size for name in ("in.ply", "out.ply")]
@@ -233,7 +225,6 @@ def test_summary_and_report_of_a_prune_are_complete(folder, capsys):
     assert sum(entry["weights"]["lambda"].values()) == pytest.approx(1.0)
     assert {"read_s", "score_s", "select_s", "write_s", "total_s"} == set(entry["timings"])
     assert 0 < entry["timings"]["total_s"] <= report["seconds"]
-    assert entry["notes"] == []
     said = capsys.readouterr()
     assert said.out.startswith("in.ply: kept 9 of 60 splats (85.0% removed), 6.1 -> 1.4 kB, by 5 o")
     assert f"\n  {entry['splats']['unseen']} of 60 splats lie in no view\n" in said.out
@@ -317,8 +308,6 @@ def test_ctrl_c_while_pictures_are_drawn_says_that_the_file_is_written(folder, m
     assert "out.ply is written, its pictures and report are not;" in capsys.readouterr().err
 
 
-# What is refused.
-
 USAGE = {
     "nothing": [],
     "no input": ["prune", "--cameras", "cameras.json", "-o", "out.ply"],
@@ -330,7 +319,6 @@ USAGE = {
     "keep a part": [*MADE, "--keep", "1.5"],
     "rounds of nothing": [*MADE, "--rounds", "2"],
     "too many rounds": [*MADE, "--method", "refit", "--rounds", "1000000"],
-    "a source that is none": [*MADE, "--source", "visble"],
     "frames that end before they start": [*MADE, "--source", "frames:3:1"],
     "a source without Blender": ["prune", "in.ply", "-o", "out.ply", "--source", "frames:1:3"],
     "render without Blender": ["render"],
@@ -338,7 +326,6 @@ USAGE = {
     "save without object": [*MADE, "--save"],
     "output of nobody": [*PRUNE, "-o", "~nobody-of-that-name/out.ply"],
     "output to standard output": [*PRUNE, "-o", "-"],
-    "pictures to standard output": [*PRUNE, "--dry-run", "--pictures", "-"],
     "report over the input": [*MADE, "--report", "./in.ply", "--overwrite"],
     "report over the output": [*MADE, "--report", "out.ply"],
     "report over other splats": [*PRUNE, "--dry-run", "--report", "b.ply", "--overwrite"],
@@ -384,18 +371,14 @@ def pruned(source="in.ply", cameras="cameras.json", output="out.ply"):
 
 
 FAILS = [
-    (pruned("none.ply"), "none.ply: cannot be read"),
     (pruned("empty.ply"), "empty.ply: there are no splats to score"),
     (pruned(cameras="in.ply"), "in.ply: not a camera file"),
     (pruned(cameras="away.json"), "in.ply: no camera sees the splats: none of 60 reaches into"),
     (pruned(output="mesh.ply"), "mesh.ply: exists already; choose"),
     (pruned(output="none/out.ply"), "none/out.ply: cannot be written, there is no folder none"),
-    (pruned(output="notes"), "notes: cannot be made ("),
     (pruned(output=LONG), f"{LONG}: cannot be made (File name"),
     ([*pruned(output="cameras.json"), "--overwrite"], "cameras.json: cannot be made (File exists)"),
     ([*MADE, "--report", "mesh.ply"], "mesh.ply: exists already; choose another name, or set"),
-    ([*MADE, "--report", "folder", "--overwrite"], "folder: is a folder, expected"),
-    ([*MADE, "--report", "link.json"], "link.json: cannot be written, there is no folder"),
     ([*MADE, "--report", LONG], f"{LONG}: cannot be written (File name too long); nothing was"),
     ([*MADE, "--max-mb", "1e-6"], "in.ply: max_mb is 1e-06"),
     (["prune", "none.ply", *PRUNE[2:], "-o", "a/new"], "none.ply: cannot be read"),
@@ -408,9 +391,6 @@ def test_what_fails_is_code_1_and_one_sentence_that_names_the_file(
     folder, capsys, arguments, expected
 ):
     """No traceback, nothing written, no empty folder left, and every file as it was."""
-    (folder / "folder").mkdir()
-    (folder / "notes").write_bytes(b"mine")
-    (folder / "link.json").symlink_to(folder / "none/report.json")
     (folder / "mesh.ply").write_bytes(plain_header(0, ["x", "y", "z"]))
     (folder / "empty.ply").write_bytes(plain_header(0, splat_names(0)))
     (folder / LONGEST).write_bytes(plain_ply(COUNT))

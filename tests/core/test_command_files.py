@@ -48,9 +48,6 @@ def test_what_the_system_refuses_is_code_1_and_one_sentence_that_names_it(
         assert not (place / "out.ply").exists()
 
 
-# The report.
-
-
 @pytest.mark.parametrize("arguments", [["info", "in.ply"], [*PRUNE, "--dry-run"], MADE])
 def test_a_report_made_meanwhile_is_left_and_what_was_written_is_told(
     folder, monkeypatch, capsys, arguments
@@ -82,8 +79,6 @@ def test_a_report_replaces_a_report_and_nothing_else(folder, capsys):
         assert "report.json exists and is no report: write to another" in capsys.readouterr().err
         assert report.read_bytes() == content
 
-
-# What is shown.
 
 NASTY = "a\x1b]0;title\x07\nb\x9b\u202e.ply"
 HARMLESS = r"a\x1b]0;title\x07\nb\x9b\u202e.ply"
@@ -150,29 +145,22 @@ def test_progress_is_drawn_on_a_terminal_escaped_and_wiped_away(folder):
         assert (b"\x1b" in done.stdout, bool(done.stdout)) == (False, not more)
 
 
-# Where nobody listens.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("how", "arguments", "code"),
-    [
-        ("gone", ["--help"], 0),
-        ("full", ["info", "in.ply"], 0),
-        ("gone", ["info", "none.ply"], 1),
-        ("closed", ["info", "none.ply"], 1),
-    ],
+    "case", ["gone --help", "full info in.ply", "gone info none.ply", "closed info none.ply"]
 )
 @pytest.mark.usefixtures("folder")
-def test_a_stream_that_takes_nothing_changes_no_exit_code(how, arguments, code):
+def test_a_stream_that_takes_nothing_changes_no_exit_code(case):
     """A pager that was left, a full disk, ``2>&-``: Python would exit with 120."""
+    how, *arguments = case.split()
+    code = int("none.ply" in arguments)
     stream, other = ("stderr", "stdout") if code else ("stdout", "stderr")
     if how == "full" and not Path("/dev/full").exists():
         pytest.skip("no /dev/full here")
     reader, gone = os.pipe()
     os.close(reader)
     target = gone if how == "gone" else os.open(f"/dev/{how.replace('closed', 'null')}", os.O_RDWR)
-    shut = (lambda: os.close(1 + bool(code))) if how == "closed" else None
+    shut = (lambda: os.close(1 + code)) if how == "closed" else None
     done = run(*arguments, preexec_fn=shut, **{stream: target})
     for descriptor in {gone, target}:
         os.close(descriptor)

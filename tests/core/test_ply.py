@@ -212,7 +212,6 @@ def counted(count: object) -> bytes:
 VERTEX = b"element vertex 3\n"
 GAP = [f"f_rest_{index}" for index in range(1, 10)]
 LIST = b"element face 2\nproperty list %s int corners\n"
-BYTES = plain_header(0, splat_names(1)).replace(b"float f_rest_4", b"uchar f_rest_4")
 POSITIONS = b"element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
 CLOUD = b"ply\nformat ascii 1.0\n" + POSITIONS + b"end_header\n0 0 0\n"
 FACES = b"element face 0\nproperty list uchar int vertex_indices\nend_header"
@@ -230,7 +229,6 @@ REFUSED = [
     (b"", "the file is empty, expected a PLY"),
     (b"\x89PNG\r\n\x1a\n....", r"not a PLY: it starts with b'\x89PNG\r\n\x1a\n'"),
     (b"\xef\xbb\xbf" + PLAIN, "not a PLY: it starts with b'\\xef\\xbb\\xbfply"),
-    (PLAIN[:100], "header without end: no 'end_header' line in the first 100 bytes"),
     (declared(b"ply\n", b"ply\r\n"), f"no 'end_header' line in the first {len(PLAIN) + 1} bytes"),
     (declared(b"little_endian 1", b"middle 1"), "line 2: don't understand format"),
     (more(b"end_header now"), "unexpected data after 'end_header'"),
@@ -239,21 +237,18 @@ REFUSED = [
     (more(VERTEX[:-1]), "header line 18: 'vertex' is declared twice, expected once"),
     (MESH, "a mesh, not splats: vertex lacks f_dc_0"),
     (declared(VERTEX, b"element point 3\n"), "expected an element 'vertex', got point"),
-    (b"ply\nformat ascii 1.0\nend_header\n", "expected an element 'vertex', got none"),
     (PACKED, "a compressed splat PLY, which 'refine convert IN OUT.ply' makes a plain one of"),
     (declared(b"property float rot_3\n", b""), "incomplete splats: vertex lacks rot_3 (it has x"),
     (more(b"property float f_rest_0"), "found 1 f_rest properties, expected f_rest_0 onward, 0,"),
     (plain_header(0, [*NAMES, *GAP]), "found 9 f_rest properties, expected f_rest_0 onward"),
     (more(b"property list uchar int links"), "property 'links' is a list, expected one number a"),
     (declared(b"float y", b"int y"), "'y' is of type i4, expected float or double"),
-    (BYTES, "property 'f_rest_4' is of type u1, expected float or double"),
     (counted(-1), f"header line 3: {ROWS} '-1'"),
     (counted("9" * 5000), f"header line 3: {ROWS} '999"),
     (counted(2**63), "9223372036854775808 rows of 'vertex', at least 516508834063867445248 bytes"),
     (ahead(b"element a %d\nproperty uchar b\n" % 2**63), "9223372036854775808 rows of 'a'"),
     (more(b"element f %d\nproperty list uchar int a" % 2**63), "9223372036854775808 rows of 'f'"),
     (ahead(b"element other %d\n" % 10**12), "'other' has 1000000000000 rows and no property"),
-    (counted(4), "truncated: the header announces 4 rows of 'vertex', at least 224 bytes"),
     (more(b"element a 1\nproperty double a"), "1 rows of 'a', at least 176 bytes so far, but on"),
     (ahead(LIST % b"uchar"), "'face' has a list and stands before the splats, expected it behind"),
     # Two rows are announced and one is there, long enough to be two by its bytes.
