@@ -7,7 +7,6 @@ Writes ``docs/slider.webp``, ``docs/store/featured.jpg`` and ``docs/store/icon.p
 from __future__ import annotations
 
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -16,9 +15,9 @@ import numpy as np
 from PIL import Image
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS.parent / "tests" / "e2e"), str(DOCS.parent / ".ci")]
+sys.path.insert(0, str(DOCS.parent))
 
-from blenders import Binary, provide
+from benchmarks.speed.main_thread import BINARIES, installed
 
 SHARES = [10, 30, 50, 60, 70, 80, 85, 90, 95]
 """Of the splats removed, percent: from left to right and back."""
@@ -40,20 +39,13 @@ ICON, BLOBS = (
 
 def frames(scene: Path) -> list[Image.Image]:
     """Pictures of the window, one for each of `SHARES`."""
-    path, reason = provide("trixie")
-    if path is None:
-        sys.exit(reason)
-    build = [sys.executable, DOCS.parent / ".ci" / "build_extension.py"]
-    archive = subprocess.run(build, capture_output=True, text=True, check=True).stdout.strip()
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        (work / "resources").mkdir()
-        files = [work / name for name in ("point_cloud.ply", "cameras.json")]
-        for file in files:
-            shutil.copy(scene / file.name, file)
-        blender = Binary("trixie", path, work, work / "resources")
-        blender.step("install", archive=shutil.copy(archive, work))
-        names = {"cloud": files[0], "cameras": files[1], "pictures": work}
+        blender = installed(BINARIES[0], work)
+        cloud, cameras = (
+            shutil.copy(scene / name, work) for name in ("point_cloud.ply", "cameras.json")
+        )
+        names = {"cloud": cloud, "cameras": cameras, "pictures": work}
         blender.window_step("slider", size=SIZE, shares=SHARES, **names)
         return [Image.open(file).convert("RGB") for file in sorted(work.glob("*.png"))]
 

@@ -79,6 +79,3 @@ def until(operator, context, is_so=lambda: False):
             return answer
         time.sleep(0.01)
     raise AssertionError("it never ended")
-
-
-until_over = until

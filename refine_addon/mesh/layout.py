@@ -344,12 +344,6 @@ def _with_harmonics(layout: Layout, count: int, rest: Sequence[Column]) -> Layou
     return Layout(plain, header)
 
 
-def note(mesh: bpy.types.Mesh | bpy.types.PointCloud, layout: Layout) -> None:
-    """Note on a mesh the layout of its file."""
-    columns = [[c.name, c.dtype, c.attribute, c.place.component] for c in layout.columns]
-    mesh[LAYOUT] = json.dumps({"header": layout.header.decode("latin-1"), "columns": columns})
-
-
 def _floats(names: Sequence[str], places: Mapping[str, Place]) -> list[Column]:
     return [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
 
@@ -411,7 +405,9 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
         attribute = mesh.attributes.new(name if plain else other, STORAGE[kind[1:]], "POINT")
         attribute = attribute or mesh.attributes.new(other, STORAGE[kind[1:]], "POINT")
         columns.append(Column(name, kind, _plain(kind, attribute.name)))
-    note(mesh, Layout(tuple(columns), vertex_header(header)))
+    noted = [[c.name, c.dtype, c.attribute, c.place.component] for c in columns]
+    text = vertex_header(header).decode("latin-1")
+    mesh[LAYOUT] = json.dumps({"header": text, "columns": noted})
     return tuple(columns)
 
 

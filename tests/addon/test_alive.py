@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 import pytest
 
-from tests.windows import event, started_in_a_window, until, until_over
+from tests.windows import event, started_in_a_window, until
 
 from .conftest import read
 
@@ -72,7 +72,7 @@ def test_only_one_operation_works_at_a_time(start, gate):
     operator, context, _ = start()
     during = polls()
     operator.modal(context, event("ESC"))
-    until_over(operator, context)
+    until(operator, context)
 
     assert before == polls() == {*names, "render"}
     assert during == set()
@@ -96,7 +96,7 @@ def test_a_merge_is_refused_when_other_splats_must_stay_since(addon, obj, start,
     else:
         volume.location, volume.scale = (0.0, 0.0, 0.0), (100.0, 100.0, 100.0)
 
-    assert until_over(operator, context) == {"CANCELLED"}
+    assert until(operator, context) == {"CANCELLED"}
     assert "what must stay or go has changed meanwhile" in said[-1]
     assert len(obj.data.vertices) == 3976
     assert noted(addon, obj) is not None
@@ -108,7 +108,7 @@ def test_a_fault_on_the_thread_is_raised_and_locks_nothing(start, gate):
     gate.open.set()
     operator, context, _ = start()
     with pytest.raises(ValueError, match="a fault"):
-        until_over(operator, context)
+        until(operator, context)
 
     assert bpy.ops.refine.score.poll()
     assert context.timers == 0
@@ -125,7 +125,7 @@ def test_scoring_on_the_thread_writes_what_scoring_at_once_writes_and_esc_nothin
     operator, context, said = start()
     until(operator, context, lambda: any("39%" in str(text) for text in context.said))
     operator.modal(context, event("ESC"))
-    assert until_over(operator, context) == {"CANCELLED"}
+    assert until(operator, context) == {"CANCELLED"}
     assert said == ["Scoring splats cancelled; nothing was changed"]
     assert scores(addon, obj) == (expected, plain)
     assert set(context.drawn) == {"VIEW_3D UI"}
@@ -135,7 +135,7 @@ def test_scoring_on_the_thread_writes_what_scoring_at_once_writes_and_esc_nothin
     gate.open.set()
     settings.views = 4
     del obj.data[addon.mesh.scores.RECORD]
-    assert until_over(*start()[:2]) == {"FINISHED"}
+    assert until(*start()[:2]) == {"FINISHED"}
     found, note = scores(addon, obj)
     assert found == expected
     assert note | {"seconds": plain["seconds"]} == plain
@@ -160,7 +160,7 @@ def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, obj, ch
     change(other)
     gate.open.set()
 
-    assert until_over(operator, context) == {"CANCELLED"}
+    assert until(operator, context) == {"CANCELLED"}
     assert said == ["object 'room.001': its splats were changed meanwhile; start again"]
     assert noted(addon, obj) is None
     assert context.timers == 0
@@ -196,7 +196,7 @@ def test_a_renamed_object_gets_its_result_once_edit_mode_is_left(start, gate, ad
     bpy.ops.object.mode_set(mode="OBJECT")
 
     assert waits == "Scoring splats: go back to object mode for the result (Esc cancels)"
-    assert until_over(operator, context) == {"FINISHED"}
+    assert until(operator, context) == {"FINISHED"}
     assert noted(addon, obj)["method"] == "occlusion"
     assert noted(addon, decoy) is None
 
@@ -208,10 +208,10 @@ def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, tmp_p
     at_once, later = (tmp_path / f"{name}{suffix}" for name in ("now", "later"))
     bpy.ops.refine.export_ply(filepath=str(at_once))
     options = {"overwrite": False, "apply_transform": False}
-    ended = until_over(*start(export, filepath=str(later), **options)[:2])
+    ended = until(*start(export, filepath=str(later), **options)[:2])
     options = {"files": [], "directory": "", "upright": False, "cameras": False, "level": 0}
     operator, context, said = start(read.REFINE_OT_import_ply, filepath=str(later), **options)
-    imported = until_over(operator, context)
+    imported = until(operator, context)
     obj = bpy.context.view_layer.objects.active
 
     assert ended == imported == {"FINISHED"}
@@ -240,12 +240,12 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, tmp_path, monke
     assert begun.wait(60.0)
     operator.modal(context, event("ESC"))
 
-    assert until_over(operator, context) == {"CANCELLED"}
+    assert until(operator, context) == {"CANCELLED"}
     (thread,) = (thread for thread in threading.enumerate() if thread.name == "refine")
     free.set()
     thread.join()
     assert list(tmp_path.iterdir()) == []
-    assert until_over(*start(export, **options)[:2]) == {"FINISHED"}
+    assert until(*start(export, **options)[:2]) == {"FINISHED"}
     assert out.read_bytes() == b"half"
 
 

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 import pytest
 
-from tests.windows import event, started_in_a_window, until, until_over
+from tests.windows import event, started_in_a_window, until
 
 from .conftest import read, splats_of
 
@@ -122,7 +122,7 @@ def test_esc_while_refitting_keeps_what_that_has_reached(addon, obj, monkeypatch
 
     assert first == "cancels"
     assert sentence == "Pruning splats (refitting); Esc keeps what that has reached"
-    assert until_over(operator, context) == {"FINISHED"}
+    assert until(operator, context) == {"FINISHED"}
     assert len(obj.data.vertices) == 3976 - int(0.6 * 3976)
     words = "after round 1" if rounds else "before its first round was done"
     assert f"refitting was stopped {words}" in said
@@ -138,12 +138,12 @@ def test_an_object_moved_while_apply_works_keeps_its_splats_together(addon, obj,
     bpy.ops.object.mode_set(mode="EDIT")
     until(operator, context, lambda: addon.ui.operator_bases.now().waits)
     operator.modal(context, event("ESC"))
-    assert until_over(operator, context) == {"CANCELLED"}
+    assert until(operator, context) == {"CANCELLED"}
     bpy.ops.object.mode_set(mode="OBJECT")
     assert said == ["Pruning splats cancelled; nothing was changed"]
     assert len(obj.data.vertices) == 3976
 
     operator, context, _ = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
     obj.location.x += 1.0
-    assert until_over(operator, context) == {"FINISHED"}
+    assert until(operator, context) == {"FINISHED"}
     np.testing.assert_array_equal(read(addon, obj, "position"), expected.astype(np.float32))

@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 import pytest
 
-from tests.windows import event, started_in_a_window, until_over
+from tests.windows import event, started_in_a_window, until
 
 
 @pytest.fixture
@@ -160,7 +160,7 @@ def test_an_operation_keeps_nothing_when_it_is_over(addon, few, noted, monkeypat
             if thread.name == "refine":
                 thread.join()
     elif how != "at once":
-        answer = until_over(operator, context)
+        answer = until(operator, context)
         assert answer == ({"FINISHED"} if how == "done" else {"CANCELLED"})
 
     gc.collect()
