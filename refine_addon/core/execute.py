@@ -1,4 +1,4 @@
-"""The one way to run work, in this thread, on threads or in processes, and its progress.
+"""The one way to run work: in this thread, on threads, in processes, on a cluster; its progress.
 
 NumPy's loops release Python's lock; many short loops keep passing it on (two threads are 1.2 times
 as fast as one, two processes nearly twice). Processes import this package under its name here

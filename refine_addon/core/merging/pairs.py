@@ -1,9 +1,10 @@
-"""Where two splats become one: what it costs the pictures, and the merged splat, colours included.
+"""Where two splats become one: what it costs the pictures, and the merged splat.
 
-docs/method.md, section 7, derives it: ``cost = tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> +
+docs/method.md, section 7, derives the cost: ``tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> +
 |s_j|^2 <q, q>)`` with ``p = f_i - l_i f_m``, ``q = f_j - l_j f_m``; f are the footprints in a plane
 across the viewing direction, s the contrasts, l the shares of the colour, m the merged splat.
-`price` and `costs` give the cost, `merge` the merged splat, `as_splats` its values in files.
+`price` and `costs` give the cost, `merge` the merged splat, `as_splats` its values in files; its
+harmonics are those of `merge._blend`.
 """
 
 from __future__ import annotations

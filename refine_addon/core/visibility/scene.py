@@ -1,4 +1,4 @@
-"""The scene's own frame: its middle, its size and its axes.
+"""The scene's own frame: its middle, size and axes. (`operations.Scene` holds splats and demands.)
 
 Results in float32 or compared with constants are computed in it, so they depend neither on the
 frame of a file nor on the order of its splats.
