@@ -8,7 +8,6 @@ import functools
 import io
 import json
 import os
-import pickle
 import re
 import shutil
 import signal
@@ -38,12 +37,11 @@ from refine_addon.core import (
     read_ply,
 )
 from refine_addon.core.formats.ply import with_count
-from refine_addon.core.mapped import Interrupted, on_disk
+from refine_addon.core.mapped import Interrupted
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.refit import round_rays
-from refine_addon.core.splats import joined, with_model
+from refine_addon.core.splats import joined
 from refine_addon.core.tiles import cluster, source, storage, writing
-from refine_addon.core.views import ViewSet
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import validation_rays
 from refine_addon.core.whole_file import Url
@@ -74,7 +72,7 @@ def small(monkeypatch):
 
 
 def room_rows():
-    """Give `COUNT` rows of the room; some are equal, some cannot be drawn, one is far away."""
+    """`COUNT` rows of the room; some are equal, some cannot be drawn, one is far away."""
     rows = room().rows[::7][:COUNT].copy()
     rows[900:1300] = rows[100]
     rows["x"][[5, 2000]] = np.nan
@@ -85,12 +83,11 @@ def room_rows():
 
 
 def write(path, rows):
-    """Write rows of the room as a file."""
     path.write_bytes(with_count(room().header, len(rows)) + rows.tobytes())
 
 
 def cut(folder, rows, cuts=CUTS):
-    """Write rows as files that are cut at some of them; names have 255 bytes, in another order."""
+    """Write rows as files cut at some of them; names have 255 bytes, in another order."""
     paths = [folder / f"{name * 251}.ply" for name in "badc"[: len(cuts) - 1]]
     for path, start, stop in zip(paths, cuts, cuts[1:], strict=False):
         write(path, rows[start:stop])
@@ -98,7 +95,6 @@ def cut(folder, rows, cuts=CUTS):
 
 
 def rows_in(folder, paths):
-    """Give the rows of the outputs of some tiles."""
     return np.concatenate([read_ply(folder / path.name).rows for path in paths])
 
 
@@ -114,15 +110,11 @@ def tiles(tmp_path):
 
 
 def run(tiles, folder, method=CLOSED, budget=HALF, views=VIEWS, **more):
-    """Prune tiles."""
     return prune_tiles(tiles, folder, views, budget, method, **more)
 
 
 class Store:
-    """Two tiles and a folder for their outputs, on the disk or behind URLs.
-
-    The second tile has elements before and after its splats, and a header of 70 kB.
-    """
+    """Two tiles and a folder for outputs; the second has more elements, and 70 kB of header."""
 
     def __init__(self, root, system):
         self.tiles = [f"{root}/in/{name}" for name in NAMES]
@@ -136,17 +128,15 @@ class Store:
         self.put(self.tiles[1], header + b"abc" + rows[230:].tobytes() + b"more")
 
     def put(self, path, data):
-        """Write a file."""
         inner = self.system._strip_protocol(path)
         self.system.makedirs(inner.rpartition("/")[0], exist_ok=True)
         self.system.pipe_file(inner, data)
 
     def get(self, path):
-        """Read a file."""
         return self.system.cat_file(path)
 
     def made(self):
-        """Give names and bytes of all outputs, and of whatever else is left there."""
+        """Names and bytes of all outputs, and of whatever else is left there."""
         if not self.system.exists(self.out):
             return {}
         self.system.invalidate_cache()
@@ -154,7 +144,7 @@ class Store:
         return {path.rpartition("/out/")[2]: self.get(path) for path in paths}
 
     def once(self, *how):
-        """Give the outputs of a run that nothing disturbs, of tiles on the disk."""
+        """The outputs of a run that nothing disturbs, of tiles on the disk."""
         here = Path("undisturbed")
         for path in self.tiles:
             (here / "in").mkdir(parents=True, exist_ok=True)
@@ -165,7 +155,6 @@ class Store:
 
 @pytest.fixture
 def memory(tmp_path, monkeypatch):
-    """Have tiles in memory, behind URLs, and stand in an empty folder."""
     monkeypatch.chdir(tmp_path)
     system = fsspec.filesystem("memory")
     yield Store("memory:/", system)
@@ -175,7 +164,6 @@ def memory(tmp_path, monkeypatch):
 
 @pytest.fixture(params=["disk", "memory"])
 def store(request, tmp_path, monkeypatch):
-    """Have tiles on the disk, or in memory behind URLs."""
     if request.param == "memory":
         return request.getfixturevalue("memory")
     monkeypatch.chdir(tmp_path)
@@ -202,21 +190,18 @@ WAYS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "budget", "model"), WAYS, ids=str)
 def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, method, budget, model):
-    """Every row to the byte, in the order of the files, and the report says the same of them.
+    """To the byte, in the order of the files; reports agree.
 
-    For a size, the four headers take bytes that one does not: here the rows left are compared with
-    those of as many in one file. Counts and bytes told of each tile are those of its file.
+    The four headers take bytes that one does not, so of a size as many rows are compared.
     """
     out, pruned = tmp_path / "out", tmp_path / "pruned.ply"
     told = run(tiles, out, method, budget, model=model)
-
     if budget.max_mb:
         assert 0 <= 400_000 - told["files"]["output_bytes"] < 2 * 248
         budget = Budget(keep=told["splats"]["kept"])
-    one = prune_file(tmp_path / "whole.ply", pruned, VIEWS, budget, method, model=model)
+    whole = prune_file(tmp_path / "whole.ply", pruned, VIEWS, budget, method, model=model).report
     assert rows_in(out, tiles).tobytes() == read_ply(pruned).rows.tobytes()
     assert {read_ply(out / tile.name).model for tile in tiles} == {model or "default"}
-    whole = one.report
     del whole["splats"]["unseen_removed"]
     for key in ("splats", "weights", "views", "estimated_psnr", "quality"):
         assert told[key] == whole[key]
@@ -233,23 +218,17 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, method, bud
     ("method", "budget"), [(CLOSED, Budget(max_mb=0.1)), (MERGE, Budget(ratio=0.6))], ids=str
 )
 def test_tiles_of_several_degrees_and_types_are_one_scene(tmp_path, method, budget):
-    """Of degrees 3, 1 and 0, the last of doubles: each keeps its own properties.
-
-    For a size each splat counts as the longest row, and the lowest go until the rest fits.
-    """
+    """Each keeps its own properties. For a size each splat counts as the longest row."""
     paths = [tmp_path / f"{name}.ply" for name in "abc"]
-    for path, degree, rows in zip(
-        paths, (3, 1, 0), np.split(room().rows[:36000:40], 3), strict=True
-    ):
+    parts = np.split(room().rows[:36000:40], 3)
+    for path, degree, rows in zip(paths, (3, 1, 0), parts, strict=True):
         kind = "f4" if degree else "f8"
         path.write_bytes(ply_of({name: rows[name].astype(kind) for name in splat_names(degree)}))
     files = [read_ply(path) for path in paths]
     sizes = max(file.row_bytes for file in files), sum(file.fixed_bytes for file in files)
     whole = joined([file.splats() for file in files])
     result = prune(whole, VIEWS, budget, method, sizes=sizes)
-
     told = run(paths, tmp_path / "out", method, budget)
-
     made = [read_ply(tmp_path / "out" / path.name).splats() for path in paths]
     assert told["splats"]["kept"] == sum(map(len, made)) == np.count_nonzero(result.keep) > 300
     assert [splats.sh_rest.shape[1] for splats in made] == [15, 3, 0]
@@ -262,9 +241,6 @@ def test_tiles_of_several_degrees_and_types_are_one_scene(tmp_path, method, budg
     assert method is MERGE or told["files"]["output_bytes"] <= 0.1 * 1e6
 
 
-# Larger scenes: region by region.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "used", "step"),
@@ -274,19 +250,16 @@ def test_tiles_of_several_degrees_and_types_are_one_scene(tmp_path, method, budg
 def test_merging_by_regions_is_as_good_as_merging_one_file(
     tmp_path, merges, monkeypatch, ratio, used, step
 ):
-    """Within .3 dB, seen from all views; of 5 %, which are deleted alone, the same rows stay.
+    """Within .3 dB; of 5 %, which are deleted alone, the same rows stay.
 
-    Stages divide along other planes, so regions of a stage are not those of the one before: no
-    splat is merged twice, and none is lost. Three of 72 views show a quarter of the room.
+    No splat is merged twice or lost, though the stages divide along other planes.
     """
     monkeypatch.setattr(mapped, "REGION", 10_000 // step)
     out, method, judging = tmp_path / "out", Merge(16), VIEWS.spread(16)
     rows, splats = room().rows[::step], room().splats().take(slice(None, None, step))
     tiles = cut(tmp_path, rows, (0, 3000, len(rows)))
     one = prune(splats, used, Budget(ratio=ratio), method)
-
     told = run(tiles, out, method, Budget(ratio=ratio), used)
-
     rays, found = validation_rays(splats, judging), rows_in(out, tiles)
     made = joined([read_ply(out / path.name).splats() for path in tiles])
     assert psnr_against(rays, made, judging) > psnr_against(rays, one.splats, judging) - 0.3
@@ -301,15 +274,11 @@ def test_merging_by_regions_is_as_good_as_merging_one_file(
 
 @pytest.mark.slow
 def test_refitting_by_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, monkeypatch):
-    """Within 1.3 dB by rays of all views: regions of 600 splats are border for the most part.
-
-    Larger ones come closer (docs/scale.md). What two views of the room do not show stays as it was.
-    """
+    """Within 1.3 dB: regions of 600 splats are border for the most part (docs/scale.md)."""
     monkeypatch.setattr(round_rays, "MIN_RAYS", 1 << 14)
     monkeypatch.setattr(mapped, "REGION", 1500)
     told = run(tiles, tmp_path / "out", Refit(8))
     one = prune_file(tmp_path / "whole.ply", None, VIEWS, HALF, Refit(8))
-
     used = VIEWS.spread(8)
     rays = validation_rays(read_ply(tmp_path / "whole.ply").splats(), used)
     made = joined([read_ply(tmp_path / "out" / path.name).splats() for path in tiles])
@@ -318,41 +287,11 @@ def test_refitting_by_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, 
     assert told["estimated_psnr"] == pytest.approx(psnr, abs=0.1)
     same = np.isin(rows_in(tmp_path / "out", tiles).view("V248"), room_rows().view("V248"))
     assert told["refitted"]["changed"] <= np.count_nonzero(~same) <= len(made) == COUNT // 2
-    few = run(tiles, tmp_path / "few", Refit(8, 1), views=ViewSet(VIEWS.views[:2]))
-    assert 0 < few["refitted"]["changed"] < COUNT // 4
 
 
-# Splats in files.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["default", "antialiased", "2dgs"])
-def test_splats_in_files_are_seen_as_in_memory(tmp_path, monkeypatch, model):
-    """Footprints are equal to the bit, in another process too, though no view reads all boxes.
-
-    So are those of few splats: a box may hold one that reaches into a view, and BLAS multiplies a
-    matrix by one column otherwise than by many.
-    """
-    monkeypatch.setattr(projection, "CHUNK", 200)
-    splats = with_model(room().splats().take(slice(None, None, 4)), model)
-    gaussians, scene, _ = projection.prepare(splats, VIEWS)
-
-    stored, same_scene, _ = projection.prepare(on_disk(tmp_path / "splats", [splats]), VIEWS)
-
-    packed, read = pickle.dumps(stored), []
-    assert len(packed) < 5000
-    for view in VIEWS.views[::18]:
-        of_all = projection.project(gaussians, scene, view)
-        found = vars(projection.project(pickle.loads(packed), same_scene, view))
-        for name, values in vars(of_all).items():
-            np.testing.assert_array_equal(found[name], values)
-        read += [first for first, _ in stored.parts(scene, view, view)]
-        for count in (1, 2, 9):
-            few = of_all.take(np.arange(len(of_all.index) // 2, len(of_all.index) // 2 + count))
-            found = projection.project(gaussians.take(few.index), scene, view)
-            for name in ("centers", "major", "minor", "alphas", "discs"):
-                np.testing.assert_array_equal(getattr(found, name), getattr(few, name))
-    assert len(stored.boxes) <= len(read) < 0.9 * 4 * len(stored.boxes)
+def when(step, act):
+    """A progress callback that acts each time it is told of a step."""
+    return lambda _fraction, what: act() if what == step else None
 
 
 # What is refused.
@@ -403,11 +342,9 @@ LISTS = plain_ply(1).replace(
     ids=["missing", "truncated", "spz", "text", "lists"],
 )
 def test_what_is_no_tile_is_named_as_it_was_given(store, content, words):
-    """Of a path and of a URL."""
     store.put(store.tiles[1], content or b"")
     if content is None:
         store.system.rm_file(store.tiles[1])
-
     path = re.escape(store.tiles[1])
     with pytest.raises(RefineError, match=rf"^{path}: .*{words}"):
         run(store.tiles, store.out)
@@ -415,16 +352,11 @@ def test_what_is_no_tile_is_named_as_it_was_given(store, content, words):
 
 
 def test_files_that_exist_stay_until_they_may_be_replaced(store):
-    """The second is there already: none is written; then both of them are.
-
-    Without a folder the same sizes are told. A path goes together with a URL.
-    """
+    """Without a folder the same sizes are told. A path goes together with a URL."""
     store.put(f"{store.out}/b.ply", b"mine")
-
     with pytest.raises(RefineError, match=rf"^{store.out}/b\.ply: exists already"):
         run(store.tiles, store.out)
     assert store.made() == {"b.ply": b"mine"}
-
     report = run(store.tiles, store.out, overwrite=True)
     assert store.made() == store.once()
     dry = run(["undisturbed/in/a.ply", store.tiles[1]], None)
@@ -443,32 +375,23 @@ def test_tiles_are_not_replaced_while_they_are_read(tmp_path, tiles):
 
 def test_a_tile_that_changes_meanwhile_stops_all(store):
     """Written again, the same bytes: they may no longer be those that were scored."""
-
-    def progress(_fraction, what):
-        if what == "scoring":
-            store.put(store.tiles[1], store.get(store.tiles[1]))
-
+    again = when("scoring", lambda: store.put(store.tiles[1], store.get(store.tiles[1])))
     with pytest.raises(RefineError, match=r"in/b\.ply: was changed while it was worked on"):
-        run(store.tiles, store.out, progress=progress)
-
+        run(store.tiles, store.out, progress=again)
     assert not store.made()
     assert not list(Path().glob(".refine*"))
 
 
 def test_outputs_that_are_links_are_refused_where_tiles_would_be_lost(tmp_path, tiles):
-    """Two to one file, also where it is not there yet, and one to another disk.
-
-    Tiles wait beside their targets and are renamed: not from disk to disk.
-    """
+    """Two to one file, also where it is not there yet; one to another disk: no renaming there."""
     out, memory = tmp_path / "out", Path("/dev/shm")
     out.mkdir()
     for tile in tiles[:2]:
         (out / tile.name).symlink_to("real.ply")
     with pytest.raises(RefineError, match=r"is the same file as .*, by a link"):
         run(tiles, out)
-    assert names_in(out) == sorted(tile.name for tile in tiles[:2])
-    (out / tiles[0].name).unlink()
-    (out / tiles[1].name).unlink()
+    for tile in tiles[:2]:
+        (out / tile.name).unlink()
     if not memory.is_dir() or memory.stat().st_dev == out.stat().st_dev:
         pytest.skip("there is no second disk")
     (out / tiles[1].name).symlink_to(memory / "far.ply")
@@ -480,7 +403,7 @@ def test_outputs_that_are_links_are_refused_where_tiles_would_be_lost(tmp_path, 
 
 
 def stopping(at):
-    """Give a progress callback that stops when it is told of a step for the second time."""
+    """A progress callback that stops when it is told of a step for the second time."""
     told = []
 
     def progress(_fraction, what):
@@ -509,10 +432,7 @@ def stopping(at):
 def test_a_job_that_was_interrupted_goes_on_behind_the_last_stage(
     store, method, stop, done, damaged
 ):
-    """What was read is not read again, what was decided not decided; the bytes are the same.
-
-    What a power cut truncated, an array or what was noted of a stage, is made again.
-    """
+    """The bytes are the same; what a power cut truncated is made again."""
     told = []
     with pytest.raises(KeyboardInterrupt):
         run(store.tiles, store.out, method, progress=stopping(stop), threads=1)
@@ -520,35 +440,26 @@ def test_a_job_that_was_interrupted_goes_on_behind_the_last_stage(
     if damaged:
         (path,) = Path().rglob(damaged)
         os.truncate(path, path.stat().st_size // 2)
-
     run(store.tiles, store.out, method, progress=lambda _fraction, what: told.append(what))
-
     if told.count("reading") > 1:  # once at the beginning of scoring
         told.append("copying")
     assert not done & set(told)
     assert store.made() == store.once(method)
 
 
-@pytest.mark.parametrize(
-    ("error", "raised"),
-    [(KeyboardInterrupt(), KeyboardInterrupt), (RefineError("the disk failed"), Interrupted)],
-)
-def test_a_job_that_was_stopped_while_it_renamed_goes_on(store, monkeypatch, error, raised):
-    """One of two files is in its place already; the same call renames the other.
-
-    Where another program has replaced that one meanwhile, it is replaced only if told.
-    """
+def test_a_job_that_was_stopped_while_it_renamed_goes_on(store, monkeypatch):
+    """One of two files is in its place already. What replaced it meanwhile stays, unless told."""
     first, publish = f"{store.out}/{NAMES[0]}", storage.publish
 
     def stop(made, path, **options):
         if path.name == NAMES[1]:
-            raise error
+            raise KeyboardInterrupt
         publish(made, path, **options)
 
     for taken in (False, True):
         with monkeypatch.context() as patched:
             patched.setattr(storage, "publish", stop)
-            with pytest.raises(raised):
+            with pytest.raises(KeyboardInterrupt):
                 run(store.tiles, store.out)
         assert set(NAMES) & store.made().keys() == {NAMES[0]}
         if taken:
@@ -562,21 +473,16 @@ def test_a_job_that_was_stopped_while_it_renamed_goes_on(store, monkeypatch, err
 
 
 def test_ctrl_c_after_the_last_tile_was_renamed_comes_too_late(store, monkeypatch):
-    """The folder of the job goes all the same: nothing is left that would go on."""
-    rmtree, calls = shutil.rmtree, []
+    """The folder of the job goes all the same."""
+    rmtree = shutil.rmtree
 
-    def stop_at_first(path, **options):
-        calls.append(path)
+    def stop_at_first(*_path, **_options):
         monkeypatch.setattr(shutil, "rmtree", rmtree)
         raise KeyboardInterrupt
 
-    def progress(_fraction, what):
-        if what == "writing":
-            monkeypatch.setattr(shutil, "rmtree", stop_at_first)
-
-    assert run(store.tiles, store.out, progress=progress)["splats"]["written"] == 200
-
-    assert len(calls) == 1
+    stop = when("writing", lambda: monkeypatch.setattr(shutil, "rmtree", stop_at_first))
+    assert run(store.tiles, store.out, progress=stop)["splats"]["written"] == 200
+    assert shutil.rmtree is rmtree
     assert [*store.made()] == NAMES
     assert not list(Path().glob(".refine*"))
 
@@ -585,29 +491,22 @@ def test_ctrl_c_after_the_last_tile_was_renamed_comes_too_late(store, monkeypatc
     ("overwrite", "words"), [(False, "exists already"), (True, "is a folder, expected a file")]
 )
 def test_what_appears_in_the_place_of_a_tile_meanwhile_stops_before_the_first(
-    store, monkeypatch, overwrite, words
+    store, overwrite, words
 ):
-    """A file, or a folder that nothing can replace: no tile is renamed, and none is lost."""
+    """A file, or a folder that nothing can replace."""
     there = f"{store.out}/{NAMES[1]}{'/in' if overwrite else ''}"
-
-    def progress(_fraction, what):
-        if what == "writing":
-            store.put(there, b"mine")
-
+    put = when("writing", lambda: store.put(there, b"mine"))
     with pytest.raises(Interrupted, match=f"{words}.*; the same command goes on"):
-        run(store.tiles, store.out, overwrite=overwrite, progress=progress)
+        run(store.tiles, store.out, overwrite=overwrite, progress=put)
     assert NAMES[0] not in store.made()
     assert store.get(there) == b"mine"
     store.system.rm(f"{store.out}/{NAMES[1]}", recursive=True)
-    monkeypatch.setattr(writing, "_write_rows", None)  # nothing is written again
     run(store.tiles, store.out, overwrite=overwrite)
-
     assert sorted(store.made()) == NAMES
 
 
 @pytest.mark.parametrize("calls", [1, 5, 10])
 def test_on_a_full_disk_what_is_done_stays(tmp_path, tiles, monkeypatch, calls):
-    """Wherever it fills up, the file is named, and the same call goes on once there is room."""
     done, guarded = [], mapped.writing
 
     @contextlib.contextmanager
@@ -632,23 +531,17 @@ def test_on_a_full_disk_what_is_done_stays(tmp_path, tiles, monkeypatch, calls):
 
 
 def test_another_job_does_not_take_over_what_is_left(store):
-    """Of another budget, the folder has another name."""
     with pytest.raises(KeyboardInterrupt):
         run(store.tiles, store.out, progress=stopping("writing"))
-
     assert run(store.tiles, store.out, CLOSED, Budget(ratio=0.25))["splats"]["removed"] == 100
 
 
 def test_two_runs_do_not_work_in_one_folder(store):
-    """The second is told so, and takes nothing away from the first."""
+    def second():
+        with pytest.raises(RefineError, match="another run is at work on the same job"):
+            run(store.tiles, store.out)
 
-    def progress(_fraction, what):
-        if what == "scoring":
-            with pytest.raises(RefineError, match="another run is at work on the same job"):
-                run(store.tiles, store.out)
-
-    run(store.tiles, store.out, progress=progress)
-
+    run(store.tiles, store.out, progress=when("scoring", second))
     assert store.made() == store.once()
 
 
@@ -700,7 +593,6 @@ def test_without_fsspec_the_extra_is_named(memory, monkeypatch):
     paths = [f"undisturbed/in/{name}" for name in NAMES]
     memory.once()
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
-
     run(paths, None)
     for tiles, out, named in ((memory.tiles, None, "in/a.ply"), (paths, memory.out, "out")):
         words = f"memory://{named}: URLs need fsspec: pip install 'refine-addon[distributed]'"
@@ -710,19 +602,14 @@ def test_without_fsspec_the_extra_is_named(memory, monkeypatch):
 
 @pytest.mark.usefixtures("memory")
 def test_a_url_is_no_path_and_has_a_name():
-    """What is behind the last slash; a query is part of it only where it is none.
-
-    A drive of Windows has one letter; a slash less makes a path; folders end with a slash.
-    """
+    """A drive of Windows has one letter; folders end with a slash."""
     for url, name in [
-        ("s3://bucket/deep/a.ply", "a.ply"),
         ("https://host/a.ply?key=1/2.x", "a.ply"),
         ("memory://a?b.ply", "a?b.ply"),
         ("simplecache::s3://a.ply", "a.ply"),
     ]:
         assert (type(storage.located(url)), storage.located(url).name) == (Url, name)
     assert {type(storage.located(path)) for path in ("C://a.ply", "s3:/a.ply")} == {type(Path())}
-    assert Url("memory://") / "a" == Url("memory://a")
     assert Url("memory://a") / "b" == Url("memory://a/b")
     for url, words in [
         ("nowhere://in/a.ply", "Protocol not known: nowhere"),
@@ -733,12 +620,9 @@ def test_a_url_is_no_path_and_has_a_name():
 
 
 class Server(SimpleHTTPRequestHandler):
-    """Serves files of the directory, by ranges unless told otherwise."""
-
     ranges = True
 
     def send_head(self):
-        """Send a part of a file where one is asked for."""
         found = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
         if not found or not self.ranges:
             return super().send_head()
@@ -759,8 +643,7 @@ class Server(SimpleHTTPRequestHandler):
 def test_a_server_sends_ranges(tmp_path, monkeypatch):
     """The same bytes as from the disk; nobody can write there, and a change is noticed.
 
-    One that only sends whole files is refused: of a large one only the beginning would have been
-    sent.
+    Of a large file, one that only sends whole files would have sent only the beginning: refused.
     """
     pytest.importorskip("aiohttp", reason="fsspec opens http:// by aiohttp")
     monkeypatch.chdir(tmp_path)
@@ -769,9 +652,7 @@ def test_a_server_sends_ranges(tmp_path, monkeypatch):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{server.server_port}"
         urls = [f"{address}/in/{name}" for name in NAMES]
-
         run(urls, "out")
-
         assert store.made() == store.once()
         with pytest.raises(RefineError, match=r"^http://.*/out: cannot be written to \("):
             run(urls, f"{address}/out")
@@ -795,10 +676,7 @@ NO_URL = r"s3://\S+: is a URL, expected a local path"
 
 
 def test_the_command_prunes_as_python_does(store, capsys, monkeypatch):
-    """By one budget over all files; a dry run says the same, and writes nothing.
-
-    After Ctrl-C, exit code 130, the same command goes on.
-    """
+    """A dry run says the same, and writes nothing. After Ctrl-C the same command goes on."""
     words = ["prune", *store.tiles, "-o", store.out, *FAST.split()]
     assert main([*words, "--dry-run"]) == 0
     assert "2 tiles: would keep 200 of 400 splats" in capsys.readouterr().out
@@ -815,10 +693,9 @@ def test_the_command_prunes_as_python_does(store, capsys, monkeypatch):
 
     assert main([*words, "--report", "told.json"]) == 0
     assert store.made() == store.once()
-    said, (told,) = capsys.readouterr().out, json.loads(Path("told.json").read_text())["results"]
-    assert "2 tiles: kept 200 of 400 splats (50.0% removed)" in said
-    for tile in told["tiles"]:
-        assert f"{tile['kept']} of {tile['before']} splats" in said
+    assert "2 tiles: kept 200 of 400 splats (50.0% removed)" in capsys.readouterr().out
+    (told,) = json.loads(Path("told.json").read_text())["results"]
+    assert sum(tile["kept"] for tile in told["tiles"]) == 200
 
 
 @pytest.mark.parametrize(
@@ -844,15 +721,10 @@ def test_the_command_prunes_as_python_does(store, capsys, monkeypatch):
     ],
 )
 def test_wrong_usage_is_known_at_once(tmp_path, monkeypatch, capsys, words, told):
-    """Exit code 2; a URL is not taken for a path, so no folder of its name is made.
-
-    What a tile would replace behind a URL cannot be looked into to see that it holds splats.
-    """
+    """Exit code 2; no folder of a URL's name is made."""
     monkeypatch.chdir(tmp_path)
     Path("a.ply").write_bytes(plain_ply())
-
     assert main(words.split()) == 2
-
     assert re.search(told, capsys.readouterr().err)
     assert names_in(tmp_path) == ["a.ply"]
 
@@ -865,7 +737,6 @@ needs_dask = pytest.mark.filterwarnings("default")  # Dask's warnings are its ow
 
 @pytest.fixture(scope="module")
 def workers():
-    """Start two workers."""
     pytest.importorskip("distributed")
     with cluster.cluster(2) as workers:
         yield workers
@@ -879,10 +750,7 @@ def workers():
     ids=["scoring", "merging", "refitting", "writing"],
 )
 def test_a_killed_worker_changes_no_byte(tmp_path, workers, moment, method, monkeypatch):
-    """Whatever it was at, others do it again; the files are those of a run without workers.
-
-    With regions of 400 splats, which workers merge and refit.
-    """
+    """The files are those of a run without workers, which merge and refit regions of 400 splats."""
     monkeypatch.setattr(mapped, "REGION", 400)
     tiles, killed = cut(tmp_path, room_rows()[::4], (0, 600, 1250)), []
 
@@ -909,9 +777,7 @@ def test_what_workers_began_one_process_ends(tmp_path, monkeypatch, workers):
         run(urls, out, workers=workers, progress=stopping("writing"))
     client = workers._client  # each worker does one thing at a time: wait until it has ended that
     client.gather([client.submit(len, "", workers=[name]) for name in client.nthreads()])
-
     run(urls, out)
-
     assert store.made() == store.once()
     assert not list(Path().glob(".refine*"))
 
@@ -936,80 +802,51 @@ def test_workers_that_do_not_see_the_files_are_named(tmp_path, tiles, workers, m
 @pytest.mark.slow
 @needs_dask
 def test_workers_that_are_not_there_are_told_in_a_sentence(monkeypatch):
-    """Nobody listens at port 1. What ends while it starts may go on where it was."""
-    distributed = pytest.importorskip("distributed")
-
-    def failing(**_options):
-        raise RuntimeError("Nanny failed to start.")
-
+    """Nobody listens at port 1."""
+    pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "_CONNECT", 1)
-    monkeypatch.setattr(distributed, "LocalCluster", failing)
-    for place, error, words in [
-        ("tcp://127.0.0.1:1", RefineError, r"tcp://127\.0\.0\.1:1: no Dask scheduler answers"),
-        (2, Interrupted, r"workers ended while they were started \(Nanny failed to start\.\)"),
-    ]:
-        with pytest.raises(error, match=words), cluster.cluster(place):
-            pass
+    words = r"tcp://127\.0\.0\.1:1: no Dask scheduler answers"
+    with pytest.raises(RefineError, match=words), cluster.cluster("tcp://127.0.0.1:1"):
+        pass
 
 
 @pytest.mark.slow
 def test_ctrl_c_while_workers_start_waits_for_them_and_closes_them(monkeypatch):
     """Dask cannot close workers that are half started: it printed an AssertionError at the end."""
-    distributed = pytest.importorskip("distributed")
-    pressed, told = threading.Event(), []
+    distributed, told = pytest.importorskip("distributed"), []
 
     def starting(**_options):
-        """Take a moment, while Ctrl-C is pressed."""
-        time.sleep(0.1)  # until whoever started this waits
+        time.sleep(0.2)  # until whoever started this waits
         os.kill(os.getpid(), signal.SIGINT)
-        pressed.wait(10.0)  # a busy machine takes its time
-        time.sleep(0.1)
+        time.sleep(0.2)
         told.append("started")
         return SimpleNamespace(close=lambda: told.append("closed"))
 
-    def press(*_called):
-        pressed.set()
-        raise KeyboardInterrupt
-
     monkeypatch.setattr(distributed, "LocalCluster", starting)
-    before = signal.signal(signal.SIGINT, press)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt), cluster.cluster(2):
             pass
     finally:
         signal.signal(signal.SIGINT, before)
-
     assert told == ["started", "closed"]
 
 
 @pytest.mark.slow
-def test_a_job_whose_workers_are_all_lost_ends(tmp_path, monkeypatch):
+def test_a_job_whose_workers_are_all_lost_ends(monkeypatch):
     """They may come back, so not at once; a job that has ended goes on where it was."""
     pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "_ALONE", 0.5)
-    left, future = [{}, {"there": 1}], SimpleNamespace(add_done_callback=lambda _: None)
-    client = SimpleNamespace(
-        nthreads=lambda: left.pop(0) if left else {}, submit=lambda *_, **__: future,
-        cancel=lambda _: None, wait_for_workers=lambda *_, **__: 0,
-        run=lambda *_, **__: {"a": OSError("lost")},
-    )  # fmt: skip
+    future = SimpleNamespace(add_done_callback=lambda _: None)
+    client = SimpleNamespace(nthreads=dict, submit=lambda *_, **__: future, cancel=lambda _: None)
     began = time.monotonic()
-
     with pytest.raises(Interrupted, match="all workers were lost"):
         next(cluster.Cluster(client).run(b"", [0], lambda *_: None, ""))
-    with pytest.raises(Interrupted, match="the workers were lost again and again"):
-        cluster.Cluster(client).check(tmp_path, [])
-
-    assert not left
     assert time.monotonic() - began > 0.5
 
 
 def test_without_dask_the_extra_is_named(store, capsys, monkeypatch):
-    """Nothing else needs it, so it is asked for only here; exit code 1, as of a missing tile."""
     monkeypatch.setitem(sys.modules, "distributed", None)
-
     assert main(["prune", *store.tiles, "-o", store.out, *FAST.split(), "--workers", "2"]) == 1
     assert "pip install 'refine-addon[distributed]'" in capsys.readouterr().err
-    assert main(["prune", *store.tiles, "no.ply", "-o", store.out, *FAST.split()]) == 1
-    assert "no.ply: cannot be read" in capsys.readouterr().err
     assert not store.made()
