@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from refine_addon.core.affine import transformed
 from refine_addon.core.execute import Cancelled
@@ -14,23 +12,15 @@ from refine_addon.core.merging import field as merge_field
 from refine_addon.core.merging import graph as merge_graph
 from refine_addon.core.merging import pairs as merging
 from refine_addon.core.merging.field import Field
-from refine_addon.core.merging.graph import MergeGraph, nearest
-from refine_addon.core.merging.merge import ALONE, STAGE, merge, stage_counts
+from refine_addon.core.merging.graph import MergeGraph
+from refine_addon.core.merging.merge import merge
 from refine_addon.core.spherical_harmonics import colors
-from refine_addon.core.splats import (
-    ALPHA_MAX,
-    LOW_PASS,
-    Splats,
-    drawable,
-    opacity,
-)
+from refine_addon.core.splats import ALPHA_MAX, ARRAYS, LOW_PASS, Splats, drawable, opacity
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility.scene import Scene, scene_of
 from tests.core.test_invariance import moved, rotation
 
 SCENE = Scene(np.zeros(3), 1.0, np.eye(3))
-
-FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 
 
 def flat(opacities, means, variances, *, colors=None, error=None):
@@ -40,27 +30,18 @@ def flat(opacities, means, variances, *, colors=None, error=None):
     covariances = np.zeros((count, 6))
     covariances[:, [0, 3, 5]] = variances
     contribution = opacities * np.sqrt(variances[:, 0] * variances[:, 1])
+    error = contribution * opacities / 2 if error is None else np.array(error, float)
+    along, zeros = np.tile([0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3))
+    colors = zeros + 0.5 if colors is None else np.array(colors, float)
     return Field(
-        means,
-        covariances,
-        opacities,
-        contribution,
-        contribution * opacities / 2 if error is None else np.array(error, float),
-        np.tile([0.0, 0.0, 1.0], (count, 1)),
-        np.zeros((count, 3)),
-        np.full((count, 3), 0.5) if colors is None else np.array(colors, float),
-        np.zeros(count),
-    )
+        means, covariances, opacities, contribution, error,
+        along, zeros, colors, np.zeros(count),
+    )  # fmt: skip
 
 
 def measured_from(splats, views, seen):
     scene = scene_of(splats.means, drawable(splats), views)
     return merge_field.measured_field(splats, np.arange(len(splats)), views, scene, seen)
-
-
-def field_of(splats, views, seen):
-    measured = measured_from(splats, views, seen)
-    return measured.with_bias(measured.seen_and_whole())
 
 
 def merged_of(field, first=0, second=1):
@@ -81,22 +62,26 @@ def cloud(count, seed=0, degree=1, spread=1.0):
     )
 
 
+def looking(at, center, down=(0.0, 1.0, 0.0), **changes):
+    """Return a view from `center` to `at`, 320 x 240 px."""
+    forward = np.array(at, float) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(down, forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    lens = {"fx": 200.0, "fy": 250.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}
+    return View(rotation, np.array(center, float), **lens | changes)
+
+
 def around(count=4, distance=6.0):
     """Look from a circle towards the origin."""
-    views = []
-    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
-        forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
-        right = np.array([-np.sin(angle), np.cos(angle), 0.0])
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        views.append(View(rotation, -distance * forward, 200.0, 200.0, 160.0, 120.0, 320, 240))
-    return ViewSet(tuple(views))
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    places = distance * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    return ViewSet(tuple(looking([0, 0, 0], place, (0, 0, -1), fy=200.0) for place in places))
 
 
 def measure(splats, _expected=None, _progress=None):
-    """Stand in for what renders: alpha times the geometric-mean area, no occlusion, one contrast.
-
-    Of no unit: the pixels of the views do not change with the scene's scale.
-    """
+    """Stand in for rendering: alpha times the geometric-mean area, of no unit, one contrast."""
     logs = np.asarray(splats.log_scales, np.float64)
     size = np.exp(2 / 3 * np.sum(logs - np.median(logs), axis=1))
     alpha = opacity(splats.opacity_logits)
@@ -104,24 +89,22 @@ def measure(splats, _expected=None, _progress=None):
 
 
 def reduced_to(splats, views, measured, keep_count, **how):
-    """Merge, with the sums before the first stage from the same function."""
     return merge(splats, views, measured(splats, None, None), measured, keep_count, **how)
 
 
 def same(one, other):
-    for name in FIELDS:
+    for name in ARRAYS:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 def test_two_splats_apart_have_the_moments_of_their_mixture():
-    """Masses 1 : 3, a step of 4 along x: mean 3/4 of the way; variance 1 + 3/16 16 = 4 along x.
+    """Masses 1 : 3, a step of 4: mean 3/4 of the way; variance 1 + 3/16 16 = 4 along x.
 
-    Seen from opposite sides they keep the line, and a deviation to the left is one to the right.
+    Seen from opposite sides they keep the line; left of the one is right of the other.
     """
     field = flat([0.1, 0.3], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
     field.direction[:], field.deviation[:] = [[0, 0, 1], [0, 0, -1]], [[0.5, 0, 0], [-0.5, 0, 0]]
     pairs, merged = merged_of(field)
-
     np.testing.assert_allclose(pairs.position, [0.25])
     np.testing.assert_allclose(merged.means, [[3, 0, 0]])
     np.testing.assert_allclose(merged.covariances, [[4, 0, 0, 1, 0, 1]])
@@ -132,7 +115,7 @@ def test_two_splats_apart_have_the_moments_of_their_mixture():
 
 
 def test_the_cost_is_the_squared_error_of_the_pictures():
-    """The closed form against the three footprints summed on a fine grid, colour by colour."""
+    """Against the three footprints summed on a fine grid, colour by colour."""
     background = np.array([0.2, 0.5, 0.3])
     colors = np.random.default_rng(1).uniform(size=(2, 3))
     alphas, means = np.array([0.3, 0.6]), np.array([[0.0, 0, 0], [0.8, 0.5, 0.3]])
@@ -165,39 +148,14 @@ def test_a_merge_along_the_viewing_direction_costs_what_views_from_aside_see():
     field.deviation[:] = [1e9, 0, 0]
     pair = np.array([0]), np.array([1])
     front, aside = (merging.price(field, *pair, tilt).cost for tilt in (0.0, 1.0))
-
     assert front < 1e-4 * aside
     np.testing.assert_allclose(aside, merging.price(turned, *pair).cost, rtol=1e-6)
 
 
-@pytest.mark.parametrize("model", ["default", "antialiased", "2dgs"])
-@pytest.mark.parametrize("unit", [1e-12, 1e12])
-def test_costs_in_float32_are_those_in_float64_whatever_the_unit(model, unit):
-    """By 1 % and a millionth of what deleting both costs; a pair alone costs as much to the bit."""
-    splats = cloud(500)
-    known = replace(field_of(splats, around(), measure(splats)), model=model)
-    field = replace(
-        known, means=known.means * unit, covariances=known.covariances * unit**2,
-        blur=known.blur * unit**2,
-    )  # fmt: skip
-    one, other = np.arange(500), nearest(splats.means.astype(float), 1)[:, 0]
-    exact = sum(0.5 * merging.price(known, one, other, tilt).cost for tilt in (-1.0, 1.0))
-    found = merging.costs(field, one, other, np.inf)
-    alone = [merging.costs(field, one[[k]], other[[k]], np.inf)[0] for k in range(0, 500, 7)]
-
-    assert found.dtype == np.float32
-    deleted = field.error[one] + field.error[other]
-    assert (np.abs(found - exact) <= 0.01 * exact + 1e-6 * deleted).all()
-    np.testing.assert_array_equal(alone, found[::7])
-
-
 def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
-    rng = np.random.default_rng(2)
-    count = 2000
-    field = flat(
-        rng.uniform(0, 1, count), rng.normal(size=(count, 3)), np.exp(rng.normal(0, 2, (count, 3)))
-    )
-    first, second = np.arange(0, count, 2), np.arange(1, count, 2)
+    rng, shape = np.random.default_rng(2), (2000, 3)
+    field = flat(rng.uniform(0, 1, 2000), rng.normal(size=shape), np.exp(rng.normal(0, 2, shape)))
+    first, second = np.arange(0, 2000, 2), np.arange(1, 2000, 2)
     pairs = merging.price(field, first, second)
     merged = merging.merge(field, first, second, pairs)
 
@@ -215,13 +173,10 @@ def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [550, 500, 499, 350, 50, 1])
 def test_as_many_survive_as_asked_and_the_unchanged_keep_their_bits(goal):
-    """Through all stages; where fewer are there than asked for, all survive. Input is only read.
-
-    Each stage blends colours by the same shares: harmonics equal to the base colours stay so.
-    """
+    """Through all stages; input is only read. Harmonics equal to base colours stay so."""
     splats = cloud(500)
     splats = replace(splats, sh_rest=np.repeat(splats.sh_dc[:, None], 3, axis=1))
-    for name in FIELDS:
+    for name in ARRAYS:
         getattr(splats, name).flags.writeable = False
     result = reduced_to(splats, around(), measure, goal)
     keep_count = min(goal, 500)
@@ -236,11 +191,10 @@ def test_as_many_survive_as_asked_and_the_unchanged_keep_their_bits(goal):
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (2, 4, 1, 0, 3), (1, 3, 2, 0, 4)])
 def test_a_kept_splat_has_the_colours_of_all_merged_into_it_by_what_is_seen_of_each(order):
-    """Three at one place seen as 1, 2 and 5, harmonics included; the one that is seen most stays.
+    """Three at one place seen as 1, 2 and 5; the one that is seen most stays.
 
-    Each as one more view may see it: of all that would be seen were nothing hidden, 26 were, and
-    that share of its mass counts with a chance of 1 / (n + 1) after n views. Three times the
-    opacity of .01, less what they hide of each other.
+    Of all that would be seen were nothing hidden 26 were; that share of a mass counts with a
+    chance of 1 / (n + 1) after n views. Opacity is three times .01, less what they hide.
     """
     splats = cloud(5)
     splats.means[:] = [[0, 0, 0], [1e-6, 0, 0], [2e-6, 0, 0], [0, 3, 0], [0, 0, 3]]
@@ -251,7 +205,6 @@ def test_a_kept_splat_has_the_colours_of_all_merged_into_it_by_what_is_seen_of_e
     contribution = np.array([1.0, 2, 5, 9, 9])
     seen = np.array([contribution, contribution * 0.005])
     result = reduced_to(splats.take(np.array(order)), around(), lambda *_: seen[:, order], 3)
-
     assert (result.merged, result.deleted) == (2, 0)
     assert result.keep.tolist() == [index > 1 for index in order]
     (row,) = np.flatnonzero(result.changed)
@@ -267,17 +220,6 @@ def test_a_kept_splat_has_the_colours_of_all_merged_into_it_by_what_is_seen_of_e
     assert 0.0298 < opacity(result.splats.opacity_logits[row]) < 0.03
     np.testing.assert_allclose(result.splats.log_scales[row], -2.0, atol=1e-4)
     np.testing.assert_allclose(result.splats.means[row], [1e-6, 0, 0], atol=1e-9)
-
-
-def looking(at, center, **changes):
-    """Return a view from `center` to `at`, 320 x 240 px."""
-    forward = np.array(at, float) - center
-    forward /= np.linalg.norm(forward)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    lens = {"fx": 200.0, "fy": 250.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}
-    return View(rotation, np.array(center, float), **lens | changes)
 
 
 FAR_OFF = looking([0, 0, 1], [-3, 0, 1.0])
@@ -313,10 +255,7 @@ def test_a_splat_is_viewed_along_the_mean_direction_of_what_sees_it(one, other, 
 
 @pytest.mark.parametrize("goal", [60, 0])
 def test_protected_splats_neither_vanish_nor_change_though_nobody_sees_or_can_draw_them(goal):
-    """A third; if all others go, more than asked for stay, and what others merged into is deleted.
-
-    Undrawable ones that are not protected go first.
-    """
+    """A third stays; undrawable ones that are not protected go first."""
     splats = cloud(100)
     splats.means[[5, 6], 0] = np.nan
     protected = np.arange(100) % 3 == 2
@@ -336,7 +275,6 @@ def test_protected_splats_neither_vanish_nor_change_though_nobody_sees_or_can_dr
 
 
 def test_where_nothing_is_seen_merging_is_deleting_the_lowest_errors():
-    """All are alike, and so are their floors."""
     splats = cloud(200, spread=1e-3)
     splats.log_scales[:], splats.opacity_logits[:] = -2.0, 0.0
     error = np.random.default_rng(5).permutation(200).astype(float)
@@ -352,13 +290,13 @@ def test_where_nothing_is_seen_merging_is_deleting_the_lowest_errors():
 
 
 def cheapest_first(field, penalty, goal):
-    """Return who went into whom, None for nobody, one operation at a time, every pair priced."""
+    """Who goes into whom, None for nobody, one operation at a time, every pair priced."""
     alive, done = list(range(len(field.means))), []
     while len(alive) > goal:
         operations = [(field.error[row], row, None) for row in alive]
         for pair in itertools.combinations(alive, 2):
-            cost = penalty * merging.costs(field, *(np.array([row]) for row in pair), np.inf)[0]
-            operations.append((cost, *pair))
+            cost = merging.price(field, *(np.array([row]) for row in pair)).cost[0]
+            operations.append((penalty * cost, *pair))
         _, gone, into = min(operations, key=lambda operation: operation[0])
         if into is not None:
             if field.contribution[gone] > field.contribution[into]:
@@ -372,7 +310,7 @@ def cheapest_first(field, penalty, goal):
 @pytest.mark.parametrize("penalty", [1.0, 0.2])
 @pytest.mark.parametrize("seed", range(8))
 def test_the_cheapest_of_all_operations_is_next_each_time(seed, penalty, monkeypatch):
-    """Seven splats are all neighbours of each other; rounds are of one operation each."""
+    """Seven splats are all neighbours; rounds are of one operation each."""
     monkeypatch.setattr(merge_graph, "BATCH", 0.0)
     rng = np.random.default_rng(seed)
     field = flat(
@@ -390,72 +328,41 @@ def test_the_cheapest_of_all_operations_is_next_each_time(seed, penalty, monkeyp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", [0.0, 0.001])
-@pytest.mark.parametrize(("places", "each"), [(1, 2000), (20, 100), (1000, 2)])
-def test_copies_of_a_splat_do_not_merge_one_by_one(places, each, hidden):
+def test_copies_of_a_splat_do_not_merge_one_by_one(monkeypatch, hidden):
     """Each lies behind the one before, of which a share is seen. Half of all may go in 138 rounds.
 
-    Rounds that remove at least a quarter of 3 % halve them in log(1/2) / log(1 - .0075) = 92. Half
-    as many are left for the last splats, of which no whole quarter can go.
+    Those that remove a quarter of 3 % take log(1/2) / log(1 - .0075) = 92, the last half as many.
     """
-    rounds = []
-
-    class Counting(MergeGraph):
-        def _round(self, *args):
-            rounds.append(args)
-            return super()._round(*args)
-
-    means = np.repeat(np.outer(np.arange(places) * 100.0, [1, 0, 0]), each, axis=0)
-    field = flat([0.2] * len(means), means, np.ones((len(means), 3)))
-    seen = (1.0 - hidden) ** np.tile(np.arange(each), places)
+    rounds, one = [], MergeGraph._round
+    monkeypatch.setattr(MergeGraph, "_round", lambda *given: rounds.append(1) or one(*given))
+    field = flat([0.2] * 2000, np.zeros((2000, 3)), np.ones((2000, 3)))
+    seen = (1.0 - hidden) ** np.arange(2000)
     field = replace(field, contribution=field.contribution * seen, error=field.error * seen)
-    graph = Counting(field, SCENE, 1.0)
+    graph = MergeGraph(field, SCENE, 1.0)
     graph.reduce(1000)
-
     assert np.count_nonzero(graph.alive) == 1000
     assert len(rounds) <= 92 + 46
 
 
 @pytest.mark.parametrize("unknown", [np.nan, np.inf])
-@pytest.mark.parametrize("apart", [100.0, 0.0])
 @pytest.mark.parametrize("goal", [0, 1, 3, 5])
-def test_splats_of_unknown_error_go_last_and_exactly_as_many_as_asked_stay(unknown, apart, goal):
-    """Errors .01 and .02 are known: rows 3 and 1 go first, then the rest in their order.
-
-    In one place, too: what is not cheaper than deleting is no merge.
-    """
-    places = np.outer(np.arange(6) * apart, [1, 0, 0])
+def test_splats_of_unknown_error_go_last_and_exactly_as_many_as_asked_stay(unknown, goal):
+    """Errors .01 and .02 are known: rows 3 and 1 go first, then the rest in their order."""
+    places = np.outer(np.arange(6) * 100.0, [1, 0, 0])
     error = [unknown, 0.02, unknown, 0.01, unknown, unknown]
     graph = MergeGraph(flat([0.5] * 6, places, np.ones((6, 3)), error=error), SCENE, 1.0)
     graph.reduce(goal)
-    left = np.flatnonzero(graph.alive).tolist()
-    assert len(left) == goal
+    assert np.flatnonzero(graph.alive).tolist() == sorted([3, 1, 0, 2, 4, 5][6 - goal :])
     assert graph.deleted >= 4 - goal
-    if apart:
-        assert left == sorted([3, 1, 0, 2, 4, 5][6 - goal :])
-
-
-def test_the_order_of_splats_and_of_views_and_threads_do_not_matter():
-    splats, views = cloud(400), around(7)
-    order = np.random.default_rng(6).permutation(400)
-    one = reduced_to(splats, views, measure, 150, threads=1)
-    other = reduced_to(splats.take(order), views.take([3, 0, 6, 2, 5, 1, 4]), measure, 150)
-
-    np.testing.assert_array_equal(one.keep[order], other.keep)
-    place = np.argsort(order[other.keep])
-    for name in FIELDS:
-        found = getattr(other.splats, name)[place]
-        np.testing.assert_allclose(found, getattr(one.splats, name), rtol=1e-6, atol=1e-9)
-    same(reduced_to(splats, views, measure, 150, threads=2).splats, one.splats)
 
 
 @pytest.mark.parametrize("focal", [1e-200, 1e200])
 def test_absurd_focal_lengths_do_no_harm_and_merging_can_be_cancelled(focal):
-    """Those whose square leaves float64 count as 1e-9 or 1e9 px: 50 of 100 survive."""
+    """Those whose square leaves float64 count as 1e-9 or 1e9 px."""
     views = ViewSet((*around(), replace(around()[0], fx=focal, fy=focal)))
-    merged = reduced_to(cloud(100), views, measure, 50)
-
-    assert len(merged.splats) == 50
-    assert all(np.isfinite(getattr(merged.splats, name)).all() for name in FIELDS)
+    merged = reduced_to(cloud(100), views, measure, 50).splats
+    assert len(merged) == 50
+    assert all(np.isfinite(getattr(merged, name)).all() for name in ARRAYS)
     with pytest.raises(Cancelled):
         reduced_to(cloud(100), views, measure, 50, progress=lambda fraction, _: fraction < 0.5)
 
@@ -463,7 +370,6 @@ def test_absurd_focal_lengths_do_no_harm_and_merging_can_be_cancelled(focal):
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_moved_turned_and_scaled_scenes_merge_alike(unit):
-    """Splats and views under one similarity: the same kept splats, moved likewise."""
     splats, matrix = cloud(400, degree=0), np.eye(4)
     matrix[:3, :3] = unit * rotation([3, -1, 2], 111.0)
     matrix[:3, 3] = np.array([10.0, -20.0, 5.0]) * unit
@@ -496,13 +402,5 @@ def test_extreme_splats_raise_no_warning_and_stay_drawable():
         for seen in (wild, lambda left, *_: np.ones((2, len(left)))):
             result = reduced_to(splats, around(), seen, 150)
             changed = result.splats.take(result.changed)
-            assert all(np.isfinite(getattr(changed, name)).all() for name in FIELDS)
+            assert all(np.isfinite(getattr(changed, name)).all() for name in ARRAYS)
             assert (opacity(changed.opacity_logits) < 1.0).all()
-
-
-@given(st.integers(1, 10**9), st.floats(0.0, 1.0), st.sampled_from([ALONE, STAGE]))
-def test_no_stage_removes_more_than_half(count, share, alone):
-    """Tiles count a merge as half a splat, and have no more to remove than that of a region."""
-    left = [count, *stage_counts(count, max(int(share * count), 1), alone)]
-
-    assert all(after >= before // 2 for before, after in itertools.pairwise(left))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, Splats
+from refine_addon.core import RefineError
 from refine_addon.core.execute import Cancelled
 from refine_addon.core.images import read_exr
 from refine_addon.core.pictures import (
@@ -26,53 +26,25 @@ from refine_addon.core.pictures import (
     seen_from,
 )
 from refine_addon.core.views import View, ViewSet
-from refine_addon.core.visibility import projection
-from refine_addon.core.visibility.cast import cast, colors_from
-
-C0 = 0.28209479177387814
-
-
-def splats_of(*rows):
-    """Return round splats of (place, standard deviation, opacity, colour)."""
-    places, sizes, opacities, colors = (
-        np.array(column, float) for column in zip(*rows, strict=True)
-    )
-    return Splats(
-        means=places,
-        log_scales=np.log(sizes)[:, None] * np.ones(3),
-        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1)),
-        opacity_logits=np.log(opacities / (1.0 - opacities)),
-        sh_dc=(colors - 0.5) / C0,
-        sh_rest=np.zeros((len(rows), 0, 3)),
-    )
+from tests.core.test_occlusion import cloud, splats_of
 
 
 def view_of(width, height, focal=50.0, **more):
-    """Return a view from the origin along z."""
+    """A view from the origin along z."""
     return View(np.eye(3), np.zeros(3), focal, focal, width / 2, height / 2, width, height, **more)
 
 
-def crowd(count=300, seed=1):
-    """Return many splats of all shapes before a view, with harmonics."""
-    rng = np.random.default_rng(seed)
-    return Splats(
-        means=rng.uniform([-1.5, -1.0, 1.0], [1.5, 1.0, 6.0], (count, 3)),
-        log_scales=rng.uniform(-4.0, -1.0, (count, 3)),
-        quaternions=rng.normal(size=(count, 4)),
-        opacity_logits=rng.normal(0.5, 2.0, count),
-        sh_dc=rng.normal(size=(count, 3)),
-        sh_rest=0.1 * rng.normal(size=(count, 3, 3)),
-    )
+def crowd(count=300):
+    """Many splats of all shapes before a view, with harmonics."""
+    return replace(cloud(count, 1), means=cloud(count, 1).means * 0.8 + [0.0, 0.0, 3.5])
 
 
 def test_a_splat_is_a_gaussian_of_its_size_and_the_low_pass():
     """Deviation .1 at depth 2 through 50 px: (50 .1 / 2)^2 + .3 = 6.55 px^2, around the middle.
 
-    The pixel (k, m) has its centre at k + .5, so that of an image of 41 px the middle one lies on
-    the axis: alpha there is the opacity, .6; d px aside it is .6 exp(-d^2 / 2 / 6.55). The colour
-    is (.9, .5, .1) times alpha, on black, in steps of 1 / 255.
+    The pixel (k, m) has its centre at k + .5; d px aside alpha is .6 exp(-d^2 / 2 / 6.55).
     """
-    splats = splats_of(((0.0, 0.0, 2.0), 0.1, 0.6, (0.9, 0.5, 0.1)))
+    splats = splats_of([[0, 0, 2]], 0.6, 0.1, [[0.9, 0.5, 0.1]])
     (found,) = compare(splats, splats, ViewSet((view_of(41, 31),)))
     for aside, down in itertools.product((0, 1, 4), (0, 2)):
         alpha = 0.6 * np.exp(-(aside**2 + down**2) / 2.0 / 6.55)
@@ -82,41 +54,18 @@ def test_a_splat_is_a_gaussian_of_its_size_and_the_low_pass():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [(64, 48), (700, 90)], ids=["one strip", "two strips"])
-def test_a_picture_is_what_the_lines_of_sight_through_all_its_pixels_see(size):
-    """`cast` finds the same by another way: all pairs first, then one sort for each pixel."""
-    splats, view = crowd(), replace(view_of(*size, focal=0.8 * size[0]), near=0.5)
-    views = ViewSet((view,))
-    gaussians, scene, _ = projection.prepare(splats, views)
-    footprints = projection.project(gaussians, scene, view)
-    expected = np.empty((3, size[1], size[0]))
-    for row in range(size[1]):
-        rays = cast(footprints, np.arange(size[0]), np.array([row]))
-        expected[:, row] = rays.colors(colors_from(splats, gaussians.index[rays.hit], view))
-    (found,) = compare(splats, splats.take(slice(None, None, -1)), views)
-    apart = np.abs(found.before.transpose(2, 0, 1) / 255.0 - expected)
-    assert apart.max() <= 0.5 / 255.0 + 1e-5
-    assert np.array_equal(found.after, found.before)
-
-
-@pytest.mark.slow
 def test_pictures_do_not_depend_on_threads_or_on_how_many_pairs_are_drawn_at_a_time(monkeypatch):
-    """Blocks of footprints end anywhere; only sums of float64 may differ, by less than 1e-9 dB.
-
-    MSE of the 8 bits tells the PSNR to a tenth of a dB; the same splats are 100 dB, the most.
-    """
+    """Nor on the order of splats; only sums of float64 differ. MSE of 8 bits is near."""
     splats, views = crowd(), ViewSet((view_of(120, 80, 90.0),))
     half = splats.take(np.arange(0, len(splats), 2))
     (one,), (same,) = compare(splats, half, views, threads=1), compare(splats, splats, views)
     monkeypatch.setattr("refine_addon.core.pictures._PAIRS", 1000)
-    (other,) = compare(splats, half, views, threads=3)
-
+    (other,) = compare(splats.take(slice(None, None, -1)), half, views, threads=3)
     assert abs(one.psnr - other.psnr) < 1e-9
     assert np.abs(one.before.astype(int) - other.before).max() <= 1  # a half rounds either way
     error = np.mean((one.after / 255.0 - one.before / 255.0) ** 2)
     assert abs(one.psnr + 10.0 * np.log10(error)) < 0.1
     assert same.psnr == 100.0
-    assert not same.difference.any()
     apart = np.abs(one.after.astype(int) - one.before)
     assert np.array_equal(one.difference, np.minimum(AMPLIFIED * apart, 255))
 
@@ -124,24 +73,20 @@ def test_pictures_do_not_depend_on_threads_or_on_how_many_pairs_are_drawn_at_a_t
 def test_a_view_of_many_pixels_is_drawn_smaller_and_sees_the_same():
     """4000 x 3000 px becomes 960 x 720; a point stays at the same share of the image."""
     small = fitted(replace(view_of(4000, 3000, 2000.0), cx=1500.0))
-
     assert (small.width, small.height) == (960, 720)
     assert [small.fx / 960, small.cx / 960] == pytest.approx([2000.0 / 4000, 1500.0 / 4000])
     assert fitted(small) is small
 
 
 def test_what_cannot_be_drawn_or_is_too_near_is_not_and_drawing_can_be_cancelled():
-    """The near plane is a share of the scene's size, which pruning changes: one for both pictures.
-
-    Without far splats the scene is far smaller, and so would be its near plane.
-    """
+    """The near plane is a share of the scene, which pruning changes: one for both pictures."""
     bad = replace(crowd(3), opacity_logits=np.full(3, np.nan))
-    close = [((0.0, 0.0, 0.5), 0.05, 0.9, (1.0, 1.0, 1.0))]
-    far = [((x, 0.0, 400.0), 1.0, 0.01, (0.5, 0.5, 0.5)) for x in (-90.0, 0.0, 90.0)]
-    splats, views = splats_of(*close, *far), ViewSet((view_of(20, 10),))
+    far = [[x, 0.0, 400.0] for x in (-90.0, 0.0, 90.0)]
+    alphas, scales = [0.9, 0.01, 0.01, 0.01], [[0.05], [1.0], [1.0], [1.0]]
+    splats = splats_of([[0.0, 0.0, 0.5], *far], alphas, scales, [1.0, 0.5, 0.5, 0.5])
+    views = ViewSet((view_of(20, 10),))
     (black,) = compare(bad, bad, views)
     (found,) = compare(splats, splats.take(np.array([0])), views)
-
     assert black.before.shape == (10, 20, 3)
     assert not black.before.any()
     assert found.before[5, 10].max() <= 4  # nearer than a hundredth of the scene's size
@@ -151,7 +96,7 @@ def test_what_cannot_be_drawn_or_is_too_near_is_not_and_drawing_can_be_cancelled
 
 
 def pixels_of(data):
-    """Return the pixels of a PNG, (H, W, 3), by hand: chunks, one zlib stream, filter 2."""
+    """The pixels of a PNG, (H, W, 3), by hand: chunks, one zlib stream, filter 2."""
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     at, chunks = 8, {}
     while at < len(data):
@@ -169,17 +114,12 @@ def pixels_of(data):
 
 
 def test_files_are_named_after_splats_and_camera_and_hold_the_pictures(tmp_path):
-    """Two of three views have one name; what no file can be called stands as _.
-
-    A picture that exists is refused before the work.
-    """
+    """Two of three views have one name; what no file can be called stands as _."""
     names = ("left/0.JPG", "left/0.JPG", "Camera: A.001")
-    views = ViewSet(tuple(
-        replace(view_of(40, 30), name=name, center=np.array([0.1 * number, 0.0, 0.0]))
-        for number, name in enumerate(names)
-    ))  # fmt: skip
-    splats = crowd(50)
-    half = splats.take(np.arange(25))
+    view, places = view_of(40, 30), np.outer([0.0, 0.1, 0.2], [1.0, 0.0, 0.0])
+    pairs = zip(names, places, strict=True)
+    views = ViewSet(tuple(replace(view, name=name, center=place) for name, place in pairs))
+    splats, half = crowd(50), crowd(50).take(np.arange(25))
     facts = PictureFiles(tmp_path, "my/room").write(splats, half, views)
     stems = ["my_room-left_0", "my_room-left_0_2", "my_room-Camera_ A.001"]
     expected = {f"{stem}-{kind}.png" for stem in stems for kind in KINDS}
@@ -192,27 +132,20 @@ def test_files_are_named_after_splats_and_camera_and_hold_the_pictures(tmp_path)
             assert np.array_equal(pixels_of(Path(told[kind]).read_bytes()), getattr(one, kind))
     assert facts["psnr"] == round(sum(one.psnr for one in found) / 3, 2)
     assert measured_in_words(facts).startswith(f"{facts['psnr']:.1f} dB measured in 3 views (")
-    refused = pytest.raises(RefineError, match=r"my_room-left_0-.*\.png: exists already")
-    with refused, PictureFiles(tmp_path, "my/room").opened(views):
-        pass
-    with PictureFiles(tmp_path, "my/room", overwrite=True).opened(views):
-        pass
 
 
 RED, GREEN, BLUE = np.eye(3)
 
 
 def layer_of(color, alpha, depth, size=9):
-    """Return the colours, alphas and depths of a layer that is the same in all pixels."""
+    """Colours, alphas and depths of a layer that is the same in all pixels."""
     plane = np.ones((size, size))
     return alpha * np.asarray(color)[:, None, None] * plane, alpha * plane, depth * plane
 
 
 def two_splats():
-    """Return two wide splats before the view: red of opacity .8 at depth 2, green of .5 at 4."""
-    return splats_of(
-        ((0.0, 0.0, 2.0), 50.0, 0.8, tuple(RED)), ((0.0, 0.0, 4.0), 100.0, 0.5, tuple(GREEN))
-    )
+    """Two wide splats before the view: red of opacity .8 at depth 2, green of .5 at 4."""
+    return splats_of([[0, 0, 2], [0, 0, 4]], [0.8, 0.5], [[50.0], [100.0]], [RED, GREEN])
 
 
 @pytest.mark.parametrize(
@@ -228,14 +161,13 @@ def two_splats():
     ],
 )
 def test_a_layer_hides_what_is_behind_it_by_its_alpha(alpha, depth, expected):
-    """Front to back: each shows what those before it let through, (1 - .8) = .2, then .2 * .5.
+    """Each shows what those before it let through, (1 - .8) = .2, then .2 * .5.
 
-    What is left of 1 is seen of a white background, which counts for no alpha.
+    The rest of 1 is seen of a white background, which counts for no alpha.
     """
     layer = in_order([layer_of(BLUE, alpha, depth)])
     lit = replace(layer, background=(1.0 - alpha) * np.ones((3, 9, 9)))
     picture, light = (draw(two_splats(), view_of(9, 9), each)[:, 4, 4] for each in (layer, lit))
-
     assert np.abs(picture - expected).max() < 2e-3  # a splat is not quite flat
     left = 1.0 - expected[3]
     assert np.abs(light - picture - [left, left, left, 0.0]).max() < 1e-3
@@ -254,7 +186,7 @@ def test_a_layer_hides_what_is_behind_it_by_its_alpha(alpha, depth, expected):
 def test_splats_between_two_layers_are_seen_through_the_nearer_one(
     near, far, expected, over, order
 ):
-    """White, the wall adds the .6 * .2 that is left. Which layer is given first is all one."""
+    """White, the wall adds the .6 * .2 that is left; the order of layers is all one."""
     layers = in_order([layer_of(*near, 1.0), layer_of(*far, 3.0)][::order])
     picture = draw(two_splats(), view_of(9, 9), layers)[:, 4, 4]
     wall = 0.12 * far[0][0]
@@ -262,35 +194,16 @@ def test_splats_between_two_layers_are_seen_through_the_nearer_one(
     assert np.abs(layers.over_nothing()[:, 4, 4] - over).max() < 1e-12
 
 
-def test_a_layer_is_the_picture_over_it_and_cuts_it_in_depth():
-    """Behind all splats: in each pixel colours plus what their alpha lets through.
-
-    Opaque and black at depth 3: as if only nearer splats were there. No splats draw nothing.
-    """
-    splats, view = crowd(), view_of(60, 40, near=0.5)
-    plain, near = draw(splats, view), splats.take(splats.means[:, 2] < 3.0)
-    colors, opaque = np.random.default_rng(3).random((3, 40, 60)), np.ones((40, 60))
-    picture = draw(splats, view, in_order([(colors, opaque, 1e4 * opaque)]))
-    cut = draw(splats, view, in_order([(0.0 * colors, opaque, 3.0 * opaque)]))
-
-    assert np.abs(picture[:3] - plain[:3] - (1.0 - plain[3]) * colors).max() < 1e-9
-    assert (picture[3] == 1.0).all()
-    assert np.abs(cut[:3] - draw(near, view)[:3]).max() < 1e-5
-    assert not draw(splats.take(np.zeros(300, np.bool_)), view).any()
-
-
 def test_colours_seen_from_a_place_are_those_of_the_harmonics():
-    """Drawn from there, all splats look the same with colours of their own."""
     splats, view = crowd(), view_of(60, 40, near=0.5)
     view = replace(view, center=np.array([0.4, -0.3, 0.2]))
     seen = seen_from(splats, view.center)
-
     assert seen.sh_degree == 0
     assert np.abs(draw(seen, view) - draw(splats, view)).max() < 1e-6
 
 
 def exr_of(channels, *, compression=0, version=2):
-    """Return an image of float32 channels (H, W), by hand."""
+    """An image of float32 channels (H, W), by hand."""
     height, width = next(iter(channels.values())).shape
     names = sorted(channels)
     listed = b"".join(name.encode() + b"\0" + struct.pack("<4i", 2, 0, 1, 1) for name in names)
@@ -313,29 +226,16 @@ def test_an_exr_image_is_read_channel_by_channel(tmp_path):
     channels = {f"View.{name}": rng.normal(size=(5, 7)).astype("f4") for name in "RGBZ"}
     (tmp_path / "in.exr").write_bytes(exr_of(channels))
     found = read_exr(tmp_path / "in.exr")
-
     assert list(found) == sorted(channels)
     assert all(np.array_equal(found[name], values) for name, values in channels.items())
 
 
-FLAT = {"Z": np.zeros((2, 2))}
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"PNG and more",
-        exr_of(FLAT)[:-3],
-        exr_of(FLAT, compression=3),
-        exr_of(FLAT, version=0x1002),
-    ],
-    ids=["empty", "another format", "truncated", "packed", "several parts"],
-)
-def test_what_is_no_such_image_is_named(tmp_path, data):
-    (tmp_path / "in.exr").write_bytes(data)
-
-    with pytest.raises(RefineError, match=r"in\.exr: expected an OpenEXR image in one part"):
-        read_exr(tmp_path / "in.exr")
+def test_what_is_no_such_image_is_named(tmp_path):
+    flat = {"Z": np.zeros((2, 2))}
+    packed, parts = exr_of(flat, compression=3), exr_of(flat, version=0x1002)
+    for data in (b"", b"PNG and more", exr_of(flat)[:-3], packed, parts):
+        (tmp_path / "in.exr").write_bytes(data)
+        with pytest.raises(RefineError, match=r"in\.exr: expected an OpenEXR image in one part"):
+            read_exr(tmp_path / "in.exr")
     with pytest.raises(RefineError, match=r"no\.exr: cannot be read"):
         read_exr(tmp_path / "no.exr")
