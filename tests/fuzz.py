@@ -2,11 +2,9 @@
 
     python -m tests.fuzz [--seconds 300] [--seed N]
 
-Good files of every format are broken by chance: bytes, words, numbers, lines, JSON values. Each
-must end in a `RefineError` that names the file, or in a result that holds together: a PLY must be
-rewritten byte for byte, cameras must be usable for scoring. Anything else, a warning of NumPy's, a
-memory beyond the file's and a run of seconds among it, is a crash: the input is kept and the exit
-code is 1.
+Good files of every format are broken by chance. Each must end in a `RefineError` that names the
+file, or in a result that holds together. Anything else, a warning of NumPy's, much memory and a run
+of seconds among it, is a crash: the input is kept and the exit code is 1.
 """
 
 from __future__ import annotations
@@ -68,12 +66,11 @@ VALUES = (
 """What a number, a list or a name in a JSON file is replaced with."""
 
 PLY_KINDS = [(f, end.encode(), 3, seed) for f in ORDERS for end in LINE_ENDS for seed in range(2)]
-Files = dict[str, bytes]
-"""A file, or several that belong together, by name."""
+Files = dict[str, bytes]  # a file, or several that belong together, by name
 
 
 def format_seeds(form: Any) -> list[Files]:
-    """Return files of a format other than plain PLY, written by ours."""
+    """Files of a format other than plain PLY, written by ours."""
     seeds = []
     for degree in (0, 1):
         rows, splats = empty_rows(5, degree)
@@ -89,7 +86,7 @@ def format_seeds(form: Any) -> list[Files]:
 
 
 def transforms_seeds() -> list[Files]:
-    """Return ``transforms.json`` of nerfstudio and of instant-ngp, and what lies beside it."""
+    """``transforms.json`` of nerfstudio and of instant-ngp, and what lies beside it."""
     studio = {**TRANSFORMS, "camera_model": "OPENCV", "k1": 0.1, "applied_transform": MATRIX[:3]}
     frames = [{**FRAME, "fl_x": 400.0, "w": 320, "h": 200}]
     ngp = {"camera_angle_x": 0.8, "w": 640.0, "h": 480.0, "aabb_scale": 4, "frames": frames}
@@ -99,13 +96,13 @@ def transforms_seeds() -> list[Files]:
 
 
 def colmap_seeds(suffix: str) -> list[Files]:
-    """Return a model of two cameras and two images."""
+    """A model of two cameras and two images."""
     parts = zip(HALVES, TWO, WRITERS[suffix], strict=True)
     return [{f"{stem}{suffix}": write(things) for stem, things, write in parts}]
 
 
 def sog_seeds() -> list[Files]:
-    """Return what is in SOG files, so that what is broken is not the archive alone."""
+    """What is in SOG files, so that what is broken is not the archive alone."""
     seeds = []
     for seed in format_seeds(FORMATS[SUFFIXES.index(".sog") - 1]):
         with zipfile.ZipFile(io.BytesIO(seed["in.sog"])) as archive:
@@ -114,7 +111,7 @@ def sog_seeds() -> list[Files]:
 
 
 def version_1_of(files: Files) -> Files:
-    """Return the files of a SOG with what version 1 says in place of version 2."""
+    """The files of a SOG with what version 1 says in place of version 2."""
     held = json.loads(files["meta.json"])
     meta = {name: {"files": held[name]["files"]} for name in ("means", "scales", "quats", "sh0")}
     meta["means"] |= {"shape": [held["count"], 3], "mins": [-1, -1, -1], "maxs": [1, 1, 1]}
@@ -126,7 +123,7 @@ def version_1_of(files: Files) -> Files:
 
 
 def ksplat_seeds() -> list[Files]:
-    """Return what files of the reference converter hold, without the zeros between."""
+    """What files of the reference converter hold, without the zeros between."""
     seeds = []
     for name in ("level_0", "level_1", "level_2", "degree_1"):
         data = (ROOT / f"tests/data/other_tools/{name}.ksplat").read_bytes()
@@ -137,7 +134,7 @@ def ksplat_seeds() -> list[Files]:
 
 
 def broken(files: Files, others: list[Files], chance: random.Random) -> Files:
-    """Return the files with one of them broken in one to five ways."""
+    """The files with one of them broken in one to five ways."""
     name = chance.choice(sorted(files))
     data = files[name]
     for _ in range(chance.choice((1, 1, 1, 2, 3, 5))):
@@ -158,7 +155,7 @@ def _flip(data: bytes, _: bytes, chance: random.Random) -> bytes:
 
 
 def _put(data: bytes, other: bytes, chance: random.Random) -> bytes:
-    """Put a word, a number, a line or a piece of a file among others or over them, or drop some."""
+    """Put a word, a number, a line or a piece of a file among others or over them."""
     value = chance.choice((0, 1, 255, 2**31, 2**32 - 1, 2**63, 2**64 - 1, 0x7FF4000000000001))
     kind = chance.choice(["<Q", ">Q", "<I", "<B"])
     start, length = chance.randint(0, len(data)), chance.choice((1, 4, 8, 60, 200))
@@ -184,13 +181,12 @@ def _splice(data: bytes, other: bytes, chance: random.Random) -> bytes:
 
 
 def _places(node: Any) -> list[tuple[Any, Any]]:
-    """Return every value within, as what holds it and its key or index."""
+    """Every value within, as what holds it and its key or index."""
     keys = {list: lambda: range(len(node)), dict: lambda: list(node)}.get(type(node), tuple)()
     return [(node, k) for k in keys] + [place for k in keys for place in _places(node[k])]
 
 
 def _other_value(data: bytes, chance: random.Random) -> bytes:
-    """Replace, drop or repeat one value of a JSON file."""
     try:
         content = json.loads(data)
         node, key = chance.choice(_places(content))
@@ -204,7 +200,6 @@ def _other_value(data: bytes, chance: random.Random) -> bytes:
 
 
 def use_ply(folder: Path) -> None:
-    """Read, describe, convert and rewrite a PLY file."""
     path, again = folder / "in.ply", folder / "out.ply"
     file = read_ply(path)
     file.splats()
@@ -231,7 +226,6 @@ def use_splats(folder: Path, name: str = "in.*", suffix: str | None = None) -> N
 
 
 def use_ksplat(folder: Path) -> None:
-    """Put header, sections and splats into a file and use that."""
     header, *sections, rest = (path.read_bytes() for path in sorted(folder.iterdir()))
     padded = b"".join(data[:1024].ljust(1024, b"\0") for data in sections)
     (folder / "in.ksplat").write_bytes(header[:4096].ljust(4096, b"\0") + padded + rest)
@@ -277,10 +271,7 @@ class Crash(Exception):
 
 
 def attempt(files: Files, use: Callable[[Path], Any], folder: Path) -> bool:
-    """Use files that may be broken; return whether they were taken.
-
-    Anything else than that or an error that names the file is a `Crash`.
-    """
+    """Use files that may be broken; return whether they were taken, or raise `Crash`."""
     for old in folder.iterdir():
         old.unlink()
     for name, data in files.items():
@@ -309,10 +300,7 @@ def attempt(files: Files, use: Callable[[Path], Any], folder: Path) -> bool:
 
 
 def fuzz(name: str, chance: random.Random, going: Callable[[int], bool]) -> tuple[int, int]:
-    """Try broken files of one format as long as `going`, asked with their number, says so.
-
-    Returns how many were tried, and how many of them were taken.
-    """
+    """Try broken files as long as `going` says so; return how many, and how many were taken."""
     make, use = TARGETS[name]
     seeds = make()
     tried = taken = 0

@@ -36,18 +36,17 @@ def _no_process_stays():
 
 
 def row(array: np.ndarray, number: int) -> tuple[int, np.ndarray]:
-    """Return where this ran, and a part of an array."""
+    """Where this ran, and a part of an array."""
     print("what work prints is no result")
     return os.getpid(), array[number] * 2
 
 
 def rows(count: int, cost: float = MUCH, threads: int = 2):
-    """Run `row` on an array of as many rows."""
     return run(partial(row, np.zeros((count, 1))), range(count), cost=cost, threads=threads)
 
 
 def where(*how) -> set[int]:
-    """Return which processes do the work."""
+    """The processes that do the work."""
     return {pid for pid, _ in rows(4, *how)}
 
 
@@ -69,7 +68,7 @@ def end_elsewhere(here: int, number: int) -> int:
 
 
 def gone(pid: int) -> bool:
-    """Return whether a process has ended, within a minute."""
+    """Say whether a process has ended, within a minute."""
     end = time.monotonic() + 60
     while time.monotonic() < end:
         try:
@@ -86,7 +85,6 @@ def gone(pid: int) -> bool:
 
 
 def endless(_piece: slice) -> None:
-    """Work until cancelled."""
     end = time.monotonic() + LONG
     while time.monotonic() < end:
         time.sleep(0.001)
@@ -103,12 +101,9 @@ def chunked(_piece: slice) -> None:
 @pytest.mark.parametrize("work", [endless, chunked])
 def test_work_that_takes_long_is_cancelled_within_a_chunk(work, threads):
     """The first report begins it, the second stops it; a checkpoint outside then does nothing."""
-    calls = iter(range(100))
-    start = time.monotonic()
-
+    calls, start = iter(range(100)), time.monotonic()
     with pytest.raises(Cancelled):
         run_all(work, chunks(2, 1), progress=lambda *_: next(calls) < 1, threads=threads)
-
     assert time.monotonic() - start < LONG / 10
     checkpoint()
 
@@ -116,8 +111,7 @@ def test_work_that_takes_long_is_cancelled_within_a_chunk(work, threads):
 @pytest.mark.parametrize("threads", [1, 2])
 def test_an_error_stops_the_chunks_that_run(threads):
     """The first chunk fails while the second runs; nothing waits for the end of that one."""
-    running = threading.Event()
-    start = time.monotonic()
+    running, start = threading.Event(), time.monotonic()
 
     def work(piece: slice) -> None:
         if piece.start:
@@ -133,14 +127,6 @@ def test_an_error_stops_the_chunks_that_run(threads):
     assert time.monotonic() - start < LONG / 10
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_results_come_in_the_order_of_the_slices(threads):
-    """The last slice is what is left."""
-    found = run_all(lambda piece: (piece.start, piece.stop), chunks(10, 4), threads=threads)
-
-    assert found == [(0, 4), (4, 8), (8, 10)]
-
-
 # In processes.
 
 
@@ -150,9 +136,7 @@ def test_processes_return_what_this_one_would_in_order(order, monkeypatch):
     """Eleven rows by two processes; of the path of modules imports ignore what is no string."""
     monkeypatch.setattr(sys, "path", [*sys.path, Path("/y"), "/nowhere"])
     array = np.asarray(np.random.default_rng(0).random((11, 1000)), order=order)
-
     pids, found = zip(*run(partial(row, array), range(11), cost=MUCH, threads=2), strict=True)
-
     np.testing.assert_array_equal(found, array * 2)
     assert len({*pids, os.getpid()}) == 3
     assert list(run(refuse, range(0), cost=MUCH, threads=2)) == []
@@ -161,18 +145,13 @@ def test_processes_return_what_this_one_would_in_order(order, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="asks Linux what is mapped")
 def test_processes_are_kept_for_the_next_work_without_that_of_the_last():
-    """Once they are there, a tenth of the work is worth them too.
-
-    Arrays of work that is done are no longer mapped, so they take neither memory nor disk.
-    """
+    """A tenth of the work is then worth them. Arrays of work that is done are no longer mapped."""
     execute.start(MUCH, 2)
     first = where(WORTH / 2)
     found = rows(4, WORTH / 2)
-
     pid, _ = next(found)
     during = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
     again = {pid for pid, _ in found}
-
     assert os.getpid() not in first
     assert {pid, *again} == first
     assert "/arrays" in during
@@ -200,12 +179,11 @@ def test_work_stays_here_if_processes_are_not_worth_it_or_not_to_be_had(monkeypa
 
 @pytest.mark.slow
 def test_work_that_processes_cannot_do_is_done_here(monkeypatch):
-    """Number 1 ends every process that tries it, and a module made at run time is here alone."""
+    """Number 1 ends every process that tries it; a module made at run time is here alone."""
     module = types.ModuleType("made_here")
     exec("def double(number): return 2 * number", vars(module))
     module.double.__module__ = "made_here"
     monkeypatch.setitem(sys.modules, "made_here", module)
-
     ended = run(partial(end_elsewhere, os.getpid()), range(5), cost=MUCH, threads=2)
     assert list(ended) == [0, 1, 2, 3, 4]
     assert list(run(module.double, range(4), cost=MUCH, threads=2)) == [0, 2, 4, 6]
@@ -213,12 +191,11 @@ def test_work_that_processes_cannot_do_is_done_here(monkeypatch):
 
 @pytest.mark.slow
 def test_what_the_work_raises_is_raised_here_and_ends_processes():
-    """Numbers 0 and 1 come first, as in this thread; a caller may also give up the rest."""
+    """Numbers 0 and 1 come first; a caller may also give up the rest."""
     found = run(refuse, range(4), cost=MUCH, threads=2)
     assert [next(found), next(found)] == [0, 1]
     with pytest.raises(RefineError, match="broken"):
         next(found)
-
     found = rows(9)
     pid, _ = next(found)
     found.close()
@@ -228,12 +205,9 @@ def test_what_the_work_raises_is_raised_here_and_ends_processes():
 @pytest.mark.slow
 def test_cancelling_ends_processes_at_once():
     """Work that would take ten minutes, and never looks whether to go on."""
-    calls = iter(range(100))
-    start = time.monotonic()
-
+    calls, start = iter(range(100)), time.monotonic()
     with pytest.raises(Cancelled):
         list(run(slow, range(4), cost=MUCH, progress=lambda *_: next(calls) < 3, threads=2))
-
     assert time.monotonic() - start < LONG / 10
 
 
@@ -252,7 +226,6 @@ os.kill(os.getpid(), 9)
         [sys.executable, "-c", program],
         stdout=subprocess.PIPE, env={**os.environ, "TMPDIR": str(tmp_path)}, check=False,
     )  # fmt: skip
-
     assert gone(int(said.stdout.split(b"\n")[-1]))
     assert not list(tmp_path.iterdir())
 
@@ -260,16 +233,14 @@ os.kill(os.getpid(), 9)
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [Occlusion(), Merge()])
 def test_processes_keep_the_same_splats_as_one_thread(method, monkeypatch):
-    """To the bit, with every view measured in a process however little work it is."""
+    """To the bit, with every view measured in a process."""
     monkeypatch.setattr(execute, "WORTH", 0.0)
     monkeypatch.setattr(execute, "WORTH_READY", 0.0)
     splats = read_ply(ROOM / "point_cloud.ply").splats().take(np.arange(0, 39755, 20))
     views = read_cameras(ROOM / "cameras.json").spread(20)
-
     one, two = (
         prune(splats, views, Budget(ratio=0.5), method, threads=threads) for threads in (1, 2)
     )
-
     assert len(execute._idle) == 2
     assert one.scores.values.tobytes() == two.scores.values.tobytes()
     assert one.keep.tobytes() == two.keep.tobytes()

@@ -24,7 +24,6 @@ NAMES = splat_names(0)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """One folder for all examples of a law."""
     return tmp_path_factory.mktemp("ply")
 
 
@@ -37,7 +36,7 @@ def opened(folder, data):
 
 
 def rewritten(folder, file, *given, **named):
-    """Return what `file` writes, which it knew the length of."""
+    """What `file` writes, which it knew the length of."""
     with np.errstate(all="raise"):
         file.write(folder / "out.ply", *given, **named, overwrite=True)
     written = (folder / "out.ply").read_bytes()
@@ -47,13 +46,9 @@ def rewritten(folder, file, *given, **named):
 
 @given(case=ply_files())
 def test_every_number_is_read_as_it_stands(folder, case):
-    """Binary rows are the file's bytes, NaN payloads included; text reads back as its numbers.
-
-    f_rest is channel by channel: coefficient k of channel c is f_rest_(c K + k).
-    """
+    """NaN payloads included; coefficient k of channel c is f_rest_(c K + k)."""
     file = opened(folder, case.data)
     splats, rows = file.splats(), file.rows
-
     assert case.rows.dtype == rows.dtype
     for name in rows.dtype.names:
         np.testing.assert_array_equal(case.rows[name], rows[name])
@@ -92,15 +87,12 @@ def test_a_prune_holds_a_few_megabytes_of_a_file(tmp_path):
 def test_a_pruned_file_is_the_kept_rows_and_another_count(folder, case, data, kind):
     """All else stays to the byte: byte order, comments, the count's spelling, what trails.
 
-    Opacity becomes 1/3 in place and in its own type; a new property is the last of each row, in
-    the file's byte order.
+    Opacity becomes 1/3 in its own type; a new property is the last of each row.
     """
     keep = data.draw(masks(len(case.rows)))
     file = opened(folder, case.data)
-
     assert case.data == rewritten(folder, file)
     assert case.pruned(keep) == rewritten(folder, file, keep)
-
     fitting = file.fixed_bytes + file.row_bytes * int(keep.sum())
     assert len(case.pruned(keep)) <= fitting or case.head[1].startswith(b"0")
     rows, values = case.rows.copy(), (np.arange(len(keep)) * 1.5 + 0.25).astype(kind)
@@ -120,7 +112,7 @@ def test_a_pruned_file_is_the_kept_rows_and_another_count(folder, case, data, ki
 
 @given(case=ply_files(forms=("ascii",)), data=st.data())
 def test_text_is_written_as_the_binary_file_of_its_splats(folder, case, data):
-    """With its comments and the spelling of its count; elements beside the splats are named."""
+    """With its comments and its count's spelling; elements beside the splats are named."""
     keep = data.draw(masks(len(case.rows)))
     file = opened(folder, case.data)
     written = rewritten(folder, file, keep)
@@ -144,9 +136,8 @@ def test_text_is_written_as_the_binary_file_of_its_splats(folder, case, data):
 def test_odd_headers_are_read_and_kept(tmp_path):
     """NumPy hands out no buffer of rows with a colon in a name.
 
-    The line end is that of the first line; 0x0a may be the first byte of x then. A byte-sized first
-    property does not turn the byte order: 1.0 is 3f 80 00 00. The count is the third word of its
-    line, wherever it stands.
+    Lines end as the first does; 0x0a may be the first byte of x then. A byte-sized first property
+    does not turn the byte order: 1.0 is 3f 80 00 00. The count is the third word of its line.
     """
     tag = np.arange(3, dtype=np.float32)
     file = opened(tmp_path, ply_of(dict.fromkeys([*NAMES, "t:ag"], tag), ["made here"]))
@@ -189,23 +180,20 @@ PLAIN = plain_ply()
 
 
 def declared(old: bytes, new: bytes) -> bytes:
-    """Return a good file with a change to its header."""
+    """A good file with a change to its header."""
     assert old in PLAIN
     return PLAIN.replace(old, new, 1)
 
 
 def ahead(element: bytes) -> bytes:
-    """Return a good file that declares an element ahead of the splats."""
     return declared(VERTEX, element + VERTEX)
 
 
 def more(declaration: bytes) -> bytes:
-    """Return a good file that declares more at the end of its header."""
     return declared(b"end_header", declaration + b"\nend_header")
 
 
 def counted(count: object) -> bytes:
-    """Return a good file with another number of splats in its header."""
     return declared(VERTEX, b"element vertex %s\n" % str(count).encode())
 
 
@@ -290,10 +278,7 @@ def test_a_text_row_that_is_wrong_is_refused_with_its_number(tmp_path, old, new,
 
 
 def test_a_small_file_cut_at_every_byte_is_refused(tmp_path):
-    """Every prefix lacks the end of the header or of the last row.
-
-    Text without its line end is whole, and within its last number nobody can tell.
-    """
+    """Text without its line end is whole, and within its last number nobody can tell."""
     for cut in range(len(PLAIN)):
         with pytest.raises(RefineError, match=r"empty|not a PLY|header without end|truncated"):
             opened(tmp_path, PLAIN[:cut])
@@ -306,7 +291,6 @@ def test_a_small_file_cut_at_every_byte_is_refused(tmp_path):
 
 
 def test_a_header_line_of_a_hundred_megabytes_costs_one(tmp_path):
-    """The header is looked for in the first 2^20 bytes."""
     path = tmp_path / "in.ply"
     with path.open("wb") as stream:
         stream.write(b"ply\nformat ascii 1.0\ncomment ")
