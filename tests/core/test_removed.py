@@ -16,14 +16,18 @@ from refine_addon.core import (
     Merge,
     Occlusion,
     RefineError,
+    Refit,
     Zone,
     clean,
     lod,
+    mapped,
     prune,
     prune_file,
     read_ply,
     score,
 )
+from refine_addon.core.mapped import on_disk
+from refine_addon.core.splats import ARRAYS
 from tests.core.test_cleaning import FLOATER, cameras, joined, wall
 from tests.core.test_levels import cameras as level_cameras
 from tests.core.test_levels import (
@@ -209,3 +213,23 @@ def test_a_file_is_cleaned_and_pruned_by_volumes_as_by_masks(splats, views, tmp_
     assert np.flatnonzero(~left).tolist() == [COUNT]
     assert np.array_equal(found.keep[left], rest.keep)
     assert not found.keep[COUNT]
+
+
+@pytest.mark.parametrize("method", [Merge(), Refit(rounds=1)], ids=["merge", "refit"])
+@pytest.mark.parametrize("region", [None, 80], ids=["in memory", "by regions of files"])
+def test_protected_splats_keep_every_bit(
+    merges, splats, views, tmp_path, monkeypatch, method, region
+):
+    """They fill regions, and lie among the others, of which most go: as many as are asked for."""
+    stored, x = splats, splats.means[:, 0]
+    mine = (x < np.quantile(x, 0.5)) | (EVERY % 6 == 0)
+    if region:
+        monkeypatch.setattr(mapped, "REGION", region)
+        stored = on_disk(tmp_path / "job/splats", [splats])
+    found = prune(stored, views, Budget(ratio=0.3), method, protected=mine)
+    kept, same = found.splats, mine[found.keep]
+    assert np.count_nonzero(found.keep) == COUNT - int(0.3 * COUNT)
+    assert found.merged.changed.any()
+    assert found.keep[mine].all()
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(kept, name)[same], getattr(splats, name)[mine])

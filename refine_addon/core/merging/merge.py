@@ -290,10 +290,10 @@ def _by_regions(stage, keep_count, askew, progress):
     numbers = range(len(boxes))
     whole = np.sum(run_all(partial(_measure, folder), numbers, progress=measuring, **how), axis=0)
     priced = run_all(partial(_price, folder, whole), numbers, progress=pricing, **how)
-    counts = _staying(priced, keep_count)
+    removals = _removals(priced, len(there) - keep_count)
     del priced
-    made = run_all(partial(_merge, folder), [*enumerate(counts)], progress=merging, **how)
-    kept, members, sums, regions = zip(*made, strict=True)
+    reduced = run_all(partial(_merge, folder), [*enumerate(removals)], progress=merging, **how)
+    kept, members, sums, regions = zip(*reduced, strict=True)
     left, order = in_one(folder, regions, kept)
     keep = np.zeros(len(stage.members), np.bool_)
     keep[np.concatenate(kept)] = True
@@ -311,7 +311,7 @@ def _measure(folder, number):
 
 
 def _price(folder, whole, number):
-    """Cost of each splat's cheapest operation, and how many splats that removes, 1 or 0.5."""
+    """Costs and weights for `_removals` of the splats of a region that are not protected."""
     _, stage = noted(folder, f"region-{number}")[1]
     rows, measured = noted(folder, f"measured-{number}")[1]
     graph = stage.graph(measured, whole)
@@ -322,28 +322,32 @@ def _price(folder, whole, number):
     weights = np.ones(len(costs), np.float32)
     # Of two splats that merge, one goes.
     costs[rows], weights[rows] = best, np.where(merges, np.float32(0.5), np.float32(1.0))
-    return costs, weights
+    return costs[~stage.protected], weights[~stage.protected]
 
 
 def _merge(folder, item):
-    """Kept rows of a region that is merged down to a count, their members, sums and splats."""
-    number, count = item
+    """Kept rows of a region after its removals, their members, sums and splats."""
+    number, removals = item
     origin, stage = noted(folder, f"region-{number}")[1]
     stage = replace(stage, splats=copied(stage.splats, origin, stage.threads))
     rows, graph = noted(folder, f"graph-{number}")[1]
     with np.errstate(under="ignore"):
-        left, keep, members, sums = stage.reduced(rows, graph, count, look)
+        left, keep, members, sums = stage.reduced(rows, graph, len(origin) - removals, look)
     return origin[keep], members, sums, on_disk(folder / f"left-{number}", [left])
 
 
-def _staying(priced, left):
-    """Number kept of each region, of `left` in all, by one ranking of all operations."""
+def _removals(priced, goal):
+    """Number removed of each region, `goal` in all, by one ranking of the operations of all.
+
+    `priced` holds (costs, weights) of each region, weights in splats that an operation removes.
+    """
     ends = np.cumsum([len(costs) for costs, _ in priced])
     costs, weights = (np.concatenate(each) for each in zip(*priced, strict=True))
-    order, goal = np.argsort(costs, kind="stable"), len(costs) - left
+    # Where more than half go, most splats that merge go, too.
+    weights, order = np.maximum(weights, goal / len(costs)), np.argsort(costs, kind="stable")
     last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), goal))
     weights[order[last + 1 :]] = 0.0
-    gone = np.cumsum(weights, dtype=np.float64)[ends - 1]
+    removed = np.append(0.0, np.cumsum(weights, dtype=np.float64))[ends]
     # Rounded so that the sum is exact: each gets what is added up to its end.
-    gone = np.rint(gone * (goal / gone[-1])).astype(np.int64)
-    return np.diff(ends - gone, prepend=0).tolist()
+    removed = np.rint(removed * (goal / removed[-1])).astype(np.int64)
+    return np.diff(removed, prepend=0).tolist()

@@ -130,7 +130,7 @@ def refit_rounds(
     """
     check_rounds(rounds)
     if in_regions(original, len(original)) and in_regions(original, 2 * len(splats)):
-        yield from _by_regions(splats, original, views, rounds, progress, threads)
+        yield from _by_regions(splats, original, views, rounds, protected, progress, threads)
         return
     rays = RoundRays.of(original, views, len(splats), part(progress, 0.0, 0.03), threads)
     later = part(progress, 0.03, 1.0)
@@ -323,7 +323,7 @@ def _product(quaternions: NDArray[np.float64], turns: NDArray[np.float64]) -> ND
     )
 
 
-def _by_regions(kept, original, views, rounds, progress, threads):
+def _by_regions(kept, original, views, rounds, protected, progress, threads):
     """Yield kept splats before and, if that is better, after all regions are refitted."""
     count, folder = len(kept), new_folder(original)
     cost = seconds("refit", count, len(views))
@@ -333,9 +333,10 @@ def _by_regions(kept, original, views, rounds, progress, threads):
     rays = RoundRays.of(original, views, count, preparing, threads)
     psnr = rays.psnr(kept, before)
     yield Refitted(kept, np.zeros(count, np.bool_), 0, psnr, psnr)
+    fixed = np.zeros(count, np.bool_) if protected is None else protected
     boxes = divided(kept.means[...], SHARE)
     for number, rows in enumerate(boxes):
-        note(folder, f"rows-{number}", rows)
+        note(folder, f"rows-{number}", (rows, fixed[rows]))
     work = partial(
         _refit_region, folder, views, rounds, rays.original, rays.target(kept, silent), threads
     )
@@ -350,7 +351,7 @@ def _by_regions(kept, original, views, rounds, progress, threads):
 
 def _refit_region(folder, views, rounds, original, kept, threads, number):
     """Refit the splats of a region amid all others: changed, rounds, splats."""
-    rows = noted(folder, f"rows-{number}")[1]
+    rows, protected = noted(folder, f"rows-{number}")[1]
     others = np.ones(len(kept.splats), np.bool_)
     others[rows] = False
     splats = kept.splats.take(rows)
@@ -359,7 +360,9 @@ def _refit_region(folder, views, rounds, original, kept, threads, number):
     if windows:
         amid = partial(_Amid, every=kept, others=others[kept.gaussians.index[...]])
         rays = RoundRays(windows, original, threads, amid)
-        *_, done = refit_on(rays, splats, rounds, progress=look, threads=threads)
+        *_, done = refit_on(
+            rays, splats, rounds, protected=protected, progress=look, threads=threads
+        )
     return done.changed, done.rounds, on_disk(folder / f"region-{number}", [done.splats])
 
 
