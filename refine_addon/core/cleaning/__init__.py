@@ -1,1 +1,1 @@
-"""Floaters and outliers: what the cameras tell of splats that belong to no surface."""
+"""Floaters and outliers: splats that belong to no surface, by what the cameras see."""

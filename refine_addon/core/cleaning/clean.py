@@ -1,8 +1,9 @@
 """Which splats float: they stand where the cameras see that nothing is.
 
-Suspects have little support (`support.own_support`), or are small clusters, giants or needles. With
-all of them absent, views measure how much light stops at the place of each and how much goes on to
-a surface behind; what loses its support joins them. Only this evidence decides (`judge`).
+Suspects have little support (`support.own_support`), or are small clusters, giants or needles
+(`search`). With all of them absent, the views measure how much light stops at the place of each and
+how much goes on to a surface behind. That evidence alone decides (`judge`). docs/method.md, section
+8, has the formulas.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..views import ViewSet
 from ..visibility import projection
 from ..visibility.projection import Gaussians
 from ..volumes import must_go
-from .search import SOLID, Found, Search, connected, is_slender, touching
+from .search import SOLID, Search, Suspects, connected, is_slender, touching
 from .support import Evidence, share
 
 REASONS = {
@@ -32,25 +33,26 @@ REASONS = {
     "haze": "haze near cameras",
     "outside": "outside all views",
 }
-"""Why a splat is removed, as said after a number."""
+"""Why a splat is removed: name, and words after a number, as in "12 in front of surfaces"."""
 
 DEFAULT_REASONS = ("front", "isolated", "giant", "needle")
-"""All but what no picture shows and what no view can judge."""
+"""All but faint splats, which pictures hardly show, and those outside, which no view can judge."""
 
 NEAR = 0.3
-"""Haze is at most this far from a camera, scene sizes."""
+"""Distance from a camera, scene sizes, within which faint floaters are haze."""
 
 SUPPORT = 0.5
-"""A suspect floats only if less than this share of the light stops near it."""
+"""A suspect floats only if its support in the last round is below this."""
 
 ISOLATED_SUPPORT = 0.05
-"""The same of what only belongs to a small cluster."""
+"""Likewise, of a suspect for no other reason than its small cluster."""
 
 AGREE = 0.1
-"""Least share of the views that see a suspect that see past it; not for giants and needles."""
+"""At least this share of the views that see a suspect must see past it, unless it is a giant or
+needle."""
 
 FEW = 2.0
-"""Least views that see past it: with fewer, none could be left out."""
+"""Least number of views that see past it: with fewer, none could be left out."""
 
 POWER = 1.5
 """Evidence is the change of a pixel times (views that see past + 1) to this power."""
@@ -59,41 +61,43 @@ NEEDED = 4 / 255
 """Evidence needed against a splat that touches nothing."""
 
 HELD = 8.0
-"""Factor of `NEEDED` for a single splat, to the power of the root of kept neighbours in touch."""
+"""Factor of `NEEDED`, to the power of the root of the number of kept neighbours in touch."""
 
 GIANT_NEEDED, NEEDLE_NEEDED = 8.0, 1 / 3
 """Factors of `NEEDED` for giants and needles."""
 
 AT_SURFACE = 150.0
-"""Factor to the power of a giant's support: giants of a sky support each other, a veil has none."""
+"""Factor of a giant's `NEEDED`, to the power of its support: giants of a sky support each other, a
+veil has no support."""
 
 FAINT = 0.15
-"""Haze is of lower opacity."""
+"""Opacity below which splats are faint."""
 
 HAZE_HELD = 1.35
-"""Factor to the power of the faint neighbours, kept or not, of a faint splat that is no giant: a
-cloud was trained as one, and pictures need it as one."""
+"""Factor of `NEEDED`, to the power of the number of faint neighbours in touch, kept or not, of a
+faint splat that is no giant: a cloud was trained as one, and pictures need it as one."""
 
 VISIBLE, GLARING, WIDE = 4 / 255, 40 / 255, 0.05
-"""A pixel's change is opacity times contrast, at most the second, more for giants wider than the
-third; what would float with the first for its change, outside haze, is nearly transparent."""
+"""Changes of a pixel, opacity times contrast: a splat that would float with the first is nearly
+transparent or haze; the second is the most that counts, but for giants whose width, as a share of
+the picture, exceeds the third."""
 
 CLUMP_NEEDED = 125.0
 """Factor of `NEEDED` for a clump that is judged as one, whatever it touches."""
 
 AGREED = 0.7
-"""Opacity-weighted share of a group's views that must see past a clump."""
+"""Share of the views of a group that see a clump, weighted by opacity, that must see past it."""
 
 FEWEST = 10
 """Least splats of a clump; smaller ones are judged singly."""
 
 CLUMP_SUPPORT = 0.1
-"""A clump floats only if less than this share of the light stops near its splats."""
+"""A clump floats only if its support is below this."""
 
 
 @dataclass(frozen=True)
 class Cleaning:
-    """What to clean away.
+    """What to clean away, and by how many views.
 
     Parameters
     ----------
@@ -143,7 +147,7 @@ class Cleaned:
         return {name: int(np.count_nonzero(self.by_reason[name])) for name in self.settings.reasons}
 
     def surety(self) -> dict[str, float | None]:
-        """Mean of `sure` for each of `REASONS`; None where no view tells."""
+        """Mean of `sure` for each of `REASONS`; None if no splat has it, and of those outside."""
         return {
             name: float(self.sure[mask].mean(dtype=np.float64))
             if name != "outside" and mask.any()
@@ -184,7 +188,7 @@ def clean(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Cleaned:
-    """Find floaters and outliers by what the cameras see.
+    """Find floaters and outliers by what the cameras see (docs/method.md, section 8).
 
     Parameters
     ----------
@@ -211,19 +215,19 @@ def clean(
         deciding = [view for view, _ in views.spread(settings.views).by_distance()]
         slender = is_slender(left.log_scales[gaussians.index])
         search = Search(gaussians, scene, deciding, threads)
-        found = search.find(slender, part(progress, 0.05, 1.0))
-        shows, faint, sure = judge(gaussians, found, threads)
-        faint &= found.doubted & ~found.large
+        suspects = search.find(slender, part(progress, 0.05, 1.0))
+        shows, faint, sure = judge(gaussians, suspects, threads)
+        faint &= suspects.doubted & ~suspects.large
         haze = faint & (gaussians.alphas < FAINT) & _near_any(gaussians, scene, deciding, faint)
         unused = [view for view in views if view not in deciding]
         masks = {
-            "front": shows & found.doubted & ~found.large,
-            "isolated": shows & ~found.doubted & ~found.large,
-            "giant": shows & found.giant,
-            "needle": shows & found.needle,
+            "front": shows & suspects.doubted & ~suspects.large,
+            "isolated": shows & ~suspects.doubted & ~suspects.large,
+            "giant": shows & suspects.giant,
+            "needle": shows & suspects.needle,
             "transparent": faint & ~haze,
             "haze": haze,
-            "outside": _outside(gaussians, scene, found.shown, unused),
+            "outside": _outside(gaussians, scene, suspects.shown, unused),
         }
     rows = np.flatnonzero(rest)[gaussians.index]
 
@@ -238,7 +242,7 @@ def clean(
     keep = rest & ~np.any([by_reason[name] for name in settings.reasons], axis=0)
     if len(left) and not keep.any():
         raise RefineError(f"cleaning would remove all {len(left)} splats; nothing was removed")
-    past, seen = (of_all(x.astype(np.int32)) for x in (found.evidence.past, found.views))
+    past, seen = (of_all(x.astype(np.int32)) for x in (suspects.evidence.past, suspects.views))
     return Cleaned(
         keep, by_reason, past, seen, of_all(sure.astype(np.float32)),
         int(np.count_nonzero(~good)), len(views), len(deciding), settings,
@@ -265,30 +269,36 @@ def _outside(gaussians, scene, shown, unused):
 
 
 def judge(
-    gaussians: Gaussians, found: Found, threads: int | None = None
+    gaussians: Gaussians, suspects: Suspects, threads: int | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
-    """Suspects that float and show, those that float only, and `Cleaned.sure`, (M,) each.
+    """Decide which suspects float (docs/method.md, section 8).
 
-    A suspect floats if little light stops near it, views see past it, and the evidence suffices,
-    more of it if kept splats touch it. With nothing behind, as in a sky, it stays.
+    One floats if little light stops near it, views see past it, and the evidence suffices, more of
+    it if kept splats touch it. With nothing behind, as in a sky, it stays.
+
+    Returns
+    -------
+    (M,) bool : suspects that float
+    (M,) bool : others, which would float if they were less faint
+    (M,) float64 : `Cleaned.sure`
     """
-    evidence, giant, large = found.evidence, found.giant, found.large
+    evidence, giant, large = suspects.evidence, suspects.giant, suspects.large
     seen, past = evidence.views, evidence.past
     support = share(evidence.near, evidence.near + evidence.behind)
     passed = np.where(large, np.maximum(past, seen * (1.0 - support)), past)
-    most = np.where(large | found.doubted, SUPPORT, ISOLATED_SUPPORT)
-    may = found.suspects & (support < most) & (large | (past >= AGREE * seen))
+    most = np.where(large | suspects.doubted, SUPPORT, ISOLATED_SUPPORT)
+    may = suspects.every & (support < most) & (large | (past >= AGREE * seen))
     may &= (past >= FEW) | (giant & (passed >= FEW))
-    rows = np.flatnonzero(found.suspects)
+    rows = np.flatnonzero(suspects.every)
     near, touch = touching(gaussians, rows, silent, threads)
     behind = np.where(evidence.behind > 0.0, evidence.behind, 1.0)
     change = np.minimum(gaussians.alphas * (evidence.contrast / behind), GLARING)
-    in_clumps = _clumps(gaussians, found, change, rows, near, touch)
+    in_clumps = _clumps(gaussians, suspects, change, rows, near, touch)
     near, touch, rows = near[may[rows]], touch[may[rows]], rows[may[rows]]
-    kind = np.where(found.needle, NEEDLE_NEEDED, 1.0)
+    kind = np.where(suspects.needle, NEEDLE_NEEDED, 1.0)
     kind = np.where(giant, GIANT_NEEDED * AT_SURFACE**support, kind)
     needed = (NEEDED * kind / (1.0 + passed) ** POWER)[rows]
-    change = (change * np.where(giant, np.maximum(found.width, WIDE) / WIDE, 1.0))[rows]
+    change = (change * np.where(giant, np.maximum(suspects.width, WIDE) / WIDE, 1.0))[rows]
     hazy = gaussians.alphas < FAINT
     in_haze = np.count_nonzero(touch & hazy[near], axis=1) * (hazy & ~giant)[rows]
 
@@ -306,12 +316,12 @@ def judge(
     return shows, faint, (passed + 1.0) / (seen + 2.0)
 
 
-def _clumps(gaussians, found, change, rows, near, touch):
-    """Solid suspects that touch and float as one clump, (M,): single ones are hit in few views.
+def _clumps(gaussians, suspects, change, rows, near, touch):
+    """Solid suspects that touch and float as one clump, (M,): rays hit each alone in few views.
 
     Each group of views has to agree; `near` and `touch`, (s, k), are of the suspects `rows`.
     """
-    chosen = np.flatnonzero(~found.large[rows] & (gaussians.alphas[rows] >= SOLID[-1]))
+    chosen = np.flatnonzero(~suspects.large[rows] & (gaussians.alphas[rows] >= SOLID[-1]))
     members, near, touch = rows[chosen], near[chosen], touch[chosen]
     place = np.full(len(change), -1)
     place[members] = np.arange(len(members))
@@ -322,11 +332,11 @@ def _clumps(gaussians, found, change, rows, near, touch):
     def total(values):
         return np.bincount(clump, values, len(clump))[clump]
 
-    evidence = Evidence(*(values[members] for values in found.evidence))
+    evidence = Evidence(*(values[members] for values in suspects.evidence))
     size, mass = total(np.ones(len(clump))), total(weight)
     change, past = (total(weight * of_each) / mass for of_each in (change[members], evidence.past))
     goes = size >= FEWEST
-    for seen_by, past_by in zip(*found.by_part[:, :, members], strict=True):
+    for seen_by, past_by in zip(*suspects.by_part[:, :, members], strict=True):
         seen = total(weight * seen_by)
         goes &= (seen <= 0.5 * mass) | (total(weight * past_by) >= AGREED * seen)
     goes &= change * (1.0 + past) ** POWER >= CLUMP_NEEDED * NEEDED

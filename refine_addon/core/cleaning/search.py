@@ -1,8 +1,9 @@
-"""Which splats are suspect, and what the views see at their places: found round by round.
+"""The search for suspects, round by round, and the evidence: what views see in their places.
 
-Each round casts rays, some aimed at suspects, with those so far absent, for evidence and for the
-support of the others: below `DOUBTED` they join. A veil through a scene stops light near everything
-in it, and the splats of a cluster support each other.
+A round takes all suspects away and looks along rays, some of them aimed at suspects. That gives the
+evidence, and the support of all other splats; those below `DOUBTED` are suspects in the next round.
+One round is not enough: a veil through a scene supports everything in it, and the splats of a
+cluster support each other. Rays are cast once, for all rounds.
 """
 
 from __future__ import annotations
@@ -22,28 +23,30 @@ from ..visibility.projection import Gaussians
 from .support import Evidence, Hits, evidence_of, hits_of_view, own_support, share
 
 DOUBTED = 0.4
-"""A splat is suspect if others support less than this share of its light."""
+"""Support by other splats below which a splat is suspect."""
 
 HUGE, GIANT = 0.15, 0.25
-"""A giant is longer than this in scene sizes, and its sigma than this share of a picture."""
+"""A giant's longest standard deviation is at least the first, in scene sizes, and the second, as a
+share of a picture."""
 
 SLENDER, LONG = 10.0, 0.05
-"""A needle is this many times as long as wide, its sigma longer than this share of a picture."""
+"""A needle is at least this many times as long as wide; its longest standard deviation is at least
+this share of a picture."""
 
 ROUNDS = ((0.3, 0.8), (0.8, 0.9), (0.9, 1.0))
-"""Begin and end of each round as shares of the work; the first casts the rays."""
+"""Begin and end of each round, as shares of the progress; the first casts the rays."""
 
 FEW_NEW = 0.02
-"""Rounds end when at most this share of the suspects joins."""
+"""Rounds end when at most this share of the suspects is new."""
 
 VIEW_PARTS = 4
-"""Groups of views that each give evidence; see `clean.judge`."""
+"""Groups of views, each of which must see past a clump; see `clean.judge`."""
 
 SMALL = 100
 """A cluster of fewer splats is suspect."""
 
 SOLID = (0.1, 0.3)
-"""Opacities below which splats do not link clusters, each tried: faint ones link many."""
+"""Least opacities of the splats of a cluster, each tried: fainter splats link many clusters."""
 
 NEIGHBOURS = 8
 """Near neighbours of a splat that are tested for touch."""
@@ -54,18 +57,18 @@ REACH = 2.0
 APART = 0.01
 """They also touch this close: a share of the scene's size plus the distance to its middle."""
 
-_DECIDED = 0.8  # others whose light is supported by this share in the first round are not doubted
+_DECIDED = 0.8  # support in the first look from which a splat is not doubted in any round
 
 
-class Found(NamedTuple):
-    """Suspects among M Gaussians, why, and what the views see with these absent."""
+class Suspects(NamedTuple):
+    """Which of M Gaussians are suspect, why, and what the views see with these absent."""
 
-    doubted: NDArray[np.bool_]  # (M,), as are giant to width
+    doubted: NDArray[np.bool_]  # (M,), as are giant to width: of low support in some round
     giant: NDArray[np.bool_]
     needle: NDArray[np.bool_]
-    small: NDArray[np.bool_]
+    small: NDArray[np.bool_]  # in a small cluster
     shown: NDArray[np.bool_]  # have a footprint in any view
-    views: NDArray[np.float64]  # number that holds the centre
+    views: NDArray[np.float64]  # number of views that hold the centre
     width: NDArray[np.float64]  # largest of `Hits.width`
     evidence: Evidence  # of the last round
     by_part: NDArray[np.float32]  # (2, VIEW_PARTS, M), `Evidence.views` and `past` of each group
@@ -76,13 +79,13 @@ class Found(NamedTuple):
         return self.giant | self.needle
 
     @property
-    def suspects(self) -> NDArray[np.bool_]:
-        """All that are suspect, (M,) bool."""
+    def every(self) -> NDArray[np.bool_]:
+        """All suspects, (M,) bool."""
         return self.doubted | self.giant | self.needle | self.small
 
 
 class Search:
-    """The search of one `clean` among M Gaussians, by the list of all views that decide."""
+    """The search for suspects among M Gaussians, by a list of views."""
 
     def __init__(self, gaussians, scene, views, threads):
         self.gaussians, self.scene, self.views, self.threads = gaussians, scene, views, threads
@@ -90,8 +93,11 @@ class Search:
         self.huge = gaussians.largest >= HUGE
         self.hits: list[Hits | None] = [None] * len(views)
 
-    def find(self, slender: NDArray[np.bool_], progress: Progress) -> Found:
-        """Look in rounds until few suspects join; `slender`, (M,) bool, is from `is_slender`."""
+    def find(self, slender: NDArray[np.bool_], progress: Progress) -> Suspects:
+        """Look in rounds until few suspects join (docs/method.md, section 8).
+
+        `slender`, (M,) bool, is `is_slender` of all. Raises `RefineError` if no ray hits a splat.
+        """
         light, supported, views, width = self._first_look(part(progress, 0.0, ROUNDS[0][0]))
         support = share(supported, light)
         giant = self.huge & (width >= GIANT)
@@ -113,12 +119,12 @@ class Search:
         by_part = np.zeros((2, VIEW_PARTS, len(giant)), np.float32)
         for number, sums in enumerate(of_groups):
             by_part[:, number % VIEW_PARTS] += sums[-2:]
-        return Found(
+        return Suspects(
             doubted, giant, needle, small, self.shown, views, width, Evidence(*evidence), by_part
         )
 
     def _first_look(self, progress: Progress) -> NDArray[np.float64]:
-        """Light, supported light, views and width, (4, M), with all present but wide giants."""
+        """Light, supported light, views and width, (4, M), with all present but giants."""
 
         def of_group(numbers: range) -> NDArray[np.float64]:
             *_, views, width = sums = np.zeros((4, len(self.shown)))
@@ -148,9 +154,10 @@ class Search:
         return total
 
     def _look(self, absent, wanted, behind, progress):
-        """Light and supported light of those wanted, and evidence, (7, M), of each group.
+        """Light and supported light of those wanted, and evidence, (7, M), of each group of views.
 
-        The first call casts the rays of all rounds, aimed at absent ones, and through all `behind`.
+        The first call, with `behind`, casts the rays of all rounds: aimed at absent ones, and with
+        the hits that may show once all of `behind` are away.
         """
 
         def of_group(numbers: range) -> NDArray[np.float64]:
@@ -169,14 +176,14 @@ class Search:
         return self._by_views(of_group, progress, "looking past suspects")
 
     def _by_views(self, work, progress, what):
-        """Results of `work` for the numbers of the views in each of some groups."""
+        """Results of `work` for each group of numbers of views."""
         count = min(VIEW_GROUPS, len(self.views))
         groups = [range(first, len(self.views), count) for first in range(count)]
         return run_all(work, groups, progress=progress, what=what, threads=self.threads)
 
 
 def is_slender(log_scales: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Splats, (M, 3), that are `SLENDER`, (M,) bool."""
+    """Which splats, by log scales, (M, 3), are `SLENDER`, (M,)."""
     with np.errstate(invalid="ignore"):
         scales = np.sort(log_scales.astype(np.float64), axis=1)
     return scales[:, 2] - scales[:, 1] >= np.log(SLENDER)
@@ -185,7 +192,7 @@ def is_slender(log_scales: NDArray[np.float32]) -> NDArray[np.bool_]:
 def small_clusters(
     gaussians: Gaussians, solid: NDArray[np.bool_], progress: Progress, threads: int | None
 ) -> NDArray[np.bool_]:
-    """Solid Gaussians, (M,) bool, in a small cluster: chains of those that touch."""
+    """Which of the Gaussians `solid`, (M,), are in a small cluster, linked by touch, (M,)."""
     small = np.zeros(len(solid), np.bool_)
     for number, least in enumerate(SOLID):
         rows = np.flatnonzero(solid & (gaussians.alphas >= least))
@@ -200,7 +207,7 @@ def small_clusters(
 def touching(
     gaussians: Gaussians, rows: NDArray[np.int64], progress: Progress, threads: int | None
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Near neighbours of r splats, and which of them each touches, (r, k) each."""
+    """Near neighbours of the splats `rows`, (r,), and which of these each touches, (r, k) each."""
     points = gaussians.means.T.astype(np.float64)  # (M, 3)
     near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)[rows].astype(np.int64)
     one, other = np.repeat(rows, near.shape[1]), near.ravel()
@@ -218,7 +225,10 @@ def touching(
 
 
 def connected(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Lowest number in the connected part of each node of a graph, (count,)."""
+    """Lowest node that is connected to each node of a graph, (count,).
+
+    Edges are between the nodes `one` and `other`, (E,) each.
+    """
     labels = np.arange(count)
     while True:
         low = np.minimum(labels[one], labels[other])

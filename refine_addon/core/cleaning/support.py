@@ -2,9 +2,9 @@
 
     support = light that stops near the place / light that stops there or behind
 
-A surface stops nearly all, a floater little. Hits are where a splat's density peaks on the ray, so
-an oblique wall is a surface. Two are near if their nearness (1 / depth, scene sizes) differs by
-less than `WINDOW` of it, or `PARALLAX`.
+A surface stops nearly all, a floater little. A hit lies where the splat's density peaks on the ray,
+so an oblique wall is a surface. Two hits are near each other if their nearness (1 / depth, in scene
+sizes) differs by less than `WINDOW` of it, or by less than `PARALLAX`.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ RAYS = 2500
 """Rays of a view."""
 
 MAX_HITS = 1 << 20
-"""About the most hits of a view's rays; dense scenes get fewer rays."""
+"""About the most hits of a view; dense scenes get fewer rays."""
 
 WINDOW = 0.1
 """Hits on a ray are near each other if their nearness differs by less than this share of it."""
 
 PARALLAX = 0.05
-"""Or by less than this, per scene size: cameras that far apart see more as a shift."""
+"""Or by less than this, 1 / scene size; cameras a scene size apart see more as a shift."""
 
 TARGET = 0.2
 """Rays are aimed at suspects whose product of sigmas is less than this share of a ray's area."""
 
 REACHED = 1e-3
-"""Hits that less light reaches are no evidence."""
+"""Share of the light that must reach a hit, or it is no evidence."""
 
 NOTHING = 0.02
-"""With less light stopped behind a place, nothing is behind it."""
+"""Share of the light that must stop behind a place, or nothing is behind it."""
 
 SEEN = 0.1
 """A view sees what is at and behind a splat if this share of the light stops there."""
@@ -56,18 +56,21 @@ _TINY = 1e-30  # replaces 0 as a divisor
 
 
 class Light(NamedTuple):
-    """The light on the rays of one view: the h hits that it reaches, near to far."""
+    """The light on the rays of one view, at the h hits that it reaches, near to far on each ray."""
 
     hit: NDArray[np.int64]  # (u,), Gaussians hit
     owner: NDArray[np.int32]  # (h,), place in `hit`
     alpha: NDArray[np.float64]  # (h,)
     transmittance: NDArray[np.float64]  # (h,), in front
-    weight: NDArray[np.float64]  # (h,), their product, 0 for absent ones
+    weight: NDArray[np.float64]  # (h,), light that stops there: their product, 0 for absent ones
     key: NDArray[np.float64]  # (h,), see `Hits`
-    window: NDArray[np.float64]  # (h,), largest difference of keys of near hits
+    window: NDArray[np.float64]  # (h,), difference of keys up to which hits are near
 
     def around(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
-        """First, last and end for some hits, (r,) each: near up to last, then behind up to end."""
+        """First, last and end of the hits near and behind some hits, (r,) each.
+
+        Near ones are those from first to before last, those behind from last to before end.
+        """
         key, window, ray = self.key[rows], self.window[rows], np.floor(self.key[rows])
         end = ray + (1.0 + _FRACTION) / 2.0
         first = np.searchsorted(self.key, np.maximum(key - window, ray))
@@ -75,12 +78,12 @@ class Light(NamedTuple):
         return first, last, np.searchsorted(self.key, end)
 
     def sums(self, rows: NDArray[np.int64], *values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sums of k values, (r,), of some hits for each of `hit`, (k, u)."""
+        """Sums over the hits `rows` of k values, (r,) each, for each of `hit`, (k, u)."""
         return np.stack([np.bincount(self.owner[rows], each, len(self.hit)) for each in values])
 
 
 class Hits(NamedTuple):
-    """The h hits of one view that may show once suspects are absent, near to far."""
+    """The h hits of one view that may show once suspects are absent, near to far on each ray."""
 
     hit: NDArray[np.int64]  # (u,), Gaussians hit
     width: NDArray[np.float32]  # (u,), longer sigma over the image's longer side
@@ -90,7 +93,7 @@ class Hits(NamedTuple):
     scale: float  # keys per unit of nearness, 1 / scene size
 
     def without(self, absent: NDArray[np.bool_]) -> Light:
-        """The light if absent Gaussians, (M,) bool, take none."""
+        """The light on the rays if absent Gaussians, (M,), stop none."""
         ray = np.floor(self.key)
         present = (~absent[self.hit]).take(self.owner).astype(np.float64)
         alpha = self.alpha.astype(np.float64)
@@ -104,13 +107,16 @@ class Hits(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What views see of M Gaussians, (M,) each, with all suspects absent; 0 but for these."""
+    """What views see at the places of suspects with all of them absent, (M,) each, else 0.
 
-    near: NDArray[np.float64]  # light that stops near, times alpha
+    Light is summed over rays, as a share of a ray's light.
+    """
+
+    near: NDArray[np.float64]  # light that stops near, times the suspect's alpha
     behind: NDArray[np.float64]  # light that stops behind, times alpha
-    contrast: NDArray[np.float64]  # the latter times the difference of colour to what is behind
-    views: NDArray[np.float64]  # number that sees what is at and behind it
-    past: NDArray[np.float64]  # number of these that sees past it
+    contrast: NDArray[np.float64]  # `behind` times the difference of colour to what is there
+    views: NDArray[np.float64]  # number of views that see what is at and behind the place
+    past: NDArray[np.float64]  # number of these that see past it
 
 
 def hits_of_view(
@@ -121,10 +127,15 @@ def hits_of_view(
     absent: NDArray[np.bool_],
     targets: NDArray[np.bool_] | None = None,
 ) -> Hits | None:
-    """Hits of one view, given with the number that sets its pixels; None if nothing is hit.
+    """Hits of one view; None if its rays hit nothing.
 
-    absent : (M,) bool, Gaussians that may take no light, though they are hit
-    targets : (M,) bool, which rays are aimed at if small
+    Parameters
+    ----------
+    gaussians : Gaussians, M in the frame of `scene`
+    footprints : Footprints of these in the view
+    numbered : (View, int), and the number that sets its pixels (`cast.pixels`)
+    absent : (M,) bool, Gaussians that are hit and stop no light
+    targets : (M,) bool, optional, which rays are aimed at if small
     """
     view, number = numbered
     count = min(RAYS, MAX_HITS / max(depth_complexity(footprints, view), 1.0))
@@ -153,7 +164,7 @@ def hits_of_view(
 
 
 def _centers(footprints, targets, number, area):
-    """Centres, (2, t) px, of targets below `area`, px^2, which rays may miss, shuffled by view."""
+    """Centres, (2, t) px, of targets below `area`, px^2, in an order that `number` shuffles."""
     small = footprints.sigmas[0] * footprints.sigmas[1] < area
     rows = np.flatnonzero(small & targets[footprints.index])
     turn = (footprints.index[rows] * _TURNS[0] + number * _TURNS[1]) % 1.0
@@ -189,9 +200,10 @@ def _depths(gaussians, footprints, scene, view, rays, reached):
 
 
 def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Light of each wanted `Light.hit`, and that times its support by others, (2, u).
+    """Light that stops at each of `Light.hit`, and that times its support by others, (2, u).
 
-    With it gone, what lies behind gets ``1 / (1 - alpha)`` times the light.
+    0 of those not `wanted`, (M,) bool. Support is as if the splat were gone: what lies behind then
+    gets ``1 / (1 - alpha)`` times the light.
     """
     rows = np.flatnonzero(wanted[light.hit].take(light.owner) & (light.weight > 0.0))
     before = _running(light.weight)
@@ -209,7 +221,14 @@ def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
 def evidence_of(
     light: Light, suspects: NDArray[np.bool_], colors: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """`Evidence` of one view for `Light.hit`, (5, u), with suspects, (M,) bool, absent."""
+    """`Evidence` of one view on each of `Light.hit`, (5, u).
+
+    Parameters
+    ----------
+    light : Light, with all suspects absent
+    suspects : (M,) bool
+    colors : (M, 3) float32, of the Gaussians
+    """
     rows = np.flatnonzero(suspects[light.hit].take(light.owner))
     before = _running(light.weight)
     first, last, end = light.around(rows)
@@ -230,7 +249,7 @@ def evidence_of(
 
 
 def share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of a part in the whole, (M,) each; 1 where there is nothing."""
+    """Part over whole, (M,) each; 1 where the whole is 0."""
     return np.divide(part, whole, out=np.ones_like(whole), where=whole > 0.0)
 
 

@@ -1,4 +1,4 @@
-"""The quantities of splats that merging needs: covariance, visibility, viewing direction."""
+"""What merging needs of each splat: covariance, visibility, mean viewing direction, colour."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from ..visibility.scene import Scene
 Array = NDArray[np.float64]
 Index = NDArray[np.int64] | NDArray[np.int32]
 Footprint = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Covariances in a plane: xx, xy and yy, (M,) each."""
 
 DIRECTION_VIEWS = 32  # most views, spread evenly, that decide the viewing directions
 
@@ -33,7 +34,7 @@ _BRIGHTEST = 1e18  # its square is a float32
 
 @dataclass(eq=False)
 class Field:
-    """N splats as merging needs them, in float64; a row becomes the merged splat."""
+    """N splats as merging needs them, in float64; merged splats replace one of their two."""
 
     means: Array  # (N, 3), world units
     covariances: Array  # (N, 6): xx, xy, xz, yy, yz, zz; world units squared
@@ -62,24 +63,24 @@ class Field:
 
 
 class MeasuredField(NamedTuple):
-    """A field without the bias for views that were not given.
+    """A field of M splats, and what its bias for views that were not given needs.
 
-    The bias is the mass that one more view would show unhidden, times the share of such mass that
-    the views did see, over n + 1 for n views with the splat's centre (rule of succession).
+    The bias (docs/method.md, section 7) is the mass that one more view would show unhidden, times
+    the share of such mass that the views did see, over n + 1 for n views with the splat's centre.
     """
 
     field: Field  # contribution and error as measured, summed over views
-    mass: Array  # (M,): unhidden contribution to one view; unhidden error: mass opacity
+    mass: Array  # (M,): contribution to one view if nothing hid it; times opacity, its error
     seen: Array  # (M,): number of views that the centre lies in
 
     def seen_and_whole(self) -> Array:
-        """Sums: ``[[contribution, unhidden contribution], [error, unhidden error]]``."""
+        """Sums over splats, (2, 2): of contribution and error, each as measured and unhidden."""
         seen = self.field.contribution.sum(), self.field.error.sum()
         whole = self.seen @ self.mass, self.seen @ (self.mass * self.field.opacity)
         return np.stack([seen, whole], axis=1)
 
     def with_bias(self, scene: Array) -> Field:
-        """The field with the bias; `scene`, (2, 2), is `seen_and_whole` of the whole scene."""
+        """Field with the bias; `scene`, (2, 2), is `seen_and_whole` of all splats that merge."""
         shares = [seen / whole if whole > 0.0 else 0.0 for seen, whole in scene.tolist()]
         unhidden = self.mass * self.field.opacity
         with np.errstate(under="ignore"):
@@ -100,10 +101,22 @@ def measured_field(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> MeasuredField:
-    """The drawable splats `rows` as merging needs them; `sums`, (2, N): contribution and error.
+    """Some splats as merging needs them.
 
-    Views weigh 1 / distance^2, of at least `NEAR_RELATIVE` scene sizes, and `BESIDE` of that if the
-    centre is not in them.
+    A view counts for a splat by 1 / distance^2, of at least `NEAR_RELATIVE` scene sizes, and by
+    `BESIDE` of that if it does not hold the centre.
+
+    Parameters
+    ----------
+    splats : Splats, N in the frame and unit of the views
+    rows : (M,) int, drawable ones among them
+    sums : (2, N) float64, contribution and error, px^2 (`visibility.measuring.Measured`)
+    scene : Scene of splats and views
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    Cancelled
     """
     count = len(rows)
     shapes = (3,), (6,), (), (), (), (3,), (3,), (3,), ()
@@ -147,14 +160,14 @@ def _viewing(means, views, closest):
     # Sums over views: of the weights, of pixels per squared world unit, of views; (M,) each.
     total, density, seen = np.zeros((3, points.shape[1]))
     first, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
-    for view, counts in views:
+    for view, view_weight in views:
         ray = points - view.center[:, None]
         planes = frustum.clip_planes(view, closest)
         inside = frustum.contains(view, view.rotation @ ray, planes)
         squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest**2)
         ray /= np.sqrt(squared)  # shorter than 1 if nearer than `closest`
         seen += inside
-        weight = np.where(inside, counts, counts * BESIDE) / squared  # (M,)
+        weight = np.where(inside, view_weight, view_weight * BESIDE) / squared  # (M,)
         weighted = ray * weight  # (3, M)
         first += weighted
         second += weighted[rows] * ray[columns]  # xx, xy, xz, yy, yz, zz
@@ -174,13 +187,13 @@ def _viewing(means, views, closest):
 
 
 def packed(matrices: Array) -> Array:
-    """Upper halves, (M, 6), of symmetric matrices, (M, 3, 3): xx, xy, xz, yy, yz, zz."""
+    """Upper halves xx, xy, xz, yy, yz, zz, (M, 6), of symmetric matrices, (M, 3, 3)."""
     upper: Array = matrices[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     return upper
 
 
 def across(normal: Array) -> tuple[Array, Array]:
-    """Orthogonal unit vectors, (3, M), across `normal`, (M, 3) (Duff et al. 2017)."""
+    """Orthogonal unit vectors, (3, M), at right angles to `normal`, (M, 3) (Duff et al. 2017)."""
     x, y, z = normal.T
     sign = np.where(z >= 0.0, z.dtype.type(1.0), z.dtype.type(-1.0))
     a = -1.0 / (sign + z)
@@ -191,7 +204,14 @@ def across(normal: Array) -> tuple[Array, Array]:
 
 
 def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
-    """xx, xy, yy of ``(u, v)' C (u, v) + blur I``, (M,) each; `plane` holds u and v, (3, M)."""
+    """Covariances in planes, ``(u, v)' C (u, v) + blur I``.
+
+    Parameters
+    ----------
+    covariances : (M, 6), C, as of `Field`
+    plane : u and v, (3, M) each, orthogonal unit vectors
+    blur : (M,), variance of the low-pass, world units squared
+    """
     u, v = plane
     xx, xy, xz, yy, yz, zz = covariances.T
     cu, cv = (

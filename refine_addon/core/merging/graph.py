@@ -56,7 +56,11 @@ _ROUNDED = np.uint32(4)  # last bits of a distance in float32, in which equal on
 
 
 class MergeGraph:
-    """Splats, pairs that may be merged, and the cost of each operation; `field` is changed."""
+    """N splats, the pairs of near ones that may merge, and the costs of merges and deletions.
+
+    `field`, (N,), is changed: merged splats replace one of their two. `penalty` is
+    `merge.merge_penalty`; for discs it is multiplied by `DISC_PENALTY`.
+    """
 
     def __init__(
         self, field: Field, scene: Scene, penalty: float, *, threads: int | None = None
@@ -109,12 +113,12 @@ class MergeGraph:
             first = np.broadcast_to(of_piece, others.shape)[once]
             return rows[first].astype(np.int32), rows[others[once]].astype(np.int32)
 
-        found = run_all(
+        edges = run_all(
             pairs, chunks(max(len(rows), 1), _CHUNK),
             progress=part(progress, 0.5, 0.6), what="merging", threads=self.threads,
         )  # fmt: skip
         # int32 takes half the memory of int64, and no file holds two billion splats.
-        self.first, self.second = map(np.concatenate, zip(*found, strict=True))
+        self.first, self.second = map(np.concatenate, zip(*edges, strict=True))
         self.cost = np.empty(len(self.first), np.float32)
         self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.6, 1.0))
         self.connected = int(np.count_nonzero(self.alive))
@@ -215,8 +219,8 @@ class MergeGraph:
             stays = valid[piece]
             return self.first[piece][stays], self.second[piece][stays], self.cost[piece][stays]
 
-        found = run_all(left, pieces, threads=self.threads)
-        self.first, self.second, self.cost = map(np.concatenate, zip(*found, strict=True))
+        rest = run_all(left, pieces, threads=self.threads)
+        self.first, self.second, self.cost = map(np.concatenate, zip(*rest, strict=True))
 
 
 def _least_costs(error: Costs, first: Rows, second: Rows, cost: Costs) -> Costs:
@@ -256,9 +260,21 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Most of the nearest neighbours of points (N, 3): (N, min(count, N - 1)), ties by index.
+    """Near neighbours of each point, most of them the nearest.
 
-    Points are in scene sizes; `count` is at most 16.
+    Parameters
+    ----------
+    points : (N, 3) float64, scene sizes
+    count : int, neighbours of each, at most 16
+    progress, threads : see `prune`
+
+    Returns
+    -------
+    (N, min(count, N - 1)) int32 : nearest first; of equally near ones the lower row
+
+    Raises
+    ------
+    Cancelled
     """
     total = len(points)
     count = min(count, total - 1)
@@ -279,7 +295,7 @@ def nearest(
 
 
 def _candidates(points, window, progress, threads):
-    """Callable: candidates (n, C) of a slice of n points, with repetitions and the point itself."""
+    """Callable: candidates, (n, C), of a slice of n points; they repeat, and hold the point."""
     total = len(points)
     if total <= max(SMALL, 2 * window + 1):
         everyone = np.arange(total, dtype=np.int32)

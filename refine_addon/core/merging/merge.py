@@ -2,7 +2,7 @@
 
 Before each stage but the first the kept splats are measured again, as visibility changes. Splats in
 files are divided into boxes, along other planes in each stage; one ranking of the operations of all
-boxes decides how many each keeps. Splats that merge nothing keep their bits.
+boxes decides how many go of each. Splats that merge nothing keep their bits.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from .graph import MergeGraph
 from .pairs import as_splats
 
 Measure = Callable[[Splats, Array, Progress], Array]
-"""``measure(splats, expected, progress)``: sums (2, n) of the kept splats, of degree 0; `expected`,
-the prediction, is right but for changed visibility."""
+"""``measure(splats, expected, progress)``: contribution and error, (2, n), of n kept splats, of
+degree 0; `expected` is what they would be if visibility had not changed."""
 
 STAGE = 0.5
 """Share that each of very many stages leaves. At least a half: regions count a splat whose cheapest
@@ -38,8 +38,8 @@ FINER = 0.8
 instead of four for 90 % nothing."""
 
 ALONE, ALONE_BY_REGIONS = 0.55, 0.6
-"""Least share that a single stage leaves, at least a half. Below 5/9: one stage for half of all
-after a tenth was deleted. By regions that takes two: four regions in one stage lost 0.5 dB."""
+"""Least share that a single stage leaves, at least a half. Below 5/9, so half of all splats go in
+one stage once a tenth is deleted; by regions in two: four regions in one stage lost 0.5 dB."""
 
 PENALTY = 2.0  # merge penalty if half of the splats are removed
 
@@ -48,12 +48,12 @@ _CHUNK = 1 << 14  # splats copied at a time: some MB
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """The result of merging N splats to K."""
+    """Result of merging N splats to K."""
 
     splats: Splats  # the K kept, in order; float64, but `sh_rest` in its old type
     keep: NDArray[np.bool_]  # (N,)
     changed: NDArray[np.bool_]  # (K,): others were merged into these; the rest keep their bits
-    merged: int
+    merged: int  # how many were merged into others
     deleted: int
 
     def facts(self) -> dict[str, int]:
@@ -70,7 +70,7 @@ class Merged:
 
 
 def merge_penalty(share: float) -> float:
-    """Factor on the cost of merging, from the share of the splats that is removed, 0 to 1.
+    """Factor on the cost of merging by the share removed, 0 to 1 (docs/method.md, section 7).
 
     Errors of neighbours deleted together add up before they are squared, so merging gets cheaper
     the more are removed. Half or twice the factor costs at most 0.3 dB on three scenes.
@@ -92,11 +92,24 @@ def merge(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Merged:
-    """Reduce splats to `keep_count` at the least cost to the pictures, in the frame of the views.
+    """Reduce splats to a number at the least cost to the pictures (docs/method.md, section 7).
 
-    `sums`, (2, N), are contribution and error (`field.Field`). `began`, N by default, is the count
-    before any were removed, for `merge_penalty`. `deleted` splats go first, then undrawable ones;
-    `protected` ones are neither removed nor changed, so more may be kept.
+    Parameters
+    ----------
+    splats : Splats, N in the frame and unit of the views
+    sums : (2, N) float64, contribution and error, px^2 (`visibility.measuring.Measured`)
+    measure : Measure, called before each stage but the first
+    keep_count : int; more are kept if more are protected
+    began : int, optional
+        Of how many splats `merge_penalty` takes the share removed: by default those not `deleted`,
+        more where splats were merged before.
+    deleted : (N,) bool, optional; they go first, then undrawable ones
+    protected : (N,) bool, optional; neither removed nor changed
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    Cancelled
     """
     total, left = len(splats), splats
     # Of each splat left: which of the N it is, and for how many of them it stands, 0 if deleted.
@@ -141,7 +154,7 @@ def merge(
 
 
 def stage_counts(count: int, goal: int, alone: float = ALONE) -> list[int]:
-    """Splats left after each stage, `goal` after the last; one stage if it leaves `alone`.
+    """Splats left after each stage, `goal` after the last; one stage if that leaves `alone`.
 
     >>> stage_counts(900, 500), stage_counts(900, 450), stage_counts(900, 900)
     ([500], [636, 450], [])
@@ -183,7 +196,7 @@ class _Stage:
         return self.reduced(rows, graph, keep_count, part(progress, 0.3, 1.0))
 
     def measured(self, progress):
-        """Rows (M,) that may merge, their field; in spatial order, so ties ignore file order."""
+        """Rows that may merge, (M,), and their field, in spatial order: ties ignore file order."""
         splats, threads = self.splats, self.threads
         excluded = self.protected | (self.members == 0)
         rows = np.flatnonzero(drawable(splats, threads=threads) & ~excluded)
@@ -240,7 +253,7 @@ class _Stage:
 
 
 def _blend(splats, members, share, left, into, progress, threads):
-    """Write harmonics of merged splats: means over `members`, (m,), grouped, into rows of `left`.
+    """Write harmonics of merged splats: means over members, (m,), into rows `into` of `left`.
 
     Rounded to float32, so that tiles and files give the same.
     """
@@ -258,7 +271,7 @@ def _blend(splats, members, share, left, into, progress, threads):
 
 
 def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) -> Splats:
-    """Copies of some splats, float64 as merged ones merge again; more than a region on disk."""
+    """Copies of some splats in float64, but `sh_rest`; of more than a region, on disk."""
     if in_regions(splats, len(rows)):
         some = pieces(splats, rows)
         return on_disk(new_folder(splats), (copied(each, np.arange(len(each))) for each in some))

@@ -3,7 +3,7 @@
 docs/method.md, section 7, derives the cost: ``tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> +
 |s_j|^2 <q, q>)`` with ``p = f_i - l_i f_m``, ``q = f_j - l_j f_m``; f are the footprints in a plane
 across the viewing direction, s the contrasts, l the shares of the colour, m the merged splat.
-`price` and `costs` give the cost, `merge` the merged splat, `as_splats` its values in files; its
+`price` and `costs` give the cost, `merge` the merged splat, `as_splats` its values as stored; its
 harmonics are those of `merge._blend`.
 """
 
@@ -25,8 +25,8 @@ Real = NDArray[np.floating[Any]]
 FLATTEST = 1e-14  # least eigenvalue of a covariance over their sum; rounding hides smaller ones
 
 ASIDE = 0.1
-"""Least standard deviation, about radians, of viewing directions that discs are made for: other
-views look from aside. Results hardly depend on it from 0.03 to 0.3."""
+"""Least standard deviation, about radians, of the viewing directions that discs are flattened for:
+other views look from aside. Results hardly depend on it from 0.03 to 0.3."""
 
 _CHUNK = 1 << 14  # splats at a time: some MB of temporary memory a thread
 _CANCELLED = 1e-6  # a mean of two unit vectors with a smaller squared length counts as 0
@@ -40,7 +40,7 @@ _FARTHEST = 160.0  # standard deviations, squared: exp(-80) is as good as 0 and 
 class Pairs(NamedTuple):
     """Merges of M pairs, (M,) each."""
 
-    cost: Array  # squared error of the pictures that it causes, unit of `Field.error`
+    cost: Array  # squared error of the pictures, unit of `Field.error`
     position: Array  # share of the first splat in mean and covariance
     color: Array  # share of the first splat in the colour
     opacity: Array  # of the merged splat
@@ -49,17 +49,25 @@ class Pairs(NamedTuple):
 
 
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
-    """Costs and results of merging pairs of rows (M,), all of contribution above 0.
+    """Costs and results of merging M pairs of splats, all of contribution above 0.
 
-    They are viewed `tilt` standard deviations from their mean direction.
+    Parameters
+    ----------
+    first, second : (M,) int, rows of `splats`
+    tilt : float, by how many standard deviations the view is turned from its mean direction
     """
     return _price(_gather(splats, first, second, np.float64), tilt)
 
 
 def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Real:
-    """Costs of merges (M,), float32: means over two viewing directions; infinite from `limit` on.
+    """Costs of merges, (M,) float32: means over two viewing directions, to either side.
 
     Computed in float64 for discs, whose thickness is 0, in float32 for others.
+
+    Parameters
+    ----------
+    first, second : (M,) int, rows of `splats`, all of contribution above 0
+    limit : (M,) float64 or float; a cost from there on is infinite
     """
     # What leaves the range of float32 costs infinity, or NaN: it is not merged.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
@@ -82,7 +90,7 @@ class _Side(NamedTuple):
 class _Ends(NamedTuple):
     """The two splats of M pairs, and means over the two; all in float32, or all in float64.
 
-    The unit is a pair's root sum of variances, so that squares of areas fit into float32.
+    Lengths are over the root of the pair's summed variances: squares of areas fit into float32.
     """
 
     model: Model
@@ -251,9 +259,15 @@ def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
 
 
 def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
-    """Merged splats, with mean and covariance of the mixture of each pair, from `price`'s `pairs`.
+    """Merged splats, (M,), with mean and covariance of the mixture of each pair.
 
-    ``mu = w mu_i + w' mu_j``, ``C = w C_i + w' C_j + w w' d d'``, w + w' = 1, d = mu_j - mu_i.
+    ``mu = w mu_i + w' mu_j``, ``C = w C_i + w' C_j + w w' d d'``, w + w' = 1, d = mu_j - mu_i
+    (docs/method.md, section 7); discs are made flat (`flat_as_viewed`).
+
+    Parameters
+    ----------
+    first, second : (M,) int, rows of `splats`
+    pairs : Pairs, of `price`
     """
     one, two = splats.take(first), splats.take(second)
     position, color = pairs.position[:, None], pairs.color[:, None]
@@ -280,7 +294,10 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
 
 
 def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[Array, Array, Array]:
-    """Log scales (M, 3), quaternions (M, 4), opacity logits (M,); third scales of discs are 0."""
+    """Stored values: log scales, (M, 3), quaternions, (M, 4), w x y z, opacity logits, (M,).
+
+    Third log scales of discs are `LOG_ZERO`.
+    """
     count = len(merged.opacity)
     stored = np.empty((count, 3)), np.empty((count, 4)), np.empty(count)
 
@@ -308,7 +325,7 @@ def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[A
 
 
 def axes(covariances: Array) -> tuple[Array, Array]:
-    """Log scales, (M, 3), ascending, and axes as columns, (M, 3, 3), of covariances, (M, 6)."""
+    """Log scales, (M, 3), ascending, and axes in columns, (M, 3, 3), from covariances, (M, 6)."""
     full = _full(covariances)
     total = np.maximum(np.trace(full, axis1=1, axis2=2), _TINY)
     values, vectors = np.linalg.eigh(full / total[:, None, None])
@@ -329,6 +346,11 @@ def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Ar
 
     The normal n has ``C n = l M n``, l least, M the mean of ``v v'`` over viewing directions v;
     what is left is ``C - l M n (M n)'``. For M = I that is `flat`.
+
+    Parameters
+    ----------
+    covariances : (M, 6) float64, xx, xy, xz, yy, yz, zz
+    direction, deviation : (M, 3) float64, of viewing directions, see `Field`
     """
     beside = deviation - np.einsum("ij,ij->i", deviation, direction)[:, None] * direction
     size = np.maximum(np.sqrt(np.einsum("ij,ij->i", beside, beside)), ASIDE)

@@ -1,1 +1,1 @@
-"""What is told about the pictures of the views: their PSNR, and how cameras and splats stand."""
+"""Estimated PSNR of the views, and whether cameras and splats belong together."""

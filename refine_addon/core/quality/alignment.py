@@ -4,7 +4,7 @@
 
 s and side, px, are geometric means of a footprint's standard deviations and of the image's sides.
 Much finer pictures after a quarter turn about x mean that only one of the files was turned upright.
-From far away all is fine: see `SMALL`.
+From far away all pictures are fine, so distant views are named, too (`SMALL`).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LEAST = 0.04
 """Pictures less fine show too little to decide by."""
 
 ONE_WAY = 0.95
-"""Views whose mean direction is this long look one way: turned, they see another part."""
+"""Views whose mean direction is this long look one way: turned, they would see another part."""
 
 WHOLE = 0.8
 """Mean share of splats in the picture if views see the whole from outside, turned or not."""
@@ -59,7 +59,7 @@ SMALL = 0.02
 
 @dataclass(frozen=True)
 class Alignment:
-    """How the views stand to the splats."""
+    """Whether the views are to be turned, and which are far away from the splats."""
 
     turn: int = 0  # quarters about x (`affine.QUARTER`) to turn the views by: 0, 1 or -1
     known: bool = False  # by the import; else it was measured
@@ -95,13 +95,13 @@ class Alignment:
         )
 
     def facts(self) -> dict[str, Any]:
-        """Plain JSON values of it."""
+        """Its fields as plain JSON values."""
         rounded = [round(value, 4) for value in self.fineness]
         return {**vars(self), "fineness": rounded, "far": list(self.far)}
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Alignment:
-        """The alignment from `facts`; an empty one if they are malformed."""
+        """Inverse of `facts`; an empty alignment if they are malformed."""
         try:
             stored = dict(facts or {})
             turn, known = int(stored.get("turn", 0)), bool(stored.get("known", False))
@@ -121,7 +121,19 @@ def alignment(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Alignment:
-    """How given views stand to splats; `used` are turned to measure, unless the views know it."""
+    """Find whether views are to be turned, and which are far away (docs/method.md, section 10).
+
+    Parameters
+    ----------
+    splats : Splats, in the frame of the views
+    views : ViewSet; where its import says how it is turned, nothing is measured
+    used : ViewSet, optional, of which some are turned to measure; by default none is
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    Cancelled
+    """
     with np.errstate(invalid="ignore"):  # signalling NaN
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
     far, in_pictures, count = [], 0, 0

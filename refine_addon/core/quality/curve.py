@@ -29,13 +29,13 @@ MERGED_SHARES = (0.3, 0.5, 0.7, 0.9)
 """Shares removed at which kept splats stand in for removed ones; see `merged_from`."""
 
 GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
-"""Gain of merging over deletion there, dB: a constant, and a part of the gain of standing in."""
+"""Gain of merging over deletion there: a constant, dB, and a factor on `merged_from`'s gains."""
 
 FULL_GAIN = 40_000
 """Scenes of at least this many splats gain that much."""
 
 FEWER = 0.2, 0.4, 0.8, 1.3
-"""Loss of gain there, dB for each halving: fewer neighbours of a kind to merge with."""
+"""Loss of gain there, dB for each halving: there are fewer like neighbours to merge with."""
 
 FEWEST = 20_000
 """Fewer splats have no prediction: scenes differ by up to 7 dB."""
@@ -51,13 +51,13 @@ UNSEEN = 60.0
 """PSNR in dB above which pictures look the same: rounding to 8 bits alone makes 59."""
 
 AS_GOOD = 0.5
-"""Merging must gain more dB, or deletion is as good: nobody sees less, and rows stay to the bit."""
+"""Gain of merging up to which deletion is as good, dB: nobody sees it, and rows keep their bits."""
 
 PARTED = 3.0
-"""Views in between lose more than those that decided if they are lower by this, dB."""
+"""Views in between visibly lose more than deciding views if their PSNR is lower by this, dB."""
 
 NOTICED = 50.0
-"""Deciding views count as at most this, dB: nobody sees more between 70 and 55."""
+"""A higher PSNR of deciding views counts as this in `parted`, dB: 70 looks like 55."""
 
 ROUNDS = 2.5
 """Time of scoring by occlusion over that of measuring all splats once."""
@@ -69,7 +69,7 @@ MERGING = (0.1, 0.5, 0.65, 1.4, 1.8, 2.4)
 """Time of merging over that of measuring once: one thread's processor time of `room_small`."""
 
 REFITTING = (20.0, 17.0, 8.5, 10.5, 7.5, 5.0)
-"""The same of refitting."""
+"""Time of refitting over that of measuring once."""
 
 _LEAST_SHARE = 1e-6  # the place of "nothing removed" on the curve's axis, where that is infinite
 
@@ -85,7 +85,7 @@ class Quality:
 
     shares: NDArray[np.float64]  # (L,), ascending
     psnr: NDArray[np.float64]  # (L,), with the lowest scores deleted
-    merged: NDArray[np.float64]  # (L,), about what merging reaches
+    merged: NDArray[np.float64]  # (L,), predicted for merging
     foretold: bool = True  # whether `merged` is accurate enough to be shown
     views: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # by name, if rays hit
     hits: float = REFIT_HITS  # mean number of splats that a ray hits
@@ -143,19 +143,19 @@ class Quality:
         curves = {name: getattr(self, name).tolist() for name in ("shares", "psnr", "merged")}
         views = {name: psnr.round(2).tolist() for name, psnr in self.views.items()}
         between = None if self.between is None else self.between.round(2).tolist()
-        told = {"foretold": self.foretold, "hits": round(self.hits, 2)}
-        return {**curves, **told, "views": views, "between": between}
+        more = {"foretold": self.foretold, "hits": round(self.hits, 2)}
+        return {**curves, **more, "views": views, "between": between}
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Quality | None:
-        """The curve that `facts` describe; None if they are malformed."""
+        """Inverse of `facts`; None if they are malformed."""
         try:
             held, array = dict(facts or {}), partial(np.array, dtype=np.float64)
             shares, psnr, merged = map(array, (held["shares"], held["psnr"], held["merged"]))
             views = {str(name): array(each) for name, each in (held.get("views") or {}).items()}
             between = None if held.get("between") is None else array(held["between"])
-            told = [] if between is None else [between]
-            every = np.stack([shares, psnr, merged, *views.values(), *told])  # of one length
+            last = [] if between is None else [between]
+            every = np.stack([shares, psnr, merged, *views.values(), *last])  # of one length
             if every.ndim != 2 or not every.size:
                 return None
             hits, foretold = float(held.get("hits", REFIT_HITS)), bool(held.get("foretold", True))
@@ -165,7 +165,7 @@ class Quality:
 
 
 def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.float64]:
-    """Predicted gain of refitting over merging, dB >= 0, by share removed and mean hits of a ray.
+    """Predicted gain of refitting over merging, dB >= 0, by shares removed and mean hits of a ray.
 
     >>> [round(float(refit_gain(0.5, hits)), 2) for hits in (39.0, 78.0, 156.0)]
     [4.5, 3.2, 1.9]
@@ -181,32 +181,32 @@ def expected(
     measured: Mapping[Way, float | None],
     hits: float | None = None,
 ) -> dict[Way, float | None]:
-    """Predicted PSNR of each method, dB, None if unknown; what was measured stays.
+    """PSNR of each way to remove a share, dB: as measured, else predicted, else None.
 
-    With a ray's mean `hits`, refitting is predicted from merging that was measured.
+    Where merging was measured, refitting is predicted from it, by a ray's mean `hits`.
     """
-    told: dict[Way, float | None] = {}
+    psnr: dict[Way, float | None] = {}
     for way in WAYS:
-        told[way] = measured.get(way)
-        if told[way] is None and curve is not None and (curve.foretold or way == "delete"):
-            told[way] = curve.at(share, way)
+        psnr[way] = measured.get(way)
+        if psnr[way] is None and curve is not None and (curve.foretold or way == "delete"):
+            psnr[way] = curve.at(share, way)
     merged = measured.get("merge")
     if measured.get("refit") is None and merged is not None:
-        told["refit"] = None
+        psnr["refit"] = None
         if hits is not None:
-            told["refit"] = min(merged + float(refit_gain(share, hits)), PSNR_CAP)
-    return told
+            psnr["refit"] = min(merged + float(refit_gain(share, hits)), PSNR_CAP)
+    return psnr
 
 
 def deletion_will_do(psnr: float | None) -> bool:
-    """Whether nobody sees a gain over deletion at `psnr` dB, None if views see too little."""
+    """Whether nobody sees what deletion at `psnr` dB loses; also if views see too little (None)."""
     return psnr is None or psnr > UNSEEN
 
 
 def needed(gone: int | None, count: int) -> int | None:
-    """Splats, of `count`, that the curve must cover for `gone` removed; None if all.
+    """How many of `count` splats need their final order if `gone` are removed; None if all.
 
-    Up to the next of `MERGED_SHARES`, so that it equals the whole curve up to there.
+    Up to the next of `MERGED_SHARES`, so that the curve up to there equals the whole curve.
     """
     places = (math.floor(share * count) for share in MERGED_SHARES)
     return None if gone is None else next((place for place in places if place >= gone), None)
@@ -215,21 +215,25 @@ def needed(gone: int | None, count: int) -> int | None:
 def merged_from(
     psnr: NDArray[np.float64], gains: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
-    """Predicted PSNR of merging at the first L of `SHARES`, dB, from that of deletion, (L,).
+    """Predicted PSNR of merging at the first L of `SHARES`, (L,) dB (docs/method.md, section 5).
 
-    Kept splats that stand in (`Rays.colors_by_nearest_kept`) give `gains`: no bound, but they vary
-    from scene to scene as those of merging do.
+    Parameters
+    ----------
+    psnr : (L,) float64, by deletion, dB
+    gains : (m,) float64, dB at the first m of `MERGED_SHARES`, where nearest kept hits stand in
+        (`Rays.colors_by_nearest_kept`): no bound, but they vary between scenes as merging's do
+    count : int, splats before any is removed
     """
-    constant, part, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
+    constant, factor, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
     halvings = max(math.log2(FULL_GAIN / max(count, 1)), 0.0)
-    foretold = (constant + part * gains - halvings * fewer).clip(0.0)
-    known = (PLAIN, *MERGED_SHARES[: len(gains)])
-    gain = np.interp(SHARES[: len(psnr)], known, np.concatenate([[0.0], foretold]))
+    merging = (constant + factor * gains - halvings * fewer).clip(0.0)
+    shares = (PLAIN, *MERGED_SHARES[: len(gains)])
+    gain = np.interp(SHARES[: len(psnr)], shares, np.concatenate([[0.0], merging]))
     return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
 
 
 def left_to_lose(goal: float, psnr: float | None) -> float:
-    """PSNR that a second change may have so that both reach `goal`, dB: squared errors add up.
+    """PSNR that a second change must keep so that both reach `goal`, dB: squared errors add up.
 
     >>> round(left_to_lose(40.0, 43.0103), 2), left_to_lose(40.0, 39.0)
     (43.01, inf)
@@ -241,7 +245,7 @@ def left_to_lose(goal: float, psnr: float | None) -> float:
 
 
 def out_of_reach(goal: float, gone: int, count: int, psnr: float | None) -> str:
-    """Sentence if a PSNR, dB, cannot be had as budget with `gone` of `count` removed, or "".
+    """Sentence on why a budget of `goal` dB removed just `gone` of `count` splats, or "".
 
     >>> out_of_reach(99.0, 0, 100, 100.0)
     'by the estimate nothing can go at 99 dB'

@@ -1,4 +1,5 @@
-"""PSNR of views from a sample of their pixels, which a `RaySample` knows with all splats or some.
+"""PSNR of views, estimated from a sample of their pixels: `RaySample` has these for any choice of
+splats.
 
 The mean squared difference over these pixels is unbiased for that over the picture.
 """
@@ -24,10 +25,15 @@ MIN_RAYS_WITH_HITS = 256
 
 
 def psnr_of(colors: NDArray[Any], truth: NDArray[Any], view: View) -> float:
-    """PSNR of a view, dB, from the colours of its rays with other and with all splats, (3, P).
+    """PSNR of a view, dB, at most `PSNR_CAP` (docs/method.md, section 5).
 
     The logarithm of a mean is too low by half its squared relative error, which is corrected; the
     variance is that between neighbouring rays, so that parts of the picture may differ.
+
+    Parameters
+    ----------
+    colors, truth : (3, P) floating, 0..1, of the view's rays with other splats and with all
+    view : View, for the number of its pixels
     """
     errors = np.mean((colors - truth) ** 2, axis=0, dtype=np.float64)
     mean, count = float(np.mean(errors)), len(errors)
@@ -42,7 +48,7 @@ def psnr_of(colors: NDArray[Any], truth: NDArray[Any], view: View) -> float:
 def psnr_kept(
     sample: RaySample, keep: NDArray[np.bool_], *, threads: int | None = None
 ) -> float | None:
-    """Mean PSNR of all views with only splats `keep`, (N,) bool, dB; None if too little is seen."""
+    """Mean PSNR of all views, dB, if only splats `keep`, (N,), stay; None if too little is seen."""
     if not _enough(sample):
         return None
     views = sample.seeing()
@@ -62,10 +68,18 @@ def quality_curve(
 ) -> Quality | None:
     """Estimated PSNR at each of `curve.SHARES`; None if too little is seen.
 
-    values : (N,) float32, the lowest are removed first; of equal ones the first in the file
-    protected : (N,) bool, removed after all others
-    settled : splats in final order, see `Scores`: the curve ends there
-    between : RaySample of views in between those of `sample`
+    Parameters
+    ----------
+    sample : RaySample, of N splats
+    values : (N,) float32, scores: the lowest are removed first, of equal ones the first in the file
+    protected : (N,) bool, optional, removed after all others
+    settled : int, optional, splats in final order, see `Scores`: the curve ends there
+    between : RaySample, optional, of views in between
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    Cancelled
     """
     last = len(values) if settled is None else settled
     if settled is not None and protected is not None:
@@ -123,7 +137,19 @@ def psnr_against(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> float | None:
-    """Estimated PSNR of other splats, dB, against the sample's; None if too little is seen."""
+    """Estimated PSNR of other splats against those of a sample, dB; None if too little is seen.
+
+    Parameters
+    ----------
+    sample : RaySample, of which about `VALIDATION_VIEWS` views are compared
+    splats : Splats, in the same frame
+    views : ViewSet of the sample
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    Cancelled
+    """
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
@@ -138,8 +164,8 @@ def psnr_against(
 
     if not _enough(sample):
         return None
-    numbers, told = sample.validating(), part(progress, 0.2, 1.0)
-    return float(_mean(sample, _of_views(sample, compare, numbers, told, threads), numbers)[0])
+    numbers, later = sample.validating(), part(progress, 0.2, 1.0)
+    return float(_mean(sample, _of_views(sample, compare, numbers, later, threads), numbers)[0])
 
 
 def _enough(sample):
@@ -148,7 +174,7 @@ def _enough(sample):
 
 
 def _removing(sample, place, counts):
-    """PSNR function of a view, dB, removing places, (M,), below each of L ascending `counts`."""
+    """Callable: PSNR of a view, (L,) dB, without places, (M,), below each of ascending counts."""
 
     def compare(number, rays):
         view, colors = sample.views[number][0], sample.colors(number, rays)

@@ -55,7 +55,7 @@ class Shapes:
 
     @classmethod
     def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene) -> Shapes:
-        """Shapes of the splats that some Gaussians were made of."""
+        """Shapes of Gaussians that were made of `splats`, in the scene's frame."""
         chosen = splats.take(gaussians.index)
         axes = np.einsum("ij,njk->kin", scene.axes, rotation_matrices(chosen.quaternions))
         logs = chosen.log_scales.astype(np.float64).T - np.log(scene.size)
@@ -67,7 +67,7 @@ class Shapes:
         return len(self.gaussians)
 
     def take(self, hit: NDArray[np.integer[Any]]) -> Shapes:
-        """Some of them."""
+        """Shapes of the Gaussians at `hit`."""
         axes, scales = self.axes.take(hit, axis=2), self.scales.take(hit, axis=1)
         return Shapes(self.gaussians.take(hit), self.scene, axes, scales)
 
@@ -114,13 +114,13 @@ class LinearView:
     """The colours of P rays of one view, linear in the changes of the u splats that they hit."""
 
     hit: NDArray[np.int64]  # (u,): Gaussians that are hit, ascending
-    errors: Singles  # (3, P): colours that the rays should see less those seen now
+    errors: Singles  # (3, P): colours of the unpruned splats less those seen now, see `_trust`
     hitting: NDArray[np.int64]  # (p,): rays with hits
     counts: NDArray[np.int64]  # (p,): hits of each
     owner: NDArray[Any]  # (h,), ray by ray: the splat's place in `hit`; uint16 or int32
     weight: NDArray[np.uint16]  # (h,): T a, see `_halves`
     by_log_alpha: NDArray[np.uint16]  # (3, h): T a (c - B); 0 where alpha is clipped
-    steepness: NDArray[np.uint16]  # (2, h): A d, 1/px; of discs (3, h), 0 where the low-pass is hit
+    steepness: NDArray[np.uint16]  # (2, h): A d, 1/px; of discs a third row, 0 on the low-pass
     unclipped: NDArray[np.bool_]  # (3, u): where the colour changes with the harmonics
     jacobian: Singles  # (2, 3, u): rows of J W, pixels a scene size
     basis: Singles  # (3, u): harmonics of the first degree in the view direction
@@ -158,7 +158,7 @@ class LinearView:
         return result
 
     def backward(self, errors: Singles, hits: tuple[Any, ...] | None = None) -> Singles:
-        """The transpose of `forward`, (22, u), applied to errors of the colours, (3, P)."""
+        """The transpose of `forward`, applied to errors of the colours, (3, P): sums, (22, u)."""
         owner, weight, by_log_alpha, (across, down, *on_plane) = hits or self.hits()
         result = np.zeros((COUNT, len(self.hit)), np.float32)
         value = np.zeros(len(owner), np.float32)
@@ -211,7 +211,10 @@ class LinearView:
         ]  # fmt: skip
 
     def diagonal(self, shapes: Shapes) -> Singles:
-        """Squared length of each column, (22, u); of a degree the mean, rotation-free."""
+        """Squared derivatives by each parameter, summed over rays, (22, u).
+
+        Those by the first degree of the harmonics are means, which do not depend on the axes.
+        """
         owner, weight, by_log_alpha, (x, y, *on_plane) = self.hits()
         result = np.zeros((COUNT, len(self.hit)), np.float32)
         result[COLOR] = np.float32(SH_C0**2) * self._sum(np.square(weight), owner, np.float64)
@@ -229,7 +232,7 @@ class LinearView:
         of_second = [self._sum(each, owner) for each in second]
         for where in on_plane:
             second = [each * where for each in second]
-        # One at a time: of all these arrays together a view's peak of memory would be made.
+        # One at a time: all these arrays together would be a view's peak of memory.
         of_fourth = [
             self._sum(second[k] * (one * other), owner)
             for k, (one, other) in [*((0, each) for each in products), (1, (y, y)), (2, (y, y))]
@@ -285,9 +288,15 @@ def linear_view(
     shapes: Shapes,
     view: View,
 ) -> tuple[LinearView, Shapes]:
-    """A view's rays as a linear function of the splats that they hit, and the shapes of these.
+    """The colours of a view's rays, linear in the splats that they hit, and these splats' shapes.
 
-    `truth` (3, P), of at most 2^16 rays, is to be seen; `colors` (3, u) are of the splats hit.
+    Parameters
+    ----------
+    visible : Rays, at most 2^16, and (h,) float32, the transmittance in front of each hit
+    footprints : Footprints that were hit
+    truth : (3, P) float32, colours of the unpruned splats on the rays
+    colors : (3, u) float32, in which the view sees the splats that are hit
+    shapes : Shapes of the M splats that can change, the first of all that can be hit
     """
     rays, transmittance = visible
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit
@@ -302,7 +311,7 @@ def linear_view(
     changing = np.where(alpha < ALPHA_MAX, alpha, np.float32(0.0)) * transmittance[kept]
     seen, by_log_alpha = np.zeros((3, rays.count)), np.empty((3, len(kept)), np.float32)
     for channel, of_splats in enumerate(colors):
-        sums = np.zeros(len(weight) + 1)  # of what all hits in front have of the colours of rays
+        sums = np.zeros(len(weight) + 1)  # running sums of what hits add to the colours of rays
         np.cumsum(weight * of_splats.take(rays.owner), dtype=np.float64, out=sums[1:])
         seen[channel, hitting] = sums.take(ends) - sums.take(ends - counts)
         background = (sums.take(last) - sums.take(kept + 1)).astype(np.float32) / left

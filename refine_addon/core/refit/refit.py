@@ -1,9 +1,10 @@
 """Refitting: kept splats learn the colours that the unpruned splats have on rays.
 
-Rounds, each on other rays, minimize ``|J x - r|^2 + sum_p (k (D_p + m_p) + K_p) x_p^2`` (Levenberg,
-Marquardt; docs/method.md, section 12): r differences of colours, D the diagonal of J'J, m its
-medians, K the sum of D over earlier rounds. Validation rays, which nothing is learned from, undo a
-round that loses. Splats in files go by boxes, amid other boxes that do not change.
+Rounds, each on other rays, minimize ``|G x - d|^2 + sum_p (k (D_p + m_p) + K_p) x_p^2`` (Levenberg,
+Marquardt; docs/method.md, section 12): x changes of parameters, G derivatives of colours, d
+differences of colours, D the diagonal of G'G, m its medians, K the sum of D over earlier rounds. A
+round that loses on validation rays, which nothing is learned from, is undone. Splats in files are
+refitted box by box, amid the others, which do not change.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ DAMPING, LEAST_DAMPING = 4.0, 0.1
 """k is `DAMPING` over the rays for each kept splat, but at least the other: colours are linear in
 the parameters only near by."""
 
-CARRIED = 0.5  # share of the J'r that a round leaves that counts in the next
+CARRIED = 0.5  # part of the gradient G'd left by a round that counts in the next
 
 MORE_DAMPING = 8.0  # factor of k after a round that lost
 
@@ -46,22 +47,22 @@ MOST_ROUNDS = 100  # limit of the option; after some ten none gains
 LEAST_GAIN = 0.05  # dB on validation rays; rounds end below
 
 ONE_PLACE = "nothing was refitted: what fits views in one place looks worse from others"
-"""If no view can move (`round_rays.steps_of`), validation rays start where those of the rounds do
-and cannot tell: one view gains 9 dB by them, others -0.6 to 0.5 dB."""
+"""If no view can move (`round_rays.steps_of`), validation rays start where those of the rounds do:
+by them one view gains 9 dB, where others gain -0.6 to 0.5 dB."""
 
 MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3}
-"""Largest move of a parameter in a round, as in `linear`; of means in longest scales."""
+"""Largest change of a parameter in a round, in units as in `linear`; of means in longest scales."""
 
-LEAST_MOVE = 0.02  # shorter moves of means are left out, longest scales; `_worthwhile`
+LEAST_MOVE = 0.02  # longest scales; shorter moves of means are left out, see `_worthwhile`
 
 SHARE = 0.5
-"""Kept splats of a region, in `mapped.REGION`: one takes twice the memory of one that merges."""
+"""Kept splats of a region over `mapped.REGION`: each takes twice the memory of one that merges."""
 
 _FIRST = 0.1  # share of progress until the first round
-_CASTING, _SOLVED = 0.35, 0.9  # of that of a round
+_CASTING, _SOLVED = 0.35, 0.9  # share of a round's progress when its rays are cast, and solved
 _SAMPLE = 1 << 12  # splats of a region that tell where it is in each view
 _EDGE = 0.005  # share of them that may lie outside on each side
-_NOTHING = 1e-30  # rays that tell less of a parameter tell nothing; 1 over it is a float32
+_NOTHING = 1e-30  # least of D from which a parameter changes; 1 over it is a float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,15 +88,15 @@ class Refitted:
 
     def note(self, seconds: float) -> str:
         """The numbers as a sentence, for the user."""
-        told = (
+        sentence = (
             "{changed:,} kept splats were refitted in {rounds} rounds: {psnr_before:.1f} -> "
             "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s"
         )
-        return told.format(**self.facts(seconds)) if self.rounds else self.why_not
+        return sentence.format(**self.facts(seconds)) if self.rounds else self.why_not
 
 
 def check_rounds(rounds: int | None) -> None:
-    """Raise `RefineError` if `rounds` is out of range."""
+    """Raise `RefineError` if `rounds` is neither None nor 1 to `MOST_ROUNDS`."""
     if rounds is not None and not 1 <= rounds <= MOST_ROUNDS:
         raise RefineError(f"rounds is {rounds}, expected 1 to {MOST_ROUNDS}")
 
@@ -107,7 +108,7 @@ def expected_rounds(count: int, rounds: int | None = None) -> int:
 
 
 def refit(*arguments: Any, **options: Any) -> Refitted:
-    """The last result of `refit_rounds`."""
+    """Refit as `refit_rounds` does, with its arguments; its last result."""
     *_, last = refit_rounds(*arguments, **options)
     return last
 
@@ -124,9 +125,21 @@ def refit_rounds(
 ) -> Iterator[Refitted]:
     """Yield kept splats as they are, and after each round that gains on validation rays.
 
-    `original` are the unpruned splats, in the frame and unit of the views like `splats`;
-    `protected` ones do not change. Memory: about 900 bytes a kept splat; a temporary file takes 14
-    bytes for each hit of a round, see `round_rays.limits`.
+    Memory: about 900 bytes a kept splat; a temporary file takes 14 bytes for each hit of a round,
+    see `round_rays.limits`.
+
+    Parameters
+    ----------
+    splats : Splats, N kept ones
+    original : Splats, the unpruned ones; both in the frame and unit of the views
+    rounds : int, optional, the most; by default rounds also end after `ENOUGH_RAYS`
+    protected : (N,) bool, optional; these do not change
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    RefineError : if `rounds` is out of range
+    Cancelled
     """
     check_rounds(rounds)
     if in_regions(original, len(original)) and in_regions(original, 2 * len(splats)):
@@ -146,7 +159,7 @@ def refit_on(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Iterator[Refitted]:
-    """`refit_rounds` on given rays."""
+    """Refit as `refit_rounds` does, on given rays."""
     count = len(splats)
     moving = np.ones(COUNT, np.bool_)
     moving[DEGREE_1] = splats.sh_rest.shape[1] > 0
@@ -172,7 +185,7 @@ def refit_on(
             ahead = max(min(math.ceil(enough * number / cast), MAX_ROUNDS), number)
         damping = more * max(DAMPING * count / linear.count, LEAST_DAMPING)
         solving = part(of_round, _CASTING, _SOLVED)
-        change, told = _solve(linear, movable, damping, before, progress=solving, threads=threads)
+        change, after = _solve(linear, movable, damping, before, progress=solving, threads=threads)
         del linear  # the hits, before those of the next round
         if not change.any():
             return
@@ -181,7 +194,7 @@ def refit_on(
         psnr = rays.psnr(trial, part(of_round, _SOLVED, 1.0))
         gain = psnr - best.psnr
         if gain > 0.0:
-            before, changed = told, best.changed | change.any(axis=0)
+            before, changed = after, best.changed | change.any(axis=0)
             best = Refitted(trial, changed, best.rounds + 1, best.psnr_before, psnr)
             yield best
             if gain < LEAST_GAIN or cast >= enough:
@@ -193,9 +206,9 @@ def refit_on(
 
 
 def _solve(linear, movable, damping, before, *, progress, threads):
-    """Change of the parameters, (22, N), and `before` updated by this round.
+    """Change of the parameters, (22, N), and the next round's `before`.
 
-    `before` holds K and the rest of J'r that the next round takes over, (22, N) each.
+    `before` holds K and the part of earlier rounds' gradient that counts, (22, N) each.
     """
     index = linear.shapes.gaussians.index
     moving = movable[:, index]
@@ -203,7 +216,7 @@ def _solve(linear, movable, damping, before, *, progress, threads):
     residual = linear.residual + np.float32(CARRIED) * before[1][:, index]
     residual *= moving
     diagonal = linear.diagonal * moving
-    # The median over splats of what rays tell, 1 where they tell nothing.
+    # Medians of D over the splats that rays hit, 1 where they hit none.
     medians = [np.median(row[row > 0.0]) if row.any() else 1.0 for row in diagonal]
     prior = np.float32(damping) * (diagonal + np.array(medians, np.float32)[:, None])
     damped = prior + before[0][:, index]
@@ -221,12 +234,12 @@ def _solve(linear, movable, damping, before, *, progress, threads):
     prior *= change
     residual += prior
     result = np.zeros(movable.shape, np.float32)
-    told = before[0].copy(), np.float32(CARRIED) * before[1]
+    after = before[0].copy(), np.float32(CARRIED) * before[1]
     for row, values in enumerate(zip(change, diagonal, residual, strict=True)):
         result[row, index] = values[0]
-        told[0][row, index] += values[1]
-        told[1][row, index] = values[2]
-    return result, told
+        after[0][row, index] += values[1]
+        after[1][row, index] = values[2]
+    return result, after
 
 
 def _conjugate_gradients(product, residual, inverse, steps):
@@ -256,10 +269,10 @@ def _dot(one: Singles, other: Singles) -> float:
 
 
 def _worthwhile(change: Singles) -> Singles:
-    """A change, (22, N), with moves of means shortened (Breiman's garrote).
+    """Change, (22, N), with moves of means shortened (Breiman's garrote).
 
-    A move changes the depth order, which no derivative knows: a squared error in proportion to the
-    move, where the gain grows with its square.
+    A move can swap splats in depth, which no derivative shows: the squared error grows with the
+    move, the gain with its square.
     """
     means = change[MEAN]
     squared = np.maximum(np.square(means).sum(axis=0), np.float32(_NOTHING))
@@ -340,9 +353,9 @@ def _by_regions(kept, original, views, rounds, protected, progress, threads):
     work = partial(
         _refit_region, folder, views, rounds, rays.original, rays.target(kept, silent), threads
     )
-    made = run_all(work, range(len(boxes)), progress=refitting, what="refitting", threads=1,
-                   cost=cost)  # fmt: skip
-    changed, numbers, regions = zip(*made, strict=True)
+    refitted = run_all(work, range(len(boxes)), progress=refitting, what="refitting", threads=1,
+                       cost=cost)  # fmt: skip
+    changed, numbers, regions = zip(*refitted, strict=True)
     splats, order = in_one(folder, regions, boxes)
     better = rays.psnr(splats, after)
     if better > psnr:
@@ -360,15 +373,14 @@ def _refit_region(folder, views, rounds, original, kept, threads, number):
     if windows:
         amid = partial(_Amid, every=kept, others=others[kept.gaussians.index[...]])
         rays = RoundRays(windows, original, threads, amid)
-        *_, done = refit_on(
-            rays, splats, rounds, protected=protected, progress=look, threads=threads
-        )
+        how: Any = {"protected": protected, "progress": look, "threads": threads}
+        *_, done = refit_on(rays, splats, rounds, **how)
     return done.changed, done.rounds, on_disk(folder / f"region-{number}", [done.splats])
 
 
 @dataclass(frozen=True, eq=False)
 class _Amid(Target):
-    """The splats of a region amid all others, for rays to hit."""
+    """What rays hit: the splats of a region, which change, amid all others."""
 
     every: Target  # of all regions
     others: NDArray[np.bool_]  # (M,), which of the Gaussians of all are not of the region
@@ -390,7 +402,7 @@ class _Amid(Target):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Both(Gaussians):
-    """The Gaussians of a region, then all others, as far as `project` asks."""
+    """The Gaussians of a region, then all others, as `project` reads them."""
 
     every: Gaussians
     others: NDArray[np.bool_]

@@ -1,7 +1,7 @@
-"""The rays of all rounds of refitting: what unpruned and kept splats look like on them.
+"""The rays of all rounds of refitting, and the colours of unpruned and kept splats on them.
 
-Each round takes other pixels, of views moved beside the given ones (`SHIFT`), since fits to the
-given views alone do not hold in between; so do validation rays. Views are cast in processes.
+Each round, and validation, takes other pixels of views moved beside the given ones (`SHIFT`), since
+fits to the given views alone do not hold in between. Processes cast the views.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from ..visibility.scene import Scene
 from .linear import COUNT, LEAST_WEIGHT, LinearView, Shapes, Singles, linear_view
 
 RAYS_OF_SPLAT = 7.0
-"""Rays of a round for each kept splat: fewer are learned by heart, and two rounds of half as many
-gain less than one."""
+"""Rays of a round for each kept splat. Fits to fewer do not hold on other rays, and two rounds of
+half as many gain less than one."""
 
-MIN_RAYS = 1 << 17  # of a round, if that is more
+MIN_RAYS = 1 << 17  # of a round, if that is more than by `RAYS_OF_SPLAT`
 
 HITS_OF_SPLAT, MIN_HITS = 112, 3 << 21
 """Most hits of a round on the unpruned splats (about; above `linear.LEAST_WEIGHT`), for each kept
@@ -49,7 +49,7 @@ SHIFT, MAX_SHIFT = 0.7, 0.1
 
 HELD = 1 << 23  # bytes that stay in memory; small scenes need no file
 
-LARGEST = np.float32(1e36)  # of harmonics' coefficients: 25 of them add up to a float32
+LARGEST = np.float32(1e36)  # coefficient of the harmonics: 25 of them add up to a float32
 
 FARTHEST = 1e18  # step from a camera, world units; its square fits into a float32
 
@@ -61,7 +61,7 @@ _NOTHING = 1e-30  # hits of a ray; keeps a division finite
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Where rays go through a view, in each round."""
+    """Part of a view that rays go through, and how many do in each round."""
 
     view: View
     number: int  # of the view, see `cast.pixels`
@@ -93,7 +93,7 @@ class Window:
         return replace(self, view=replace(self.view, center=center))
 
     def pixels(self, hits: float, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Columns and rows of the rays of a round (0: validation), for about `hits` a ray.
+        """Columns and rows of the rays of a round (0: validation), with about `hits` hits each.
 
         Rounds continue an estimate's R2 sequence (`cast.pixels`), so their pixels differ.
         """
@@ -129,12 +129,12 @@ class Target:
         return projection.project(self.gaussians, self.scene, window.view, window.part)
 
     def colors(self, hit: NDArray[np.int64], view: View) -> Singles:
-        """Colours that a view sees of Gaussians, (3, u)."""
+        """Colours in which a view sees the Gaussians `hit`, (3, u)."""
         return colors_of(self.splats, self.gaussians.index[hit], view)
 
 
 def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> Singles:
-    """Colours that a view sees of splats, (3, u), as far as they can be drawn."""
+    """Colours in which a view sees splats by their rows, (3, u) float32, 0 to `BRIGHTEST`."""
     result = np.empty((3, len(rows)), np.float32)
     for piece in chunks(len(rows), _CHUNK):
         chosen = rows[piece]
@@ -151,7 +151,7 @@ def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> Singles:
 
 
 class Truth(NamedTuple):
-    """Rays of one view, and the unpruned splats' colours on them."""
+    """Rays of one view, and the colours of the unpruned splats on them."""
 
     columns: NDArray[np.int64]  # (C,), see `Rays`
     rows: NDArray[np.int64]  # (R,)
@@ -167,9 +167,9 @@ class RoundRays:
         windows: Sequence[Window],
         original: Target,
         threads: int | None,
-        made: Callable[..., Target] = Target,
+        kind: Callable[..., Target] = Target,
     ) -> None:
-        self.windows, self.original, self._threads, self._made = windows, original, threads, made
+        self.windows, self.original, self._threads, self._kind = windows, original, threads, kind
         step = -(-len(windows) // cast.VALIDATION_VIEWS)
         self._validating = [window.moved(0) for window in windows[::step]] if step else []
         self._validation: list[Truth] = []
@@ -178,7 +178,7 @@ class RoundRays:
     def of(
         cls, original: Splats, views: ViewSet, count: int, progress: Progress, threads: int | None
     ) -> RoundRays:
-        """Rays of all views into `original`, in memory, for `count` kept splats; see `limits`."""
+        """Rays of all views into `original`, as many as `limits` of `count` kept splats."""
         gaussians, scene, _ = projection.prepare(
             original, views, progress=progress, threads=threads
         )
@@ -197,8 +197,8 @@ class RoundRays:
         target = self.target(splats, part(progress, 0.0, 0.05))
         shapes = Shapes.of(splats, target.gaussians, target.scene)
         windows = [window.moved(number) for window in self.windows]
-        told = [truth.shown for truth in self._validation]
-        shown = float(np.mean(told)) if told else None
+        shares = [truth.shown for truth in self._validation]
+        shown = float(np.mean(shares)) if shares else None
         truth = partial(cast_truth, self.original, windows, number, shown)
         work = partial(_linearized, truth, windows, target, shapes)
         seen = self._each(work, windows, splats, part(progress, 0.05, 1.0))
@@ -219,27 +219,27 @@ class RoundRays:
         return float(np.average(psnr, weights=[window.weight for window in windows]))
 
     def target(self, splats: Splats, progress: Progress) -> Target:
-        """What rays are cast into: kept splats, the first of all that are hit."""
+        """What rays are cast into: these kept splats, and any others that `kind` adds."""
         views, scene = ViewSet(tuple(window.view for window in self.windows)), self.original.scene
         prepared = projection.prepare(
             splats, views, scene, progress=progress, threads=self._threads
         )
-        return self._made(splats, prepared[0], scene)
+        return self._kind(splats, prepared[0], scene)
 
-    def _each(self, work, windows, splats, told):
-        numbers = range(len(windows))
+    def _each(self, work, windows, splats, progress):
         cost = seconds("refit", len(self.original.splats) + len(splats), len(windows))
-        return run(work, numbers, cost=cost, progress=told, what="refitting", threads=self._threads)
+        how = {"progress": progress, "what": "refitting", "threads": self._threads}
+        return run(work, range(len(windows)), cost=cost, **how)
 
 
 def limits(count: int) -> tuple[float, float]:
-    """About how many rays and hits a round of `count` kept splats may have."""
+    """About how many rays and hits a round has, for `count` kept splats (docs/method.md, 12)."""
     hits = min(max(HITS_OF_SPLAT * count, MIN_HITS), max(FEWER_HITS * count, MANY_HITS))
     return max(RAYS_OF_SPLAT * count, MIN_RAYS), hits
 
 
 def steps_of(views: Sequence[View], scene: Scene) -> list[float]:
-    """How far each view is moved, world units; see `SHIFT`."""
+    """About how far each view moves in a round, world units; see `SHIFT`."""
     centers = np.stack([view.center for view in views])
     steps = []
     for center in centers:
@@ -253,7 +253,10 @@ def steps_of(views: Sequence[View], scene: Scene) -> list[float]:
 def cast_truth(
     target: Target, windows: Sequence[Window], number: int, shown: float | None, place: int
 ) -> Truth:
-    """Rays of the view at a `place` in a round (0: validation), cast into unpruned splats."""
+    """Rays of ``windows[place]`` in a round (0: validation), and the unpruned splats' colours.
+
+    `shown` is the mean of `Truth.shown` over validation rays; None while these are cast.
+    """
     window = windows[place]
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
@@ -295,7 +298,7 @@ def _linearized(truth_of, windows, target, shapes, place):
 class LinearRays:
     """The colours of all rays, as a linear function of changes of M Gaussians.
 
-    `seen` yields each view with its part of J'r and of the diagonal of J'J, (22, u).
+    `seen` yields each view with its part of the gradient G'd and of the diagonal of G'G, (22, u).
     """
 
     def __init__(self, shapes: Shapes, seen: Iterable[tuple[LinearView, Singles, Singles]]) -> None:
@@ -309,7 +312,7 @@ class LinearRays:
         self.residual = shapes.by_parameter(residual)
 
     def normal(self, change: Singles, progress: Progress, threads: int | None) -> Singles:
-        """J'J times a change of the parameters, (22, M)."""
+        """G'G times a change of the parameters, (22, M)."""
         in_scene = self.shapes.in_scene(change)
         total = np.zeros_like(in_scene)
 
@@ -342,23 +345,23 @@ class Stored:
         return len(self._places)
 
     def append(self, item: Any) -> None:
-        """Add one."""
-        place: Any = (told := pickle.dumps(item, 5))
-        if self._held + len(told) > HELD:
+        """Add an object, which may be changed afterwards."""
+        place: Any = (data := pickle.dumps(item, 5))
+        if self._held + len(data) > HELD:
             with suppress(OSError):
                 if self._file is None:
                     # Without a buffer, so that nothing is left to be written when it closes.
                     self._file = tempfile.TemporaryFile("w+b", 0, prefix="refine-")  # noqa: SIM115
                     weakref.finalize(self, self._file.close)
                 start = self._file.seek(0, os.SEEK_END)
-                if self._file.write(told) == len(told):
-                    place = start, start + len(told)
-        if place is told:
-            self._held += len(told)
+                if self._file.write(data) == len(data):
+                    place = start, start + len(data)
+        if place is data:
+            self._held += len(data)
         self._places.append(place)
 
     def __getitem__(self, number: int) -> Any:
-        """One of them, equal to the bit, for any thread."""
+        """A copy of an object, equal to the bit, for any thread."""
         place = self._places[number]
         if isinstance(place, tuple):
             start, end = place

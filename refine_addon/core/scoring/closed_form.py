@@ -3,8 +3,9 @@
     D_i = sum over k of  lambda^k  H_i G_i^k / mean_j(H_j G_j^k)        REFINE, Eq. 20
     H_i = alpha_i  mean over views of  inside_iv / (d_iv^2 + eta)       Eq. 13-16
 
-G is the product of the two largest scales, luma^2 and alpha^2. Our additions: `inside`, the share
-that counts as in the frustum, and `_compare`. Splats are read once, in chunks: 49 bytes each stay.
+For geometry, colour and opacity, k, G is the product of the two largest scales, luma^2 and alpha^2.
+Our additions are `inside`, the share that counts as in the frustum, and `_compare`. Splats are read
+once, in chunks; 49 bytes of each stay in memory. docs/method.md, section 1, has all formulas.
 """
 
 from __future__ import annotations
@@ -37,19 +38,19 @@ ETA_RELATIVE = 0.005
 """Eta over the squared size of the scene: the paper's 0.05 at a viewing distance of 3 m."""
 
 UNSEEN = 1e-6
-"""H of a splat in no view, times (squared distance + eta): nearly always below all others."""
+"""H over alpha of a splat in no view, times (squared distance + V + eta): below nearly all seen."""
 
 REACH = 2.0
 """Standard deviations along its longest axis that a splat reaches into an image from outside."""
 
 LOCAL_HALF = 0.05
-"""Score, in units of the mean, at which w of `_compare` is 1/2."""
+"""Score, over the mean, at which w of `_compare` is 1/2."""
 
 CELLS = 64
 """Cells of the neighbourhoods along each axis."""
 
 ROWS = 1 << 18
-"""Splats ordered and summed over cells together; the last bits of scores depend on it."""
+"""Splats ordered, and summed over cells, at a time; the last bits of scores depend on it."""
 
 _CHUNK = 4096
 _RUN = 1000
@@ -63,15 +64,15 @@ _NOISE = 1e-12  # a smaller statistic counts as 0: rounding leaves about this mu
 # The grid whose cells a Hilbert curve connects, see `_near_order`. Bits of a cell's number along
 # each axis: those of three axes fit into 16, which NumPy sorts by radix.
 _BITS = 5
-_SAMPLE = 4096  # splats that say where it lies
+_SAMPLE = 4096  # splats that decide where it lies
 _ENDS = (0.02, 0.98)  # quantiles of the sample along each axis between which it lies
 _LEAST_SPAN = 1e-200
 
 
 class _Columns(NamedTuple):
-    """What the formula needs of N splats."""
+    """What the formula needs of N splats, (N,) but for `means`."""
 
-    good: NDArray[np.bool_]  # which can be drawn
+    good: NDArray[np.bool_]  # whether it can be drawn
     means: NDArray[np.floating[Any]]  # (N, 3)
     alpha: NDArray[np.float64]
     area: NDArray[np.float64]  # product of the two largest scales
@@ -94,11 +95,20 @@ def score(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Score splats, in files or not, by the closed form; threads do not change a bit.
+    """Score splats, in memory or files, by the closed form; threads do not change a bit.
 
-    depth : along the view's axis (the paper) or to its centre (the authors' code)
-    frustum : whether only views that a splat lies in, or reaches into, count for it
-    local : whether a splat counts relative to those around it, see `_compare`
+    Parameters
+    ----------
+    splats : Splats, in the frame of the views
+    depth : d along the view's axis (the paper) or as distance to its centre (the authors' code)
+    frustum : bool, whether only views that a splat lies in, or reaches into, count for it
+    local : bool, whether a splat counts relative to those around it, see `_compare`
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    RefineError : no splats, none that can be drawn, or none in any frustum
+    Cancelled
     """
     total = len(splats)
     if not total:
@@ -172,7 +182,8 @@ def score(
 def lambdas(anisotropy: float, luma_variance: float, translucency: float) -> list[float]:
     """Lambda of geometry, colour and opacity, of sum 1 (REFINE, Eq. 17-20; authors' constants).
 
-    From the mean axis ratio, the variance of luma in 0..1, and the mean of 4 alpha (1 - alpha).
+    They follow from the mean axis ratio, the variance of luma, 0..1, and the mean of 4 alpha
+    (1 - alpha).
 
     >>> [round(value, 3) for value in lambdas(10.73, 0.05, 0.5)]
     [0.274, 0.111, 0.615]
@@ -212,7 +223,7 @@ def _read(splats, origin, spread, progress, threads):
             red, green, blue = base_color(clean(chunk.sh_dc)).T
             columns.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
             logs = clean(chunk.log_scales).astype(np.float64)
-            if chunk.model == "2dgs":  # how long they are is told by the axes that they have
+            if chunk.model == "2dgs":  # discs have two axes
                 logs[:, 2] = logs[:, :2].min(axis=1)
             columns.area[piece], ratio, longest = _axes(logs)
             columns.reach[piece] = REACH * longest
@@ -258,7 +269,7 @@ def _statistics(tallies):
 
 
 def _sum_views(columns, counted, progress, threads):
-    """H without its factor alpha, which takes the place of `reach`; views that each lies in."""
+    """H over alpha, (N,), in the memory of `reach`, and number of views that hold each centre."""
     total = len(columns.good)
     seen, order = np.empty(total, np.int32), np.arange(total, dtype=np.int32)
 
@@ -324,7 +335,7 @@ def _places():
 
 
 class _Views:
-    """Views that sum what splats are worth to them."""
+    """The views as the closed form sums over them."""
 
     def __init__(self, views, origin, near, eta, by_distance, frustum):
         self.origin, self.weights, self.eta = origin, views.weights, eta
@@ -332,7 +343,7 @@ class _Views:
         self.frustums = Frustums(views, origin, near)
 
     def sums(self, points, reach):
-        """H without alpha, and number of views that hold each, of n points, (4, n)."""
+        """H over alpha, and number of views that hold the centre, of n points, (4, n)."""
         starts = np.arange(0, len(reach), _RUN)
         low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
         visibility, seen = np.empty(len(reach)), np.empty(len(reach), np.int32)
@@ -354,7 +365,7 @@ class _Views:
         return visibility, seen
 
     def _of_run(self, points, reach, views, partly):
-        """The same of a run that some views see, (v,); the first `partly` of them not all of it."""
+        """The same of a run that `views`, (v,), see; the first `partly` see only part of it."""
         total = np.zeros(len(reach))
         seen = np.full(len(reach), len(views) - partly, np.int32)
         for start in range(0, len(views), _VIEW_BLOCK):
@@ -430,7 +441,7 @@ def _compare(values, cells, good, threads):
 
 
 def _store(into, values, good, piece):
-    """Set the scores of some splats; only undrawable ones score 0, despite underflow."""
+    """Store scores as float32; only undrawable splats score 0, despite underflow."""
     stored = values.astype(np.float32)
     # A drawable splat must not tie with undrawable ones by underflow.
     np.maximum(stored, np.finfo(np.float32).tiny, out=stored, where=good[piece])

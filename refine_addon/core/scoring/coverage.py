@@ -1,8 +1,9 @@
 """The floor of occlusion scores: what a splat may be worth to views that were not given.
 
-It is the closed form, which ignores occlusion, times a weight for each of `SHARES`, chosen by
-cross-validation: an eighth of the views is left out, the others score with each of `FLOOR_WEIGHTS`,
-and the one wins whose order removes least error of those left out.
+What no given view shows may be plain to see from others. So each score gets a floor: the closed
+form, which ignores occlusion, less where more views hold the splat, times a weight. Each of
+`SHARES` has its weight, chosen by cross-validation: an eighth of the views is left out, the others
+score with each of `FLOOR_WEIGHTS`, and the weight wins by which the left-out views lose least.
 """
 
 from __future__ import annotations
@@ -17,32 +18,37 @@ from ..visibility.projection import Gaussians
 from ..visibility.scene import MIX, fingerprint
 
 FLOOR_WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
-"""Weights tried. At 1, a splat in no view, of average prior, gets the mean score as its floor."""
+"""Weights tried. At 1, a splat in no view, of mean prior, gets the mean score as its floor."""
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Shares removed, each with the weight that loses least there."""
 
 LEAST_FLOOR_WEIGHTS = (0.0, 0.0, 0.03, 0.03, 0.03)
-"""Least weight for each of `SHARES`: costs tenths of a dB on views like those given, and gains up
-to 20 dB on others, as left-out views resemble those given."""
+"""Least weight for each of `SHARES`, as views left out resemble those given: it costs tenths of a
+dB on such views, and gains up to 20 dB on others."""
 
 SAMPLE = 1 << 16
 """Splats that are enough to choose the floor's weights."""
 
 TIED = 0.002
-"""Weights with losses this close are equally good: their log-mean is taken, which is stable."""
+"""A weight of a loss this much above the least counts 1 / e in the log-mean, which is stable."""
 
 DOUBTS = (0.03, 0.03, 0.0, 0.0, 0.0)
-"""Share of the error removed, by `SHARES`, that a tenfold weight must gain: losses are noisy."""
+"""What a tenfold weight must gain in a loss (`_losses`), by `SHARES`, since losses are noisy."""
 
 _NO_WEIGHT = 10.0**-5.5  # stands for 0 in a mean of logarithms
 
 
 def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> NDArray[np.float64]:
-    """Worth of each splat to views not given, from its prior and the views that hold it, (n,) each.
+    """Worth of each splat to views not given, (n,), of mean 1 if `seen` is 0 (docs/method.md, 6).
 
     If none shows it, the next does with probability ``1 / (1 + seen)``, by the rule of succession.
-    Scores are ``error contribution^p``, so `power` is 1 + p.
+
+    Parameters
+    ----------
+    prior : (n,) float64, closed form without frustum test and neighbourhoods
+    seen : (n,) int32, views that hold the centre
+    power : float, 1 + p for scores ``error contribution^p``
     """
     return np.asarray(_unit(prior**power) / (1.0 + seen))
 
@@ -53,10 +59,12 @@ def _with_floor(scores, floors, weight):
 
 
 def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
-    """Best weight of the floor for each of `SHARES`; all 1 if every view is ignored.
+    """Best weight of the floor for each of `SHARES`; all 1 if no view left out has an error.
 
-    folds : (scores, floors, errors), (n,), (n,), and (views, n) of the views left out; those
-        without any error are ignored
+    Parameters
+    ----------
+    folds : iterable of (scores, floors, errors), (n,), (n,) and (views, n): scores and floors by
+        the views that stay, errors of the splats in each view left out
     """
     losses = []
     for scores, floors, errors in folds:
@@ -77,9 +85,9 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
 
 
 def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
-    """Ascending rows of at most `count` splats, by a hash of opacity and colour.
+    """Ascending rows of at most `count` splats, chosen by a hash of opacity and colour.
 
-    So the choice depends neither on the order of the splats nor on the frame of the scene.
+    The choice depends neither on the order of the splats nor on the frame of the scene.
     """
     total = len(gaussians)
     if total <= count:
@@ -100,8 +108,12 @@ def order(
 ) -> NDArray[np.int64]:
     """All n rows in the order of removal, exact up to the last of `stops`.
 
-    ties : (n,), of equal scores the lower value goes first
-    stops : for each weight, in turn, the number removed when the next takes over, ascending
+    Parameters
+    ----------
+    scores, floors : (n,) float64
+    ties : (n,) float32, of equal scores the lower goes first
+    floor_weights : one for each of `SHARES`
+    stops : ascending, for each weight, the number removed when the next weight takes over
     """
     left, going = np.arange(len(scores)), [np.arange(0)]
     for weight, count in zip(floor_weights, np.diff(stops, prepend=0), strict=True):

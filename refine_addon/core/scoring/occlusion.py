@@ -1,8 +1,8 @@
 """Scores with occlusion: ``error_i contribution_i^(1/4)`` (`measuring`), plus a floor (`coverage`).
 
-A splat's worth rises as those around it go, so they go in rounds, the rest scored again, down to a
-tenth: one order, so larger budgets contain smaller ones. Views are measured once, then corrected by
-the n_i rays that hit splat i, cast once::
+A splat's worth rises as those around it go. So splats go in rounds, and each round scores the rest
+again, down to a tenth. All budgets use this one order. Views are measured once; later rounds
+correct that by rays, cast once, of which n_i hit splat i (docs/method.md, section 6)::
 
     error_i = (n_i  error on the rays now  +  KNOWN  error measured, `_grown`) / (n_i + KNOWN)
 """
@@ -33,7 +33,7 @@ EXPONENT = 0.25
 """Exponent of the contribution."""
 
 BETWEEN = 12
-"""Most views in between that are looked at."""
+"""Most views in between that are estimated."""
 
 BETWEEN_RAYS = 0.375
 """Their rays, as a part of `VALIDATION_RAYS`."""
@@ -55,13 +55,23 @@ def score(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Score splats, in files or not, by the change of all views without them, with occlusion.
+    """Score splats, in memory or files, by how much the views change without them, with occlusion.
 
-    Values are the share removed once a splat is, in (0, 1]. Memory: 300 bytes a splat, 100 more for
-    each further thread, and 100 a point (`points.MAX_POINTS`) of a view and thread.
+    A splat's value is the share of splats gone once it is, in (0, 1]; 0 if undrawable. Memory: 300
+    bytes a splat, 100 more for each further thread, and 100 for each point
+    (`points.MAX_POINTS`) of a view in each thread.
 
-    rounds : how often scores are computed: once, or again after each part of the removal, >= 1
-    settled : splats to put in their final order, the first removed first; by default all
+    Parameters
+    ----------
+    splats : Splats, in the frame of the views
+    rounds : int, at least 1, how often scores are computed
+    settled : int, optional, how many splats, the first to go, need their final order; else all
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    RefineError : no splats, none that can be drawn or that a view sees, or no rounds
+    Cancelled
     """
     if rounds < 1:
         raise RefineError(f"rounds is {rounds}, expected 1 or more")
@@ -77,7 +87,10 @@ def score_once(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Scores, Measured]:
-    """Scores of one round, and what was measured of all N; `few_views` as for `RaySample`."""
+    """Scores of one round, and what was measured of all N splats; else as `score`.
+
+    `few_views` is that of `RaySample`, for validation rays.
+    """
     with np.errstate(under="ignore"):  # numbers that underflow to 0 are negligible in all sums
         return _score(splats, views, 1, None, sampling, few_views, progress, threads)
 
@@ -94,7 +107,16 @@ def measure_part(
 ) -> tuple[Measured, float]:
     """What one part of the views sees of all N splats, and its share of the weights of all views.
 
-    Turn 0 is the first of at most `parts` parts, each spread over all views, and so on in a circle.
+    Parameters
+    ----------
+    splats : Splats, in the frame of the views
+    turn : int, number of the part, modulo `parts`
+    parts : int, into at most how many parts, each spread over all views, the views are divided
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    Cancelled
     """
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.05), threads=threads
@@ -115,9 +137,9 @@ def measure_part(
 def _score(splats, views, rounds, settled, sampling, few_views, progress, threads):
     """Scores, and what was measured of all N; a stage of the job if splats lie in files."""
     job, stage = folder_of(splats), f"scores-{rounds}-{settled}-{few_views}"
-    done, found = (False, None) if job is None else noted(job, stage)
+    done, result = (False, None) if job is None else noted(job, stage)
     if done:
-        return found
+        return result
     count = len(splats)
     if not count:
         raise RefineError("there are no splats to score")
@@ -173,8 +195,8 @@ def _score(splats, views, rounds, settled, sampling, few_views, progress, thread
         {"floor": weights}, method="occlusion", ray_sample=samples[0], between=between,
         settled=settled,
     )  # fmt: skip
-    found = scores, everything
-    return found if job is None else note(job, stage, found)
+    result = scores, everything
+    return result if job is None else note(job, stage, result)
 
 
 def _folds(whole, of_groups, errors, prior, progress):
@@ -210,7 +232,7 @@ def _order(index, prior, measured, rays, weights, kept, progress):
 
 
 class _RemovalRounds:
-    """M Gaussians, of which ever more are removed, and scoring rays cast while all were there."""
+    """Errors and contributions of M Gaussians as ever more go, by rays cast before any removal."""
 
     def __init__(self, scoring_rays, measured, progress, threads):
         self._measured, self._threads = measured, threads
@@ -234,7 +256,7 @@ class _RemovalRounds:
         self._first = self._sums(every, part(progress, _LOADING, 1.0))
 
     def remove_and_measure(self, left, progress):
-        """Remove all but the ascending rows `left`, (n,); `Measured` sums of these now."""
+        """Remove all but the ascending rows `left`, (n,); `Measured` of these now."""
         all_left = len(left) == len(self._rays_hitting)
         now = self._first if all_left else self._sums(left, progress)
         measured = self._measured.error[left], self._measured.contribution[left]
@@ -270,16 +292,16 @@ class _RemovalRounds:
         return error[left], contribution[left]
 
 
-def _grown(measured, before, now, known):
+def _grown(measured, before, now, weight):
     """Measured sums, (n,), times their growth from `before` any removal to `now`, by the rays::
 
-        growth = (now + scene growth  prior) / (before + prior),    prior = known  measured
+        growth = (now + scene growth  prior) / (before + prior),    prior = weight  measured
 
-    The scene's mean growth weighs most for splats that few rays hit.
+    The scene's growth counts most for splats that few rays hit.
     """
     total = float(before.sum())
     scene_growth = float(now.sum()) / total if total > 0.0 else 1.0
-    prior = known * measured
+    prior = weight * measured
     both = before + prior
     grown = now + scene_growth * prior
     return measured * np.divide(grown, both, out=np.ones_like(both), where=both > 0.0)

@@ -1,7 +1,7 @@
 """Rays through a few hundred pixels of each view, evenly spread, and the footprints that they hit.
 
-What these pixels show, with all splats or any choice of them, follows without projecting again.
-A choice made by scoring rays looks too good on them: validation rays go through other pixels.
+The colours of these pixels follow for any choice of splats, without projecting again. A choice made
+by scoring rays looks too good on them, so validation rays go through other pixels.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from .rays import LOG_OPAQUE, Rays
 from .scene import Scene
 
 VALIDATION_RAYS = 1 << 14
-"""Validation rays of all views together."""
+"""Validation rays, of all views together."""
 
 MAX_VALIDATION_HITS = 1 << 24
-"""About the most hits of these; dense scenes get fewer rays."""
+"""About the most hits of validation rays; dense scenes get fewer rays."""
 
 SCORING_RAYS = 1 << 16
-"""Scoring rays of all views together."""
+"""Scoring rays, of all views together."""
 
 MAX_SCORING_HITS = 3 << 24
-"""About the most hits of these, 16 bytes each."""
+"""About the most hits of scoring rays, 16 bytes each."""
 
 MAX_HITS_OF_VIEW = 1 << 21
 """About the most hits of one view, which take 60 bytes each while views are cast side by side."""
 
 MAX_RAYS_OF_VIEW = 60_000
-"""Ray numbers of a view fit into 16 bits."""
+"""Most rays of a view: their numbers fit into 16 bits."""
 
 VALIDATION_VIEWS = 24
 """About the most views in which merged splats and written files are compared, which is slow."""
@@ -61,13 +61,20 @@ _STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
 class RaySample:
-    """Scoring or validation rays of all views, `ViewSet.by_distance`, into one scene.
+    """Scoring or validation rays of all views into one scene.
 
-    With `few_views` only about `VALIDATION_VIEWS` are cast: enough to validate, not for a curve.
+    Parameters
+    ----------
+    views : sequence of (View, weight), see `ViewSet.by_distance`
+    gaussians : Gaussians, M that were made of `splats`
+    few_views : bool, cast only about `VALIDATION_VIEWS`: enough to compare, not for a curve
+    scoring : bool, whether they are scoring rays
 
+    Attributes
+    ----------
     splat_rows : (M,) int64, the splat of each Gaussian
-    share : number of rays over the usual number
-    rays : list of Rays, None of views that were not cast
+    share : float, number of rays over the usual number
+    rays : list of Rays, None of views that are not cast
     """
 
     def __init__(
@@ -85,7 +92,7 @@ class RaySample:
         self.rays: list[Rays | None] = [None] * len(views)
 
     def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:
-        """Colours in which view `number` sees the splats that its rays hit, (3, u)."""
+        """Colours in which view `number` sees the splats that its rays hit, (3, u) float64."""
         return colors_from(self.splats, self.splat_rows[rays.hit], self.views[number][0])
 
     def wants(self, number: int) -> bool:
@@ -114,7 +121,7 @@ class RaySample:
         return [k for k, rays in enumerate(self.rays) if rays is not None and len(rays.ray)]
 
     def validating(self) -> list[int]:
-        """Numbers of the views that slow comparisons use."""
+        """Numbers of the validation views, at most `VALIDATION_VIEWS` of those that see splats."""
         seeing = self.seeing()
         return seeing[:: max(math.ceil(len(seeing) / VALIDATION_VIEWS), 1)]
 
@@ -127,7 +134,7 @@ class RaySample:
 def validation_rays(
     splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
 ) -> RaySample:
-    """Validation rays of all views, for scores that did not project splats."""
+    """Validation rays of all views into splats in their frame; `Cancelled` if progress says so."""
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
@@ -144,7 +151,13 @@ def cast_view(
     scoring: bool = False,
     share: float = 1.0,
 ) -> Rays:
-    """Rays of view `number` of the `views` of a sample, which share its rays; see `RaySample`."""
+    """Rays of view `number` of the `views` of a sample, which share its rays equally.
+
+    Parameters
+    ----------
+    views, scoring, share : as of `RaySample`
+    footprints : Footprints of that view
+    """
     view = views[number][0]
     rays_of_all, hits_of_all = VALIDATION_RAYS, MAX_VALIDATION_HITS
     if scoring:
@@ -157,7 +170,7 @@ def cast_view(
 
 
 def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
-    """Colours in which a view sees n splats by their rows, (3, n), at least 0.
+    """Colours in which a view sees n splats by their rows, (3, n), 0 to `BRIGHTEST`.
 
     All harmonics count: by the constant alone the estimated PSNR was 1.2 dB too high outdoors.
     """
@@ -169,7 +182,10 @@ def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[
 
 
 def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Ascending columns and rows of about `count` pixels, evenly spread, others by `number`."""
+    """Columns, (C,), and rows, (R,), ascending, of about `count` pixels, evenly spread.
+
+    `number` shifts them, by an R2 sequence: other numbers give other pixels.
+    """
     count = max(count, MIN_RAYS_OF_VIEW)
     columns = max(round(math.sqrt(count * view.width / view.height)), 1)
     columns = min(columns, view.width, max(int(count), 1))
@@ -181,7 +197,7 @@ def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], 
 
 
 def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
-    """`count` of `size` pixels, evenly spread and ascending; `start`, 0 to 1, shifts them."""
+    """Indices of `count` of `size` pixels, evenly spread; `start`, 0 to 1, shifts them."""
     places = (np.arange(count) + start) * (size / count)
     return np.floor(places).astype(np.int64)
 
@@ -197,10 +213,15 @@ def depth_complexity(footprints: Footprints, view: View) -> float:
 def aimed(
     view: View, columns: NDArray[np.int64], rows: NDArray[np.int64], targets: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """Column and row of the pixel of each ray, (2, P), aimed at targets, (2, t) px in the image.
+    """Column and row of the pixel of each of P rays, (2, P), aimed at targets.
 
-    Ascending columns and rows make cells of one ray each: it goes through the first target in its
-    cell, or where column and row cross.
+    Columns and rows divide the image into cells of one ray each. It goes through the first target
+    in its cell, or where column and row cross.
+
+    Parameters
+    ----------
+    columns, rows : (C,), (R,) int64, ascending; P = C R
+    targets : (2, t) float32, px
     """
     row, column = np.divmod(np.arange(len(columns) * len(rows)), len(columns))
     aims = np.stack([columns[column], rows[row]])
@@ -222,18 +243,24 @@ def cast(
     rows: NDArray[np.int64],
     aims: NDArray[np.int64] | None = None,
 ) -> Rays:
-    """Rays with all their hits on footprints, front to back, of an alpha of `ALPHA_CUT` or more."""
-    found = hits(footprints, columns, rows, _PAIRS, aims=aims)
-    return _front_to_back(footprints, columns, rows, aims, found)
+    """Rays with all their hits of alpha `ALPHA_CUT` or more, front to back.
+
+    Parameters
+    ----------
+    columns, rows : (C,), (R,) int64, ascending, of the pixels
+    aims : (2, P) int64, optional, column and row of each ray instead (`aimed`)
+    """
+    pieces = hits(footprints, columns, rows, _PAIRS, aims=aims)
+    return _front_to_back(footprints, columns, rows, aims, pieces)
 
 
 def cast_visible(
     footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]
 ) -> tuple[Rays, NDArray[np.float32]]:
-    """The same as `Rays.visible` of `cast`, but stops rays behind opaque hits."""
+    """`Rays.visible` of what `cast` gives, in less time: rays end behind opaque hits."""
     log_left = np.zeros(len(columns) * len(rows))
 
-    def found():
+    def visible_hits():
         for piece in hits(footprints, columns, rows, _PAIRS, wanted):
             yield piece
             log_left[:] += np.bincount(piece[1], np.log1p(-piece[2]), len(log_left))
@@ -241,15 +268,16 @@ def cast_visible(
     def wanted(_footprint, ray):
         return (log_left > LOG_OPAQUE - _MARGIN).take(ray)
 
-    return _front_to_back(footprints, columns, rows, None, found()).visible()
+    return _front_to_back(footprints, columns, rows, None, visible_hits()).visible()
 
 
-def _front_to_back(footprints, columns, rows, aims, found):
+def _front_to_back(footprints, columns, rows, aims, of_hits):
+    """Rays with the hits that `hits` yields, sorted by ray."""
     # The smallest types hold them. A view has fewer than 2^16 rays: NumPy sorts numbers of 16 bits
     # by radix, in linear time.
     types = np.int32, np.uint16, np.float32
     pieces = [[np.empty(0, kind) for kind in types]]
-    pieces += [[*map(np.ndarray.astype, piece, types)] for piece in found]
+    pieces += [[*map(np.ndarray.astype, piece, types)] for piece in of_hits]
     footprint, ray, alpha = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
     order = np.argsort(ray, kind="stable")  # footprints are front to back, and so stay hits
     used = np.zeros(len(footprints.index), np.bool_)
@@ -274,11 +302,18 @@ def hits(
     *,
     aims: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
-    """Yield hits: ascending rows of some footprints at a time, rays, and alphas, (h,) each.
+    """Yield hits of some footprints at a time: ascending rows of these, rays, alphas, (h,) each.
 
-    limit : about how many pairs of footprint and pixel in its bounding box are held at once
-    wanted : callable of footprints and pixels, (p,) each: which pairs matter, (p,) bool
-    aims : (2, P) int64, see `Rays`
+    Parameters
+    ----------
+    columns, rows : (C,), (R,) int64, ascending: the rays, see `Rays`
+    limit : int, about how many pairs of footprint and pixel in its bounding box are held at once
+    wanted : callable, optional, of footprints and rays, (p,) each: which pairs to test, (p,) bool
+    aims : (2, P) int64, optional, see `Rays`
+
+    Raises
+    ------
+    Cancelled
     """
     squared_radius = _squared_radius(footprints.alphas)  # (n,)
     # Of each footprint: the first column and row in its bounding box, and how many lie in it.

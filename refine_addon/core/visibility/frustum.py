@@ -2,8 +2,8 @@
 
     near <= z <= far,   0 <= fx x / z + cx <= width,   0 <= fy y / z + cy <= height
 
-The latter are computed as ``|f x + offset z| <= half z``, the offset from the image's centre to the
-principal point: without division, and False behind the camera.
+The last two are computed as ``|f x + offset z| <= half z``, without division, so they are False
+behind the camera; the offset is from the image's centre to the principal point.
 """
 
 from __future__ import annotations
@@ -47,12 +47,18 @@ def image_sides(view: View) -> tuple[Side, Side]:
 
 
 def clip_planes(view: View, near: float) -> tuple[float, float]:
-    """Near and far plane, world units; `near` is for views that have none of their own."""
+    """Near and far plane, world units; `near` if the view has none of its own."""
     return (view.near if view.near > 0.0 else near), view.far
 
 
 def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> NDArray[np.bool_]:
-    """Which points, (3, n) in camera coordinates x right, y down, z forward, lie in a view."""
+    """Which of n points lie in a view's frustum, (n,).
+
+    Parameters
+    ----------
+    local : (3, n) floating, camera coordinates: x right, y down, z forward
+    planes : near and far, in the unit of the points
+    """
     x, y, z = local
     inside: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
     for coordinate, side in zip((x, y), image_sides(view), strict=True):
@@ -61,10 +67,16 @@ def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> ND
 
 
 class Frustums:
-    """The frustums of V views; points are relative to `origin`, (3,), to keep digits far from zero.
+    """The frustums of V views, for points relative to an origin, to keep digits far from zero.
 
-    near : for views that have no near plane of their own, world units, > 0
-    centers : (V, 3) float64, relative to the origin
+    Parameters
+    ----------
+    origin : (3,) float64, world units
+    near : float, > 0, for views that have no near plane of their own, world units
+
+    Attributes
+    ----------
+    centers : (V, 3) float64, of the views, relative to the origin
     beyond_per_unit : (V, 1) float64, growth of `project`'s `beyond` per unit away from a side
     """
 
@@ -83,10 +95,15 @@ class Frustums:
     def classify(
         self, low: NDArray[np.float64], high: NDArray[np.float64], reach: NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which views may see part of k boxes, and which surely see all of them, (V, k) bool each.
+        """Which views may see part of each box, and which surely see all of it, (V, k) bool each.
 
-        Boxes are low and high corners, (3, k). Points of a box not touched lie beyond a plane, or
-        their ``beyond`` (`project`) is at least `reach`, (k,), times `beyond_per_unit`.
+        Points of a box that a view does not touch lie beyond a plane, or their ``beyond``
+        (`project`) is at least `reach` times `beyond_per_unit`.
+
+        Parameters
+        ----------
+        low, high : (3, k) float64, corners of k boxes
+        reach : (k,) float64, world units, from how far outside an image their points count
         """
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         x, y, z = self._rows
@@ -109,12 +126,20 @@ class Frustums:
     def project(
         self, points: NDArray[np.float64], views: NDArray[np.int64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Depth of points (x, y, z, 1), (4, n), in b views, (b, n); in the first c, (c, n) each:
+        """Where points lie in some views. Depths and `beyond` last until this thread's next call.
 
-        beyond : ``max(|x'|, |y'|) - depth``, x' and y' in half images at depth 1: <= 0 in the image
-        between : whether they lie between near and far plane
+        Parameters
+        ----------
+        points : (4, n) float64: x, y, z, 1
+        views : (b,) int64, numbers of views
+        count : int, c, of how many of these more than the depth is wanted
 
-        The first two are overwritten by this thread's next call.
+        Returns
+        -------
+        depth : (b, n)
+        beyond : (c, n), ``max(|x'|, |y'|) - depth``, x' and y' in half images at depth 1: at most 0
+            in the image
+        between : (c, n) bool, whether the points lie between near and far plane
         """
         end = len(views) + 2 * count
         stack = np.zeros((-(-end // _STACK), _STACK, 4))

@@ -1,10 +1,11 @@
-"""What views see of each splat, with T the transmittance before it and B the colour behind it:
+"""What views see of each splat, with T the transmittance in front and B the colour behind it:
 
     contribution_i = sum over views of  integral of alpha_i  x  mean T        MesonGS, LightGaussian
     error_i        = sum over views of  integral of alpha_i^2  x  mean of T^2 |c_i - B_i|^2
 
-Points sorted by depth in cells of the image (`points`) replace a grid: one of mass m has the
-optical depth ``-log(1 - m / A)`` in a cell of area A, and running sums down a cell give T and B.
+Nothing is rendered. Points stand for the splats, sorted by depth in cells of the image (`points`):
+one of mass m has the optical depth ``-log(1 - m / A)`` in a cell of area A, and running sums down a
+cell give T and B. docs/method.md, section 4, derives it.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from .rays import contrasts, in_front, paired
 from .scene import Scene
 
 VIEW_GROUPS = 8
-"""Sums over views are added group by group, so they do not depend on threads."""
+"""Groups of views: sums are added group by group, so they do not depend on threads."""
 
 SECONDS = 1.2e-6
 """Seconds of one core for a splat in a view, about; decides whether processes are worth it."""
@@ -38,11 +39,11 @@ SECONDS = 1.2e-6
 GAMMA_SHAPE = 2.3
 """Shape of the gamma distribution in `_transmittance`; the larger, the nearer to exp(-mean)."""
 
-_MAX_THICKNESS = 60.0
+_MAX_DEPTH = 60.0
 """Nothing is seen behind a larger optical depth; keeps exponentials in float32's range."""
 
 _LEAST_LEFT = 1e-4
-"""Least transmittance that the colour behind a point is divided by; less cannot be seen."""
+"""Least transmittance behind a point, by which the colour behind is divided; less shows nothing."""
 
 _ADDED = 1 << 16  # splats of a view that are added to the sums at a time
 
@@ -73,7 +74,7 @@ class Measured(NamedTuple):
         return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
 
     def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
-        """Sums of `count` splats: these at `index`, 0 for all others."""
+        """Sums of `count` splats: these at `index`, (M,), 0 for all others."""
         every = Measured.zero(count)
         for name in self._fields:
             getattr(every, name)[index] = getattr(self, name)
@@ -120,11 +121,26 @@ def measure(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Measured, list[Measured], list[NDArray[np.float64]]]:
-    """Sums over the views of groups, and of each group for a sample, with its errors in each view.
+    """Measure Gaussians in views, and cast rays while their footprints are there.
 
-    views : sequence of (View, float), with weights, see `ViewSet.by_distance`
-    sample : (m,) int64, rows of Gaussians; the errors are (views, m) for each group
+    Parameters
+    ----------
+    gaussians, scene : as of `projection.prepare`
+    views : sequence of (View, weight), see `ViewSet.by_distance`
+    groups : numbers of the views to use, in groups (`view_groups`)
+    sample : (m,) int64, rows of Gaussians
     ray_samples : sequence of RaySample, which get the rays of these views that they lack
+    progress, threads : see `prune`
+
+    Returns
+    -------
+    Measured : (M,), over all groups
+    list of Measured : (m,), of the sample, over each group
+    list of (views, m) float64 : errors of the sample in each view of each group
+
+    Raises
+    ------
+    Cancelled
     """
     rows, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
     lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]
@@ -147,12 +163,12 @@ def measure(
         total.add(sums)
         of_groups.append(sums.take(rows))
         errors.append(np.array(of_views))
-    next(each, None)  # lets it end
+    next(each, None)  # so that `run` ends
     return total, of_groups, errors
 
 
 def _measure_and_cast(gaussians, scene, views, sampling, number_and_kinds):
-    """What a view sees of the splats, and its scoring or validation rays; any process can."""
+    """What a view sees of the splats, and its scoring or validation rays, in any process."""
     number, kinds = number_and_kinds
     footprints, measurement = _measure_view(gaussians, scene, views[number][0], sampling)
     with np.errstate(under="ignore"):
@@ -162,7 +178,7 @@ def _measure_and_cast(gaussians, scene, views, sampling, number_and_kinds):
 
 
 def _measure_view(gaussians, scene, view, sampling):
-    """Footprints in a view; their rows, which are inside, contributions and errors, (n,) each."""
+    """Footprints in a view; rows, whether centres are inside, contributions, errors, (n,) each."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         integrals = np.empty(0), np.empty(0)
@@ -200,8 +216,8 @@ def _integrals(footprints, colors, points):
         of_points = traits.take(points.owners[members], axis=0)
         covered = shares * of_points[:, 3]  # of the cell; at most the splat's opacity
         np.minimum(covered, of_points[:, 4], out=covered)
-        thick = -np.log(np.float32(1.0) - covered)
-        sums = in_front(paired(thick, thick * of_points[:, 5]), counts)
+        depth = -np.log(np.float32(1.0) - covered)  # optical
+        sums = in_front(paired(depth, depth * of_points[:, 5]), counts)
         front, even = sums.real.astype(np.float32), sums.imag.astype(np.float32)
         weight = _transmittance(front, even)
         weight *= shares
@@ -226,7 +242,7 @@ def _evenness(footprints, area):
 def _transmittance(front, even):
     """Transmittance in front of points, (m,), of mean optical depth `front`, `even` without gaps.
 
-    The rest, gamma distributed with shape k, passes ``E[exp(-tau)] = (1 + mean / k)^-k``: with
+    The rest, gamma distributed with shape k, lets ``E[exp(-tau)] = (1 + mean / k)^-k`` through: by
     exp(-mean), splats that show through foliage would count as hidden.
     """
     shape = np.float32(GAMMA_SHAPE)
@@ -236,7 +252,7 @@ def _transmittance(front, even):
 
 def _squared_contrast(front, covered, colors, counts):
     """``|c_k - B_k|^2`` of points, (m,), ``B_k = (sum over j > k of T_j a_j c_j) / T_{k+1}``."""
-    weight = np.exp(-np.minimum(front, np.float32(_MAX_THICKNESS)))  # T_k
+    weight = np.exp(-np.minimum(front, np.float32(_MAX_DEPTH)))  # T_k
     left = np.maximum(weight * (np.float32(1.0) - covered), np.float32(_LEAST_LEFT))  # T_{k+1}
     weight *= covered  # T_k a_k
     return sum(contrast * contrast for contrast in contrasts(weight, left, colors.T, counts))

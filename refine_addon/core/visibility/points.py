@@ -1,7 +1,7 @@
 """Points over the footprints of a view, sorted by depth within the square cells of the image.
 
-Lattices of points stand for the normal distribution, with more points the more cells it covers.
-Each has a share of the splat's mass, the integral of its alpha.
+A lattice of points stands for a splat's normal distribution, with more points the more cells that
+covers. Each point has a share of the splat's mass, the integral of its alpha.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WIDE_EXTENT = 3.0
 """Standard deviations to which a lattice of many points reaches."""
 
 FEW_CELLS = 10_000
-"""An image may always have this many cells."""
+"""Most cells of an image, unless it shows many footprints (`FOOTPRINTS`)."""
 
 FOOTPRINTS = 4.0
 """Footprints for each cell beyond `FEW_CELLS`: cells much smaller than splats only cost points."""
@@ -41,7 +41,7 @@ MAX_POINTS = 1 << 22
 """Most points of a view, as estimated, about 100 bytes each: cells grow until it holds."""
 
 LEAST_POINTS = 1.25
-"""At least this many for each footprint: one has a point, however large the cells."""
+"""But this many for each footprint, if that is more: one has a point, however large the cells."""
 
 _EXTENT = 2.4  # standard deviations, of lattices of fewer than `_WIDE` points along an axis
 _WIDE = 8
@@ -57,7 +57,7 @@ _FAR = 15.0  # standard deviations; farther out a Gaussian is 0 in float32
 
 
 class _Lattices(NamedTuple):
-    """L lattices of P patches and K points: a patch that misses the image is not laid out."""
+    """L lattices of P patches, with K points in all; patches that miss the image are left out."""
 
     first: NDArray[np.int64]  # (L,), the first patch of each lattice
     patches: NDArray[np.int64]  # (L,), how many patches it has
@@ -74,7 +74,7 @@ class _Lattices(NamedTuple):
 class Points(NamedTuple):
     """The m points in an image, cell by cell, front to back, of n footprints in C cells.
 
-    Of a splat's points in a cell the first has all shares, so that it does not hide itself.
+    Of a splat's points in a cell the first has all their shares: a splat does not hide itself.
     """
 
     owners: NDArray[np.int32]  # (m,), rows of the `Footprints`
@@ -86,7 +86,10 @@ class Points(NamedTuple):
 
 
 def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Yield runs of groups of `sizes` with about `_BLOCK` members: slices of groups and members."""
+    """Yield slices of groups, and of their members, about `_BLOCK` members at a time.
+
+    `sizes`, (G,), are the numbers of members.
+    """
     ends = np.cumsum(sizes)
     cuts = np.searchsorted(ends, np.arange(_BLOCK, int(sizes.sum()), _BLOCK)) + 1
     start = member = 0
@@ -98,7 +101,10 @@ def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
 
 
 def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
-    """Side of a cell, px: `cell`, or larger by `FOOTPRINTS`, `MAX_CELLS` or `MAX_POINTS`."""
+    """Side of a view's cells, px: `cell`, or more to keep `FOOTPRINTS`, `MAX_CELLS`, `MAX_POINTS`.
+
+    `cell` and `density` are those of `measuring.Sampling`.
+    """
     needed = max(FEW_CELLS, len(footprints.index) / FOOTPRINTS)
     side = max(cell, math.sqrt(view.width * view.height / min(needed, MAX_CELLS)) * _SLACK)
     while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:
@@ -113,7 +119,7 @@ def cell_size(footprints: Footprints, view: View, cell: float, density: float) -
 
 
 def scatter(footprints: Footprints, view: View, side: float, density: float) -> Points:
-    """Points over footprints, front to back, in cells of `side` px; for density see `Sampling`."""
+    """Points over footprints, front to back, in cells of `side` px; `density` is `Sampling`'s."""
     kinds = _kinds(footprints, view, density / side)  # (n,)
     # Half axes, major, minor, and centre, each across and down, in cells, (6, n).
     axes = np.concatenate([footprints.major, footprints.minor, footprints.centers])
@@ -142,7 +148,7 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
 
 
 def _kinds(footprints, view, scale):
-    """Lattice of each footprint, (n,); `scale` is points per pixel of sigma."""
+    """Number of each footprint's lattice, (n,); `scale` is points per pixel of sigma."""
     place_of = np.searchsorted(COUNTS, np.arange(COUNTS[-1] + 1)).astype(np.uint8)
     wanted = np.ceil((footprints.sigmas * np.float32(scale)).clip(1.0, COUNTS[-1]))  # (2, n)
     index = place_of[wanted.astype(np.int64)]  # (2, n)
@@ -154,7 +160,7 @@ def _kinds(footprints, view, scale):
 
 
 def _patches(axes, size, kinds):
-    """Patches whose boxes reach into the image: footprint, row of the table, and if whole, (q,)."""
+    """Patches that may reach into the image: footprint, patch, whether all is inside, (q,) each."""
     table = _lattices()
     count = table.patches.take(kinds)  # (n,)
     rows = np.repeat(np.arange(len(kinds)), count)  # (q,), as all that follows
@@ -237,7 +243,7 @@ def _cell_numbers(positions, size):
 
 
 def _flat_points(footprints, row, view, side):
-    """Cells, (FLAT^2,), and shares, density times area, (r, FLAT^2), of the widest footprints."""
+    """Cells, (FLAT^2,), and shares, density times area, (r, FLAT^2), of r vast footprints."""
     points = _lattices().points[:, -(FLAT**2) :]
     u = np.float32(view.width / 2) * (points[0] + 1)
     v = np.float32(view.height / 2) * (points[1] + 1)
@@ -273,7 +279,7 @@ def _merge(owners, shares, squares, counts):
 
 @functools.cache
 def _lattices():
-    """Lattice ``i len(COUNTS) + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points, the last `FLAT`."""
+    """Lattice ``i len(COUNTS) + j``: ``COUNTS[i]`` by ``COUNTS[j]`` points; the last is `FLAT`."""
     axes = [_axis(count) for count in COUNTS]
     steps = (np.arange(FLAT) + 0.5) / FLAT * 2.0 - 1.0
     flat = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)
@@ -293,7 +299,7 @@ def _lattices():
 
 
 def _lattice(major, minor):
-    """Points, (2, k), shares, (k,), and patch sizes of a grid without corners, of variance 1."""
+    """Points, (2, k), of variance 1, shares, (k,), and patch sizes of a grid without corners."""
     product = np.outer(major[1], minor[1])  # (k_major, k_minor), shares
     place = np.broadcast_arrays(major[0][:, None], minor[0])  # (k_major, k_minor) each
     extent = WIDE_EXTENT if max(product.shape) >= _WIDE else _EXTENT
@@ -315,7 +321,7 @@ def _lattice(major, minor):
 
 
 def _axis(count):
-    """Places and shares of the normal distribution: means of equal bins, variance 1."""
+    """Places and shares of `count` equally wide bins of the normal distribution, of variance 1."""
     if count == 1:
         return np.zeros(1), np.ones(1)
     extent = WIDE_EXTENT if count >= _WIDE else _EXTENT

@@ -37,16 +37,16 @@ CUT_SIGMAS = 3.3
 """Standard deviations to which a footprint reaches: alpha = 1 falls to `ALPHA_CUT` at 3.33."""
 
 BRIGHTEST = 16.0
-"""Colours are clipped to this, white being 1; keeps sums finite."""
+"""Largest colour, white being 1: others are clipped, to keep sums finite."""
 
 LOG_SCALE_RANGE = (-16.0, 5.0)
-"""Logarithms of scales over the size of the scene; beyond them float32 would overflow."""
+"""Logarithms of scales over the scene's size are clipped to it: beyond, float32 would overflow."""
 
 CHUNK = 1 << 16
-"""Gaussians in files that have one box, 3.7 MB; a multiple of those that are projected together."""
+"""Gaussians of a box in files, 3.7 MB; a multiple of those projected at a time."""
 
 _CHUNK = 1 << 14
-_FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
+_FARTHEST = 1e6  # scene sizes; splats farther from the middle count as in no view
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
 _FARTHEST_VIEW = 1e18  # scene sizes; a view farther away sees the scene as one point
 _LARGEST_LENS = 1e9  # px; beyond this or `_FARTHEST_VIEW` float32 would overflow
@@ -61,9 +61,10 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """The M splats that can contribute to a picture, in scene frame and sizes, by `spatial_order`.
+    """The M splats that can contribute to a picture, by `spatial_order`.
 
-    In files, means, covariances and normals are (C, k, CHUNK): a view reads the boxes it may show.
+    Lengths are scene sizes, in the scene's frame. In files, means, covariances and normals are (C,
+    k, CHUNK) instead of (k, M): a view reads the boxes that it may show.
     """
 
     index: NDArray[np.int64]  # (M,), rows of the splats
@@ -80,7 +81,7 @@ class Gaussians:
         return len(self.index)
 
     def parts(self, scene: Scene, view: View, window: View) -> Iterator[tuple[int, Gaussians]]:
-        """Yield Gaussians in memory that may reach into a window, and the row of the first."""
+        """Yield first row, and Gaussians in memory, of parts that may reach into a window."""
         if self.boxes is None:
             yield 0, self
             return
@@ -138,10 +139,23 @@ def prepare(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Gaussians, Scene, NDArray[np.bool_]]:
-    """Activate the splats once for all views; `scene` is the frame, by default theirs.
+    """Activate splats once for all views.
 
-    Gaussians are those that can be drawn, with an opacity above `ALPHA_CUT`; the last value is
-    which of the N splats can be drawn.
+    Parameters
+    ----------
+    splats : Splats, N in the frame and unit of the views
+    scene : Scene, optional, the frame of the Gaussians; by default that of splats and views
+    progress, threads : see `prune`
+
+    Returns
+    -------
+    Gaussians : splats that can be drawn and are more opaque than `ALPHA_CUT`
+    Scene
+    (N,) bool : which splats can be drawn
+
+    Raises
+    ------
+    Cancelled
     """
     good, opaque = np.empty((2, len(splats)), np.bool_)
 
@@ -166,8 +180,8 @@ def prepare(
         positions, lambda rows: splat_fingerprint(splats, index[rows]), threads=threads
     )
     make = _activate if folder_of(splats) is None else _activate_on_disk
-    told = part(progress, 0.4, 1.0)
-    return make(splats, index[order], positions[order], scene, told, threads), scene, good
+    later = part(progress, 0.4, 1.0)
+    return make(splats, index[order], positions[order], scene, later, threads), scene, good
 
 
 def _activate_on_disk(splats, index, positions, scene, progress, threads):
@@ -177,20 +191,20 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
     def columns(piece):
         part = _activate(bare, index[piece], positions[piece], scene, silent, 1)
         low, high = part.means.min(axis=1), part.means.max(axis=1)
-        made = {name: getattr(part, name) for name in ("index", "largest", "alphas", "colors")}
-        made["boxes"] = np.concatenate([low, high, [part.largest.max()]])[None]
+        arrays = {name: getattr(part, name) for name in ("index", "largest", "alphas", "colors")}
+        arrays["boxes"] = np.concatenate([low, high, [part.largest.max()]])[None]
         for name in ("means", "covariances", "normals"):
             if (values := getattr(part, name)) is not None:
-                made[name] = np.zeros((1, len(values), CHUNK), np.float32)
-                made[name][0, :, : len(part)] = values
-        return made
+                arrays[name] = np.zeros((1, len(values), CHUNK), np.float32)
+                arrays[name][0, :, : len(part)] = values
+        return arrays
 
     if not len(index):
         return _activate(bare, index, positions, scene, progress, threads)
-    made = run(columns, chunks(len(index), CHUNK), progress=progress, what="reading",
-               threads=threads)  # fmt: skip
+    parts = run(columns, chunks(len(index), CHUNK), progress=progress, what="reading",
+                threads=threads)  # fmt: skip
     folder = folder_of(splats) / f"gaussians-{secrets.token_hex(4)}"  # type: ignore[operator]
-    arrays = write(folder, made)
+    arrays = write(folder, parts)
     arrays["boxes"] = arrays["boxes"][...]
     gaussians = Gaussians(**arrays, model=splats.model)
     weakref.finalize(gaussians, shutil.rmtree, folder, ignore_errors=True)
@@ -240,7 +254,13 @@ def project(
 
     The covariance is ``C + 0.3 I``, ``C = J W S W' J'`` (Zwicker et al., "EWA splatting", 2002, Eq.
     31), J the Jacobian at the mean; antialiased opacity is ``o sqrt(det C / det(C + 0.3 I))``.
-    Equal depths keep their order.
+    Splats with centres nearer than the near plane or beyond the far one have no footprint. Equal
+    depths keep their order.
+
+    Parameters
+    ----------
+    gaussians : Gaussians, M in the frame of `scene`
+    view, window : View; a window has the view's pose and lens, and may be smaller
     """
     planes, discs = clip_planes(scene, view), gaussians.normals is not None
     turned = (view.rotation @ scene.axes.T).astype(np.float32)
@@ -286,7 +306,7 @@ def project(
 def in_camera(
     gaussians: Gaussians, scene: Scene, view: View
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Centres, (3, M), and covariances, (6, M), in camera coordinates, scene sizes."""
+    """Centres, (3, M), and covariances, (6, M), in camera coordinates and scene sizes, float32."""
     turned = _product(_rotation6(view.rotation @ scene.axes.T), gaussians.covariances)
     return coordinates(gaussians.means, scene, view), turned
 
@@ -295,8 +315,8 @@ def _computable(scene, view):
     """Whether float32 can hold this view's coordinates; if not, the view counts as empty."""
     away = float(np.abs(view.center - scene.origin).max())
     lens = (view.fx, view.fy, abs(view.cx), abs(view.cy), view.width, view.height)
-    known = min(view.fx, view.fy) >= 1.0 / _LARGEST_LENS and max(lens) <= _LARGEST_LENS
-    return known and away <= _FARTHEST_VIEW * scene.size
+    usual = min(view.fx, view.fy) >= 1.0 / _LARGEST_LENS and max(lens) <= _LARGEST_LENS
+    return usual and away <= _FARTHEST_VIEW * scene.size
 
 
 def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
@@ -306,7 +326,7 @@ def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
 
 
 def coordinates(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
-    """Camera coordinates of centres, (3, M), scene sizes."""
+    """Camera coordinates, (3, M) float32 scene sizes, of means in the scene's frame, (3, M)."""
     shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
     local = _product((view.rotation @ scene.axes.T).astype(np.float32), means)
     local -= shift[:, None]
@@ -316,7 +336,7 @@ def coordinates(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray
 def _product(matrix, columns):
     """A matrix times columns, (n, M), each summed in the same order.
 
-    BLAS rounds by a column's place: a splat would differ in a tile and among all.
+    BLAS rounds by a column's place: a splat would differ between its tile and one file.
     """
     result = np.multiply.outer(matrix[:, 0], columns[0])
     for factors, row in zip(matrix.T[1:], columns[1:], strict=True):
@@ -341,7 +361,11 @@ def boxes_touch(
 ) -> NDArray[np.bool_]:
     """Which of B boxes may hold a Gaussian that reaches into a window of a view, (B,).
 
-    Boxes, (B, 7): least and greatest means, longest standard deviation; scene frame and sizes.
+    Parameters
+    ----------
+    boxes : (B, 7) float32, least means, greatest means and longest standard deviation, in the
+        scene's frame and sizes
+    window : View, optional, part of the image; by default all of it
     """
     if not _computable(scene, view):
         return np.zeros(len(boxes), np.bool_)
@@ -402,7 +426,7 @@ def _near_image(across, down, view):
 def jacobian(
     gaussians: Gaussians, scene: Scene, view: View
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """J W of Gaussians: px of column and row per scene size along the scene's axes, (M, 3) each."""
+    """Rows of J W of Gaussians, (M, 3) each: px, across and down, per scene size along its axes."""
     x, y, z = coordinates(gaussians.means, scene, view).astype(np.float64)
     across, down = _near_image(x / z, y / z, view)
     turned = view.rotation @ scene.axes.T  # W

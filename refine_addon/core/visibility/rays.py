@@ -2,8 +2,8 @@
 
     C = sum over hits of  T alpha c,    T = product over the hits in front of  1 - alpha
 
-Values of all rays lie one after the other. Running sums restart at each ray, without a loop;
-likewise down the columns of points in `measuring`.
+The hits of all rays lie one after the other. Running sums restart at each ray, without a loop;
+`measuring` sums down its columns of points with the same functions.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from numpy.typing import NDArray
 from ..execute import checkpoint
 
 LOG_OPAQUE = -9.3
-"""Logarithm of the transmittance below which nothing is seen, 1e-4."""
+"""Logarithm of the transmittance, 1e-4, below which nothing is seen."""
 
 LEAST_LEFT = 1e-8
-"""Least divisor of the colour behind a hit; hidden hits are gone, so it only guards against 0."""
+"""Least transmittance behind a hit, as a divisor: hidden hits are gone, so it only replaces 0."""
 
 _PIECE = 1 << 15  # hits processed at a time: what stays in the second-level cache
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """The P = C R rays of one view, where columns and rows cross, and their h hits on u splats."""
+    """The P = C R rays of a view, where columns and rows cross, and their h hits on u Gaussians."""
 
     columns: NDArray[np.int64]  # (C,), ascending
     rows: NDArray[np.int64]  # (R,), ascending; rays are numbered row by row
     ray: NDArray[np.int32]  # (h,), ascending; the hits of a ray are front to back
-    owner: NDArray[np.int32]  # (h,), the splat as a place in `hit`
+    owner: NDArray[np.int32]  # (h,), the Gaussian that is hit, as a place in `hit`
     alpha: NDArray[np.float32]  # (h,)
     log_passed: NDArray[np.float32]  # (h,), log(1 - alpha)
     hit: NDArray[np.int64]  # (u,), rows of Gaussians, ascending
@@ -54,11 +54,11 @@ class Rays:
         return self.columns.take(ray % len(self.columns)), self.rows.take(ray // len(self.columns))
 
     def keeping(self, keep: NDArray[np.bool_]) -> Rays:
-        """The rays with their hits on the splats `keep`, (u,) bool, alone."""
+        """The rays with only their hits on the splats `keep`, (u,) bool."""
         return self._with_hits(np.flatnonzero(keep.take(self.owner)))
 
     def visible(self) -> tuple[Rays, NDArray[np.float32]]:
-        """The rays without hidden hits, which see the same; transmittance before each hit, (h,)."""
+        """The rays without hidden hits, which show the same; transmittance in front, (h,)."""
         kept, log_front = self._seen()
         owner = self.owner.take(kept)
         used = np.zeros(len(self.hit), np.bool_)
@@ -79,7 +79,7 @@ class Rays:
         return result.clip(0.0, 1.0)
 
     def contributions(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-        """Ray, owner and ``T alpha``, the share of the pixel, of hits not hidden, (r,) each."""
+        """Ray, owner and T alpha, the share of the pixel, of visible hits, (r,) each."""
         seen, log_front = self._seen()
         return self.ray.take(seen), self.owner.take(seen), self.alpha.take(seen) * np.exp(log_front)
 
@@ -94,10 +94,10 @@ class Rays:
     def removal_errors(
         self, colors: NDArray[np.float32]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Error and contribution of each splat over all rays, (u,) each, of colours (3, u).
+        """Error and contribution of each splat, (u,) each, summed over rays; colours are (3, u).
 
-        The error is ``sum (T alpha)^2 |c - B|^2`` over all channels, B the colour behind; the
-        contribution is ``sum T alpha``, px.
+        The error is ``sum (T alpha)^2 |c - B|^2``, B the colour behind, the contribution ``sum T
+        alpha`` (docs/method.md, section 5).
         """
         ends = np.append(self._first_hits(), len(self.ray))
         cuts = np.unique(np.searchsorted(ends, [*range(0, len(self.ray), _PIECE), len(self.ray)]))
@@ -118,8 +118,8 @@ class Rays:
     ) -> NDArray[np.float64]:
         """Colour of each ray, (3, P), 0..1, if kept splats, (u,) bool, stand in for removed ones.
 
-        A removed splat keeps its opacity and takes the colour of the ray's nearest kept hit,
-        counted in hits, of two the one in front; black where there is none.
+        A removed splat keeps its alpha and takes the colour of the ray's nearest kept hit, counted
+        in hits: of two, that of the one behind; black where there is none.
         """
         kept, here = keep.take(self.owner), np.arange(len(self.owner))
         none = len(here)  # farther than any hit
@@ -146,7 +146,7 @@ class Rays:
         return np.flatnonzero(new)
 
     def _seen(self):
-        """The hits that are not hidden, and the logarithm of the transmittance in front of them."""
+        """Visible hits, (r,), and the logarithms of the transmittance in front of them."""
         log_front = in_front(self.log_passed.astype(np.float64), self.counts())
         seen = np.flatnonzero(log_front > LOG_OPAQUE)
         return seen, log_front.take(seen).astype(np.float32)
@@ -179,7 +179,7 @@ def paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[A
 
 
 def in_front(values: NDArray[Any], counts: NDArray[np.int64]) -> NDArray[Any]:
-    """Sum of values, (m,), in front of each in its column; `counts`, (C,) >= 1, sizes columns.
+    """Sums of the values, (m,), in front of each in its column; columns have `counts`, (C,) >= 1.
 
     >>> in_front(np.array([1.0, 2.0, 4.0, 8.0]), np.array([3, 1])).tolist()
     [0.0, 1.0, 3.0, 0.0]
@@ -191,7 +191,7 @@ def in_front(values: NDArray[Any], counts: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def behind(values: NDArray[Any], counts: NDArray[np.int64]) -> NDArray[Any]:
-    """Sum of values, (m,), behind each in its column, see `in_front`."""
+    """Sums of the values, (m,), behind each in its column, see `in_front`."""
     sums = np.cumsum(values)
     return np.repeat(sums.take(np.cumsum(counts) - 1), counts) - sums
 
@@ -202,7 +202,15 @@ def contrasts(
     colors: NDArray[np.float32],
     counts: NDArray[np.int64],
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield for each channel the colour behind each value less its own, (m,); weight: T alpha."""
+    """Yield B - c, colour behind less own colour, (m,), for each channel.
+
+    Parameters
+    ----------
+    weight : (m,) float32, T alpha of hits or points, front to back in columns
+    left : (m,) float32, > 0, transmittance behind each
+    colors : (3, m) float32
+    counts : (C,) int64, >= 1, how many each column has
+    """
     red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
     blue = behind((weight * colors[2]).astype(np.float64), counts)
     for own, light in zip(colors, (red_green.real, red_green.imag, blue), strict=True):

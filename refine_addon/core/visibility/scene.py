@@ -34,19 +34,20 @@ _SPREAD_BITS = (
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The frame of a scene, world units.
+    """The frame of a scene, in world units.
 
-    Size is ``sqrt(S + V)``, median squared distances to the origin of drawable splats and of views.
+    Size is ``sqrt(S + V)`` (docs/method.md, section 1): S is the median over drawable splats of the
+    squared distance to the origin, V that over views.
     """
 
     origin: NDArray[np.float64]  # (3,), geometric median of the views' centres
     size: float  # > 0
-    axes: NDArray[np.float64]  # (3, 3), to the frame: rows are the principal axes of the splats
+    axes: NDArray[np.float64]  # (3, 3), world to frame: rows are the splats' principal axes
 
     def positions(
         self, means: NDArray[Any], rows: NDArray[np.int64] | None = None, *, threads: int | None = 1
     ) -> NDArray[np.float64]:
-        """Positions in the frame, scene sizes, (M, 3), of means, (N, 3), or of M of their rows."""
+        """Positions in the frame, (M, 3) scene sizes, of world means (N, 3), or M of their rows."""
         count, turn = len(means) if rows is None else len(rows), self.axes.T / self.size
         places = np.empty((count, 3))
 
@@ -63,14 +64,20 @@ class Scene:
 
 
 def size_of(median: float) -> float:
-    """Size of a scene from S + V of `Scene`; 1 if the whole scene is one point."""
+    """Size of a scene, from S + V of `Scene`; 1 if all is in one point."""
     return float(np.sqrt(median)) or 1.0
 
 
 def scene_of(
     means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet, *, threads: int | None = 1
 ) -> Scene:
-    """Frame of drawable splats, means (N, 3) in world units, and views."""
+    """Frame of splats and views.
+
+    Parameters
+    ----------
+    means : (N, 3) floating, world units
+    drawable : (N,) bool; the others do not count
+    """
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
 
@@ -103,7 +110,10 @@ def _moments(means, scene):
 
 
 def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Principal axes as rows of a rotation, least variance first, from `_moments`, (4, 3)."""
+    """Principal axes as rows of a rotation, least variance first, from sums of positions p.
+
+    `total`, (4, 3), holds the sums of ``w p p'`` and of ``w p``, w a weight; the latter set signs.
+    """
     _, vectors = np.linalg.eigh(total[:3])  # in columns
     axes = (vectors * np.where(total[3] @ vectors < 0.0, -1.0, 1.0)).T
     if np.linalg.det(axes) < 0.0:
@@ -136,7 +146,7 @@ def spatial_order(
     *,
     threads: int | None = 1,
 ) -> NDArray[np.int64]:
-    """Order of positions, (N, 3) scene sizes, along a Z-curve (Morton, 1966): neighbours follow.
+    """Rows of positions, (N, 3) scene sizes, along a Z-curve (Morton, 1966): near ones are close.
 
     Those that agree in 21 bits a coordinate are ordered by ``ties(rows)``, or keep their order.
     """
