@@ -240,28 +240,28 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
     doing = "Comparing"
 
     def gather(self, context: Context) -> tuple[Members, Any]:
-        """Apply's arguments, the splats, and the active camera's view."""
+        """Apply's arguments, the splats, the active camera's view, and the present plan."""
         view = CameraChoice("ACTIVE").views(context, context.object)[0]
         group = selected(context)
         forced = splat_group.forced(context.scene, group)
         arguments = apply_arguments(context, group, forced)
         splats = arguments["splats"] or splat_group.gather(group, whole=None)
-        return [], (arguments, splats, ViewSet((replace(view, weight=1.0),)))
+        plan = plans.stored(context.object, context.scene.refine)
+        return [], (arguments, splats, ViewSet((replace(view, weight=1.0),)), plan)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> tuple[Comparison, float | None]:
         """Both pictures of the kept splats; the estimated PSNR, dB."""
-        arguments, splats, view = job
+        arguments, splats, view, _ = job
         decided = 0.6 if arguments["method"].changes else 0.1  # of the time, by then
         result = prune(**arguments, partial=True, progress=part(progress, 0.0, decided))
         kept = result.merged.splats if result.merged else splats.take(result.keep)
         (comparison,) = compare(splats, kept, view, progress=part(progress, decided, 1.0))
         return comparison, result.report["estimated_psnr"]
 
-    def put(self, context: Context, _group: Members, _job: Any, result: Any) -> None:
+    def put(self, context: Context, _group: Members, job: Any, result: Any) -> None:
         """Put the pictures into images, show them, report the PSNR."""
-        comparison, estimated = result
-        plan = plans.stored(context.object, context.scene.refine)
+        (*_, plan), (comparison, estimated) = job, result
         if plan is not None:
             plan["measured"] = comparison
         pixels = {kind: getattr(comparison, kind) / np.float32(255.0) for kind in KINDS}

@@ -315,3 +315,21 @@ def test_the_pictures_are_those_of_what_apply_leaves(addon, few, room_cameras, m
     for name, wanted in zip(made, ("before", "after", "difference"), strict=True):
         apart = np.abs(pixels(name).astype(int) - getattr(expected, wanted))
         assert apart.max() <= (8 if wanted == "difference" else 1)  # what is merged is float32 then
+
+
+def test_a_comparison_counts_for_the_budget_that_it_drew(addon, few, room_cameras, monkeypatch):
+    """Meanwhile the budget changes, and another object becomes the active one."""
+    scene, layer, compare = bpy.context.scene, bpy.context.view_layer, addon.ui.operators.compare
+    scene.camera = room_cameras.objects[24]
+    active = [few, scene.camera]
+
+    def meanwhile(*arguments, **options):
+        scene.refine.ratio += 0.1
+        layer.objects.active = active.pop(0)
+        return compare(*arguments, **options)
+
+    bpy.ops.refine.score()
+    monkeypatch.setattr(addon.ui.operators, "compare", meanwhile)
+    for _ in range(2):
+        assert bpy.ops.refine.compare() == {"FINISHED"}
+        assert addon.ui.operators.measured(few, scene.refine) == ""
