@@ -22,6 +22,7 @@ from ..core.quality.alignment import Alignment
 from ..core.quality.curve import Quality, Way, expected_seconds, in_words, out_of_reach, parted
 from ..core.report import MANY_UNSEEN, little_seen, sizes_in_words
 from ..core.selection import Budget, quality_of
+from ..core.splats import MODELS
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -53,6 +54,7 @@ _WORDS = {
     "matrix": "object moved",
     "cameras": "cameras changed",
     "must_go": "what must go changed",
+    "model": "Drawn As changed",
     "settings": "settings changed",
 }
 
@@ -273,6 +275,7 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
         "frame": context.scene.frame_current,
         "cameras": _cameras(context),
         "must_go": _marked(obj, 2),
+        "model": obj.data.get(mesh_layout.MODEL, MODELS[0]),
         # All methods but the closed form score by occlusion.
         "settings": [method.name == "closed-form", method.views],
     }

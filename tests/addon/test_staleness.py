@@ -40,6 +40,7 @@ def test_what_changed_since_scoring_is_said(addon, quarter, room_cameras, tmp_pa
         (settings, "source", "FRAMES", cameras),
         (settings, "method", "occlusion", changed),
         (settings, "views", 8, changed),
+        (settings, "model", "antialiased", ["Drawn As changed"]),
         (settings, "ratio", 0.7, []),
         (settings, "protect", "x", []),
         (settings, "source", "VISIBLE", []),
