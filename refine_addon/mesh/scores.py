@@ -212,11 +212,6 @@ def floater_mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.b
     return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)
 
 
-def mark_floaters(checked: SplatObject, reasons: Collection[str]) -> None:
-    """Mark the floaters of these reasons as removed, for the preview."""
-    mesh_edit.mark_removed(checked.obj, floater_mask(checked, reasons))
-
-
 def forget_floaters(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     """Remove the cleaning result."""
     mesh_attributes.remove_attribute(mesh, REASON)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -151,21 +151,23 @@ def _is_shape(obj: bpy.types.Object) -> bool:
     return obj.type == "EMPTY" and obj.empty_display_type in {"CUBE", "SPHERE"}
 
 
-def mark(checked: SplatObject, forced: Forced) -> None:
+def _mark(checked: SplatObject, forced: Forced, reasons: Collection[str]) -> None:
     """Mark protected and removed splats for previews, and record their numbers.
-    Removed ones also get `REMOVE`, unless scores or floaters set it."""
+    `REMOVE` marks removed splats and floaters of these reasons; with scores it is the budget's."""
     mesh, removed = checked.mesh, forced.removed
     force = np.zeros(len(checked), np.int32)
     for number, mask in ((2, removed), (1, forced.protected)):
         if mask is not None:
             force[mask] = number
     mesh_edit.mark(checked.obj, mesh_edit.FORCE, force, even_none=False)
-    scored = mesh_scores.record(mesh) is not None
-    if removed is not None:
-        if not scored:
-            mesh_edit.mark_removed(checked.obj, removed)
-    elif not scored and not mesh_scores.floater_counts(mesh):
-        mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
+    if mesh_scores.record(mesh) is None:
+        going, searched = force == 2, mesh_scores.floater_counts(mesh) is not None
+        if searched:
+            going |= (force != 1) & mesh_scores.floater_mask(checked, reasons)
+        if searched or removed is not None:
+            mesh_edit.mark_removed(checked.obj, going)
+        else:
+            mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
     if forced.facts or forced.protected is not None or removed is not None:
         volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]
         _record(mesh, {**forced.counts(), "volumes": volumes})
@@ -178,7 +180,7 @@ def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced
     try:
         each = Demands.of_scene(scene).of_each(group)
         for checked, forced in zip(group, each, strict=True):
-            mark(checked, forced)
+            _mark(checked, forced, scene.refine.to_reasons())
     except RefineError as error:
         for checked in group:
             _record(checked.mesh, {"error": str(error)})

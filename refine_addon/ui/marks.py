@@ -204,9 +204,9 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
         return clean(*arguments, **masks, progress=progress)
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, cleaned: Any) -> None:
-        """Store the floaters, mark them as removed, report them."""
+        """Store the floaters, show them, report them."""
         mesh_scores.store_floaters(group[0], cleaned)
-        mesh_scores.mark_floaters(group[0], context.scene.refine.to_reasons())
+        plans.refresh(context)
         self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")
 
 

@@ -81,7 +81,7 @@ def mark_again(context: bpy.types.Context) -> None:
     active = getattr(context, "object", None)
     objects = [obj for obj in context.scene.objects if mesh_layout.looks_like_splats(obj)]
     first = [active] if active in objects else [obj for obj in objects if obj.visible_get()][:1]
-    noted = {demands.FACTS, mesh_scores.RECORD}
+    noted = {demands.FACTS, mesh_scores.RECORD, mesh_scores.FOUND}
     others = [obj for obj in objects if obj.select_get() or noted & set(obj.data.keys())]
     if bpy.app.background:
         _refresh(context.scene, [*first, *others])

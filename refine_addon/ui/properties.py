@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -27,7 +26,6 @@ from ..core.methods import Merge, Method
 from ..core.selection import Budget
 from ..core.splats import MODELS
 from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
 from ..mesh.edit import MARKING
 from . import plans
 from .marks import RefineVolume
@@ -95,6 +93,10 @@ def _plan_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
     plans.changed(context)
 
 
+def _mark_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
+    plans.mark_again(context)
+
+
 def _model(_settings: RefineSettings) -> int:
     obj = getattr(bpy.context, "object", None)
     if not mesh_layout.looks_like_splats(obj):
@@ -110,16 +112,6 @@ def _set_model(_settings: RefineSettings, value: int) -> None:
     if mesh_layout.looks_like_splats(obj):
         obj.data[mesh_layout.MODEL] = MODELS[value]
         obj.data.update_tag()
-
-
-def _mark_floaters(settings: RefineSettings, context: bpy.types.Context) -> None:
-    obj = getattr(context, "object", None)  # not in every editor
-    if not mesh_layout.looks_like_splats(obj) or mesh_scores.floater_counts(obj.data) is None:
-        return
-    if obj.mode == "EDIT":
-        return
-    with contextlib.suppress(RefineError):  # *Delete Floaters* says what is wrong
-        mesh_scores.mark_floaters(mesh_layout.check(obj), settings.to_reasons())
 
 
 def _protectable(
@@ -181,7 +173,7 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         description="How much of what floats goes",
         items=STRENGTHS,
         default="USUAL",
-        update=_mark_floaters,
+        update=_mark_again,
     )
     budget: EnumProperty(
         name="Budget",

@@ -56,6 +56,26 @@ def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
         assert scores.floater_counts(obj.data) is None
 
 
+def test_what_goes_is_what_floats_or_must_go_and_with_scores_what_the_budget_removes(
+    addon, polluted
+):
+    """Ten splats that do not float are marked to go; neither search nor strength changes a plan."""
+    obj, _ = polluted
+    bpy.ops.refine.find_floaters()
+    floating = read(addon, obj, "refine_remove")
+    marked = ~floating & (np.cumsum(~floating) <= 10)
+    addon.mesh.selection.select(obj, marked)
+    bpy.ops.refine.protect(mark="GO")
+    np.testing.assert_array_equal(read(addon, obj, "refine_remove"), floating | marked)
+
+    bpy.ops.refine.score()
+    goes = read(addon, obj, "refine_remove")
+    assert goes.sum() == 1988
+    bpy.ops.refine.find_floaters()
+    bpy.context.scene.refine.strength = "STRONG"
+    np.testing.assert_array_equal(read(addon, obj, "refine_remove"), goes)
+
+
 def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     """But for those that were marked to stay since; where all are, scores and findings stay.
     Scores are of all splats together, floaters included: without these they do not hold."""
@@ -63,7 +83,9 @@ def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     scores, delete = addon.mesh.scores, bpy.ops.refine.delete
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()
-    goes, opacities = read(addon, obj, "refine_remove"), read(addon, obj, "opacity")
+    reasons = bpy.context.scene.refine.to_reasons()
+    goes = scores.floater_mask(addon.mesh.layout.check(obj), reasons)
+    opacities = read(addon, obj, "opacity")
     addon.mesh.edit.mark_by_hand(obj, goes)
     with pytest.raises(RuntimeError, match="no splat floats that need not stay"):
         delete(what="FLOATERS")
