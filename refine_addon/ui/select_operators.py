@@ -171,7 +171,7 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
             bpy.data.batch_remove([apart.data, apart])
             raise
         selection.select(apart, np.zeros(mesh_layout.splat_count(apart.data), np.bool_))
-        apart.select_set(True)
+        apart.select_set(False)  # selected objects are pruned together
         plans.refresh(context)
         self.report({"INFO"}, f"'{apart.name}' has {mesh_layout.splat_count(apart.data):,} splats")
         return {"FINISHED"}

@@ -127,7 +127,7 @@ def test_the_selected_splats_are_deleted_but_for_protected_ones_or_parted(addon,
     assert np.array_equal(read(quarter.data, "opacity"), opacities[1::2])
     assert apart.location == quarter.location
     assert chosen(addon, apart) == chosen(addon, quarter) == []
-    assert apart.select_get()
+    assert (bpy.context.object, bpy.context.selected_objects) == (quarter, [quarter])
 
 
 def test_what_is_marked_to_go_goes_before_all_others(addon, quarter, room_cameras):
