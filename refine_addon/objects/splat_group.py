@@ -373,10 +373,13 @@ def add_levels(
             frames = frames_of(group)
             apply(group, changes(frames, level.result))
             facts = {**level.facts(), "distance": distance}
-            copy[LEVEL_OF] = checked.obj
             copy[LEVEL_FACTS] = {key: value for key, value in facts.items() if value is not None}
             copy.select_set(False)
+        for obj in bpy.data.objects:
+            if obj.get(LEVEL_OF) == checked.obj:  # the new levels replace those made before
+                del obj[LEVEL_OF]
         for obj in collection.objects:  # all stand in one place
+            obj[LEVEL_OF] = checked.obj
             obj.hide_set(True)
             obj.hide_render = True
     except BaseException:
@@ -399,10 +402,12 @@ def has_levels(obj: bpy.types.Object | None) -> bool:
 def levels_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
     """An object and its levels, finest first, from any of them; `RefineError` without levels."""
     original = obj.get(LEVEL_OF) or obj
-    levels = [each for each in bpy.data.objects if each.get(LEVEL_OF) == original]
+    objects = [each for each in bpy.data.objects if each.get(LEVEL_OF) == original]
+    # A copy of a level is none; its name sorts behind that of the level.
+    levels = {each[LEVEL_FACTS]["level"]: each for each in reversed(objects)}
     if not levels:
         raise RefineError(f"object '{obj.name}': has no levels; make them first")
-    return [original, *sorted(levels, key=lambda each: each[LEVEL_FACTS]["level"])]
+    return [original, *(levels[number] for number in sorted(levels))]
 
 
 def prune_object(

@@ -65,7 +65,8 @@ def test_levels_that_cannot_be_leave_the_scene_alone(addon, few, monkeypatch, un
 
 
 def test_levels_are_exported_as_a_streamed_sog(addon, few, tmp_path):
-    """3976, 1988 and 398 splats, from the object or a level of it; replaced only when told."""
+    """3976, 1988 and 398 splats, from the object or a level of it; replaced only when told.
+    A copy of a level is none, nor are levels once others were made."""
     has, path = addon.objects.splat_group.has_levels, tmp_path / "web/lod-meta.json"
     assert not has(few)
     few.matrix_world = Matrix.Scale(2.0, 4)
@@ -81,6 +82,7 @@ def test_levels_are_exported_as_a_streamed_sog(addon, few, tmp_path):
         )
         return len(means)
 
+    bpy.data.collections["room levels"].objects.link(bpy.data.objects["room_lod1"].copy())
     assert bpy.ops.refine.export_levels(filepath=str(tmp_path / "web")) == {"FINISHED"}
     names = ("room", "room_lod1", "room_lod2")
     assert [is_level(*pair, 1.0) for pair in enumerate(names)] == [3976, 1988, 398]
@@ -91,3 +93,8 @@ def test_levels_are_exported_as_a_streamed_sog(addon, few, tmp_path):
     assert is_level(2, "room_lod2", 2.0) == 398
     assert has(few)
     assert has(level)
+    bpy.context.view_layer.objects.active = few
+    bpy.context.scene.refine.levels = "0.2"
+    bpy.ops.refine.levels()
+    others = list(bpy.data.collections["room levels.001"].objects)
+    assert addon.objects.splat_group.levels_of(few) == [few, *others]
