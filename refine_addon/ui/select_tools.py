@@ -296,7 +296,7 @@ _OBJECT_KEYS = (
     _key("refine.select", "H", ("action", "REVEAL"), alt=True),
     _key("refine.grow_selection", "NUMPAD_PLUS", ("shrink", False), ctrl=True),
     _key("refine.grow_selection", "NUMPAD_MINUS", ("shrink", True), ctrl=True),
-    _key("refine.delete", "DEL", ("what", "SELECTED")),
+    *(_key("refine.delete", key, ("what", "SELECTED")) for key in ("X", "DEL")),
 )
 """Keys in object mode, besides the mouse's. Edit mode has its own."""
 

@@ -130,6 +130,13 @@ def test_the_selected_splats_are_deleted_but_for_protected_ones_or_parted(addon,
     assert (bpy.context.object, bpy.context.selected_objects) == (quarter, [quarter])
 
 
+def test_x_and_del_delete_splats_with_a_tool_and_not_the_object():
+    """In object mode Blender's own X would delete the object."""
+    name = "3D View Tool: Object, Select Splats: Brush"
+    keys = bpy.context.window_manager.keyconfigs.addon.keymaps[name].keymap_items
+    assert {key.type for key in keys if key.idname == "refine.delete"} == {"X", "DEL"}
+
+
 def test_what_is_marked_to_go_goes_before_all_others(addon, quarter, room_cameras):
     """Of 4,969 that go the 100 best are marked; a mark to stay takes the place of one to go."""
     read, facts = addon.mesh.attributes.read_attribute, addon.objects.demands.facts
