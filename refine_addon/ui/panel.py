@@ -319,6 +319,9 @@ def _draw_objects(
     size = None if several else cached("size", context, lambda: mesh_layout.export_bytes(obj))
     text += f", {size_in_words(size)}" if size is not None else ""
     wrapped.label(layout, context, text, icon="OUTLINER_OB_POINTCLOUD")
+    if several:
+        text = f"Score, Apply, Compare and Mend take all; other buttons '{obj.name}' alone"
+        wrapped.label(layout, context, text, icon="INFO")
     transforms.draw(layout, context, objects)
     if not several and cached("model", context, lambda: _model_is_open(obj)):
         _named_column(layout).prop(context.scene.refine, "model")

@@ -127,6 +127,14 @@ def test_each_step_shows_what_came_of_it(addon, draw, few, room_cameras):
     assert "1 camera" in draw()
 
 
+def test_of_several_objects_it_says_which_buttons_take_all(draw, few):
+    assert "take all" not in " ".join(draw())
+    other = few.copy()
+    bpy.context.scene.collection.objects.link(other)
+    other.select_set(True)
+    assert "Score, Apply, Compare and Mend take all; other buttons 'room' alone" in " ".join(draw())
+
+
 def test_floaters_and_what_cameras_and_curve_say_are_drawn(addon, draw, few):
     """How many float and how sure that is, the mean over what goes; scores without an estimate."""
     settings, scores = bpy.context.scene.refine, addon.mesh.scores
