@@ -112,7 +112,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
-    """Add cameras around the splats that see all of them; they decide together with the others"""
+    """Add cameras around the splats, taking Z as up; they decide together with the others"""
 
     bl_idname = "refine.add_ring"
     bl_label = "Add a Ring of Cameras"
