@@ -23,11 +23,11 @@ from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject, recorded, splat_count
 
-FACTS = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
+RECORD = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
 
 UNFIT = "expected a mesh, or an empty that is shown as a cube or a sphere"
 
-_MOST_MASKS = 16  # that are kept; 1 MB each at a million splats
+_MOST_MASKS = 16  # Most cached masks; 1 MB each at a million splats
 
 _masks: dict[bytes, NDArray[np.bool_]] = {}  # Points in each volume, by a digest of both
 
@@ -170,9 +170,9 @@ def _mark(checked: SplatObject, forced: Forced, reasons: Collection[str]) -> Non
             mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
     if forced.facts or forced.protected is not None or removed is not None:
         volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]
-        _record(mesh, {**forced.counts(), "volumes": volumes})
+        _store(mesh, {**forced.counts(), "volumes": volumes})
     else:
-        mesh.pop(FACTS, None)
+        mesh.pop(RECORD, None)
 
 
 def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced]:
@@ -183,12 +183,12 @@ def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced
             _mark(checked, forced, scene.refine.to_reasons())
     except RefineError as error:
         for checked in group:
-            _record(checked.mesh, {"error": str(error)})
+            _store(checked.mesh, {"error": str(error)})
         raise
     return each
 
 
-def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
+def record(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
     """``protected``, ``removed_by_user``, ``volumes`` (splats by label), or ``error``, as marked.
     Empty if splats came or went since."""
 
@@ -200,11 +200,11 @@ def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
         counts = {name: int(noted[name]) for name in ("protected", "removed_by_user")}
         return {**counts, "volumes": dict(noted["volumes"])}
 
-    return recorded(mesh, FACTS, read) or {}
+    return recorded(mesh, RECORD, read) or {}
 
 
-def _record(mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:
-    mesh[FACTS] = json.dumps({"splats": splat_count(mesh), **facts})
+def _store(mesh: bpy.types.Mesh, counts: dict[str, Any]) -> None:
+    mesh[RECORD] = json.dumps({"splats": splat_count(mesh), **counts})
 
 
 def _surface(

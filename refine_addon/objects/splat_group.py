@@ -43,7 +43,7 @@ from . import demands
 from .demands import NONE, Demands
 from .transforms import read_to_move, uneven_notes
 
-LEVEL_FACTS = "refine_lod"  # Custom property of a level object: its stats, as in files' reports
+LEVEL_STATS = "refine_lod"  # Custom property of a level object: its stats, as in files' reports
 
 LEVEL_OF = "refine_level_of"  # Custom property of a level object: its original
 
@@ -158,7 +158,7 @@ def _matrix(checked: SplatObject) -> NDArray[np.float64]:
 
 
 def possible(group: Sequence[SplatObject], method: Method) -> Method:
-    """The method; where an object's scale is uneven, merging only deletes."""
+    """The method, or `Occlusion` for merging where an object's scale is uneven."""
     even = all(is_uniform(_matrix(member)) for member in group)
     return method if even or not isinstance(method, Merge) else Occlusion(method.views)
 
@@ -170,7 +170,7 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
     if not names:
         return []
     return [
-        f"object '{obj.name}': scored as without its modifiers ({', '.join(names)}); apply them "
+        f"object '{obj.name}': scored without its modifiers ({', '.join(names)}); apply them "
         "first if they move splats"
     ]
 
@@ -185,12 +185,12 @@ def drift_notes(checked: SplatObject) -> list[str]:
 
 
 def store(
-    group: Members, scores: Scores, method: Method, origins: Sequence[dict[str, Any]], **facts: Any
+    group: Members, scores: Scores, method: Method, origins: Sequence[dict[str, Any]], **record: Any
 ) -> None:
     """Write scores of `gather`'s splats to each mesh, with its origin; see `mesh.scores.store`."""
     _check_counts(group, len(scores.values))
     ranks, scoring, all_scored = rank(scores.values), uuid.uuid4().hex, scores.scored is None
-    protected = parts_of(facts.pop("protected", None), group)
+    protected = parts_of(record.pop("protected", None), group)
     each = zip(group, origins, _rows(map(len, group)), protected, strict=True)
     for member, origin, rows, mask in each:
         own, together = scores, None
@@ -201,7 +201,7 @@ def store(
             own = replace(scores, values=values, seen=seen, undrawable=undrawable, scored=scored)
             together = (scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
-            member, own, method, origin=origin, protected=mask, together=together, **facts
+            member, own, method, origin=origin, protected=mask, together=together, **record
         )
 
 
@@ -257,20 +257,20 @@ def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
 
 def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
     """Change of each object's splats, from the result for all; arrays only."""
-    found, first, merged = [], 0, result.merged
+    parts, first, merged = [], 0, result.merged
     for frame, rows in zip(frames, _rows(frame.count for frame in frames), strict=True):
         keep = result.keep[rows]
         start, first = first, first + int(np.count_nonzero(keep))
         if merged is None:
-            found.append(_deletion(keep))
+            parts.append(_deletion(keep))
             continue
         changing = np.flatnonzero(merged.changed[start:first])
         splats = merged.splats.take(start + changing).up_to_degree(frame.degree)
         if not np.array_equal(frame.matrix, np.eye(4)):
             splats = transformed(splats, frame.matrix)
         columns = {name: np.ascontiguousarray(v) for name, v in values_by_name(splats).items()}
-        found.append(Change(keep, changing, columns))
-    return found
+        parts.append(Change(keep, changing, columns))
+    return parts
 
 
 def _deletion(keep: NDArray[np.bool_]) -> Change:
@@ -279,8 +279,8 @@ def _deletion(keep: NDArray[np.bool_]) -> Change:
 
 def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
     """Delete the splats that are not kept and store changed values: in all objects or none.
-    All else stays, scores to be looked at only: they hold for all splats together. `RefineError` if
-    the number of splats changed, or an object would end up empty."""
+    All else stays; the scores' record goes, as scores hold for all splats together. `RefineError`
+    if the number of splats changed, or an object would end up empty."""
     _check_counts(group, sum(len(part.keep) for part in parts))
     outcomes = []
     for checked, part in zip(group, parts, strict=True):
@@ -372,8 +372,8 @@ def add_levels(
             group = [mesh_layout.check(copy)]
             frames = frames_of(group)
             apply(group, changes(frames, level.result))
-            facts = {**level.facts(), "distance": distance}
-            copy[LEVEL_FACTS] = {key: value for key, value in facts.items() if value is not None}
+            stats = {**level.facts(), "distance": distance}
+            copy[LEVEL_STATS] = {key: value for key, value in stats.items() if value is not None}
             copy.select_set(False)
         for obj in bpy.data.objects:
             if obj.get(LEVEL_OF) == checked.obj:  # the new levels replace those made before
@@ -404,7 +404,7 @@ def levels_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
     original = obj.get(LEVEL_OF) or obj
     objects = [each for each in bpy.data.objects if each.get(LEVEL_OF) == original]
     # A copy of a level is none; its name sorts behind that of the level.
-    levels = {each[LEVEL_FACTS]["level"]: each for each in reversed(objects)}
+    levels = {each[LEVEL_STATS]["level"]: each for each in reversed(objects)}
     if not levels:
         raise RefineError(f"object '{obj.name}': has no levels; make them first")
     return [original, *(levels[number] for number in sorted(levels))]
@@ -429,7 +429,7 @@ def prune_object(
     checked = mesh_layout.check(find(name))
     save = save and not dry_run
     method = possible([checked], method)
-    # Where the scale is uneven there are no pictures, for which it is not refused.
+    # None: an uneven scale is not refused, since only the pictures would need harmonics.
     compares = method.name != "closed-form" or budget.psnr is not None or pictures is not None
     harmonics = True if method.changes else None if compares else False
     target = None if output is None else expanded(output)

@@ -71,15 +71,13 @@ _MARGIN = 1.1  # Distance of a camera over the least that frames all
 
 
 class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
-    """Turn the cameras that decide a quarter about the world's X axis, and drop their scores"""
+    """Turn the cameras that decide a quarter about the world's X axis, and drop the scores"""
 
     bl_idname = "refine.turn_cameras"
     bl_label = "Turn the Cameras"
     bl_options = {"REGISTER", "UNDO"}
 
-    back: BoolProperty(
-        name="Back", description="From z up to y down, instead of to z up as Upright turns"
-    )
+    back: BoolProperty(name="Back", description="Turn from z up to y down, the opposite of Upright")
 
     def act(self, context: bpy.types.Context) -> Answer:
         """Turn them, or the parents that animate them."""
@@ -106,7 +104,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
             parent.matrix_world = turn
         context.view_layer.update()
         for checked in group:
-            mesh_scores.forget(checked)  # of cameras that stood elsewhere
+            mesh_scores.forget(checked)  # the cameras stood elsewhere
         self.report({"INFO"}, f"Turned {counted(len(cameras), 'camera')}; score again")
         return {"FINISHED"}
 
@@ -118,13 +116,13 @@ class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
     bl_label = "Add a Ring of Cameras"
     bl_options = {"REGISTER", "UNDO"}
 
-    count: IntProperty(name="Cameras", default=16, min=3, max=360)
+    count: IntProperty(name="Cameras", description="Number of cameras", default=16, min=3, max=360)
 
     def act(self, context: bpy.types.Context) -> Answer:
         """Add them."""
         means = demands.finite_means(mesh_layout.check(context.object))
         low, high = np.percentile(means, _INNER, axis=0)
-        # Of one point, and of what is flat, a ball of some size.
+        # All splats may lie in one point.
         radius = float(np.linalg.norm(high - low)) / 2.0 or 1.0
         data, render = bpy.data.cameras.new("Ring"), context.scene.render
         width = render.resolution_x * render.pixel_aspect_x

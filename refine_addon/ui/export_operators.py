@@ -40,7 +40,7 @@ _FORMATS = (
 
 
 class Exporting(Job, OnSplats, ExportHelper):
-    """An operator that writes what the active object holds, and only reads it."""
+    """An operator that writes the active object's splats, and does not change it."""
 
     apply_transform: BoolProperty(
         name="Apply Transform",
@@ -49,7 +49,7 @@ class Exporting(Job, OnSplats, ExportHelper):
     )
     overwrite: BoolProperty(
         name="Overwrite",
-        description="Replace what is there of that name",
+        description="Replace a file or folder of that name",
         options={"SKIP_SAVE"},
     )
 
@@ -84,11 +84,11 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     filter_glob: StringProperty(default=";".join(f"*{end}" for end in SUFFIXES), options={"HIDDEN"})
     suffix: EnumProperty(
         name="Format",
-        description="Of the file that is picked here; a suffix that is typed chooses it",
+        description="Format of the file; a suffix that you type chooses it, too",
         items=_FORMATS,
         options={"SKIP_SAVE"},
     )
-    settled = _FORMATS[0][0]  # What `check` saw last
+    settled = _FORMATS[0][0]  # Format at the last `check`
 
     @staticmethod
     def new_name(obj: bpy.types.Object) -> str:
@@ -163,8 +163,8 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
         notes = [
             note for one in each for note in splat_group.export_notes(one, apply_transform=moved)
         ]
-        width = objects[1][splat_group.LEVEL_FACTS].get("distance", np.inf)
-        if not moved:  # as long in the object's own unit
+        width = objects[1][splat_group.LEVEL_STATS].get("distance", np.inf)
+        if not moved:  # in the object's own unit
             width /= np.cbrt(abs(objects[0].matrix_world.to_3x3().determinant())) or 1.0
         path = expanded(bpy.path.abspath(self.filepath))
         target = path if path.name == INDEX else path / INDEX
@@ -174,12 +174,12 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
     def compute(job: Any, progress: Progress) -> int:
         """Write the levels; their number."""
         files, width, target, overwrite, _ = job
-        with folder_for(target, overwrite=overwrite) as made:
+        with folder_for(target, overwrite=overwrite) as folder:
             scene = None
             for number, file in enumerate(files):
                 report(progress, number / len(files), f"level {number}")
                 splats = held_splats(target, sog.FORMAT, file(), None, {})
-                scene = scene or StreamedSog(splats.means, width, made)
+                scene = scene or StreamedSog(splats.means, width, folder)
                 scene.add(splats)
             assert scene is not None
             scene.publish(target, overwrite=overwrite)

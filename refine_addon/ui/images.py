@@ -1,4 +1,4 @@
-"""Images: pictures in the .blend; the trade as a chart, dB over the share removed, in the panel."""
+"""Images in the .blend; the panel's chart of dB over the share removed."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ _DEFAULT_SIZE = (1920, 1080, 100)  # of Blender's factory settings, with the per
 
 _OF_MODELS = {".bin", ".txt"}  # several files of one folder are a COLMAP model
 
-_USUAL_NAMES = {"cameras", "images", "transforms", "transforms_train"}  # of any capture
+_USUAL_NAMES = {"cameras", "images", "transforms", "transforms_train"}  # tell no captures apart
 
 
 class _Importing(Job, Needing, ImportHelper):
@@ -97,9 +97,9 @@ class _Dropped:
 class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
     """Import cameras as objects: Inria cameras.json, nerfstudio transforms.json or COLMAP"""
 
-    # On a thread not for its time alone. What the file browser calls is put down as the last
-    # operation only where it goes on after that: else the box *Adjust Last Operation* would stay
-    # that of the splats before, and adjusting them would undo these cameras.
+    # On a thread also because Blender does not record an operator that ends within the file
+    # browser's call: *Adjust Last Operation* would still be that of the splats imported before,
+    # and adjusting them would undo these cameras.
     bl_idname = "refine.import_cameras"
     bl_label = "Import Cameras"
     doing = "Reading cameras"
@@ -109,7 +109,7 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Ask for the file; upright by default where the splats are.
-        A dropped JSON file may hold splats, whose import asks then."""
+        A dropped JSON file that is an index of splats goes to the import of splats."""
         self.by_hand = True
         path = self.properties.filepath
         if path.lower().endswith(INDEX_NAMES):
@@ -172,7 +172,7 @@ def cameras_beside(folder: Path) -> Path | None:
     """Camera file of splats in a folder, there or above.
     Trained scenes have splats some folders below, in ``point_cloud/iteration_30000``."""
     places = (folder, *folder.parents[:_ABOVE])
-    return next((found[0] for place in places if (found := cameras_in(place))), None)
+    return next((files[0] for place in places if (files := cameras_in(place))), None)
 
 
 def capture_folder(obj: bpy.types.Object | None) -> Path | None:
@@ -180,8 +180,8 @@ def capture_folder(obj: bpy.types.Object | None) -> Path | None:
     stored = obj.get(FOLDER) if obj is not None else None
     if not isinstance(stored, str) or not stored or not os.path.isdir(stored):
         return None
-    found = cameras_beside(Path(stored))
-    return Path(stored) if found is None else found if found.is_dir() else found.parent
+    cameras = cameras_beside(Path(stored)) or Path(stored)
+    return cameras if cameras.is_dir() else cameras.parent
 
 
 def _imported_splats(context: Context) -> bpy.types.Object | None:
@@ -212,7 +212,7 @@ FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)  # File browser'
 
 
 class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
-    """Import files of splats, of any format: a vertex a splat, a point attribute a property"""
+    """Import files of splats as meshes: a vertex for each splat, an attribute for each property"""
 
     bl_idname = "refine.import_ply"
     bl_label = "Import Splats"
@@ -227,7 +227,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
     )
     level: IntProperty(
         name="Level",
-        description="Of a streamed SOG (lod-meta.json): 0 is the finest level",
+        description="Level of a streamed SOG (lod-meta.json); 0 is the finest",
         min=0,
         options={"SKIP_SAVE"},
     )
@@ -249,16 +249,16 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         folder = path.parent
         if path.name.lower().endswith(INDEX):
             layout.prop(self, "level")
-        if browser is not None and browser.type == "FILE_BROWSER":  # what is looked at now
+        if browser is not None and browser.type == "FILE_BROWSER":  # the folder that is shown
             folder = Path(os.fsdecode(browser.params.directory))
-        found = cameras_beside(folder)
-        if found is None:
+        cameras = cameras_beside(folder)
+        if cameras is None:
             layout.label(text="No cameras beside the file", icon="INFO")
             return
         layout.prop(self, "cameras")
         column = layout.column()
         column.enabled = self.cameras
-        column.label(text=os.path.relpath(found, folder), icon="CAMERA_DATA")
+        column.label(text=os.path.relpath(cameras, folder), icon="CAMERA_DATA")
         column.prop(self, "set_resolution")
 
     def gather(self, _context: Context) -> tuple[list[SplatObject], Any]:
@@ -301,17 +301,17 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         for obj in imported:
             obj.select_set(True)
         context.view_layer.objects.active = imported[-1]
-        if not bpy.app.background:  # scripts say what they want
+        if not bpy.app.background:  # scripts set what they want
             properties.fill(context.scene.refine, context, *properties.DEFAULTS)
             draw.show("SCENE")
         count = sum(len(obj.data.vertices) for obj in imported)
-        told = f"Imported {count:,} splats from {counted(len(imported), 'file')}"
+        text = f"Imported {count:,} splats from {counted(len(imported), 'file')}"
         if views is not None:
             self.add_cameras(context, views, cameras)
             beside = os.path.relpath(cameras, paths[0].parent)
-            told += f", and {counted(len(views), 'camera')} from {beside}"
+            text += f", and {counted(len(views), 'camera')} from {beside}"
         self.warn_of_turn(context, imported[-1])
-        self.report({"INFO"}, told)
+        self.report({"INFO"}, text)
 
     def _paths(self) -> list[Path]:
         names = [item.name for item in self.files if item.name]

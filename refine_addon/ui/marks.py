@@ -1,4 +1,4 @@
-"""What must stay and go in the panel: volumes, marks by hand, floaters; deleting at once."""
+"""Operators on what must stay and go: volumes, marks by hand, floaters, deleting at once."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from .operator_bases import Answer, AtOnce, Job, Needing, OnSplats, idle, on_spl
 from .operators import chosen_views
 
 ROLES = (
-    ("PROTECT", "Protect Inside", "Splats in it stay, whatever else is said", "LOCKED", 0),
-    ("REMOVE", "Remove Inside", "Splats in it go before all others", "TRASH", 1),
-    ("KEEP", "Keep Inside", "Splats in no volume of this kind go", "FULLSCREEN_EXIT", 2),
+    ("PROTECT", "Protect Inside", "Splats inside stay, even where they must go", "LOCKED", 0),
+    ("REMOVE", "Remove Inside", "Splats inside go before all others", "TRASH", 1),
+    ("KEEP", "Keep Inside", "Splats outside of all volumes of this kind go", "FULLSCREEN_EXIT", 2),
 )
-"""Roles of volumes, by core's names, in small letters there."""
+"""Roles of volumes: core's names in capitals."""
 
 _OUTSIDE, _OUTSIDE_KEPT = 0.25, 0.02
-"""Share of splats beyond each face of a new volume; the latter where it keeps what is inside."""
+"""Share of splats beyond each face of a new volume; the latter for *Keep Inside*."""
 
-_LEAST_HALF = 1e-3  # Half width, world units, at least: flat splats make no flat volume
+_LEAST_HALF = 1e-3  # Least half width of a new volume, world units; splats may lie in a plane
 
 SHAPES = (
     ("BOX", "Box", "A new box around the middle of the splats"),
     ("SPHERE", "Sphere", "A new sphere around the middle of the splats"),
-    ("SELECTED", "Selected Objects", "Closed meshes, cube and sphere empties that are selected"),
+    ("SELECTED", "Selected Objects", "Selected closed meshes, and empties shown as cube or sphere"),
 )
 
 
@@ -61,7 +61,7 @@ class RefineVolume(bpy.types.PropertyGroup):
         update=_changed,
     )
     role: EnumProperty(
-        name="Role", description="What becomes of the splats in it", items=ROLES, update=_changed
+        name="Role", description="What happens to the splats inside", items=ROLES, update=_changed
     )
 
 
@@ -73,12 +73,12 @@ class REFINE_OT_add_volume(AtOnce, Needing, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     needs = (idle, on_splats)
 
-    role: EnumProperty(name="Role", description="What becomes of the splats in it", items=ROLES)
-    shape: EnumProperty(name="Shape", description="What is added", items=SHAPES)
+    role: EnumProperty(name="Role", description="What happens to the splats inside", items=ROLES)
+    shape: EnumProperty(name="Shape", description="The volume to add", items=SHAPES)
     description = tooltips("role", ROLES)
 
     def act(self, context: bpy.types.Context) -> Answer:
-        """Add it, selected to be moved; the splats stay active."""
+        """Add it, and select it to be moved; the splats stay active."""
         checked = mesh_layout.check(context.object)
         if self.shape == "SELECTED":
             objects = _selected_volumes(context)
@@ -128,7 +128,7 @@ def _new_empty(
 
 
 class REFINE_OT_drop_volume(Needing, bpy.types.Operator):
-    """Take the volume off the list; the object stays"""
+    """Remove the volume from the list; the object stays"""
 
     bl_idname = "refine.drop_volume"
     bl_label = "Remove from List"
@@ -137,7 +137,7 @@ class REFINE_OT_drop_volume(Needing, bpy.types.Operator):
     index: IntProperty(name="Index", description="Place in the list", min=0)
 
     def execute(self, context: bpy.types.Context) -> Answer:
-        """Take it off."""
+        """Remove it."""
         context.scene.refine.volumes.remove(self.index)
         plans.mark_again(context)
         return {"FINISHED"}
@@ -146,9 +146,9 @@ class REFINE_OT_drop_volume(Needing, bpy.types.Operator):
 _MARKS = {"STAY": mesh_edit.PROTECT, "GO": mesh_edit.MUST_GO}
 
 _ITEMS = (
-    ("STAY", "Stay", "Mark the selected splats: they stay, whatever the budget"),
-    ("GO", "Go", "Mark the selected splats: they go before all others"),
-    ("NONE", "Unmark", "Take both marks off the selected splats"),
+    ("STAY", "Stay", "Mark the selected splats to stay, whatever the budget"),
+    ("GO", "Go", "Mark the selected splats to go before all others"),
+    ("NONE", "Unmark", "Remove both marks from the selected splats"),
 )
 
 
@@ -159,7 +159,7 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
     bl_label = "Mark Splats"
     bl_options = {"REGISTER", "UNDO"}
 
-    mark: EnumProperty(name="Mark", description="What becomes of them", items=_ITEMS)
+    mark: EnumProperty(name="Mark", description="The mark to set", items=_ITEMS)
     description = tooltips("mark", _ITEMS)
 
     def act(self, context: bpy.types.Context) -> Answer:
@@ -181,7 +181,7 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
-    """Find splats that float where the cameras see empty space; nothing is deleted (Esc cancels)"""
+    """Find splats of the active object that float where cameras see empty space (Esc cancels)"""
 
     bl_idname = "refine.find_floaters"
     bl_label = "Find Floaters"
@@ -211,15 +211,15 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
 
 
 WHAT = (
-    ("SELECTED", "Selected", "Delete the selected splats, but for those that must stay"),
-    ("FLOATERS", "Floaters", "Delete what floats, as much as the strength says"),
-    ("VOLUMES", "By Volumes", "Delete what volumes and marks say must go, and nothing else"),
+    ("SELECTED", "Selected", "Delete the selected splats, except what must stay"),
+    ("FLOATERS", "Floaters", "Delete the floaters of this strength, except what must stay"),
+    ("VOLUMES", "By Volumes", "Delete the splats that must go by volumes and marks, and no others"),
 )
 
 _NONE = {
-    "SELECTED": "no splat is selected that need not stay",
-    "FLOATERS": "no splat floats that need not stay",
-    "VOLUMES": "no volume says of any splat that it must go",
+    "SELECTED": "no splat is selected, or all selected ones must stay",
+    "FLOATERS": "no splat floats, or all floaters must stay",
+    "VOLUMES": "no splat must go by volumes or marks",
 }
 
 
@@ -249,7 +249,7 @@ class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
             raise RefineError(f"object '{checked.obj.name}': {_NONE[self.what]}")
         outcome = splat_group.delete_splats(checked, ~going)
         plans.refresh(context)
-        self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")
+        self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, kept {outcome.kept:,}")
         return {"FINISHED"}
 
 

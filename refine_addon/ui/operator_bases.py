@@ -1,6 +1,5 @@
-"""Common parts of operators: needs, threads, error messages.
-One operation at most is on a thread, as panels, polls and menus see it. The thread gets arrays
-only: Blender's data is not safe to touch from there."""
+"""Common parts of operators: what they need to run, work on a thread, error messages.
+At most one operation runs on a thread. It gets arrays only: Blender's data is not thread-safe."""
 
 from __future__ import annotations
 
@@ -47,7 +46,7 @@ def described(error: Exception) -> str:
 
 
 class Worker:
-    """``work(progress)`` on a thread; `fraction` done, 0 to 1, of `what`, a word or two."""
+    """A thread that runs ``work(progress)``. `fraction`: share done, 0 to 1; `what`: its step."""
 
     def __init__(self, work: Callable[[Progress], Any]) -> None:
         self.fraction, self.what = 0.0, ""
@@ -57,8 +56,8 @@ class Worker:
         self._thread.start()
 
     def running(self) -> bool:
-        """Whether there is still something to wait for: not `PATIENCE` after cancelling.
-        Such work, like packing a file, ends at its next checkpoint, and its result is dropped."""
+        """Whether to wait for it: until it ends, or `PATIENCE` after it was cancelled.
+        Cancelled work that goes on, like packing a file, ends at its next check, for nothing."""
         late = self.cancelled and time.monotonic() - self._cancelled > PATIENCE
         return not late and self._thread.is_alive()
 
@@ -68,7 +67,7 @@ class Worker:
         return self._cancelled is not None
 
     def cancel(self) -> None:
-        """Ask it to stop; `result` raises `Cancelled` then, unless the work offers one."""
+        """Ask it to stop; `result` raises `Cancelled` then, unless the work has a partial one."""
         if not self.cancelled:
             self._cancelled = time.monotonic()
 
@@ -78,7 +77,7 @@ class Worker:
         self._thread.join(PATIENCE)
 
     def result(self) -> Any:
-        """The work's result or error; keeps neither."""
+        """Hand over the work's result, or raise its error."""
         if self.cancelled and self._thread.is_alive():
             raise Cancelled
         self._thread.join()
@@ -90,10 +89,10 @@ class Worker:
             with checked_by(self._check):
                 result = work(self._progress)
             if getattr(result, "stopped", None) is None:  # see `Result.stopped`
-                self._check()  # nobody may be left to ask for the result
+                self._check()  # it may have been cancelled since its last check
             self._outcome.set_result(result)
         except BaseException as error:
-            # Whoever cancels asks for no reason, and a traceback would keep what was worked on.
+            # A traceback would keep the work's arrays alive.
             self._outcome.set_exception(Cancelled() if self.cancelled else error)
 
     def _check(self) -> None:
@@ -106,7 +105,7 @@ class Worker:
 
 
 class Target(NamedTuple):
-    """An object as read, known by its number in this session, which an undo keeps."""
+    """State of an object when it was read; `uid` stays the same through undo."""
 
     name: str
     uid: int
@@ -122,9 +121,9 @@ class Target(NamedTuple):
 
 
 class Running:
-    """A running operation; dropped at its end, as Blender's history must not keep splats.
-    `operator`: its name; `job`: data from the scene; `worker`: or a render's stand-in; `waits`:
-    what must happen before the result is written, "" if nothing."""
+    """A running operation. Apart from its operator, which Blender's history would keep with splats.
+    `operator`: its `bl_idname`; `job`: see `Job.gather`; `worker`: a `Worker`, or a render's
+    stand-in; `waits`: what the user must do before the result is written, "" if nothing."""
 
     def __init__(
         self,
@@ -137,22 +136,22 @@ class Running:
         self.operator, self.doing = type(operator).bl_idname, operator.doing
         self.job, self.waits = job, ""
         self._offers, self._targets = operator.offers, [Target.of(each) for each in group]
-        self._left, self._told = TimeLeft(), ""
+        self._left, self._shown = TimeLeft(), ""
         self.worker = worker or Worker(partial(operator.compute, job))
         self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
         _now[:] = [self]
         self.tell(context)
 
     def objects(self) -> list[bpy.types.Object]:
-        """Objects to write to; raises `RefineError` once one was deleted."""
+        """Objects to write to; raises `RefineError` if one was deleted."""
         there = {obj.session_uid: obj for obj in bpy.data.objects}
-        found = [there.get(target.uid) for target in self._targets]
-        for obj, target in zip(found, self._targets, strict=True):
+        objects = [there.get(target.uid) for target in self._targets]
+        for obj, target in zip(objects, self._targets, strict=True):
             if obj is None or not obj.users_scene:
                 raise RefineError(
                     f"object '{target.name}': was deleted; {self.doing.lower()} has ended"
                 )
-        return found
+        return objects
 
     def done(self) -> bool:
         """Whether the thread ended and its result can be written; see `waits`."""
@@ -180,7 +179,7 @@ class Running:
     def at_escape(self) -> str:
         """What Esc does now."""
         keeps = self._offers and self.worker.what == self._offers and not self.waits
-        return "keeps what that has reached" if keeps else "cancels"
+        return "keeps the result so far" if keeps else "cancels"
 
     @property
     def factor(self) -> float:
@@ -204,10 +203,10 @@ class Running:
         return f"{self.doing}{what}; Esc {self.at_escape}"
 
     def tell(self, context: bpy.types.Context) -> None:
-        """Show news of the progress in status bar and panels."""
+        """Show the progress in status bar and panels, if it changed."""
         text = f"{self.sentence}: {self.share}"
-        if text != self._told:
-            self._told = text
+        if text != self._shown:
+            self._shown = text
             context.workspace.status_text_set(text)
             redraw_panels(context)
 
@@ -218,7 +217,7 @@ class Running:
             _now.clear()
         context.window_manager.event_timer_remove(self._timer)
         if not bpy.app.background:
-            # Not at once: a window that is being closed ends Blender where it is drawn.
+            # Later: Blender crashes if a window is drawn while it is being closed.
             bpy.app.timers.register(_clear_bars, first_interval=0.0)
         redraw_panels(context)
 
@@ -265,7 +264,7 @@ def on_splats(context: bpy.types.Context) -> str:
     """A need: the active object holds splats."""
     if mesh_layout.looks_like_splats(context.object):
         return ""
-    return "Select an object that holds splats: import a file of splats"
+    return "Select an object that holds splats, or import a file of splats"
 
 
 def out_of_edit_mode(context: bpy.types.Context) -> str:
@@ -279,7 +278,7 @@ def scored(context: bpy.types.Context) -> str:
 
 
 def tooltips(name: str, items: Sequence[Sequence[Any]]) -> Any:
-    """The `description` of an operator whose buttons differ by an enum, of these items."""
+    """A `description` for an operator: the tooltip of the enum item that a button has."""
 
     def described(_cls: type, _context: bpy.types.Context, properties: Any) -> str:
         return next(text for value, _, text, *_ in items if value == getattr(properties, name))
@@ -288,13 +287,13 @@ def tooltips(name: str, items: Sequence[Sequence[Any]]) -> Any:
 
 
 class Needing:
-    """An operator that can run if none of its `needs`, in order, is missing."""
+    """An operator that can run if all its `needs` are met; Blender shows the first unmet one."""
 
     needs: tuple[Need, ...] = (idle,)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Whether the operator can run; Blender shows why not."""
+        """Whether the operator can run."""
         missing = next(filter(None, (need(context) for need in cls.needs)), "")
         if missing:
             cls.poll_message_set(missing)
@@ -329,16 +328,16 @@ class AtOnce:
 
 
 class Job:
-    """An operator on a thread, with progress bar and Esc: three functions and a name, `doing`.
-    Other events go on to the window. Objects are compared with what they were before writing.
-    `offers`: the stage whose partial result is kept on cancel (`Result.stopped`)."""
+    """An operator on a thread, with progress bar and Esc, defined by three functions and `doing`,
+    its name while it runs. The window stays usable; the result is refused if objects changed.
+    `offers`: the step whose partial result is kept on cancel (`Result.stopped`)."""
 
     doing = offers = ""
-    by_hand = False  # Somebody watches: set by `invoke`, or before a file browser's `execute`
+    by_hand = False  # A user started it: set by `invoke`, or before a file browser's `execute`
     _running: Running | None = None
 
     def gather(self, context: bpy.types.Context) -> tuple[list[SplatObject], Any]:
-        """Objects that `put` writes to, and the input of `compute`; or raise why not."""
+        """Objects that `put` writes to, and the input of `compute`; raises one of `FAILURES`."""
         raise NotImplementedError
 
     @staticmethod
@@ -358,7 +357,7 @@ class Job:
         return self.execute(context)
 
     def execute(self, context: bpy.types.Context) -> Answer:
-        """Do all of it at once where nobody watches: a script, or an operation adjusted."""
+        """Start a thread for a user; for scripts and *Adjust Last Operation* do all at once."""
         watched, self.by_hand = self.by_hand and not bpy.app.background, False
         if watched and context.window is not None:
             return self.launch(context)

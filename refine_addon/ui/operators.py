@@ -34,7 +34,7 @@ from .images import put
 from .operator_bases import Answer, Job, OnScored, OnSplats, in_object_mode
 from .wrapped import counted
 
-_SCORED = 0.97  # Share of the scoring's time after which only splats in each view are counted
+_SCORED = 0.97  # Share of the time that scoring takes; the rest counts the splats in each view
 
 
 def chosen_views(context: Context) -> ViewSet:
@@ -51,7 +51,7 @@ def apply_arguments(context: Context, group: Members, forced: Forced) -> dict[st
 
 
 def selected(context: Context) -> Members:
-    """The objects that are worked on; see `splat_group.members`."""
+    """The selected splat objects, checked; see `splat_group.members`."""
     return splat_group.members(context.view_layer, mesh_layout.check(context.object))
 
 
@@ -68,7 +68,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
     doing = "Scoring splats"
 
     def gather(self, context: Context) -> tuple[Members, Any]:
-        """The arguments of `score`, and the origin of all (`plans.origin`)."""
+        """The arguments of `score`, and `plans.origin` of each object."""
         settings = context.scene.refine
         method, views = settings.to_method(), chosen_views(context)
         group = selected(context)
@@ -76,7 +76,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
             mesh_edit.check_writable(member.obj)
         quality = method.name != "closed-form" or settings.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
-        forced = splat_group.refresh(context.scene, group)  # marked, as is noted of each origin
+        forced = splat_group.refresh(context.scene, group)  # before `origin` reads the marks
         arguments = {
             "splats": splats,
             "views": views,
@@ -103,8 +103,8 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         (arguments, origins), (scores, counts, seconds) = job, result
         pairs = zip(arguments["views"], counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
-        facts = {"cameras": cameras, "protected": arguments["protected"], "seconds": seconds}
-        splat_group.store(group, scores, arguments["method"], origins, **facts)
+        record = {"cameras": cameras, "protected": arguments["protected"], "seconds": seconds}
+        splat_group.store(group, scores, arguments["method"], origins, **record)
         plans.refresh(context)
         removed = arguments["removed"]
         out = 0 if removed is None else int(np.count_nonzero(removed))
@@ -131,7 +131,7 @@ class _Applied(NamedTuple):
 
 
 class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
-    """Delete the splats that the budget does not keep; the others make up for them, if they may"""
+    """Delete the splats that the budget does not keep; Merge and Refit adapt the kept ones"""
 
     bl_idname = "refine.apply"
     bl_label = "Apply"
@@ -164,17 +164,17 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
         """Delete removed splats, and change kept ones."""
         (arguments, forced, _), result = job, applied.result
         context.view_layer.update()
-        if arguments["method"].changes:  # on a thread, while volumes can be moved
+        if arguments["method"].changes:  # volumes may have moved meanwhile
             splat_group.check_forced(context.scene, group, forced)
-        decided = arguments["budget"].needs_scores or not result.merged  # by the scores
-        changed = plans.stale(context, *(each.obj for each in group)) if decided else []
+        by_scores = arguments["budget"].needs_scores or not result.merged
+        changed = plans.stale(context, *(each.obj for each in group)) if by_scores else []
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
         outcome = splat_group.apply(group, applied.changes)
         plans.refresh(context)
         psnr = result.report["estimated_psnr"]
-        known = scoring_notes(result.scores)  # said when they were scored
+        reported = scoring_notes(result.scores)  # after scoring
         for note in result.report["notes"]:
-            if note not in known:
+            if note not in reported:
                 self.report({"INFO"}, note)
         self.report(
             {"INFO"},
@@ -187,13 +187,13 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
         if changed:
             self.report(
                 {"WARNING"},
-                f"The scores were from before a change ({', '.join(changed)}); undo and "
-                "score again if it is to count",
+                f"The scores were from before a change ({', '.join(changed)}); to have it count, "
+                "undo and score again",
             )
 
 
 class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
-    """Make objects with fewer and fewer splats, by what the cameras see, in a new collection"""
+    """Make copies of the active object with fewer and fewer splats, hidden in a new collection"""
 
     bl_idname = "refine.levels"
     bl_label = "Make Levels"
@@ -217,22 +217,22 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         arguments, masks = job
         return list(lod(*arguments, **masks, progress=progress))
 
-    def put(self, _context: Context, group: Members, job: Any, made: Any) -> None:
+    def put(self, _context: Context, group: Members, job: Any, levels: Any) -> None:
         """Make the objects and report each level's cost."""
-        (splats, views, levels, _), _ = job
-        collection = splat_group.add_levels(group[0], made, viewing_distance(splats, views))
+        (splats, views, wanted, _), _ = job
+        collection = splat_group.add_levels(group[0], levels, viewing_distance(splats, views))
         counts = [
             f"{level.facts()['splats']:,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
-            for level in made
+            for level in levels
         ]
-        told = f"'{collection.name}', hidden: {', '.join(counts)} splats"
-        self.report({"INFO"}, f"{told}; show one by its eye in the Outliner")
-        for note in levels.notes({level.asked: level.remark for level in made}):
+        text = f"Made '{collection.name}', hidden: {', '.join(counts)} splats"
+        self.report({"INFO"}, f"{text}; show one by its eye in the Outliner")
+        for note in wanted.notes({level.asked: level.remark for level in levels}):
             self.report({"WARNING"}, note)
 
 
 class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
-    """Draw what the active camera sees before and after Apply, and say how close both are in dB"""
+    """Draw what the active camera sees before and after Apply, and measure the loss in dB"""
 
     bl_idname = "refine.compare"
     bl_label = "Compare"
@@ -253,10 +253,10 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
     def compute(job: Any, progress: Progress) -> tuple[Comparison, float | None]:
         """Both pictures of the kept splats; the estimated PSNR, dB."""
         arguments, splats, view, _ = job
-        decided = 0.6 if arguments["method"].changes else 0.1  # of the time, by then
-        result = prune(**arguments, partial=True, progress=part(progress, 0.0, decided))
+        pruned = 0.6 if arguments["method"].changes else 0.1  # share of the time until then
+        result = prune(**arguments, partial=True, progress=part(progress, 0.0, pruned))
         kept = result.merged.splats if result.merged else splats.take(result.keep)
-        (comparison,) = compare(splats, kept, view, progress=part(progress, decided, 1.0))
+        (comparison,) = compare(splats, kept, view, progress=part(progress, pruned, 1.0))
         return comparison, result.report["estimated_psnr"]
 
     def put(self, context: Context, _group: Members, job: Any, result: Any) -> None:
@@ -277,7 +277,7 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
 
 
 def measured(obj: bpy.types.Object, settings: Any) -> str:
-    """A sentence on the measurement of the current plan, "" without."""
+    """The measured PSNR of the current plan in words, "" without."""
     measured: Comparison | None = (plans.stored(obj, settings) or {}).get("measured")
     return f"Measured in '{measured.view.name}': {measured.psnr:.1f} dB" if measured else ""
 

@@ -1,4 +1,4 @@
-"""The tab REFINE in the 3D view's sidebar, by an artist's steps; it only draws what is stored."""
+"""The tab REFINE in the 3D view's sidebar, in the order of work; drawing computes nothing."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ MODES = (
     ("OFF", "Off", "Show the plain points of the mesh again"),
     ("SCENE", "Scene", "Show the splats as they are"),
     ("HEAT", "Heat", "Colour each splat by its rank: dark goes first, yellow goes last"),
-    ("STAYS", "What Stays", "Show what Apply would leave"),
-    ("GOES", "What Goes", "Show what Apply would remove, in orange"),
+    ("STAYS", "What Stays", "Show what Apply would keep; before scoring, all but What Goes"),
+    ("GOES", "What Goes", "Show what Apply would remove; before scoring, what floats or must go"),
 )
 
 
@@ -76,7 +76,7 @@ def _instances(context: bpy.types.Context) -> str:
 
 
 class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):
-    """Make objects of the scene of the splats that the active object instances, to be scored"""
+    """Turn the splats that the active object instances into objects, which can be scored"""
 
     bl_idname = "refine.make_real"
     bl_label = "Make Splats Real"
@@ -237,8 +237,8 @@ class REFINE_PT_clean(_InSidebar, bpy.types.Panel):
             reasons, sure = settings.to_reasons(), mesh_scores.floater_surety(obj.data)
             total = sum(counts[name] for name in reasons)
             text = f"{total:,} of {mesh_layout.splat_count(obj.data):,} float"
-            known = sum(counts[name] * sure.get(name, 0.0) for name in reasons)
-            text += f", {100.0 * known / total:.0f} % sure" if known else ""
+            certain = sum(counts[name] * sure.get(name, 0.0) for name in reasons)
+            text += f", {100.0 * certain / total:.0f} % sure" if certain else ""
             layout.label(text=text, icon="TRASH")
             text = "Delete Floaters"
             layout.operator("refine.delete", text=text, icon="TRASH").what = "FLOATERS"
@@ -254,13 +254,13 @@ class REFINE_PT_protect(_InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw marks, volumes, and the splats in them."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
-        facts = demands.facts(obj.data) if mesh_layout.looks_like_splats(obj) else {}
+        record = demands.record(obj.data) if mesh_layout.looks_like_splats(obj) else {}
         layout.prop(settings, "protect", text="", icon="GROUP_VERTEX", placeholder="Vertex group")
         column = layout.column(align=True)
         for role, text, _, icon, _ in ROLES:
             button = column.operator_menu_enum("refine.add_volume", "shape", text=text, icon=icon)
             button.role = role
-        counts = facts.get("volumes", {})
+        counts = record.get("volumes", {})
         for index, item in enumerate(settings.volumes):
             row = layout.row(align=True)
             row.prop(item, "role", text="", icon_only=True)
@@ -269,13 +269,13 @@ class REFINE_PT_protect(_InSidebar, bpy.types.Panel):
             if count is not None:
                 row.label(text=f"{count:,}")
             row.operator("refine.drop_volume", text="", icon="X").index = index
-        if "error" in facts:
-            wrapped.label(layout, context, facts["error"], icon="ERROR")
+        if "error" in record:
+            wrapped.label(layout, context, record["error"], icon="ERROR")
             return
-        if facts.get("protected"):
-            layout.label(text=f"Stay: {facts['protected']:,}", icon="LOCKED")
-        if facts.get("removed_by_user"):
-            layout.label(text=f"Go: {facts['removed_by_user']:,}", icon="TRASH")
+        if record.get("protected"):
+            layout.label(text=f"Stay: {record['protected']:,}", icon="LOCKED")
+        if record.get("removed_by_user"):
+            layout.label(text=f"Go: {record['removed_by_user']:,}", icon="TRASH")
             layout.operator("refine.delete", text="Delete Now", icon="TRASH").what = "VOLUMES"
 
 
@@ -343,7 +343,7 @@ def _draw_plan(
         text = f"Score again: {', '.join(changed)}"
         wrapped.label(layout, context, text, icon="ERROR")
     if plan is None:
-        return  # it is being made
+        return  # a timer makes it
     if "error" in plan:
         wrapped.label(layout, context, plan["error"], icon="ERROR")
         return

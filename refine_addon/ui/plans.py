@@ -1,6 +1,6 @@
-"""Plans: the budget's effect, computed when the slider rests, not when drawn.
-Protected and removed splats likewise: marked anew after a volume or a mark has changed.
-Also what changed since scoring, and values that panels keep until the scene changes."""
+"""Plans: the effect of a budget, computed once its slider rests, never while drawing.
+Likewise marks on protected and removed splats, renewed after a volume or a mark changed; changes
+since scoring; values that panels keep until the scene changes."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from ..objects.splat_group import Outcome
 from . import images, operator_bases
 from .wrapped import counted
 
-Answer = TypeVar("Answer")
+Value = TypeVar("Value")
 
 REST = 0.2  # Seconds without a change after which a slider rests
 
 WAYS: dict[str, Way] = {"occlusion": "delete", "merge": "merge", "refit": "refit"}
 """What each method does after scoring with occlusion."""
 
-_made: list[tuple[Any, dict[str, Any]]] = []  # The last plan, and its key; one at most
+_last: list[tuple[Any, dict[str, Any]]] = []  # The last plan after its key; or none
 
 _waiting: list[tuple[str, str]] = []
 """Scene and objects, by name, to be marked when the slider rests."""
 
-_answers: dict[Hashable, Any] = {}  # What `cached` keeps
+_values: dict[Hashable, Any] = {}  # What `cached` keeps
 
-_NOISE = 1e-6  # Relative to the largest number beside it: difference that another machine may make
+_NOISE = 1e-6  # Difference between machines, relative to the largest number in a list
 
 _FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
 
@@ -60,7 +60,7 @@ _WORDS = {
 
 
 def changed(context: bpy.types.Context) -> None:
-    """Plan another budget when the slider rests, in scripts at once."""
+    """Plan anew once the slider rests, in scripts at once."""
     obj = getattr(context, "object", None)  # not in every editor
     if bpy.app.background:
         refresh(context)
@@ -69,19 +69,19 @@ def changed(context: bpy.types.Context) -> None:
 
 
 def refresh(context: bpy.types.Context) -> None:
-    """Plan for the active object if it has scores, and mark removed splats."""
+    """Plan at once for the active object, or mark what goes if it has no scores."""
     obj = getattr(context, "object", None)
     if obj is not None:
         _refresh(context.scene, [obj])
 
 
 def mark_again(context: bpy.types.Context) -> None:
-    """Mark soon which splats are protected and removed.
-    Of the active or first visible object, and others selected, marked or scored."""
+    """Renew soon the marks on protected and removed splats.
+    Of the active or first visible object, and of others selected, marked, searched or scored."""
     active = getattr(context, "object", None)
     objects = [obj for obj in context.scene.objects if mesh_layout.looks_like_splats(obj)]
     first = [active] if active in objects else [obj for obj in objects if obj.visible_get()][:1]
-    noted = {demands.FACTS, mesh_scores.RECORD, mesh_scores.FOUND}
+    noted = {demands.RECORD, mesh_scores.RECORD, mesh_scores.FOUND}
     others = [obj for obj in objects if obj.select_get() or noted & set(obj.data.keys())]
     if bpy.app.background:
         _refresh(context.scene, [*first, *others])
@@ -98,17 +98,17 @@ def ask(context: bpy.types.Context) -> None:
 
 def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
     """The plan of this object and budget, else None."""
-    return _made[0][1] if _made and _made[0][0] == _key(obj, settings) else None
+    return _last[0][1] if _last and _last[0][0] == _key(obj, settings) else None
 
 
 def shown(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
     """The plan to draw: while a new one is made, the last of the same scores."""
-    same = _waiting and _made and _made[0][0][0] == _key(obj, settings)[0]
-    return _made[0][1] if same else stored(obj, settings)
+    same = _waiting and _last and _last[0][0][0] == _key(obj, settings)[0]
+    return _last[0][1] if same else stored(obj, settings)
 
 
 def sentence(plan: dict[str, Any]) -> str:
-    """What a plan without an error keeps.
+    """The splats and megabytes that a plan keeps, in words; not of a plan with an error.
 
     >>> plan = {"splats": 100, "kept": 50, "bytes_before": 5e6, "bytes_after": 2.5e6}
     >>> sentence(plan | {"about": False})
@@ -132,12 +132,12 @@ def price(plan: dict[str, Any] | None, method: str) -> str:
     if between is not None and in_words(between) != words:
         words += f", {in_words(between).removeprefix('about ').removesuffix(' dB')} between"
     seconds = plan["seconds"].get(way, 0.0)
-    seconds = 60.0 * round(seconds / 60.0) if seconds > 60.0 else seconds  # a row is short
+    seconds = 60.0 * round(seconds / 60.0) if seconds > 60.0 else seconds  # rows are short
     return words + (f" · {in_time(seconds)}" if seconds else "")
 
 
 def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
-    """What cameras of a scoring (`record`) do not know, if it matters to an errorless plan."""
+    """What the cameras of a scoring (`record`) cannot tell of a plan without an error."""
     alignment = Alignment.from_facts(record.get("alignment"))
     curve, share, texts = plan["quality"], plan["share"], [alignment.turned()]
     if record["views_used"] == 1:
@@ -186,9 +186,9 @@ def _key(obj: bpy.types.Object, settings: Any) -> Any:
 
 
 def _wait(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: float) -> None:
-    """Schedule `_refresh`, later if it is asked for others meanwhile."""
-    asked = [(scene.name, obj.name) for obj in objects]
-    _waiting[:] = [*asked, *(pair for pair in _waiting if pair not in asked)]
+    """Schedule `_refresh` of these objects and of those that wait already."""
+    pairs = [(scene.name, obj.name) for obj in objects]
+    _waiting[:] = [*pairs, *(pair for pair in _waiting if pair not in pairs)]
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
     bpy.app.timers.register(_rested, first_interval=seconds)
@@ -204,23 +204,23 @@ def _rested() -> None:
 
 
 def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> None:
-    """Plan for the objects, or without scores mark their demands; the first one last."""
+    """Plan for each object, the first one last, or mark its demands if it has no scores."""
     done: set[bpy.types.Object] = set()
     firsts = []
     for obj in objects:
         if obj not in done:
             firsts.append(obj)
             done.update(splat_group.chosen(bpy.context.view_layer, obj) if _can_have(obj) else [])
-    bpy.context.view_layer.update()  # or volumes that a script moved are not yet there
+    bpy.context.view_layer.update()  # or volumes that a script moved are still elsewhere
     for obj in reversed(dict.fromkeys(firsts)):
         if _can_have(obj):
             try:
                 plan = _plan(scene, obj)
             except RefineError as error:
                 plan = {"error": str(error)}
-            _made[:] = [(_key(obj, scene.refine), plan)]
+            _last[:] = [(_key(obj, scene.refine), plan)]
         elif _is_ours(obj):
-            with contextlib.suppress(RefineError):  # which the panel shows
+            with contextlib.suppress(RefineError):  # the panel shows it
                 demands.refresh(scene, [mesh_layout.check(obj)])
 
 
@@ -283,23 +283,23 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
 
 def stale(context: bpy.types.Context, *objects: bpy.types.Object) -> list[str]:
     """Changes since any object was scored, in few words; none without an origin."""
-    found: dict[str, None] = {}
+    changes: dict[str, None] = {}
     for obj in objects:
         record = mesh_scores.record(obj.data) or {}
         now = origin(context, obj)
         try:
             then = {name: record["origin"][name] for name in now}
             source, others = then["cameras"][0], now["cameras"]
-        except (IndexError, KeyError, TypeError):  # whoever wrote there, it was not `origin`
+        except (IndexError, KeyError, TypeError):  # not written by `origin`
             continue
         if source == "FRAMES" and then["frame"] != now["frame"]:
-            then["matrix"] = now["matrix"]  # the views of a shot follow the object, which moves
+            then["matrix"] = now["matrix"]  # views of a shot follow the object as it moves
         if source == "SELECTED" and others[:2] == ["SELECTED", 0]:
-            then["cameras"] = others  # selecting the splats deselected them
-        found |= {_WORDS[name]: None for name in _WORDS if not _same(then[name], now[name])}
+            then["cameras"] = others  # selecting the splats deselected the cameras
+        changes |= {_WORDS[name]: None for name in _WORDS if not _same(then[name], now[name])}
         if record.get("quality") and record.get("protected") != _marked(obj, 1):
-            found["what is protected changed"] = None
-    return list(found)
+            changes["what is protected changed"] = None
+    return list(changes)
 
 
 def _same(one: Any, other: Any, scale: float = 0.0) -> bool:
@@ -331,7 +331,7 @@ def _cameras(context: bpy.types.Context) -> list[Any]:
         return chosen
     (width, height), aspect = render_size(scene)
     numbers = np.array([_numbers(camera, (width, height, aspect)) for camera in cameras])
-    # In any order, and short however many there are: (2, C).
+    # The same in any order, and of the same length however many there are: (2, C).
     means = np.array([numbers.mean(axis=0), np.sqrt((numbers**2).mean(axis=0))])
     axes, place, rest = np.split(means, (9, 12), axis=1)
     return [*chosen, axes.ravel().tolist(), place.ravel().tolist(), *rest.T.tolist()]
@@ -349,35 +349,35 @@ def _numbers(camera: bpy.types.Object, frame: tuple[int, int, float]) -> tuple[f
     )
 
 
-def cached(what: Hashable, context: bpy.types.Context, compute: Callable[[], Answer]) -> Answer:
+def cached(what: Hashable, context: bpy.types.Context, compute: Callable[[], Value]) -> Value:
     """Value of `compute` (of the scene, active object, settings), kept until anything changes.
     A script's silent changes, such as custom properties, show after the next change."""
     obj, settings = context.object, context.scene.refine
     names = set(settings.bl_rna.properties.keys()) - {"rna_type", "name"}
     values = repr([getattr(settings, name) for name in sorted(names)])
     key = (what, context.scene.session_uid, obj and obj.session_uid, values)
-    if key not in _answers:
-        _answers[key] = compute()
-    return _answers[key]
+    if key not in _values:
+        _values[key] = compute()
+    return _values[key]
 
 
 @persistent
 def _forget(*_arguments: object) -> None:
-    _answers.clear()
+    _values.clear()
 
 
 @persistent
 def _undone(*_: object) -> None:
     """After undo or redo, mark again what may differ, and draw the right chart."""
     _forget()
-    _made.clear()
+    _last.clear()
     if not bpy.app.background:
         (mark_again if bpy.context.scene.refine.volumes else changed)(bpy.context)
 
 
 @persistent
 def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
-    """Watch moving volumes, and splats moving under them."""
+    """Renew the marks after volumes, or splats, have moved."""
     _forget()
     if depsgraph is None or bpy.app.background or not scene.refine.volumes:
         return
@@ -399,8 +399,8 @@ HANDLERS = {
 
 
 def unregister() -> None:
-    """Plan no more."""
+    """Stop the timer, and forget all plans."""
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
-    for kept in (_made, _waiting, _answers):
+    for kept in (_last, _waiting, _values):
         kept.clear()

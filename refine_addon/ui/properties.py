@@ -32,16 +32,16 @@ from .marks import RefineVolume
 from .select_operators import SelectSettings
 
 METHODS = (
-    ("closed-form", "Closed Form", "REFINE's formula: nothing is hidden. Rows stay as they were"),
-    ("occlusion", "Occlusion", "Knows what hides what; deletes. Rows stay as they were"),
-    ("merge", "Merge", "What goes is merged into what stays; deletes where that is as good"),
-    ("refit", "Refit", "Merges, then fits what stays to how all splats looked: closest, slowest"),
+    ("closed-form", "Closed Form", "REFINE's formula, ignores occlusion. Kept splats unchanged"),
+    ("occlusion", "Occlusion", "Knows what hides what. Only deletes; kept splats are unchanged"),
+    ("merge", "Merge", "Merges what goes into what stays; deletes where that is as good"),
+    ("refit", "Refit", "Merges, then fits kept splats to the original look: closest, slowest"),
 )
 """The dial, from instant to best, by core's names."""
 
 HINTS = {
-    "closed-form": "rows stay as they were",
-    "occlusion": "rows stay as they were",
+    "closed-form": "only deletes",
+    "occlusion": "only deletes",
     "merge": "what goes is merged",
     "refit": "merged, then fitted",
 }
@@ -62,10 +62,10 @@ UPRIGHT_TEXT = (
 
 DRAWN = (
     ("default", "Default", "As ordinary 3D Gaussian splats"),
-    ("antialiased", "Antialiased", "Trained so in Mip-Splatting, gsplat, Brush or Postshot"),
-    ("2dgs", "2DGS", "Flat discs without a third scale"),
+    ("antialiased", "Antialiased", "Trained antialiased in Mip-Splatting, gsplat, Brush, Postshot"),
+    ("2dgs", "2DGS", "As flat discs, which have no third scale"),
 )
-"""Drawing models, by the names of `rendering.MODELS` and in their order."""
+"""Drawing models, by the names of `splats.MODELS` and in their order."""
 
 STRENGTHS = (
     ("CAREFUL", "Careful", "What stands in front of surfaces, and small clusters by themselves"),
@@ -128,7 +128,7 @@ def _protectable(
 
 
 def decimal(value: float) -> float:
-    """The number as typed: else the panel would remove other splats than the command.
+    """The number as typed, so that panel and command remove the same splats.
 
     >>> decimal(0.28999999165534973)  # as Blender keeps 0.29
     0.29
@@ -157,27 +157,27 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
 
     model: EnumProperty(
         name="Drawn As",
-        description="How the splats of the active object are drawn, in all of the panel and in the "
-        "exported file; by default as the imported file says",
+        description="The model that the splats of the active object were trained with. Views, "
+        "scores, pictures and the exported file follow it; by default as the imported file says",
         items=DRAWN,
         get=_model,
         set=_set_model,
     )
-    source: EnumProperty(name="Cameras", description="Which cameras decide", items=SOURCES)
+    source: EnumProperty(name="Cameras", description="Cameras that decide", items=SOURCES)
     collection: PointerProperty(
         name="Collection", description="The collection of the cameras", type=bpy.types.Collection
     )
-    frame_step: IntProperty(name="Step", description="Every how many frames", default=10, min=1)
+    frame_step: IntProperty(name="Step", description="Frames from view to view", default=10, min=1)
     strength: EnumProperty(
         name="Strength",
-        description="How much of what floats goes",
+        description="How many of the floaters go",
         items=STRENGTHS,
         default="USUAL",
         update=_mark_again,
     )
     budget: EnumProperty(
         name="Budget",
-        description="How the number of splats that go is given",
+        description="How the budget is given",
         items=BUDGETS,
         update=_plan_again,
     )
@@ -216,7 +216,7 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
     )
     protect: StringProperty(
         name="Protect",
-        description="Vertex group, or boolean or float point attribute: the splats in it stay",
+        description="Vertex group, or boolean or float point attribute, whose splats stay",
         search=_protectable,
         search_options={"SORT", "SUGGESTION"},
         update=_plan_again,
@@ -261,7 +261,7 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         return Levels(shares)
 
     def to_frames(self, scene: bpy.types.Scene) -> range:
-        """Frames whose views count."""
+        """Frames whose views decide."""
         return range(scene.frame_start, scene.frame_end + 1, self.frame_step)
 
     def to_reasons(self) -> tuple[str, ...]:
@@ -275,7 +275,7 @@ DEFAULTS = ("method", "views")  # Preferences that are scene settings of the sam
 
 
 class RefinePreferences(_Preferred, bpy.types.AddonPreferences):
-    """Defaults, in Blender's preferences beside the extension."""
+    """Defaults, in the extension's preferences."""
 
     bl_idname = PACKAGE
 
@@ -292,7 +292,7 @@ class RefinePreferences(_Preferred, bpy.types.AddonPreferences):
 
 
 def fill(values: Any, context: bpy.types.Context, *names: str) -> None:
-    """Set preferred values that settings or an operator's properties do not set yet."""
+    """Set settings or an operator's properties from the preferences, unless they are set."""
     addon = context.preferences.addons.get(PACKAGE)
     for name in names if addon else ():
         if addon.preferences.is_property_set(name) and not values.is_property_set(name):

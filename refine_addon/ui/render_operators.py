@@ -35,12 +35,11 @@ NOTICE = "Splats are not in this render: use Render > Render with Splats"
 
 IN_BACKGROUND = "refine: splats are not in this render; use --command refine render"
 
-_LINGERS = 10.0  # Seconds that it stays after the render
+_LINGERS = 10.0  # Seconds that `NOTICE` stays after the render
 
-_until: list[float] = []
+_until: list[float] = []  # Time until which `NOTICE` is shown
 
-
-_watched: list[engine.Shared] = []  # What Esc stops; each `_watch_anew` makes another list
+_watched: list[engine.Shared] = []  # The render that Esc stops; `_watch_anew` makes a new list
 
 
 def _watch_anew(shared: engine.Shared) -> None:
@@ -59,10 +58,10 @@ def no_render(_context: bpy.types.Context) -> str:
 
 
 class REFINE_OT_watch_render(bpy.types.Operator):
-    """Stops a render at Esc, and leaves that to Blender, too"""
+    """Stop a render with splats at Esc, which Blender's render gets as well"""
 
-    # Of operators that wait, the last is told of an event first. Blender's render keeps Esc for
-    # itself, also where it has just ended by itself and so is not ended by that.
+    # Blender passes an event first to the modal operator that started last. Its render takes Esc
+    # away from all others, even if it has just ended by itself and so is not stopped.
     bl_idname = "refine.watch_render"
     bl_label = "Watch a Render"
     bl_options = {"INTERNAL"}
@@ -74,7 +73,7 @@ class REFINE_OT_watch_render(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def modal(self, _context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Heed Esc; end at the first event after the render."""
+        """Stop the render at Esc; end at the first event after the render."""
         if not self._watched:
             return {"FINISHED", "PASS_THROUGH"}
         self._watched[0].stopped |= event.type == "ESC" and event.value == "PRESS"
@@ -82,7 +81,7 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 
 
 class REFINE_OT_render(Needing, bpy.types.Operator):
-    """Render what the camera sees with the splats as the 3D view shows them, among meshes that the scene's engine renders; an animation is written where Output says"""  # noqa: E501
+    """Render splats as the 3D view draws them, among what the scene's engine renders"""
 
     bl_idname = "refine.render"
     bl_label = "Render with Splats"
@@ -106,7 +105,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         return str(cls.__doc__)
 
     def execute(self, context: bpy.types.Context) -> Answer:
-        """Do all of it at once."""
+        """Render at once."""
         self._begin(context)
         try:
             for step in filter(None, self._steps or ()):
@@ -116,12 +115,12 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         return self._finished(context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
-        """Start the first render, unless nobody watches."""
+        """Start the first render; in the background render at once."""
         if bpy.app.background or context.window is None:
             return self.execute(context)
         self._begin(context)
         answer = self._go_on(context)
-        if "RUNNING_MODAL" in answer:  # else Blender would keep the handler of what it frees
+        if "RUNNING_MODAL" in answer:  # Blender frees a finished operator, not its handler
             stop = partial(setattr, self._shared, "stopped", True)
             worker = SimpleNamespace(fraction=0.0, what="", cancel=stop, end=stop)
             self._running = Running(self, context, [], None, worker)
@@ -154,7 +153,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
         """Take the last render's result, or start the next one at the next event:
-        an Esc may wait behind this one, and renders forget it as they begin."""
+        a render that begins would drop an Esc that waits behind this event."""
         try:
             step, self._next = self._next, None
             undone = step is not None and step.scene not in bpy.data.scenes
@@ -169,7 +168,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             return self._finished(context)
         except _ENDS as error:
             return self._stopped(context, error)
-        except Exception:  # a fault of the program, which Blender prints
+        except Exception:  # a bug, which Blender prints
             self._over(context)
             raise
         return {"RUNNING_MODAL"}

@@ -1,4 +1,4 @@
-"""The box *Select* of the panel: its settings, what changes the selection at once, its uses."""
+"""The box *Select* of the panel, with its settings and operators."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ ACTIONS = (
 )
 
 SETS = (
-    ("FLOATERS", "Floaters", "Those that Find Floaters found, by the strength of Clean"),
-    ("OUTSIDE", "Go", "Those that must go: outside or inside of volumes, or marked"),
-    ("STAYING", "Stay", "Those that must stay: inside of volumes, or marked"),
-    ("GOING", "What Goes", "Those that Apply would remove"),
-    ("FAINT", "Opacity Below", "Those that are less opaque than the field says"),
-    ("LARGE", "Size Above", "Those whose longest standard deviation is more than the field says"),
+    ("FLOATERS", "Floaters", "Select the floaters of the strength in Clean"),
+    ("OUTSIDE", "Go", "Select what must go, by volumes and marks"),
+    ("STAYING", "Stay", "Select what must stay, by volumes and marks"),
+    ("GOING", "What Goes", "Select what Apply would remove, as the view What Goes shows it"),
+    ("FAINT", "Opacity Below", "Select splats less opaque than the field below"),
+    ("LARGE", "Size Above", "Select splats whose longest axis is above the field below"),
 )
 
 
@@ -52,7 +52,7 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
     bl_label = "Select"
     bl_options = {"REGISTER", "UNDO"}
 
-    action: EnumProperty(name="Action", description="What is done", items=ACTIONS)
+    action: EnumProperty(name="Action", description="What to do", items=ACTIONS)
     description = tooltips("action", ACTIONS)
 
     def act(self, context: Context) -> Answer:
@@ -74,14 +74,14 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
-    """Select splats by what is known of them"""
+    """Select splats by a property"""
 
     bl_idname = "refine.select_by"
     bl_label = "Select By"
     bl_options = {"REGISTER", "UNDO"}
 
-    what: EnumProperty(name="What", description="Which splats are taken", items=SETS)
-    mode: EnumProperty(name="Mode", description="What becomes of those taken", items=MODES)
+    what: EnumProperty(name="What", description="The splats to select", items=SETS)
+    mode: EnumProperty(name="Mode", description="How they combine with the selection", items=MODES)
     description = tooltips("what", SETS)
 
     def act(self, context: Context) -> Answer:
@@ -115,14 +115,14 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
-    """Select the neighbours of the selected splats too, or leave out those at the edge (Esc cancels)"""  # noqa: E501
+    """Select the neighbours of selected splats too, or deselect those at the edge (Esc cancels)"""
 
     bl_idname = "refine.grow_selection"
     bl_label = "Grow Selection"
     bl_options = {"REGISTER", "UNDO"}
     doing = "Looking for neighbours"
 
-    shrink: BoolProperty(name="Shrink", description="Leave out those at the edge")
+    shrink: BoolProperty(name="Shrink", description="Deselect those at the edge")
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
         """Positions, and the selection."""
@@ -145,7 +145,7 @@ class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
-    """Make an object of its own of the selected splats"""
+    """Move the selected splats into a new object"""
 
     bl_idname = "refine.separate_selected"
     bl_label = "Separate Selected"
@@ -188,14 +188,14 @@ class SelectSettings:
 
     select_radius: FloatProperty(
         name="Radius",
-        description="Of the brush, in pixels",
+        description="Radius of the brush, in pixels",
         subtype="PIXEL",
         default=40.0,
         min=1.0,
         max=1000.0,
     )
     select_hidden: BoolProperty(
-        name="Through", description="Take splats that others hide, too: those behind surfaces"
+        name="Through", description="Also select splats that others hide, behind surfaces"
     )
     select_tolerance: FloatProperty(
         name="Tolerance",
@@ -206,17 +206,17 @@ class SelectSettings:
         max=1.0,
     )
     select_connected: BoolProperty(
-        name="Connected", description="Take the colour only where it hangs together with the mouse"
+        name="Connected", description="Select only the connected piece under the mouse"
     )
     select_mode: EnumProperty(
-        name="Mode", description="What becomes of the splats that a button takes", items=MODES
+        name="Mode", description="How Select By changes the selection", items=MODES
     )
     select_opacity: FloatProperty(
-        name="Opacity", description="Less opaque splats are taken", default=0.1, min=0.0, max=1.0
+        name="Opacity", description="Limit of Opacity Below", default=0.1, min=0.0, max=1.0
     )
     select_size: FloatProperty(
         name="Size",
-        description="Splats with a longer standard deviation are taken, units of the object",
+        description="Limit of Size Above: the longest standard deviation, units of the object",
         default=0.1,
         min=1e-6,
         precision=3,

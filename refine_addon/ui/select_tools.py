@@ -1,6 +1,6 @@
-"""Toolbar tools that select the splats one sees: brush, lasso, box, sphere, colour.
-During a stroke, from press to release, a thread computes what the view shows. This is kept for
-further strokes from the same place; until it is known the mouse is recorded."""
+"""Toolbar tools that select the splats in view: brush, lasso, box, sphere, colour.
+As a stroke begins, a thread computes which splats the view shows; until then the mouse is only
+recorded. The result is kept for further strokes in the same view."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ _TOOLS = (
     ("BRUSH", "Brush", "that a round brush covers", "generic.select_circle"),
     ("LASSO", "Lasso", "inside a line around them", "generic.select_lasso"),
     ("BOX", "Box", "inside a rectangle", "generic.select_box"),
-    ("SPHERE", "Sphere", "around the place one presses", "mesh.primitive_sphere_add_gizmo"),
+    ("SPHERE", "Sphere", "around the place where you press", "mesh.primitive_sphere_add_gizmo"),
     ("COLOR", "Colour", "of the colour under the mouse", "sculpt.mask_by_color"),
 )
-"""Shapes of strokes with their names, the splats they take, and Blender's icons for them."""
+"""Shapes of strokes: name, label, the splats they select, Blender's icon."""
 
-SHAPES = tuple((name, label, f"Take the splats {which}") for name, label, which, _ in _TOOLS)
+SHAPES = tuple((name, label, f"Select the splats {which}") for name, label, which, _ in _TOOLS)
 
 MODES = (
     ("SET", "Set", "Select these splats and no others", "SELECT_SET", 0),
     ("ADD", "Add", "Select these splats as well (Shift)", "SELECT_EXTEND", 1),
-    ("SUBTRACT", "Subtract", "Select these splats no more (Ctrl)", "SELECT_SUBTRACT", 2),
-    ("INTERSECT", "Intersect", "Select what both hold (Shift Ctrl)", "SELECT_INTERSECT", 3),
+    ("SUBTRACT", "Subtract", "Deselect these splats (Ctrl)", "SELECT_SUBTRACT", 2),
+    ("INTERSECT", "Intersect", "Deselect all but these splats (Shift Ctrl)", "SELECT_INTERSECT", 3),
 )
 
 _STEP = 0.03  # Seconds between two looks at the thread that sees the view
@@ -60,7 +60,7 @@ _kept: dict[object, Prepared | Sight] = {}  # The last stroke's splats, and what
 class Stroke:
     """A tool's stroke over a view, from the press of the button to its release.
     `shape`, `mode`: see `SHAPES`, `Mode`; `path`: columns and rows from the
-    region's upper left, pixels; `before`, `selected`: (N,), the latter as far as known."""
+    region's upper left, pixels; `before`, `selected`: (N,), the latter None until computed."""
 
     def __init__(self, context: Context, shape: str, mode: Mode, at: tuple[float, float]) -> None:
         settings, region = context.scene.refine, context.region
@@ -75,7 +75,7 @@ class Stroke:
         self._worker = Worker(self._read(context))
 
     def _read(self, context: Context) -> Callable[[Progress], dict[object, Prepared | Sight]]:
-        """Note the selection; what a thread calls to fill `_kept`."""
+        """Read selection and view; a thread-safe callable gives what `_kept` is to hold."""
         obj, region, eye = self.obj, context.region, context.region_data
         matrix = world_matrix(obj, context.evaluated_depsgraph_get())
         camera = (
@@ -102,7 +102,7 @@ class Stroke:
         return look
 
     def follow(self) -> bool:
-        """Select what the stroke covers by now; whether that is known. Raises a thread's error."""
+        """Select what the stroke covers so far; False if the view is not computed yet."""
         if self._sight is None:
             if self._worker.running():
                 return False
@@ -165,7 +165,7 @@ class Stroke:
 
 
 def _drawn(checked: SplatObject, away: NDArray[np.bool_]) -> Splats:
-    """An object's splats; those that views do not show, (N,), get no opacity."""
+    """An object's splats; those in `away`, (N,), get no opacity."""
     splats = mesh_attributes.splats_from_object(checked, sh_rest=False)
     logits = np.where(away, np.float32(-np.inf), splats.opacity_logits)
     return replace(splats, opacity_logits=logits)
@@ -191,15 +191,15 @@ def _in_view(context: Context) -> str:
 
 
 class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
-    """Select splats by what the view shows; those that others hide only if the tool is told so"""
+    """Select the splats that the view shows, with Through also those behind them"""
 
     bl_idname = "refine.select_stroke"
     bl_label = "Select Splats"
     bl_options = {"UNDO"}
     needs = (idle, on_splats, _in_view)
 
-    shape: EnumProperty(name="Shape", description="What takes splats", items=SHAPES)
-    mode: EnumProperty(name="Mode", description="What becomes of those taken", items=MODES)
+    shape: EnumProperty(name="Shape", description="Shape of the stroke", items=SHAPES)
+    mode: EnumProperty(name="Mode", description="How they combine with the selection", items=MODES)
 
     _stroke: Stroke | None = None
 
@@ -218,7 +218,7 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: Context, event: bpy.types.Event) -> Answer:
-        """Follow the mouse until the button is released and the view's splats are known."""
+        """Follow the mouse until the button is released and the view is computed."""
         stroke = self._stroke
         if stroke is None or event.type in {"ESC", "RIGHTMOUSE"}:
             return self._over(context, kept=False)
@@ -229,11 +229,11 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
         elif event.type != "TIMER" or (stroke.selected is not None and not stroke.released):
             return {"RUNNING_MODAL"}
         try:
-            known = stroke.follow()
+            computed = stroke.follow()
             context.area.tag_redraw()
-            if known:
+            if computed:
                 context.area.header_text_set(stroke.sentence())
-            if known and stroke.released:
+            if computed and stroke.released:
                 return self._over(context, kept=True)
         except FAILURES as error:
             self._over(context, kept=False)
@@ -298,7 +298,7 @@ _OBJECT_KEYS = (
     _key("refine.grow_selection", "NUMPAD_MINUS", ("shrink", True), ctrl=True),
     *(_key("refine.delete", key, ("what", "SELECTED")) for key in ("X", "DEL")),
 )
-"""Keys in object mode, besides the mouse's. Edit mode has its own."""
+"""Keys in object mode, besides the mouse. In edit mode Blender's own do."""
 
 
 def _draw_settings(
@@ -339,7 +339,7 @@ def _tool(shape: str, label: str, which: str, icon: str, mode: str) -> type:
         "bl_context_mode": mode,
         "bl_idname": f"refine.select_{shape.lower()}",
         "bl_label": f"Select Splats: {label}",
-        "bl_description": f"Take the splats {which}.\nShift adds, Ctrl subtracts, both intersect",
+        "bl_description": f"Select the splats {which}.\nShift adds, Ctrl subtracts, both intersect",
         "bl_icon": f"ops.{icon}",
         "bl_cursor": "EYEDROPPER" if shape == "COLOR" else "CROSSHAIR",
         "bl_keymap": keys,

@@ -1,4 +1,4 @@
-"""Operators that move whole splat objects, and notices of drift."""
+"""Operators that bake and mend transforms; warnings where Blender's own tools moved splats."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from . import plans, wrapped
 from .operator_bases import Answer, AtOnce, Job, OnSplats, in_object_mode
 from .wrapped import counted
 
-_SOON = 0.1  # Seconds until new splats are noted: Blender's operator is over by then
+_SOON = 0.1  # Seconds until new splats are stamped: Blender's operator is over by then
 
-_known: dict[int, Drift | None] = {}  # Drift by the data's number in this session, until it changes
+_drifts: dict[int, Drift | None] = {}  # By the data's `session_uid`, until it changes
 
 
 class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
-    """Move the splats themselves as their object is moved: sizes, rotations and colours follow"""
+    """Apply the transforms of selected objects to their splats: places, sizes, turns, colours"""
 
     bl_idname = "refine.bake_transform"
     bl_label = "Bake Transform"
@@ -39,7 +39,7 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
 
     location: BoolProperty(
         name="Location",
-        description="Also put the object's origin where that of the world is, or of its parent",
+        description="Also apply the location: the origin moves to that of the world or the parent",
         default=True,
     )
 
@@ -54,7 +54,7 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
-    """Have sizes, rotations and colours follow what Blender's own tools did to the positions"""
+    """Make sizes, rotations and colours follow what Blender's own tools did to the positions"""
 
     bl_idname = "refine.mend"
     bl_label = "Mend Splats"
@@ -63,7 +63,7 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
     doing = "Mending splats"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """Selected objects with drift, and their notes."""
+        """Selected objects with drift, and a callable each that computes new values."""
         mesh_layout.check(context.object)
         chosen = splat_group.chosen(context.view_layer, context.object)
         drifted = {obj.data: obj for obj in chosen if of(obj)}
@@ -74,29 +74,29 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
 
     @staticmethod
     def compute(moves: Any, progress: Progress) -> Any:
-        """The maps that moved splats, and values repaired by them."""
+        """New values, by property, and the number of mended splats, of each object."""
         return run_all(lambda move: move(), moves, progress=progress, threads=1)
 
-    def put(self, context: Context, group: list[SplatObject], _job: Any, found: Any) -> None:
+    def put(self, context: Context, group: list[SplatObject], _job: Any, mended: Any) -> None:
         """Mend the objects."""
         transforms.write_moved(
-            [(one, columns) for one, (columns, _) in zip(group, found, strict=True)]
+            [(one, columns) for one, (columns, _) in zip(group, mended, strict=True)]
         )
         plans.refresh(context)
-        self.report({"INFO"}, f"Mended {counted(sum(count for _, count in found), 'splat')}")
+        self.report({"INFO"}, f"Mended {counted(sum(count for _, count in mended), 'splat')}")
 
 
 def of(obj: bpy.types.Object) -> Drift | None:
-    """Drift of an object, None if none; computed once for each change."""
+    """Drift of an object, None without; computed once for each change."""
     if obj.mode == "EDIT":
         return None
     key = obj.data.session_uid
-    if key not in _known:
+    if key not in _drifts:
         try:
-            _known[key] = mesh_drift.found(mesh_layout.check(obj).mesh)
+            _drifts[key] = mesh_drift.found(mesh_layout.check(obj).mesh)
         except RefineError:
-            _known[key] = None
-    return _known[key]
+            _drifts[key] = None
+    return _drifts[key]
 
 
 def _in_view(context: Context) -> list[str]:
@@ -127,20 +127,20 @@ def _draw_apply(menu: bpy.types.Menu, context: Context) -> None:
 
 @persistent
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
-    """Forget drift of what changed; note new splats soon."""
+    """Forget the drift of changed objects; stamp new splats soon."""
     for update in depsgraph.updates if depsgraph else ():
         if update.is_updated_geometry:
             data = getattr(update.id.original, "data", update.id.original)
-            _known.pop(getattr(data, "session_uid", 0), None)
+            _drifts.pop(getattr(data, "session_uid", 0), None)
             if _is_new(data):
-                _note_soon()
+                _stamp_soon()
 
 
 @persistent
 def _changed(*_: object) -> None:
-    _known.clear()
+    _drifts.clear()
     if any(_is_new(data) for data in (*bpy.data.meshes, *bpy.data.pointclouds)):
-        _note_soon()
+        _stamp_soon()
 
 
 def _is_new(data: object) -> bool:
@@ -152,13 +152,13 @@ def _is_new(data: object) -> bool:
     )
 
 
-def _note_soon() -> None:
-    """Note new splats once Blender is idle: nothing may be written while it works."""
-    if not bpy.app.background and not bpy.app.timers.is_registered(_note):
-        bpy.app.timers.register(_note, first_interval=_SOON)
+def _stamp_soon() -> None:
+    """Stamp new splats once Blender is idle: nothing may be written while it works."""
+    if not bpy.app.background and not bpy.app.timers.is_registered(_stamp):
+        bpy.app.timers.register(_stamp, first_interval=_SOON)
 
 
-def _note() -> None:
+def _stamp() -> None:
     for obj in bpy.data.objects:
         if _is_new(obj.data) and obj.mode != "EDIT":
             try:
@@ -168,16 +168,16 @@ def _note() -> None:
 
 
 def register() -> None:
-    """Have the views warn of what moved."""
+    """Have the 3D views warn of drift."""
     viewport_draw.warned_by.append(_in_view)
 
 
 def unregister() -> None:
     """Undo `register`."""
     viewport_draw.warned_by.remove(_in_view)
-    if bpy.app.timers.is_registered(_note):
-        bpy.app.timers.unregister(_note)
-    _known.clear()
+    if bpy.app.timers.is_registered(_stamp):
+        bpy.app.timers.unregister(_stamp)
+    _drifts.clear()
 
 
 CLASSES = (REFINE_OT_bake_transform, REFINE_OT_mend)

@@ -121,7 +121,7 @@ def test_esc_while_refitting_keeps_what_that_has_reached(addon, obj, monkeypatch
     operator.modal(context, event("ESC"))
 
     assert first == "cancels"
-    assert sentence == "Pruning splats (refitting); Esc keeps what that has reached"
+    assert sentence == "Pruning splats (refitting); Esc keeps the result so far"
     assert until(operator, context) == {"FINISHED"}
     assert len(obj.data.vertices) == 3976 - int(0.6 * 3976)
     words = "after round 1" if rounds else "before its first round was done"

@@ -139,7 +139,7 @@ def test_x_and_del_delete_splats_with_a_tool_and_not_the_object():
 
 def test_what_is_marked_to_go_goes_before_all_others(addon, quarter, room_cameras):
     """Of 4,969 that go the 100 best are marked; a mark to stay takes the place of one to go."""
-    read, facts = addon.mesh.attributes.read_attribute, addon.objects.demands.facts
+    read, facts = addon.mesh.attributes.read_attribute, addon.objects.demands.record
     bpy.ops.refine.score()
     best = np.argsort(-read(quarter.data, "refine_score"), kind="stable")[:100]
     choose(addon, quarter, best)

@@ -64,7 +64,7 @@ def mask(addon, obj, name):
 
 
 def facts(addon, obj):
-    return addon.objects.demands.facts(obj.data)
+    return addon.objects.demands.record(obj.data)
 
 
 def select(addon, obj, rows):
@@ -348,7 +348,7 @@ def test_volumes_are_added_dropped_and_deleted(addon, quarter):
     assert 0 < inside.sum() < COUNT
     assert np.array_equal(mask(addon, quarter, "opacity"), opacity[~inside])
     assert facts(addon, quarter)["removed_by_user"] == 0
-    with pytest.raises(RuntimeError, match="no volume says of any splat that it must go"):
+    with pytest.raises(RuntimeError, match="no splat must go by volumes or marks"):
         bpy.ops.refine.delete(what="VOLUMES")
 
 
@@ -424,5 +424,5 @@ def test_a_damaged_note_counts_as_none(addon, quarter):
     """A .blend may come from anywhere."""
     whole = '{"splats": 9939, "protected": %s, "removed_by_user": 1, "volumes": []}'
     for text in ("", "{", "[]", '{"splats": 9939}', whole % '"x"', whole % 7):
-        quarter.data[addon.objects.demands.FACTS] = text
+        quarter.data[addon.objects.demands.RECORD] = text
         assert ("protected" in facts(addon, quarter)) == (text == whole % 7)

@@ -54,7 +54,7 @@ def main(cloud, cameras, models, pictures, blend):
 
 def must_go(splats):
     """Return how many splats the panel says that volumes remove."""
-    return extension.module("objects.demands").facts(splats.data).get("removed_by_user", 0)
+    return extension.module("objects.demands").record(splats.data).get("removed_by_user", 0)
 
 
 def handle(hand, splats):
