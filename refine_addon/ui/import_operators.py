@@ -32,15 +32,11 @@ from .operator_bases import FAILURES, Answer, Job, Needing, described, idle, in_
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
-FOLDER = "refine_folder"  # Custom property of an imported object: its file's folder
-
 _ABOVE = 3  # folders above the splats in which their cameras are looked for
 
 _DEFAULT_SIZE = (1920, 1080, 100)  # of Blender's factory settings, with the percentage
 
 _OF_MODELS = {".bin", ".txt"}  # several files of one folder are a COLMAP model
-
-_USUAL_NAMES = {"cameras", "images", "transforms", "transforms_train"}  # tell no captures apart
 
 
 class _Importing(Job, Needing, ImportHelper):
@@ -61,11 +57,9 @@ class _Importing(Job, Needing, ImportHelper):
         options={"SKIP_SAVE"},
     )
 
-    def add_cameras(self, context: Context, views: ViewSet, path: Path) -> bpy.types.Collection:
-        """Camera objects in a new collection named after `path`, which decides from now on."""
-        scene = context.scene
-        name = "Cameras" if path.is_dir() or path.stem in _USUAL_NAMES else f"Cameras {path.stem}"
-        collection = bpy.data.collections.new(name)
+    def add_cameras(self, context: Context, views: ViewSet) -> bpy.types.Collection:
+        """Camera objects in a new collection, which decides from now on."""
+        scene, collection = context.scene, bpy.data.collections.new("Cameras")
         target_collection(context).children.link(collection)
         cameras = create_cameras(views, collection, upright=self.upright)
         scene.refine.collection = collection
@@ -114,18 +108,13 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
         path = self.properties.filepath
         if path.lower().endswith(INDEX_NAMES):
             return bpy.ops.refine.import_ply("INVOKE_DEFAULT", filepath=path)
-        obj = _imported_splats(context)
+        obj = _splats_in(context)
         if obj is None:
             properties.fill(self.properties, context, "upright")
         elif not self.properties.is_property_set("upright"):
             self.upright = _is_upright(obj)
         suggest_resolution(self, context)
-        folder = None if self.properties.is_property_set("filepath") else capture_folder(obj)
-        if folder is None:
-            return self.invoke_popup(context)
-        self.filepath = os.path.join(folder, "")
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+        return self.invoke_popup(context)
 
     def gather(self, _context: Context) -> tuple[list[SplatObject], Path]:
         """The path."""
@@ -139,10 +128,10 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
         """The file's views; of a COLMAP model, the whole folder's."""
         return read_cameras(path.parent if path.suffix in _OF_MODELS else path)
 
-    def put(self, context: Context, _group: list[SplatObject], path: Path, views: ViewSet) -> None:
+    def put(self, context: Context, _group: list[SplatObject], _job: Any, views: ViewSet) -> None:
         """Make camera objects."""
-        collection = self.add_cameras(context, views, path)
-        if (splats := _imported_splats(context)) is not None:
+        collection = self.add_cameras(context, views)
+        if (splats := _splats_in(context)) is not None:
             self.warn_of_turn(context, splats)
         self.report({"INFO"}, f"Imported {counted(len(views), 'camera')} into '{collection.name}'")
 
@@ -175,21 +164,10 @@ def cameras_beside(folder: Path) -> Path | None:
     return next((files[0] for place in places if (files := cameras_in(place))), None)
 
 
-def capture_folder(obj: bpy.types.Object | None) -> Path | None:
-    """Folder to search for cameras of a splat object; None if unknown."""
-    stored = obj.get(FOLDER) if obj is not None else None
-    if not isinstance(stored, str) or not stored or not os.path.isdir(stored):
-        return None
-    cameras = cameras_beside(Path(stored)) or Path(stored)
-    return cameras if cameras.is_dir() else cameras.parent
-
-
-def _imported_splats(context: Context) -> bpy.types.Object | None:
-    """Splats that cameras are imported for: the active ones, else any imported ones."""
-    if mesh_layout.looks_like_splats(context.object):
-        return context.object
-    splats = (obj for obj in context.scene.objects if FOLDER in obj)
-    return next((obj for obj in splats if mesh_layout.looks_like_splats(obj)), None)
+def _splats_in(context: Context) -> bpy.types.Object | None:
+    """Splats that cameras are imported for: the active ones, else the first of the scene."""
+    objects = (context.object, *context.scene.objects)
+    return next(filter(mesh_layout.looks_like_splats, objects), None)
 
 
 def _is_upright(obj: bpy.types.Object) -> bool:
@@ -307,7 +285,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         count = sum(len(obj.data.vertices) for obj in imported)
         text = f"Imported {count:,} splats from {counted(len(imported), 'file')}"
         if views is not None:
-            self.add_cameras(context, views, cameras)
+            self.add_cameras(context, views)
             beside = os.path.relpath(cameras, paths[0].parent)
             text += f", and {counted(len(views), 'camera')} from {beside}"
         self.warn_of_turn(context, imported[-1])
@@ -323,7 +301,6 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         mesh = mesh_attributes.mesh_from_file(file)
         mesh_drift.stamp(mesh)
         obj = bpy.data.objects.new(mesh.name, mesh)
-        obj[FOLDER] = str(Path(file.path).parent.absolute())
         if self.upright:
             obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
         target_collection(context).objects.link(obj)

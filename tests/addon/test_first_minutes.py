@@ -37,7 +37,7 @@ def test_one_import_brings_the_cameras_that_lie_above(addon, capture, upright):
     bpy.context.view_layer.update()
     bpy.context.view_layer.objects.active = None
     # The matrix of an object is float32: a quarter turn has 7.5e-8 for some of its zeros.
-    assert module._is_upright(module._imported_splats(bpy.context)) is upright
+    assert module._is_upright(module._splats_in(bpy.context)) is upright
     bpy.ops.refine.import_cameras(filepath=str(capture.parents[2] / "cameras.json"))
     assert (len(cameras()), scene.render.resolution_x) == (72, 1000)
 
