@@ -216,17 +216,13 @@ def drawn(data, count: int = 4) -> Splats:
 def drawn_views(data) -> ViewSet:
     """Two views, of which the first counts."""
     place = st.sampled_from([0.0, 1e-30, 0.1, 1e6, 1e30])
-    return ViewSet(
-        tuple(
-            view(
-                [data.draw(place), 0.0, -data.draw(place)],
-                fx=data.draw(st.sampled_from([1.0, 50.0, 1e6])),
-                near=data.draw(st.sampled_from([0.0, 1e-30, 1.0])),
-                weight=data.draw(st.sampled_from(weights)),
-            )
-            for weights in ([1.0, 1e-3], [0.0, 1.0, 1e3])
-        )
-    )
+    lens = {"fx": [1.0, 50.0, 1e6], "near": [0.0, 1e-30, 1.0]}
+    views = []
+    for weights in ([1.0, 1e-3], [0.0, 1.0, 1e3]):
+        choices = {**lens, "weight": weights}
+        chosen = {name: data.draw(st.sampled_from(some)) for name, some in choices.items()}
+        views.append(view([data.draw(place), 0.0, -data.draw(place)], **chosen))
+    return ViewSet(tuple(views))
 
 
 @pytest.mark.slow

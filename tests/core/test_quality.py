@@ -136,9 +136,7 @@ def test_the_estimate_depends_on_nothing_but_the_scene(method):
 
 
 def test_a_curve_is_read_between_its_points_and_back():
-    """Linear in the logarithm of the odds. Nothing removed is the cap; where points are equal as
-    much as can be is removed.
-    """
+    """Linear in the logarithm of the odds; of equal points the last."""
     for way, points in (("delete", [50.0, 40.0, 30.0]), ("merge", [52.0, 47.0, 38.0])):
         assert [CURVE.at(at, way=way) for at in (0.2, 0.5, 0.8)] == pytest.approx(points)
         assert [CURVE.share(value, way=way) for value in points] == pytest.approx([0.2, 0.5, 0.8])
@@ -270,9 +268,7 @@ def test_views_that_see_all_or_look_one_way_are_not_judged():
 
 
 def test_a_cloud_that_is_alike_from_all_sides_has_no_up_axis():
-    """Opaque splats a unit wide, at most two away, are not fine: 50 px of 69,
-    1 / (1 + (.7 / .015)^2).
-    """
+    """Opaque splats a unit wide are not fine: 50 px of 69, 1 / (1 + (.7 / .015)^2)."""
     splats = cloud(3000)
     small = replace(splats, log_scales=splats.log_scales - 2.5)
     large = splats_of(splats.means[:500], alphas=0.9, scales=1.0)

@@ -18,18 +18,13 @@ from tests.core.test_invariance import moved, rotation
 from tests.core.test_occlusion import cloud, ring
 from tests.hostile import files_of_at_most
 
+NOISE = [*zip(ARRAYS, (0.02, 0.1, 0.1, 0.3, 0.1, 0.05), strict=True)]
 COLUMNS, ROWS = np.arange(3, 78, 8), np.arange(4, 58, 8)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize(
-    ("name", "noise"),
-    [
-        *(("means", 0.02), ("log_scales", 0.1), ("quaternions", 0.1)),
-        *(("opacity_logits", 0.3), ("sh_dc", 0.1), ("sh_rest", 0.05)),
-    ],
-)
+@pytest.mark.parametrize(("name", "noise"), NOISE)
 def test_splats_that_are_off_in_one_attribute_come_back(name, noise, model):
     """Two rounds undo 40 % of it at least; a derivative of the wrong sign gains 4 dB at most.
 
@@ -58,9 +53,7 @@ def test_harmonics_of_the_first_degree_are_learned_and_those_above_stay():
     rest[:, 3:] *= 0.01
     splats = replace(cloud(200), sh_rest=rest)
     flat = replace(splats, sh_rest=np.concatenate([np.zeros((200, 3, 3)), rest[:, 3:]], axis=1))
-    every, constant = (
-        refit.refit(kept, splats, ring(), 1) for kept in (flat, flat.up_to_degree(0))
-    )
+    every, constant = (refit.refit(k, splats, ring(), 1) for k in (flat, flat.up_to_degree(0)))
     found = every.splats.sh_rest
     np.testing.assert_array_equal(found[:, 3:], rest[:, 3:])
     assert np.corrcoef(found[:, :3].ravel(), rest[:, :3].ravel())[0, 1] > 0.7
