@@ -328,10 +328,7 @@ def test_the_cheapest_of_all_operations_is_next_each_time(seed, penalty, monkeyp
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", [0.0, 0.001])
 def test_copies_of_a_splat_do_not_merge_one_by_one(monkeypatch, hidden):
-    """Each lies behind the one before, of which a share is seen. Half of all may go in 138 rounds.
-
-    Those that remove a quarter of 3 % take log(1/2) / log(1 - .0075) = 92, the last half as many.
-    """
+    """Rounds that remove a quarter of 3 % halve them in 92, and half as many for the last."""
     rounds, one = [], MergeGraph._round
     monkeypatch.setattr(MergeGraph, "_round", lambda *given: rounds.append(1) or one(*given))
     field = flat([0.2] * 2000, np.zeros((2000, 3)), np.ones((2000, 3)))

@@ -28,6 +28,7 @@ from refine_addon.core.scoring.closed_form import lambdas
 from refine_addon.core.splats import ARRAYS, drawable
 
 from .test_closed_form import FLOOR, reference
+from .test_occlusion import cloud as round_cloud
 from .test_views import view
 
 EXTREME = [
@@ -49,16 +50,11 @@ def _raise_on_every_numpy_warning():
         yield
 
 
-def cloud(count: int = 20, seed: int = 0) -> Splats:
-    rng = np.random.default_rng(seed)
-    return Splats(
-        means=(rng.normal(size=(count, 3)) * 0.3 + [0, 0, 3]).astype(np.float32),
-        log_scales=rng.normal(-3, 1, size=(count, 3)).astype(np.float32),
-        quaternions=rng.normal(size=(count, 4)).astype(np.float32),
-        opacity_logits=rng.normal(0, 2, size=count).astype(np.float32),
-        sh_dc=rng.normal(size=(count, 3)).astype(np.float32),
-        sh_rest=rng.normal(size=(count, 3, 3)).astype(np.float32),
-    )
+def cloud(count: int = 20) -> Splats:
+    """Splats before the views, in float32."""
+    splats = round_cloud(count)
+    splats = replace(splats, means=splats.means * 0.3 + [0, 0, 3])
+    return Splats(**{name: getattr(splats, name).astype(np.float32) for name in ARRAYS})
 
 
 def scored(splats, views=TWO, settings=METHODS["closed form"]):

@@ -28,6 +28,8 @@ from refine_addon.core.pictures import (
 from refine_addon.core.views import View, ViewSet
 from tests.core.test_occlusion import cloud, splats_of
 
+RED, GREEN, BLUE = np.eye(3)
+
 
 def view_of(width, height, focal=50.0, **more):
     """A view from the origin along z."""
@@ -116,9 +118,7 @@ def pixels_of(data):
 def test_files_are_named_after_splats_and_camera_and_hold_the_pictures(tmp_path):
     """Two of three views have one name; what no file can be called stands as _."""
     names = ("left/0.JPG", "left/0.JPG", "Camera: A.001")
-    view, places = view_of(40, 30), np.outer([0.0, 0.1, 0.2], [1.0, 0.0, 0.0])
-    pairs = zip(names, places, strict=True)
-    views = ViewSet(tuple(replace(view, name=name, center=place) for name, place in pairs))
+    views = ViewSet(tuple(replace(view_of(40, 30), name=name) for name in names))
     splats, half = crowd(50), crowd(50).take(np.arange(25))
     facts = PictureFiles(tmp_path, "my/room").write(splats, half, views)
     stems = ["my_room-left_0", "my_room-left_0_2", "my_room-Camera_ A.001"]
@@ -132,9 +132,6 @@ def test_files_are_named_after_splats_and_camera_and_hold_the_pictures(tmp_path)
             assert np.array_equal(pixels_of(Path(told[kind]).read_bytes()), getattr(one, kind))
     assert facts["psnr"] == round(sum(one.psnr for one in found) / 3, 2)
     assert measured_in_words(facts).startswith(f"{facts['psnr']:.1f} dB measured in 3 views (")
-
-
-RED, GREEN, BLUE = np.eye(3)
 
 
 def layer_of(color, alpha, depth, size=9):

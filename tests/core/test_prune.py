@@ -227,9 +227,6 @@ def test_scores_of_one_budget_are_refused_for_a_larger_one(splats, views):
             select(scores, budget, protected=shield)
 
 
-# The dial.
-
-
 @pytest.mark.slow
 def test_hidden_copies_are_deleted_and_rows_stay(small, views, tmp_path):
     """Of four splats in one place, each all but opaque, three are hidden: .3 of all can go."""

@@ -37,7 +37,8 @@ from tests.core.test_invariance import MOTIONS, moved
 from tests.core.test_levels import merges  # noqa: F401 - a fixture
 from tests.core.test_occlusion import cloud, look_along_z, ring, splats_of
 
-FAST = ClosedForm()
+ROOM = Path(__file__).parents[1] / "data" / "room_small"
+FAST, KNOWN = ClosedForm(), Alignment(1, known=True)
 CURVE = Quality(*np.array([[0.2, 0.5, 0.8], [50.0, 40.0, 30.0], [52.0, 47.0, 38.0]]))
 
 
@@ -149,20 +150,17 @@ def test_a_curve_is_read_between_its_points_and_back():
     assert Quality(CURVE.shares, np.full(3, 40.0), np.full(3, 40.0)).share(40.0) == 0.8
 
 
-@pytest.mark.parametrize(
-    ("keep", "expected"),
-    [
-        ([True, False, True], [0.5, 0.0, 0.375]),
-        ([False, False, True], [0.0, 0.0, 0.875]),
-        ([False, False, False], [0.0, 0.0, 0.0]),
-    ],
-)
-def test_on_a_ray_the_nearest_kept_hit_stands_in(keep, expected):
+def test_on_a_ray_the_nearest_kept_hit_stands_in():
     """Red, green, blue, one behind the other, alpha .5; as near as another, the one behind."""
     line, half, three = np.zeros(3, np.int32), np.full(3, 0.5), np.arange(3)
     rays = Rays(np.arange(1), np.arange(1), line, three, half, np.log1p(-half), three)
-    seen = rays.colors_by_nearest_kept(np.eye(3), np.array(keep))[:, 0]
-    assert seen.tolist() == pytest.approx(expected)
+    for keep, expected in (
+        ([True, False, True], [0.5, 0.0, 0.375]),
+        ([False, False, True], [0.0, 0.0, 0.875]),
+        ([False, False, False], [0.0, 0.0, 0.0]),
+    ):
+        seen = rays.colors_by_nearest_kept(np.eye(3), np.array(keep))[:, 0]
+        assert seen.tolist() == pytest.approx(expected)
 
 
 def test_a_curve_comes_back_from_json():
@@ -226,10 +224,6 @@ def test_what_merging_would_reach_is_told_of_many_splats_alone(merges):
     assert not Quality.from_facts(facts).foretold
     del facts["foretold"]  # as of older versions
     assert Quality.from_facts(facts).foretold
-
-
-ROOM = Path(__file__).parents[1] / "data" / "room_small"
-KNOWN = Alignment(1, known=True)
 
 
 def within() -> ViewSet:

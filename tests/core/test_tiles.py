@@ -472,21 +472,6 @@ def test_a_job_that_was_stopped_while_it_renamed_goes_on(store, monkeypatch):
         store.system.rm(store.out, recursive=True)
 
 
-def test_ctrl_c_after_the_last_tile_was_renamed_comes_too_late(store, monkeypatch):
-    """The folder of the job goes all the same."""
-    rmtree = shutil.rmtree
-
-    def stop_at_first(*_path, **_options):
-        monkeypatch.setattr(shutil, "rmtree", rmtree)
-        raise KeyboardInterrupt
-
-    stop = when("writing", lambda: monkeypatch.setattr(shutil, "rmtree", stop_at_first))
-    assert run(store.tiles, store.out, progress=stop)["splats"]["written"] == 200
-    assert shutil.rmtree is rmtree
-    assert [*store.made()] == NAMES
-    assert not list(Path().glob(".refine*"))
-
-
 @pytest.mark.parametrize(
     ("overwrite", "words"), [(False, "exists already"), (True, "is a folder, expected a file")]
 )
