@@ -392,14 +392,15 @@ def convert_files(
     ----------
     sources : sequence of path-like, one at least; the first comes first
     moves : sequence of Move, one for each file, or none
-    degree : int, optional; harmonics above it are left out
+    degree : int from 0 to 4, optional; harmonics above it are left out
     morton : bool, whether splats are sorted along a Z-shaped (Morton) curve: near ones follow
     level : int, of a streamed SOG; 0 is the finest
     model : Model, optional; see `prune_file`
 
     Raises
     ------
-    RefineError : see `read_splats`; also if models differ, or files have no such level
+    RefineError : see `read_splats`; also if models differ, files have no such level, or there are
+        no files or another number of moves
 
     Examples
     --------
@@ -408,6 +409,12 @@ def convert_files(
         moves = (Move(), Move(translate=(0.0, -0.5, 0.0)))
         convert_files(["room.ply", "statue.spz"], "both.sog", moves=moves)
     """
+    if not sources:
+        raise RefineError("no files to convert, expected at least one")
+    if moves and len(moves) != len(sources):
+        raise RefineError(f"got {len(moves)} moves, expected {len(sources)}: one for each file")
+    if degree not in (None, *range(5)):
+        raise RefineError(f"degree is {degree}, expected a whole number from 0 to 4")
     alone = len(sources) == 1 and not (moves or morton or level) and degree is None
 
     def read(form: Format | None) -> Scene:

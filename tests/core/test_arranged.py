@@ -178,3 +178,17 @@ def test_a_move_that_is_none_is_refused(files, capsys, values, word):
     assert call(files, "a.ply", "b.ply", "folder") == 2
     assert "folder: expected a name that ends in .ply" in capsys.readouterr().err
     assert not (files / "o.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("sources", "how", "words"),
+    [
+        ([], {}, "no files to convert, expected at least one"),
+        (["a.ply"], {"moves": [Move()] * 2}, "got 2 moves, expected 1: one for each file"),
+        (["a.ply"], {"degree": -1}, "degree is -1, expected a whole number from 0 to 4"),
+    ],
+    ids=["no files", "moves", "degree"],
+)
+def test_a_call_that_does_not_fit_is_refused(files, sources, how, words):
+    with pytest.raises(RefineError, match=words):
+        convert_files([files / name for name in sources], files / "o.ply", **how)
