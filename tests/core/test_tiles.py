@@ -573,6 +573,18 @@ def test_a_storage_that_fails_leaves_what_is_done(memory, monkeypatch):
     assert memory.made() == memory.once()
 
 
+def test_another_url_is_another_job(memory):
+    """One that was interrupted goes on where it was, whatever is written elsewhere meanwhile."""
+    told = []
+    with pytest.raises(KeyboardInterrupt):
+        run(memory.tiles, memory.out, progress=stopping("writing"))
+
+    run(memory.tiles, f"{memory.out}/elsewhere")
+    run(memory.tiles, memory.out, progress=lambda _fraction, what: told.append(what))
+
+    assert set(told) == {"writing"}
+
+
 def test_without_fsspec_the_extra_is_named(memory, monkeypatch):
     """Paths need none."""
     paths = [f"undisturbed/in/{name}" for name in NAMES]

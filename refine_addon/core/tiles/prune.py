@@ -28,7 +28,7 @@ from ..views import ViewSet
 from ..whole_file import Url
 from .cluster import Cluster
 from .source import Tile, copied, tiles_at
-from .storage import located, new_folder
+from .storage import identity, located, new_folder
 from .writing import Kept, Outputs, header_of, waiting_in
 
 try:
@@ -87,7 +87,7 @@ def prune_tiles(
             job = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-"))) / "job"
         else:
             near = Path.cwd() if isinstance(output, Url) else output.absolute()
-            job = near / f".refine-{_digest(tiles, views, budget, method)}"
+            job = near / f".refine-{_digest(output, tiles, views, budget, method)}"
             held.enter_context(new_folder(output))
             outputs = Outputs(job, tiles, output, overwrite)
         held.enter_context(_opened(job, outputs))
@@ -219,11 +219,11 @@ def _remove(job: Path) -> None:
         shutil.rmtree(job, ignore_errors=True)
 
 
-def _digest(tiles: Sequence[Tile], views: ViewSet, budget: Budget, method: Method) -> str:
+def _digest(output, tiles, views, budget, method):
     """Name of a job: equal for the same job, and for no other."""
     digest = hashlib.blake2b(digest_size=8)
-    for fact in (VERSION, [*tiles], budget, method):
-        digest.update(repr(fact).encode("utf-8", "surrogateescape"))
+    for argument in (VERSION, identity(output), [*tiles], budget, method):
+        digest.update(repr(argument).encode("utf-8", "surrogateescape"))
     for view in views.spread(method.views):
         for field in fields(view):
             value = getattr(view, field.name)
