@@ -202,8 +202,8 @@ def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
     moves = [Move(np.flatnonzero(same), np.eye(4))] if same.any() else []
     left = np.flatnonzero(finite & ~same)
     random = np.random.default_rng(0)
-    while len(left) >= LEAST and len(moves) <= _MOST:
-        matrix = _agreed(before[left], after[left], random)
+    for _ in range(_MOST):
+        matrix = _agreed(before[left], after[left], random) if len(left) >= LEAST else None
         if matrix is None:
             break
         fits = _fits(matrix, before[left], after[left])

@@ -250,3 +250,12 @@ def test_a_plane_is_turned_and_scaled_as_a_whole_but_a_line_or_four_points_are_n
 
     np.testing.assert_allclose(move.matrix[:3, :3], 3.0 * TURN, atol=2e-6)
     assert affine_moves(few, mapped(few, TURN)) == affine_moves(line, mapped(line, TURN)) == []
+
+
+def test_as_many_maps_are_looked_for_whether_or_not_some_points_stay():
+    """32 of 40 groups that move apart."""
+    before = points(41 * 20)
+    shifts = np.repeat(np.arange(41.0, dtype=np.float32), 20)[:, None]
+    for some in (slice(None), slice(20, None)):
+        moves = affine_moves(before[some], (before + shifts)[some])
+        assert sum(move.matrix[0, 3] != 0.0 for move in moves) == 32
