@@ -45,7 +45,6 @@ SECONDS = {
     "compare": 0.15e-6,
     "merge": 11e-6,
     "refit": 0.75e-6,
-    "clean": 1.5e-6,
     "draw": 1e-6,
     "write": 0.5e-6,
 }
