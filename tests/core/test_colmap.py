@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import struct
+from io import BufferedReader
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from refine_addon.core import read_cameras
+from refine_addon.core import RefineError, read_cameras
 from tests.hostile import refused
 
 from .test_camera_files import POINT, pixel
@@ -288,3 +290,14 @@ def test_a_wrong_row_or_line_is_named(tmp_path, file, data, problem):
     data = data if isinstance(data, bytes) else data.encode()
     write(tmp_path, file[-4:], **{file[:-4]: data})
     wrong(tmp_path, file, problem)
+
+
+def test_a_file_that_is_refused_is_closed(tmp_path):
+    """The error holds what was being read; Windows deletes no file that is open."""
+    write(tmp_path, ".txt", images=b"1 2 3\n")
+    with pytest.raises(RefineError) as caught:
+        read_cameras(tmp_path)
+    readers = [each for each in gc.get_objects() if isinstance(each, BufferedReader)]
+    names = [str(getattr(each, "name", "")) for each in readers if not each.closed]
+    assert str(tmp_path / "images.txt") not in names
+    del caught

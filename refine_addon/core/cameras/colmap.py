@@ -8,11 +8,12 @@ models add ``rigs`` and ``frames``; ``images`` still holds every pose.
 from __future__ import annotations
 
 import codecs
-import mmap
+import contextlib
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -143,7 +144,7 @@ class _Binary:
     """A little-endian file, read from start to end; refused where it is truncated."""
 
     file: CameraPlace
-    data: mmap.mmap
+    data: mmap
     offset: int = 0
 
     def take(self, layout: str, what: str) -> tuple[Any, ...]:
@@ -172,8 +173,8 @@ class _Binary:
 def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, str, CameraPlace]]:
     """Yield file, name and place of each row, of at least `least` bytes."""
     # Memory-mapped, since images.bin is mostly observations, which are skipped.
-    with opened(file) as (stream, _):
-        data = _Binary(file, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+    with opened(file) as (stream, _), mmap(stream.fileno(), 0, access=ACCESS_READ) as mapped:
+        data = _Binary(file, mapped)
         (count,) = data.take("Q", f"number of {thing}s")
         if count * least > len(data.data) - data.offset:
             announced = f"{count} of at least {least} bytes each are announced"
@@ -208,7 +209,8 @@ def _binary_images(file: CameraPlace) -> Iterator[Any]:
         yield name, image_id, place, pose, camera_id
 
 
-def _lines(file: CameraPlace) -> Iterator[tuple[CameraPlace, bytes]]:
+def _lines(file):
+    """Yield place and bytes of each line that is no comment."""
     with opened(file) as (stream, _):
         for number, text in enumerate(stream, 1):
             line = text.strip()
@@ -236,22 +238,22 @@ def _text_cameras(file: CameraPlace) -> Iterator[Any]:
 
 
 def _text_images(file: CameraPlace) -> Iterator[Any]:
-    lines = _lines(file)
-    for row, (place, line) in enumerate(item for item in lines if item[1]):
-        fields = line.decode("utf-8", "replace").split(maxsplit=len(IMAGE_FIELDS) - 1)
-        where = place.at(f"image row {row}")
-        if len(fields) < len(IMAGE_FIELDS):
-            where.fail(f"expected {', '.join(IMAGE_FIELDS)}, got {len(fields)} fields")
-        image_id, *pose, camera_id, name = fields
-        numbers = [_parsed(where, field) for field in pose]
-        image_id, camera_id = (_parsed(where, each, int) for each in (image_id, camera_id))
-        yield name, image_id, where, numbers, camera_id
-        place, points = next(lines, (place, b""))
-        if len(points) < SHORT_LINE and len(points.split()) % 3:
-            place.fail(
-                f"expected the points of image row {row} as X, Y, POINT3D_ID each "
-                "(an image takes two lines, of which the second may be empty)"
-            )
+    with contextlib.closing(_lines(file)) as lines:
+        for row, (place, line) in enumerate(item for item in lines if item[1]):
+            fields = line.decode("utf-8", "replace").split(maxsplit=len(IMAGE_FIELDS) - 1)
+            where = place.at(f"image row {row}")
+            if len(fields) < len(IMAGE_FIELDS):
+                where.fail(f"expected {', '.join(IMAGE_FIELDS)}, got {len(fields)} fields")
+            image_id, *pose, camera_id, name = fields
+            numbers = [_parsed(where, field) for field in pose]
+            image_id, camera_id = (_parsed(where, each, int) for each in (image_id, camera_id))
+            yield name, image_id, where, numbers, camera_id
+            place, points = next(lines, (place, b""))
+            if len(points) < SHORT_LINE and len(points.split()) % 3:
+                place.fail(
+                    f"expected the points of image row {row} as X, Y, POINT3D_ID each "
+                    "(an image takes two lines, of which the second may be empty)"
+                )
 
 
 def _parsed(place: CameraPlace, field: str, kind: Any = float) -> Any:
