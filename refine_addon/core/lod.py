@@ -189,10 +189,8 @@ def lod(
         rest = ~gone
         splats = splats.take(rest)
         protected = None if protected is None else protected[rest]
-    share = 0.5 if method.changes else 0.02  # of the time before that the next level takes
-    of_levels = stages(progress, *(share**place for place in range(len(budgets))))
     left, number, scores = len(whole), 0, None
-    results = _results(splats, views, budgets, method, protected, of_levels, threads)
+    results = _results(splats, views, budgets, method, protected, progress, threads)
     for asked, result in zip(levels.asked, results, strict=True):
         scores = result.scores if scores is None else scores
         kept = int(np.count_nonzero(result.keep))
@@ -209,13 +207,17 @@ def lod(
 def _results(splats, views, budgets, method, protected, progress, threads):
     """Results of all splats: by one ranking where rows stay, else each from the one before."""
     scores, whole, origin = None, None, None
+    # Shares of the time: a level takes half of that before it, or, once scored, hardly any.
+    times = (0.5**place if method.changes else 0.02 for place in range(len(budgets)))
+    scoring, *of_levels = stages(progress, 0.0 if method.changes else 1.0, *times)
     if not method.changes:
-        scores = score(splats, views, method, quality=True, progress=progress[0], threads=threads)
-    for budget, of_level in zip(budgets, progress, strict=True):
+        scores = score(splats, views, method, quality=True, progress=scoring, threads=threads)
+    for budget, of_level in zip(budgets, of_levels, strict=True):
         if scores is not None:
             yield prune(
-                splats, views, budget, method, protected=protected, scores=scores, threads=threads
-            )
+                splats, views, budget, method, protected=protected, scores=scores,
+                progress=of_level, threads=threads,
+            )  # fmt: skip
             continue
         spared = protected if protected is None or whole is None else protected[whole.keep]
         result = prune(
