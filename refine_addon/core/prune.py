@@ -530,6 +530,7 @@ def _as_deleted(splats: Splats, keep: NDArray[np.bool_], threads: int | None) ->
 
 def _share_between(tried: Sequence[_Try], goal: float, total: int) -> float | None:
     """Share of `total` to remove by the tries next to a PSNR, linear in its log odds, or None."""
+    tried = [one for one in tried if one.kept < total]  # those whose odds are finite
     above = min((one for one in tried if one.psnr >= goal), default=None)
     below = max((one for one in tried if one.psnr < goal), default=None)
     if above is None or below is None:

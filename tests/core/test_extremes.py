@@ -9,6 +9,8 @@ import pytest
 
 from refine_addon.core import Budget, Merge, Occlusion, Refit, ViewSet, prune
 
+from .test_cleaning import cameras
+from .test_levels import colourful
 from .test_merging import around, cloud
 
 COUNT = 60
@@ -74,3 +76,9 @@ def test_kept_splats_of_a_scene_at_an_edge_are_as_many_as_asked_for_and_numbers(
     assert all(psnr is None or 0.0 < psnr <= 100.0 for psnr in reached.values())
     if name == "images of a pixel":  # too little is seen for a measurement
         assert reached == {"delete": None, "merge": None, "refit": None}
+
+
+def test_a_psnr_that_only_all_splats_keep_is_looked_for():
+    """12 splats of a wall, each of its own colour: nobody stands in for one that goes."""
+    result = prune(colourful().take(slice(1, None, 48)), cameras(2), Budget(psnr=80.0), Refit(2, 1))
+    assert result.report["estimated_psnr"] >= 80.0
