@@ -264,3 +264,18 @@ def test_levels_that_are_not_there_and_two_models_are_refused(copied):
     around = copied.parent / "env/meta.json"
     around.write_text(json.dumps({**json.loads(around.read_text()), "model": "antialiased"}))
     refused(copied, "model antialiased, others have default", file=around)
+
+
+def test_what_links_lead_to_is_left_alone(written):
+    """A folder that the old index names; and an index, which must lie beside its folders."""
+    folder, mine = written.parent, written.parents[1] / "mine"
+    (folder / "0_0").rename(mine)
+    (folder / "0_0").symlink_to(mine)
+    held = sorted(mine.iterdir())
+    write(written, room(400), overwrite=True)
+    assert sorted(mine.iterdir()) == held
+    link = folder.parent / "lod-meta.json"
+    link.symlink_to(written)
+    with pytest.raises(RefineError, match="is a link, expected the index itself"):
+        write(link, room(160), overwrite=True)
+    assert len(read_splats(written)) == 100

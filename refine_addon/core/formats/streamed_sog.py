@@ -223,8 +223,9 @@ class StreamedSog:
                 shutil.rmtree(there, ignore_errors=True)
             raise
         for folder in (path.parent / name for name in old):
+            # What a link leads to is not the index's.
             with contextlib.suppress(OSError):  # it is not there, or holds something else
-                for file in (META, *IMAGES):
+                for file in () if folder.is_symlink() else (META, *IMAGES):
                     (folder / file).unlink(missing_ok=True)
                 folder.rmdir()
 
@@ -254,6 +255,8 @@ class StreamedSog:
 def folder_for(path: Path, *, overwrite: bool) -> Iterator[Path]:
     """Yield an empty folder beside `path`, removed at the end; refuses what may not be replaced."""
     with new_folder(path.parent):
+        if path.is_symlink():
+            raise RefineError(f"{path}: is a link, expected the index itself, beside its folders")
         refuse_existing(path, overwrite=overwrite)
         _folders_of(path)
         try:
