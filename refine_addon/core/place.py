@@ -6,7 +6,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, Self, TypeGuard
 
@@ -41,7 +41,7 @@ class Place:
 
     def at(self, where: str) -> Self:
         """A place within this one."""
-        return replace(self, where=f"{self.where} {where}" if self.where else where)
+        return type(self)(self.path, f"{self.where} {where}" if self.where else where)
 
     def fail(self, problem: str) -> NoReturn:
         """Raise the error of this place."""
@@ -137,6 +137,8 @@ def foreign_kind(path: Path | Url, head: bytes) -> str:
     suffix, read = path.suffix.lower(), "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
     if suffix in (".splat", ".ksplat"):  # only the name tells: they have no signature
         return f"a {suffix} file: {read}"
+    if suffix == ".gltf" and head.lstrip().startswith(b"{"):
+        return "a glTF file, whose splats lie in another: save it as one file, .glb"
     if is_spz(head):
         return f"an SPZ file: {read}"
     if is_sog(path, head):

@@ -34,6 +34,7 @@ SOG = f"a SOG file: {READ}"
 LONG = zipped("a.txt", *(f"{'x' * 200}{i}.webp" for i in range(500)), "meta.json")
 
 FOREIGN = [
+    ("in.gltf", b' {"asset": {}}', "a glTF file, whose splats lie in another: save it as"),
     ("in.splat", bytes(64), f"a .splat file: {READ}"),
     ("IN.SPLAT", bytes(64), f"a .splat file: {READ}"),
     ("in.splat", b"\x1f\x8b" + bytes(62), "a .splat file"),  # as gzip begins

@@ -38,6 +38,13 @@ _SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # width -> type of accessor
 _FLOAT, _BYTE = 5126, 5121
 _POINTS, _VERTICES = 0, 34962
 
+_MOVES = ("matrix", "translation", "rotation", "scale")  # keys of a node that move what it holds
+
+_READ = (EXTENSION, "KHR_mesh_quantization")  # extensions that a file may require
+
+_DRAWN = {"colorSpace": "srgb_rec709_display", "projection": "perspective"}
+"""How splats are drawn, whatever the extension says."""
+
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # between the frames of captures and glTF, either way
 
 
@@ -92,26 +99,29 @@ class _Part(NamedTuple):
     splats: int
     degree: int
     logs: bool  # whether scales are held as their logarithms, as in drafts of the extension
+    remarks: tuple[str, ...]  # what is not as the file says, behind "FILE has"
     values: Callable[[str, slice], NDArray[Any]]  # of an attribute without its prefix
 
 
 def _read(path, data):
     """Read the splats of all nodes of a file's scene, each where the node puts it."""
     document = _opened(path, data)
-    meshes, shown, every = {}, [], []
+    meshes, shown, every, moves = {}, [], [], []
     left, visited, count, place = [], set(), 0, document.place.at("scene")
     if "scenes" in document.content:
         scene, place = document.item("scenes", document.content.get("scene", 0), place)
-        left = [(index, place, np.eye(4)) for index in _listed(scene, "nodes", place)[::-1]]
+        left = [(index, place, 0) for index in _listed(scene, "nodes", place)[::-1]]
     while left:
-        index, place, matrix = left.pop()
+        index, place, frame = left.pop()
         node, place = document.item("nodes", index, place)
         if index in visited:
             place.fail("belongs to two nodes, expected a tree")
         visited.add(index)
-        with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-            matrix = _moved(matrix, node, place)
-        left += [(child, place, matrix) for child in _listed(node, "children", place)[::-1]]
+        if not node.keys().isdisjoint(_MOVES):
+            moves.append((node, place, frame))
+            frame = len(moves)
+        if "children" in node:
+            left += [(child, place, frame) for child in _listed(node, "children", place)[::-1]]
         if "mesh" not in node:
             continue
         mesh, where = document.item("meshes", node["mesh"], place)
@@ -119,7 +129,7 @@ def _read(path, data):
             meshes[node["mesh"]] = _parts(document, mesh, where)
             every += meshes[node["mesh"]]
         parts = [part for part in meshes[node["mesh"]] if part.splats]
-        shown += [(part, matrix, place) for part in parts]
+        shown += [(part, frame, place) for part in parts]
         count += sum(part.splats for part in parts)
         if count > len(data):  # many nodes may show one mesh
             wanted = f"expected at most {len(data)}, the bytes of the file"
@@ -130,21 +140,26 @@ def _read(path, data):
     file, splats = new_file(path, origin, count, degree)
     start = 0
     with np.errstate(all="ignore"):  # any number may stand in a file
-        for part, matrix, place in shown:
+        frames = _frames(moves)
+        for part, frame, place in shown:
             for piece in pieces(part.splats):
                 target = splats.take(slice(start + piece.start, start + piece.stop))
                 _fill(target, part, piece)
                 try:
-                    unmoved = np.array_equal(matrix, np.eye(4))
-                    turned = _HALF_TURN @ matrix
+                    unmoved = np.array_equal(frames[frame], np.eye(4))
+                    turned = _HALF_TURN @ frames[frame]
                     moved = _half_turned(target) if unmoved else transformed(target, turned)
                 except RefineError as error:
                     place.fail(str(error))
                 for name in ARRAYS:
                     getattr(target, name)[:] = getattr(moved, name)
             start += part.splats
-    remark = f"{path.name} has negative scales: its scales are read as logarithms"
-    return replace(file, remarks=(remark,)) if any(part.logs for part in every) else file
+    required = _listed(document.content, "extensionsRequired", document.place)
+    unread = [described(name) for name in required if name not in _READ]
+    remarks = [f"a required extension that is not read, {name}" for name in unread[:1]]
+    remarks += [remark for part in every for remark in part.remarks]
+    once = dict.fromkeys(remarks)
+    return replace(file, remarks=tuple(f"{path.name} has {remark}" for remark in once))
 
 
 def _opened(path, data):
@@ -169,20 +184,28 @@ def _listed(holder, key, place):
     return place.at(key).items(holder.get(key, []))
 
 
-def _moved(frame, node, place):
-    """Frame of a node, (4, 4), in that of the scene; `frame` is that of its parent."""
-    if "matrix" in node:
-        return frame @ np.reshape(place.at("matrix").numbers(node["matrix"], 16), (4, 4)).T
-    if node.keys().isdisjoint(("translation", "rotation", "scale")):
-        return frame
+def _frames(moves):
+    """Frames of the scene and of M nodes, (M + 1, 4, 4), in that of the scene.
+
+    `moves`: of each, JSON object, place, and number of the frame in which it stands.
+    """
 
     def numbers(key, *default):
-        return place.at(key).numbers(node.get(key, [*default]), len(default))
+        values = np.tile(default, (len(moves), 1))
+        for row, (node, place, _) in zip(values, moves, strict=True):
+            if key in node:
+                row[:] = place.at(key).numbers(node[key], len(default))
+        return values
 
-    turn, matrix = np.roll(numbers("rotation", 0.0, 0.0, 0.0, 1.0), 1), np.eye(4)
-    matrix[:3, :3] = rotation_matrices(turn) * numbers("scale", 1.0, 1.0, 1.0)
-    matrix[:3, 3] = numbers("translation", 0.0, 0.0, 0.0)
-    return frame @ matrix
+    turns = np.roll(numbers("rotation", 0.0, 0.0, 0.0, 1.0), 1, axis=1)
+    frames = np.tile(np.eye(4), (len(moves) + 1, 1, 1))
+    frames[1:, :3, :3] = rotation_matrices(turns) * numbers("scale", 1.0, 1.0, 1.0)[:, None]
+    frames[1:, :3, 3] = numbers("translation", 0.0, 0.0, 0.0)
+    matrices = numbers("matrix", *np.eye(4).flat).reshape(-1, 4, 4)  # which others lack
+    frames[1:] = frames[1:] @ matrices.transpose(0, 2, 1)
+    for number, (*_, above) in enumerate(moves, 1):
+        frames[number] = frames[above] @ frames[number]
+    return frames
 
 
 def _parts(document, mesh, place):
@@ -201,7 +224,13 @@ def _parts(document, mesh, place):
             where.fail(f"splats by {described(next(iter(more)))}, expected plain accessors")
         if primitive.get("mode", 4) != _POINTS:
             where.at("mode").expected(str(_POINTS), primitive.get("mode", 4))
-        parts.append(_part(document, primitive.get("attributes"), where.at("attributes")))
+        remarks = tuple(
+            f"{key} {described(extension[key])}, read as {described(drawn)}"
+            for key, drawn in _DRAWN.items()
+            if extension.get(key, drawn) != drawn
+        )
+        part = _part(document, primitive.get("attributes"), where.at("attributes"))
+        parts.append(part._replace(remarks=remarks + part.remarks))
     return parts
 
 
@@ -225,7 +254,8 @@ def _part(document, attributes, place):
         return stored[piece] if unit == 1.0 else np.maximum(stored[piece] / unit, -1.0)
 
     logs = any((values("SCALE", piece) < 0.0).any() for piece in pieces(count))
-    return _Part(count, degree, logs, values)
+    remarks = ("negative scales: its scales are read as logarithms",) if logs else ()
+    return _Part(count, degree, logs, remarks, values)
 
 
 def _fill(target, part, piece):
@@ -307,7 +337,7 @@ def _json(attributes, count, low, high):
         at += length
     accessors[0].update(min=low, max=high)
     accessors[1]["normalized"] = True
-    kernel = {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
+    kernel = {EXTENSION: {"kernel": "ellipse", "colorSpace": _DRAWN["colorSpace"]}}
     names = {name: index for index, (name, *_) in enumerate(attributes)}
     content = {
         "asset": {"version": "2.0", "generator": "REFINE for Blender"},
