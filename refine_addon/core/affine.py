@@ -25,16 +25,16 @@ _FLAT = 1e-9  # least over largest scale of a matrix that cannot be inverted in 
 _SMALLEST, _LARGEST = 1e-30, 1e30
 """Scales of a matrix that is applied: its determinant fits float64, usual splats float32."""
 
-LEAST = 6  # least points a map is found of: any four have one in common
+LEAST = 6  # fewest points of a map: any four have one in common
 
 _MOST = 32  # maps that are looked for
 
-_NOISE = 4e-6  # rounding of float32, relative to the terms of a coordinate: 32 times its precision
+_NOISE = 4e-6  # rounding of moved points, relative to a coordinate's terms: 32 units of float32
 
 _PLANAR = 1e-5  # thickness over extent of points that count as lying in a plane
 
 _SAMPLE, _FITTED = 2048, 16384
-"""Points by which candidates are compared, and to which a map is fitted at last; evenly spread."""
+"""Points, evenly spread, by which candidates are compared, and to which the best is fitted."""
 
 _ROWS = 1 << 14  # points that are mapped at a time
 
@@ -42,8 +42,8 @@ _TRIES, _DRAWN = 240, 4
 """Candidates for each map, and points that each is fitted to: the fewest that determine one."""
 
 _BLOCKS = (1.0, 0.1, 0.01)
-"""Shares of the points, in a row, from which a candidate draws: what was joined or copied lies
-together, what was selected by hand does not."""
+"""Shares of the points, consecutive rows, from which a candidate draws its own: rows of a joined or
+copied object lie together, those selected by hand do not."""
 
 _CHUNK = 1 << 16  # splats whose covariances are computed together, which limits temporary memory
 
@@ -67,17 +67,29 @@ def is_flat(matrix: NDArray[Any]) -> bool:
 
 
 def moved(means: NDArray[Any], matrix: NDArray[Any]) -> NDArray[np.float64]:
-    """Places, (N, 3), where an affine (4, 4) matrix moves them."""
+    """Points, (N, 3), moved by an affine matrix, (4, 4): (N, 3) float64."""
     with np.errstate(invalid="ignore", over="ignore"):  # of what is not finite
         return np.asarray(means @ matrix[:3, :3].T.astype(np.float64) + matrix[:3, 3])
 
 
 def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True) -> Splats:
-    """Splats transformed by an invertible affine matrix, (4, 4).
+    """Splats transformed by an invertible affine matrix.
 
-    Values are float64: rounded, they and so the kept set might differ from those in the old frame.
-    Without `rotate_sh`, harmonics stay those of the old frame (the closed form uses only the
-    constant) and the matrix may be non-uniform. `RefineError`: see `check_affine`.
+    Parameters
+    ----------
+    splats : Splats, N of them
+    matrix : (4, 4), from their frame to the new one
+    rotate_sh : bool
+        Without it, harmonics stay those of the old frame, of which the closed form uses only the
+        constant, and the matrix may be non-uniform.
+
+    Returns
+    -------
+    Splats : float64; rounded values might lead to another kept set than in the old frame
+
+    Raises
+    ------
+    RefineError : see `check_affine`
     """
     matrix = np.asarray(matrix, np.float64)
     check_affine(matrix, with_sh=rotate_sh)
@@ -107,7 +119,10 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
 
 
 def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
-    """Like `transformed`, by non-uniform matrices, too: harmonics become the nearest ones."""
+    """Like `transformed`, also by non-uniform matrices.
+
+    Their harmonics are fitted, see `spherical_harmonics.stretched`.
+    """
     uniform = is_uniform(matrix)
     result = transformed(splats, matrix, rotate_sh=uniform)
     if uniform or not splats.sh_degree:
@@ -141,8 +156,8 @@ def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit quaternions w x y z of rotation matrices, (..., 3, 3) -> (..., 4).
 
-    The largest eigenvalue's eigenvector of a symmetric 4 x 4 matrix (Bar-Itzhack 2000): without
-    cases, and as accurate for half a turn as for other angles.
+    The eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack 2000), which
+    needs no cases and is as accurate for half a turn as for other angles. Float64, w >= 0.
     """
     m = np.asarray(rotation, np.float64)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -182,7 +197,7 @@ def _stretched(splats, means, linear):
 class Move(NamedTuple):
     """Rows, (M,), of points that one affine map, (4, 4), moved.
 
-    Its linear part is exactly the identity where they were moved alike or not at all.
+    The linear part of a translation, or of no move at all, is exactly the identity.
     """
 
     rows: NDArray[np.int64]
@@ -190,11 +205,20 @@ class Move(NamedTuple):
 
 
 def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
-    """Maps that explain how points, (N, 3), moved, those that did not move first.
+    """Affine maps that explain how points moved, by RANSAC (Fischler and Bolles 1981).
 
-    A map is fitted to all, then to random draws, of which most agree with one (RANSAC, Fischler and
-    Bolles 1981), then to the rest; draws are the same at each call. None explains points moved one
-    by one, into a plane, or not finite.
+    A map is fitted to all points, and to random draws of a few; the one that most points agree with
+    is kept, and the search goes on with the others. The draws are the same at each call.
+
+    Parameters
+    ----------
+    before, after : (N, 3) floating, the points in one frame
+
+    Returns
+    -------
+    list of Move
+        First the points that did not move, then at most 32 maps. Points that were moved one by one
+        or into a plane, and those that are not finite, are in none.
     """
     before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
     finite = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
@@ -213,13 +237,13 @@ def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
 
 
 def _agreed(before, after, random):
-    """Map that most points agree with, (4, 4), None where hardly any do."""
+    """Map, (4, 4), that most points agree with; None if fewer than `LEAST` agree with any."""
     everything = np.arange(len(before))
     some = _spread(everything, _SAMPLE)
     start, end = before[some], after[some]
     best, most = None, LEAST - 1
     for number in range(-1, _TRIES):
-        drawn = some  # one map of all
+        drawn = some  # at first, one map for all
         if number >= 0:
             size = max(min(len(before), 8), int(len(before) * _BLOCKS[number % len(_BLOCKS)]))
             first = random.integers(0, len(before) - size + 1)
@@ -227,7 +251,7 @@ def _agreed(before, after, random):
         matrix = _fitted(before[drawn], after[drawn])
         if matrix is None:
             continue
-        # Few points tell a map less exactly than all that agree with it.
+        # A map fitted to few points is less exact than one fitted to all that agree with it.
         agree = _fits(matrix, start, end, slack=100.0)
         if np.count_nonzero(agree) >= LEAST:
             better = _fitted(start[agree], end[agree])
@@ -244,15 +268,15 @@ def _agreed(before, after, random):
 
 
 def _spread(rows, most):
-    """At most so many of some rows, evenly spread."""
+    """At most `most` of some rows, evenly spread."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]
 
 
 def _fits(matrix, before, after, *, slack=1.0):
-    """Which points a map takes to where they are but for rounding, (N,)."""
+    """Points that a map moves as they moved, up to `slack` times rounding, (N,) bool."""
     fits = np.empty(len(before), np.bool_)
     turn, shift = np.abs(matrix[:3, :3]).T, np.abs(matrix[:3, 3])
-    for part in chunks(len(before), _ROWS):  # whose arrays stay in the caches
+    for part in chunks(len(before), _ROWS):  # small enough for the caches
         start, end = before[part], after[part]
         allowed = slack * _NOISE * (np.abs(start) @ turn + shift + np.abs(end)).max(axis=1)
         fits[part] = np.abs(moved(start, matrix) - end).max(axis=1) <= allowed
@@ -260,11 +284,7 @@ def _fits(matrix, before, after, *, slack=1.0):
 
 
 def _fitted(before, after):
-    """Affine least-squares map between points, (4, 4); a translation where that explains them.
-
-    A plane's points are mapped across it by the mean scale, not mirrored. None for points on a
-    line, or in a plane only now (Blender's *Mirror* merges).
-    """
+    """Affine least-squares map, (4, 4); None of points on a line, or moved into a plane."""
     shift = np.eye(4)
     shift[:3, 3] = (after - before).mean(axis=0)
     if _fits(shift, before, after).all():
@@ -277,6 +297,7 @@ def _fitted(before, after):
     left, spread, axes = np.linalg.svd(source, full_matrices=False)
     if len(spread) < 3 or not spread[1] > _PLANAR * spread[0]:
         return None
+    # Points in a plane leave the axis across it free: it gets their mean scale, unmirrored.
     flat = not spread[2] > _PLANAR * spread[0]
     inverse = np.array([1.0 / spread[0], 1.0 / spread[1], 0.0 if flat else 1.0 / spread[2]])
     images = (inverse[:, None] * left.T) @ ((after - target) * weights[:, None])  # (3 axes, 3)

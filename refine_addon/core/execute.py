@@ -1,9 +1,10 @@
-"""The one way to run work: in this thread, on threads, in processes, on a cluster; its progress.
+"""Work in this thread, on threads, in processes or on a cluster, and its progress.
 
-NumPy's loops release Python's lock; many short loops keep passing it on (two threads are 1.2 times
-as fast as one, two processes nearly twice). Processes import this package under its name here
-(Blender's, for an extension), nothing of the caller as `ProcessPoolExecutor` would, and end after
-`IDLE` seconds. Progress has `stages`, as long as `seconds` expects.
+NumPy's loops release Python's global lock. Where loops are short, threads wait for it: two are only
+1.2 times as fast as one, two processes nearly twice. Unlike those of `ProcessPoolExecutor`, the
+processes import nothing of the caller, only this package, under the name that it has here, which
+for an extension Blender chose. They end after `IDLE` seconds. Progress is divided into `stages`,
+whose lengths `seconds` predicts.
 """
 
 from __future__ import annotations
@@ -48,22 +49,23 @@ SECONDS = {
     "draw": 1e-6,
     "write": 0.5e-6,
 }
-"""Seconds of one core for each splat, of the lower kinds in each view. By processor time of runs of
-40,000 to 2 million splats."""
+"""Seconds on one core for a splat, or for a splat in a view where `seconds` gets views. Measured as
+processor time of runs with 40,000 to 2 million splats."""
 
 REPLACES_MAPPED = os.name != "nt"
-"""Whether a file that is mapped into memory can be replaced; Windows refuses."""
+"""Whether the system can replace a file that is mapped into memory; Windows cannot."""
 
 IDLE = 8.0  # seconds without work after which a process ends, to free its memory; others start fast
 
 WORTH, WORTH_READY = 2.0, 0.2
-"""Seconds of work on one core worth starting processes, a third of a second each, or using them."""
+"""Least seconds of work on one core for which processes are started, a third of a second each, and
+for which ready ones are used."""
 
 _HEAPS = -8  # M_ARENA_MAX of glibc's malloc.h
-_HELD = 30_000_000  # bytes; above 32 MB, freeing a block does not raise glibc's threshold
+_HELD = 30_000_000  # bytes, see `run`; freeing a block above 32 MB raises no threshold of glibc
 _INTERVAL = 0.1  # seconds between two reports while a piece of work takes long
 _ALIGNED = 64  # bytes, of arrays in a file
-_SENT = 1 << 24  # bytes of work that is sent to a cluster; arrays in files travel as names
+_SENT = 1 << 24  # most bytes of work sent to a cluster; arrays in files are sent as names
 _AHEAD = 4  # pieces of work for each thread whose results may wait for those before them
 _PACKAGE, _FOLDER = __name__.rpartition(".core.")[0], Path(__file__).resolve().parents[1]
 
@@ -78,11 +80,11 @@ for package, place in places.items():
     module.__path__ = place
 importlib.import_module(name + ".core.execute").serve()
 """
-"""What a process runs: it finds modules under their names here, without the packages' code."""
+"""Program of a process: modules get the names they have here, and packages are empty ones."""
 
 
 class _Own(threading.local):
-    """What holds for the work of this thread alone."""
+    """Settings for the work of one thread."""
 
     check: Callable[[], None] = staticmethod(lambda: None)
     cluster: Any = None
@@ -103,11 +105,11 @@ class _LostError(Exception):
 
 
 def silent(_fraction: float, _what: str) -> None:
-    """Show nothing: the default progress callback."""
+    """Ignore progress: the default callback."""
 
 
 def report(progress: Progress, fraction: float, what: str) -> None:
-    """Tell `progress`, and raise `Cancelled` if it answers ``False``."""
+    """Call `progress`; raise `Cancelled` if it returns ``False``."""
     if progress(fraction, what) is False:
         raise Cancelled
 
@@ -118,7 +120,7 @@ def part(progress: Progress, start: float, end: float) -> Progress:
 
 
 def seconds(kind: str, splats: float, views: float = 1) -> float:
-    """Expected time of a stage on one core: a constant of `SECONDS` times splats and views."""
+    """Expected seconds of a stage on one core: a constant of `SECONDS` times splats and views."""
     return SECONDS[kind] * splats * views
 
 
@@ -136,13 +138,13 @@ def stages(progress: Progress, *expected: float) -> list[Progress]:
 
 
 class TimeLeft:
-    """How long a run still takes, from the share that is done; rises only if it was far too low."""
+    """Estimate of the time that a run still takes, which rises only if it was far too low."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock, self._start, self._last = clock, clock(), math.inf
 
     def seconds(self, fraction: float) -> float | None:
-        """Seconds left; None in the first two seconds, and where nothing or all is done."""
+        """Seconds left with this fraction done, or None: in the first 2 s, and at 0 and 1."""
         passed = self._clock() - self._start
         if passed < 2.0 or not 0.0 < fraction < 1.0:
             return None
@@ -174,7 +176,7 @@ def checkpoint() -> None:
 
 @contextmanager
 def _with(**own: Any) -> Iterator[None]:
-    """Let something hold in this thread, within the block."""
+    """Set attributes of `_own` within the block."""
     before = {name: getattr(_own, name) for name in own}
     vars(_own).update(own)
     try:
@@ -189,7 +191,7 @@ def checked_by(check: Callable[[], None]) -> AbstractContextManager[None]:
 
 
 def on(cluster: Any) -> AbstractContextManager[None]:
-    """Have `run` in this thread, within the block, send long work to a `Cluster`; None does not.
+    """Make `run` in this thread send long work to a `Cluster` within the block, unless it is None.
 
     Work that holds large arrays is not sent.
     """
@@ -197,7 +199,7 @@ def on(cluster: Any) -> AbstractContextManager[None]:
 
 
 def alone(work: Callable[[Item], Outcome], items: Iterable[Item]) -> list[Outcome]:
-    """`run_all` in this thread alone, with whatever the work runs."""
+    """`run_all` in this thread alone; what the work itself runs uses one core, too."""
     with _with(cores=1):
         return run_all(work, items, threads=1)
 
@@ -209,14 +211,14 @@ def default_threads() -> int:
 
 
 def return_freed() -> None:
-    """Return freed memory to the system; only glibc, which keeps it, needs to be asked."""
+    """Return freed memory to the system, which only glibc does not do by itself."""
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).malloc_trim(0)
 
 
 def share_heap() -> None:
-    """Let all threads share one heap: glibc's separate ones keep 70 MB of 300 after freeing."""
+    """Make all threads share one heap: glibc's separate ones keep 70 of 300 MB after freeing."""
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).mallopt(_HEAPS, 1)
@@ -243,13 +245,21 @@ def run(
 ) -> Iterator[Outcome]:
     """Call ``work(item)`` for each item, and yield the results in order, as soon as they are there.
 
+    Parameters
+    ----------
     work : callable, whose results must not depend on where it runs
+    items : iterable
     progress, what
-        Called in this thread between items and, on threads or if work calls `checkpoint`, ten times
-        a second. When it cancels, running items end at their next `checkpoint`, processes at once.
+        ``progress(fraction, what)`` is called in this thread between items and, on threads or if
+        `work` calls `checkpoint`, ten times a second. When it cancels, running items end at their
+        next `checkpoint`, processes at once.
     threads : int, optional; 1 does everything in this thread, by default `default_threads`
-    cost : float, expected seconds on one core if it may run in processes
-        Work, items and results are pickled then, and what work changes is lost.
+    cost : float, expected seconds on one core; 0 runs no processes
+        In processes work, items and results are pickled, and changes that work makes are lost.
+
+    Raises
+    ------
+    Cancelled, and any error of `work`
     """
     # Freeing one 30 MB block raises glibc's mmap threshold, so that buffers are reused instead of
     # page-faulted. No effect on other systems.
@@ -280,18 +290,18 @@ def run(
 
 
 def _in_turn(work, items, tell):
-    step, told = max(len(items) // 100, 1), 0.0  # enough reports for a progress bar
+    step, reported = max(len(items) // 100, 1), 0.0  # enough reports for a progress bar
 
     def check():
-        nonlocal told
-        if time.monotonic() - told >= _INTERVAL:
-            told = time.monotonic()
+        nonlocal reported
+        if time.monotonic() - reported >= _INTERVAL:
+            reported = time.monotonic()
             tell(done)
 
     for done, item in enumerate(items):
         if done % step == 0:
-            checkpoint()  # what this is a part of may be cancelled
-            told = -math.inf
+            checkpoint()  # the work that this is a part of may be cancelled
+            reported = -math.inf
             check()
         with checked_by(check):
             result = work(item)
@@ -332,7 +342,7 @@ def _side_by_side(work, items, threads, tell, stop=lambda: None):
 
 
 def start(cost: float, threads: int | None = None) -> None:
-    """Start the processes that `run` will want soon."""
+    """Start the processes that `run` will use soon for work of this `cost`, as there."""
     number = default_threads() if threads is None else threads
     if _worth(cost, number):
         with suppress(_LostError):
@@ -393,11 +403,11 @@ def _lost(*kinds):
 
 
 def _tell_all(team: list[_Process], message: tuple[str, Any]) -> None:
-    """Tell all of a team what to call from now on, and wait until they know."""
+    """Send a message to all processes of a team, and wait for their answers."""
     for process in team:
         process.tell(message)
     for process in team:
-        with _lost(Exception):  # it has ended, or lacks a module that this process has
+        with _lost(Exception):  # it has ended, or cannot import a module that this process has
             process.answer()
 
 
@@ -470,12 +480,12 @@ class _Process:
         return result
 
     def kill(self) -> None:
-        with suppress(OSError), self._popen:  # closes pipes and waits; of what was yet to be told
+        with suppress(OSError), self._popen:  # closes pipes, with messages in them, and waits
             self._popen.kill()
 
 
 def _stored(work, path):
-    """What a process needs to have `work`, whose arrays go to a file that all map."""
+    """Arguments of `_unpacked` for some work; its arrays go to a file that all processes map."""
     arrays: list[pickle.PickleBuffer] = []
     pickled = pickle.dumps(work, protocol=5, buffer_callback=arrays.append)
     places = []
@@ -486,7 +496,7 @@ def _stored(work, path):
             stream.write(array.raw())
             places.append((begin, stream.tell()))
         stream.write(bytes(1))  # an empty file cannot be mapped
-    arrays.clear()  # copies, where what is pickled made some
+    arrays.clear()  # which may be copies
     return_freed()
     return pickled, str(path), places
 
@@ -499,8 +509,8 @@ def _unpacked(pickled, path, places):
 
 
 def serve() -> None:
-    """Do what another process asks for, until it ends or falls silent."""
-    told, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    """Answer requests of another process, until it ends or sends none for `IDLE` seconds."""
+    requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever is printed is no answer
     work: Any = None
     while True:
@@ -508,7 +518,7 @@ def serve() -> None:
         watch.daemon = True
         watch.start()
         try:
-            kind, message = pickle.load(told)
+            kind, message = pickle.load(requests)
         except EOFError:
             sys.exit()
         finally:
@@ -521,7 +531,7 @@ def serve() -> None:
                 return_freed()
                 work = _unpacked(*message) if message else None
                 result = True, None
-        except BaseException as error:  # raised again where it was asked for
+        except BaseException as error:  # raised again in the other process
             result = False, error
         pickle.dump(result, answers, protocol=5)
         answers.flush()

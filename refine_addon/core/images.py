@@ -1,8 +1,8 @@
 """PNG, OpenEXR and WebP images, and the size of a PNG or JPEG, read from its header.
 
-PNG has 8 bits a channel (ISO/IEC 15948); OpenEXR is read as Blender writes it for us, one part
-without compression ("OpenEXR File Layout"). Core has no codec for lossless WebP: `use` names
-Blender's, else Pillow is imported when needed.
+PNG has 8 bits a channel (ISO/IEC 15948). OpenEXR is read as Blender writes it for us: one part,
+without compression ("OpenEXR File Layout"). Core has no codec of its own for lossless WebP: `use`
+sets one, such as Blender's, and without it Pillow is imported when needed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _TYPES = {1: "<f2", 2: "<f4"}  # of numbers in a channel
 
 _JPEG_START = b"\xff\xd8"
 
-_MOST_SEGMENTS = 4096  # most segments and fill bytes that are skipped; no camera writes more
+_MOST_SEGMENTS = 4096  # segments and fill bytes of a JPEG skipped at most; cameras write fewer
 
 _FILL = 0xFF
 _LAST = 0xDA, 0xD9  # start of scan and end of image
@@ -42,7 +42,7 @@ _FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
-    """PNG image of pixels (H, W, 3), the top row first."""
+    """PNG file that holds 8-bit pixels, (H, W, 3), the top row first."""
     height, width = pixels.shape[:2]
     rows = pixels.reshape(height, -1)
     filtered = np.full((height, 1 + rows.shape[1]), _UP, np.uint8)
@@ -56,7 +56,12 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Channels of an image by name, (H, W) float32, top row first; or `RefineError`."""
+    """Channels of an image by name, (H, W) float32, the top row first.
+
+    Raises
+    ------
+    RefineError : if the file cannot be read, has several parts or is compressed
+    """
     try:
         return _channels(path.read_bytes())
     except OSError as error:
@@ -84,7 +89,7 @@ def _channels(data):
     width, height = right - left + 1, bottom - top + 1
     parts: list[Any] = [("head", f"V{_LINE_HEAD}")]
     listed, place = header["channels"], 0
-    while listed[place]:  # in the order in which lines hold them
+    while listed[place]:  # in the order of the channels in a line
         name, place = _text(listed, place)
         (kind,) = struct.unpack_from("<i", listed, place)
         parts.append((name, _TYPES[kind], (width,)))
@@ -94,15 +99,15 @@ def _channels(data):
 
 
 def _text(data: bytes, start: int) -> tuple[str, int]:
-    """Text that begins here, and where it ends."""
+    """Text that begins at byte `start`, and the byte after its end."""
     end = data.index(b"\0", start)
     return data[start:end].decode(errors="replace"), end + 1
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Width and height as stored, before EXIF rotation, pixels; None if no whole PNG or JPEG."""
+    """Width and height of a PNG or JPEG in pixels, before any EXIF rotation; None for others."""
     try:
-        if not path.is_file():  # a pipe would be waited for
+        if not path.is_file():  # opening a pipe would wait for a writer
             return None
         with path.open("rb") as stream:
             head = stream.read(24)
@@ -132,13 +137,13 @@ def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
 
 
 class Codec(Protocol):
-    """What reads and writes WebP images."""
+    """A reader and writer of WebP images."""
 
     def size(self, data: bytes) -> tuple[int, int]:
-        """Width and height, without unpacking; raises `ValueError`."""
+        """Width and height in pixels, without unpacking; `ValueError` if damaged."""
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
-        """Pixels, (height, width, 4), the top row first; raises `ValueError`."""
+        """Pixels, (height, width, 4), the top row first; `ValueError` if damaged."""
 
     def encode(self, pixels: NDArray[np.uint8]) -> bytes:
         """WebP image that holds these pixels, (height, width, 4), to the bit."""
@@ -162,7 +167,7 @@ class _Pillow:
     def _opened(self, data):
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of large images, which are refused by their size
+                warnings.simplefilter("ignore")  # about large images, which we refuse by their size
                 image = self._image.open(io.BytesIO(data), formats=["WEBP"])
             with image:
                 yield image
@@ -177,18 +182,18 @@ class _Pillow:
         return stream.getvalue()
 
 
-_named: list[Codec] = []
+_chosen: list[Codec] = []
 
 
 def use(codec: Codec | None) -> None:
     """Read and write images by `codec` from now on; None stands for Pillow."""
-    _named[:] = [] if codec is None else [codec]
+    _chosen[:] = [] if codec is None else [codec]
 
 
 def codec_for(path: Path) -> Codec:
     """Codec in use; `RefineError`, naming `path`, if there is none."""
-    if _named:
-        return _named[0]
+    if _chosen:
+        return _chosen[0]
     try:
         return _Pillow()
     except ImportError as error:

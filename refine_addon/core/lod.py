@@ -1,7 +1,8 @@
 """Levels of detail: the same scene with ever fewer splats, in memory or as files.
 
-Where kept splats may change, each level is made from the one before, independent of later ones.
-Where splats are deleted, one ranking decides all. A level's rows are among those of the one before.
+If the method merges, each level is made from the one before; if it deletes, one ranking decides all
+levels. Either way, a level's rows are among those of the level before, and no level depends on a
+later one.
 """
 
 from __future__ import annotations
@@ -49,8 +50,7 @@ MAX_LEVELS = 16  # the last of so many halvings would hold 0.0015 % of the splat
 
 SHARES = (0.5, 0.25, 0.12, 0.06)  # shares kept, by default
 
-_SAMPLE = 4096  # splats that tell how far away what the views see is
-_VIEWS = 8  # views that tell it
+_SAMPLE, _VIEWS = 4096, 8  # splats and views from which `viewing_distance` is estimated
 
 
 @dataclass(frozen=True)
@@ -90,24 +90,24 @@ class Levels:
             raise RefineError(f"got {len(values)} levels, expected at most {MAX_LEVELS}")
 
     def __len__(self) -> int:
-        return len(self.asked)
+        return len(self.goals)
 
     @property
-    def asked(self) -> tuple[float, ...]:
-        """The shares, or the PSNR."""
+    def goals(self) -> tuple[float, ...]:
+        """The shares, or the PSNR in dB."""
         return self.shares or self.psnr
 
     def notes(self, remarks: Mapping[float, str]) -> list[str]:
-        """Which levels were not made, and `remarks` (`Level.remark` by `asked`), in sentences."""
+        """Notes for the user: levels that were not made, and `remarks`, `Level.remark` by goal."""
         notes, number, unit = [], 0, "" if self.shares else " dB"
-        for asked in self.asked:
-            if asked not in remarks:
+        for goal in self.goals:
+            if goal not in remarks:
                 copied = f"level {number}" if number else "the input"
-                notes.append(f"no level for {asked:g}{unit}: it would be a copy of {copied}")
+                notes.append(f"no level for {goal:g}{unit}: it would be a copy of {copied}")
                 continue
             number += 1
-            if remarks[asked]:
-                notes.append(f"level {number}: {remarks[asked]}")
+            if remarks[goal]:
+                notes.append(f"level {number}: {remarks[goal]}")
         return notes
 
     def budgets(self, count: int) -> list[Budget]:
@@ -121,10 +121,10 @@ class Levels:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level, of all splats; the report of its result is that of the last step."""
+    """One level, as a result for all splats, with the report of the step from the level before."""
 
     number: int  # from 1; level 0 is the original
-    asked: float  # the share or the PSNR
+    goal: float  # the share or the PSNR, dB
     result: Result
     scores: Scores
 
@@ -135,7 +135,7 @@ class Level:
 
     @property
     def remark(self) -> str:
-        """Why the PSNR that was asked for is out of reach; "" if it is not."""
+        """Why the PSNR that is its goal is out of reach; "" if it is not."""
         return self.result.report["budget_remark"]
 
     def facts(self) -> dict[str, Any]:
@@ -143,7 +143,7 @@ class Level:
         report = self.result.report
         return {
             "level": self.number,
-            "asked": self.asked,
+            "asked": self.goal,
             "splats": int(np.count_nonzero(self.result.keep)),
             "psnr": self.psnr,
             "done": report["method"]["done"],
@@ -162,16 +162,22 @@ def lod(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Iterator[Level]:
-    """Make levels of detail one by one, when they are asked for, the finest first.
+    """Make levels of detail, each when the iterator is advanced, the finest first.
 
     A level with as many splats as the one before is left out; see `Levels.notes`.
 
     Parameters
     ----------
     splats, views, method, progress, threads : see `prune`
+    levels : Levels
     protected : (N,) bool, optional; in all levels, unchanged
     removed : (N,) bool, optional
-        In no level unless protected. They count as removed; levels are compared with the others.
+        In no level unless protected, and counted as removed. Levels are compared with pictures
+        without them.
+
+    Yields
+    ------
+    Level
 
     Raises
     ------
@@ -191,7 +197,7 @@ def lod(
         protected = None if protected is None else protected[rest]
     left, number, scores = len(whole), 0, None
     results = _results(splats, views, budgets, method, protected, progress, threads)
-    for asked, result in zip(levels.asked, results, strict=True):
+    for goal, result in zip(levels.goals, results, strict=True):
         scores = result.scores if scores is None else scores
         kept = int(np.count_nonzero(result.keep))
         if kept < left:
@@ -199,13 +205,13 @@ def lod(
             assert scores is not None
             if rest is not None:
                 result = replace(result.for_all(rest), source=whole)
-            yield Level(number, asked, result, scores)
+            yield Level(number, goal, result, scores)
     if not number:
         raise RefineError(f"no level has fewer splats than the input, which has {len(whole)}")
 
 
 def _results(splats, views, budgets, method, protected, progress, threads):
-    """Results of all splats: by one ranking where rows stay, else each from the one before."""
+    """Yield results for all splats: by one ranking, or each from the one before."""
     scores, whole, origin = None, None, None
     # Shares of the time: a level takes half of that before it, or, once scored, hardly any.
     times = (0.5**place if method.changes else 0.02 for place in range(len(budgets)))
@@ -233,7 +239,7 @@ def _results(splats, views, budgets, method, protected, progress, threads):
 
 
 def _both(first, second):
-    """Two steps as one; the second is of what the first kept."""
+    """Two results as one; the second is of the splats that the first kept."""
     keep, one, merged = among_all(second.keep, first.keep), first.merged, second.merged
     if one is not None and merged is None:
         splats, changed = one.splats.take(second.keep), one.changed[second.keep]
@@ -268,7 +274,7 @@ def is_streamed(target: Path) -> bool:
 
 @contextlib.contextmanager
 def _into_folder(source, target, count, overwrite):
-    """A file of each level but 0. New files are deleted if the block fails.
+    """Write a file for each level but 0. New files are deleted if the block fails.
 
     Yields ``add(scene, level)``, which writes one and returns its file's name and size, how many
     splats it lacks, and notes; and ``finish()``, which returns notes.
@@ -304,36 +310,37 @@ def _into_folder(source, target, count, overwrite):
 
 @contextlib.contextmanager
 def _streamed(target, views, overwrite):
-    """A streamed SOG of all levels, 0 without what the user removed; see `_into_folder`."""
+    """Write a streamed SOG of all levels, 0 without removed splats; see `_into_folder`."""
     codec_for(target)  # refuses where no library for images is
-    made: list[StreamedSog] = []
+    streamed: list[StreamedSog] = []
     with folder_for(target, overwrite=overwrite) as folder:
 
         def add(scene, level):
             file, said, removed = scene.file(), list[str](), scene.demands.removed
-            if not made:
+            if not streamed:
                 whole = np.ones(len(scene.splats), np.bool_) if removed is None else ~removed
                 finest = held_splats(target, sog.FORMAT, file, whole, {})
                 distance = viewing_distance(scene.splats, views)
-                made.append(StreamedSog(finest.means, distance, folder))
-                made[0].add(finest)
+                streamed.append(StreamedSog(finest.means, distance, folder))
+                streamed[0].add(finest)
                 said = notes(file, sog.FORMAT, whole)
             keep, columns = level.result.keep, level.result.changed(file.rows)
-            size = made[0].add(held_splats(target, sog.FORMAT, file, keep, columns))
+            size = streamed[0].add(held_splats(target, sog.FORMAT, file, keep, columns))
             missing = left_out(file, sog.FORMAT, keep)
             return f"{level.number}_*/{sog.META}", size, missing, said
 
         def finish():
-            made[0].publish(target, overwrite=overwrite)
+            streamed[0].publish(target, overwrite=overwrite)
             return list[str]()
 
         yield add, finish
 
 
 def viewing_distance(splats: Splats, views: ViewSet) -> float:
-    """Median distance from views to what they see, world units; inf if nothing.
+    """Median distance from the views to the splats in them, world units; inf if there are none.
 
-    A streamed SOG's chunks are as wide, so their far ends are at most twice as far as their near.
+    A streamed SOG's chunks are at most this wide: from such a distance, the far end of a chunk is
+    at most twice as far away as its near end.
     """
     means = splats.means[:: max(len(splats) // _SAMPLE, 1)].astype(np.float64)
     distances = [np.empty(0)]
@@ -360,7 +367,7 @@ def lod_file(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Make levels of detail of a file: a file each, or a streamed SOG of all. Returns the report.
+    """Make levels of detail of a file: a file for each, or one streamed SOG.
 
     Parameters
     ----------
@@ -369,7 +376,11 @@ def lod_file(
         A folder, made if missing; a file in it that gives the names (`level_paths`); or the index
         of a streamed SOG, ``lod-meta.json``.
     views, levels, method, progress, threads : see `lod`
-    zones, model : see `prune_file`
+    zones, model, overwrite : see `prune_file`
+
+    Returns
+    -------
+    dict : the report, plain JSON values; see docs/report.md
 
     Raises
     ------
@@ -385,7 +396,7 @@ def lod_file(
         scene = read_scene(source, zones, model)
         clock.lap("read_s")
         demands, entries, notes, remarks = scene.demands, list[dict[str, Any]](), list[str](), {}
-        facts: dict[str, Any] = {"settings": method.facts(), "volumes": list(demands.facts)}
+        report: dict[str, Any] = {"settings": method.facts(), "volumes": list(demands.facts)}
         count = len(scene.splats)
         making, writing = stages(progress, seconds("merge", count), seconds("write", count))
         for level in lod(
@@ -395,19 +406,19 @@ def lod_file(
             if level.number == 1:
                 seen = scored(level.scores)
                 seen["splats"] |= {"before": count, **demands.counts()}
-                facts |= {"source": {"file": file.name, "bytes": scene.bytes}, **seen}
-                facts["nested"] = not method.changes
+                report |= {"source": {"file": file.name, "bytes": scene.bytes}, **seen}
+                report["nested"] = not method.changes
                 notes += scoring_notes(level.scores)
             name, size, missing, more = add(scene, level)
             notes += [note for note in more if note not in notes]
             entry = level.facts() | {"left_out": missing, "file": name, "bytes": size}
             entries.append(entry | {"splats": entry["splats"] - missing})
-            remarks[level.asked] = level.remark
+            remarks[level.goal] = level.remark
         writing(0.5, "writing")
         notes += levels.notes(remarks) + finish()
         clock.lap("levels_s")
     clock.stop()
-    return facts | {
+    return report | {
         "levels": entries,
         "files": {"input": scene.name, "output": str(path)},
         "timings": clock.timings,

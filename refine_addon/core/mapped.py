@@ -1,8 +1,9 @@
-"""Arrays, splats and regions in files, and what a job has done.
+"""Arrays and splats in files, and the finished stages of a job.
 
-Indexing maps the file, copies and unmaps, as mapped pages count as memory; pickled, an array is its
-file's name, type and shape. A job's folder holds the files and its stages' results (`once`), to
-continue after a kill. Splats too many at once are divided into regions, for any process.
+Indexing an array maps its file, copies the elements and unmaps the file, since mapped pages count
+as memory. Pickled, an array is the name, type and shape of its file. The folder of a job holds such
+files, and the results of its stages (`once`), so that a killed job can go on. Splats that are too
+many to be worked on at once are divided into regions, which any process can work on.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32
 
 
 class Interrupted(RefineError):
-    """Workers, a disk or a storage failed: what is done stays for the next run."""
+    """Workers, a disk or a storage failed; finished stages are kept for the next run."""
 
 
 class Mapped:
@@ -65,14 +66,27 @@ class Mapped:
         return np.asarray(self[...], dtype)
 
     def take(self, rows: NDArray[np.int64], axis: int = 0) -> NDArray[Any]:
-        """Some rows; the axis is the first."""
+        """Elements at `rows`, along the first axis, whatever `axis`, which NumPy passes."""
         return np.asarray(self[rows])
 
 
 def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, Any]:
-    """Write arrays, a piece of each at a time, into a folder that is replaced whole or not at all.
+    """Write arrays to a folder, which is replaced whole or not at all.
 
-    All pieces have the names, types and further axes of the first.
+    Parameters
+    ----------
+    folder : Path, within that of a job
+    pieces : iterable of mappings
+        Consecutive rows of each array by name; all with the names, types and other axes of the
+        first.
+
+    Returns
+    -------
+    dict of str to Mapped
+
+    Raises
+    ------
+    Interrupted : if the disk is full or fails
     """
     unfinished = folder.with_name(f"{folder.name}-{secrets.token_hex(4)}.tmp")
     files: dict[str, BinaryIO] = {}
@@ -101,13 +115,13 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
 
 
 def once(job: Path, stage: str, make: Callable[[], Result]) -> Result:
-    """Result of a stage of a job: that of an earlier run, or of `make`, which is kept."""
+    """Result of a stage of a job: of an earlier run, or of ``make()``, which is then stored."""
     done, result = noted(job, stage)
     return result if done else note(job, stage, make())
 
 
 def note(job: Path, stage: str, result: Result) -> Result:
-    """Keep the result of a stage, whole or not at all, and return it; see `once`."""
+    """Store the result of a stage, whole or not at all, and return it; see `once`."""
     path = job / f"{stage}.done"
     temporary = path.with_name(f"{secrets.token_hex(8)}.tmp")
     try:
@@ -122,12 +136,12 @@ def note(job: Path, stage: str, result: Result) -> Result:
 
 
 def noted(job: Path, stage: str) -> tuple[bool, Any]:
-    """Whether a stage is done, and its result; one whose files are damaged is not done."""
+    """Whether a stage is done, and its result; not done if its files are damaged."""
     path = job / f"{stage}.done"
     if not path.exists():
         return False, None
     with reading(path), path.open("rb") as stream:
-        # Unpickling runs what it reads: nothing that another user has written.
+        # Unpickling can run code in the file, so files of other users are not read.
         if not hasattr(os, "getuid") or os.fstat(stream.fileno()).st_uid == os.getuid():
             with contextlib.suppress(Interrupted, EOFError, ValueError, pickle.PickleError):
                 return True, pickle.load(stream)
@@ -136,7 +150,7 @@ def noted(job: Path, stage: str) -> tuple[bool, Any]:
 
 @contextlib.contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Raise `Interrupted` where the system cannot read a file of a job."""
+    """Raise `Interrupted` in place of the system's errors in reading a file of a job."""
     try:
         yield
     except OSError as error:
@@ -145,7 +159,7 @@ def reading(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Raise `Interrupted` where the disk is full, or the system cannot write."""
+    """Raise `Interrupted` in place of the system's errors in writing a file of a job."""
     try:
         yield
     except OSError as error:
@@ -158,7 +172,10 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def on_disk(folder: Path, parts: Iterable[Splats]) -> Splats:
-    """Splats in files of a new folder in that of a job; parts have one type, degree and model."""
+    """Write splats to files of a new folder in that of a job; `parts` are joined in order.
+
+    They have the same types, degree and model. Returns splats whose arrays are `Mapped`.
+    """
     model: Any = None
 
     def columns() -> Iterator[dict[str, NDArray[Any]]]:
@@ -172,17 +189,17 @@ def on_disk(folder: Path, parts: Iterable[Splats]) -> Splats:
 
 
 def pieces(splats: Splats, rows: NDArray[np.int64]) -> Iterator[Splats]:
-    """Some splats by their rows, in that order, some at a time, for `on_disk`."""
+    """Splats at `rows`, (n,), in that order, a piece at a time, for `on_disk`."""
     return (splats.take(rows[piece]) for piece in chunks(len(rows), _ROWS))
 
 
 def folder_of(splats: Splats) -> Path | None:
-    """Folder of the job in whose files the splats lie; None if in memory."""
+    """Folder of the job whose files hold the splats; None for splats in memory."""
     return splats.means.path.parents[1] if isinstance(splats.means, Mapped) else None
 
 
 def new_folder(splats: Splats) -> Path:
-    """A new folder, in that of their job, for what is made of splats."""
+    """Make a folder in that of the splats' job, for files derived from them."""
     job = folder_of(splats)
     assert job is not None
     folder = job / f"regions-{secrets.token_hex(4)}"
@@ -190,11 +207,11 @@ def new_folder(splats: Splats) -> Path:
     return folder
 
 
-# Regions of them.
+# Regions of splats in files.
 
 
 def in_regions(splats: Splats, count: int) -> bool:
-    """Whether so many of some splats are too many at once: in files, not in memory."""
+    """Whether `count` of the splats must be divided: more than a `REGION`, of splats in files."""
     return folder_of(splats) is not None and count > REGION
 
 
@@ -203,7 +220,8 @@ def divided(
 ) -> list[NDArray[np.int64]]:
     """Rows, ascending, of boxes of about equally many splats, at most `share` of a `REGION` each.
 
-    Planes are across where `means`, (n, 3), vary, or `askew`; non-finite ones count as the origin.
+    Boxes are halved across the axis along which `means`, (n, 3), vary most; with `askew`, the axes
+    are turned, so that other splats lie at the borders. Non-finite means count as the origin.
     """
     with np.errstate(over="ignore"):  # doubles that are no floats
         place = np.asarray(means, np.float32)
@@ -226,14 +244,18 @@ def divided(
 
 
 def look(_fraction: float, _what: str) -> None:
-    """Progress within a region: nobody is told, but the work can be cancelled."""
+    """Progress callback within a region: shows nothing, but the work can be cancelled."""
     checkpoint()
 
 
 def in_one(
     folder: Path, regions: Sequence[Splats], boxes: Sequence[NDArray[np.int64]]
 ) -> tuple[Splats, NDArray[np.int64]]:
-    """Splats of all regions (whose folder is deleted) by rows (`boxes`), and their order, (N,)."""
+    """Join regions, whose folder is then deleted; `boxes` are the rows of each.
+
+    Returns the splats in ascending order of their rows, and that order, (N,): for each, its place
+    among the splats of the regions one after another.
+    """
     every, order = on_disk(folder / "every", regions), np.argsort(np.concatenate(boxes))
     result = on_disk(folder.with_name(f"{folder.name}-done"), pieces(every, order))
     shutil.rmtree(folder, ignore_errors=True)

@@ -11,11 +11,11 @@ from .refit import refit
 
 @dataclass(frozen=True)
 class Method:
-    """What all methods share; `views` are spread evenly, 0 uses all."""
+    """Settings of all methods: at most `views` views are used, spread evenly; 0 uses all."""
 
-    name: ClassVar[str]  # the word for it in panel, command and report
+    name: ClassVar[str]  # in panel, command and report
 
-    changes: ClassVar[bool] = False  # whether kept splats may change; else rows stay to the bit
+    changes: ClassVar[bool] = False  # whether kept splats may change; if not, rows stay to the bit
 
     views: int = 64
 
@@ -29,19 +29,19 @@ class Method:
 
 
 class ClosedForm(Method):
-    """REFINE's formula, which takes nothing as hidden; deletes the lowest scores."""
+    """Scores by REFINE's formula, without occlusion; deletes the lowest."""
 
     name = "closed-form"
 
 
 class Occlusion(Method):
-    """Scores that know what hides what; deletes the lowest."""
+    """Scores with occlusion; deletes the lowest."""
 
     name = "occlusion"
 
 
 class Merge(Method):
-    """Occlusion, and what goes is merged into what stays; deletes where that is as good."""
+    """Scores with occlusion; merges splats into kept ones, or deletes where that is as good."""
 
     name = "merge"
     changes = True
@@ -49,9 +49,9 @@ class Merge(Method):
 
 @dataclass(frozen=True)
 class Refit(Method):
-    """Merge, then fit the kept splats to what all splats looked like.
+    """Merges, then fits the kept splats to the pictures of all splats.
 
-    `rounds` is the most, each to other rays; None ends where a round brings little for its time.
+    `rounds` is the most, each with other rays; None ends when a round gains little for its time.
     """
 
     name = "refit"

@@ -40,7 +40,7 @@ PROPERTY = "refine_score"  # the property of a PLY that holds the scores
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Splats in memory, which of them are forced, and the rows that are written."""
+    """Splats in memory, those that are protected or removed, and the rows that are written."""
 
     name: str  # in the report
     bytes: int  # of the source
@@ -58,9 +58,18 @@ def read_scene(
     model: Model | None = None,
     form: Format | None = None,
 ) -> Scene:
-    """Read a file of any format, whose frame is that of the views.
+    """Read a file of splats into memory; its frame is that of the views.
 
-    `model` is used where the file is silent or wrong; `form` is the output's, by default plain PLY.
+    Parameters
+    ----------
+    path : path-like, of any format
+    zones : sequence of Zone, in that frame
+    model : Model, optional; how splats are drawn, if the file does not say or is wrong
+    form : Format, optional; of the output, for sizes; None is plain PLY
+
+    Raises
+    ------
+    RefineError : see `read_splats` and `forced`
     """
     file = read_splats(path, model)
     splats = file.splats()
@@ -86,15 +95,25 @@ def run(
 ) -> Result:
     """Read, decide, write and compare; the report of the result is complete afterwards.
 
-    read : ``read(form)`` returns the scene; `form` is the format of the output, None for plain PLY
-    decide : ``decide(scene, clock, progress)`` returns the result
-    output : its suffix names the format; None writes nothing
-    source : the file that is read meanwhile
-    dry_run : decide as for the output, and write no splats
-    views : those that decide; they tell what a lossy file costs, and are drawn
-    save : ``save(result, written)`` does what is left once the file is written
+    If this fails nothing is written, but for the last round of a refit that is cancelled, and for
+    a file whose comparison fails.
 
-    Where it fails nothing is written, unless comparing fails or a partial refit is cancelled.
+    Parameters
+    ----------
+    read : callable, ``read(form)``, the scene; `form` is the output's format, None for plain PLY
+    decide : callable, ``decide(scene, clock, progress)``, the result
+    output : Path, optional; its suffix names the format, without it nothing is written
+    source : Path, optional; the file that is read meanwhile
+    overwrite : bool, whether files may be replaced
+    dry_run : bool, whether to decide as for the output and write no splats
+    views : ViewSet, optional; in them a lossy file and pictures are compared with all splats
+    pictures : PictureFiles, optional; where pictures before and after go
+    save : callable, optional; ``save(result, written)`` is called once the file is written
+    progress, threads : see `prune`
+
+    Raises
+    ------
+    RefineError, Cancelled
     """
     clock, written = Clock(), None if dry_run else output
     with contextlib.nullcontext() if pictures is None or views is None else pictures.opened(views):
@@ -115,7 +134,6 @@ def run(
         if stopped is not None and save is not None:  # nothing is saved over what is unfinished
             raise stopped
         report(silent if stopped else writing, 0.0, "writing")
-        facts = result.report
         file = scene.file()
         result = replace(result, source=file, matrix=scene.matrix)
         keep, columns = result.keep, result.changed(file.rows)
@@ -132,29 +150,30 @@ def run(
             raise stopped
         missing = registry.left_out(file, form, keep)
         left = int(np.count_nonzero(keep)) - missing
-        facts["splats"] |= {"written": None if written is None else left, "left_out": missing}
-        facts["notes"] += [*registry.notes(file, form, keep), *scene.notes]
-        facts["files"] = {
+        counts = {"written": None if written is None else left, "left_out": missing}
+        result.report["splats"] |= counts
+        result.report["notes"] += [*registry.notes(file, form, keep), *scene.notes]
+        result.report["files"] = {
             "input": scene.name, "output": None if written is None else str(written),
             "input_bytes": scene.bytes, "output_bytes": size,
         }  # fmt: skip
         try:
             rays = None if result.scores is None else result.scores.ray_sample
-            after = None  # what a lossy file holds, where that is to be told
+            after = None  # splats of a lossy file, read again
             lossy = None if form is None or views is None else written
             if lossy is not None and (rays or pictures):
                 after = _reread(lossy, scene.matrix)
             if lossy is not None and views is not None and result.scores:
                 psnr = None
                 if rays is not None and after is not None:
-                    used = views.spread(facts["settings"]["views"])
+                    used = views.spread(result.report["settings"]["views"])
                     psnr = psnr_against(rays, after, used, threads=threads)
-                facts["written_psnr"] = None if psnr is None else round(psnr, 2)
+                result.report["written_psnr"] = None if psnr is None else round(psnr, 2)
             if pictures is not None and views is not None:
                 if after is None:
                     merged = result.merged
                     after = scene.splats.take(keep) if merged is None else merged.splats
-                facts["pictures"] = pictures.write(
+                result.report["pictures"] = pictures.write(
                     scene.splats, after, views, progress=comparing, threads=threads
                 )
                 clock.lap("pictures_s")
@@ -163,7 +182,7 @@ def run(
                 stop.add_note(f"{written} is written, its pictures and report are not")
             raise
     clock.stop()
-    facts["timings"] = clock.timings
+    result.report["timings"] = clock.timings
     return result
 
 
@@ -184,7 +203,7 @@ def prune_scene(
     views: ViewSet, budget: Budget, method: Method = DEFAULT, cleaning: Cleaning | None = None,
     *, reusable: bool = False, threads: int | None = None,
 ) -> Callable[[Scene, Clock, Progress], Result]:  # fmt: skip
-    """For `run`: clean, if asked, and prune the rest; see `prune`."""
+    """`decide` of `run` that cleans, if there is `cleaning`, and prunes the rest; see `prune`."""
 
     def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands, splats, left = scene.demands, scene.splats, None
@@ -238,7 +257,16 @@ def prune_file(
     cleaning : Cleaning, optional; what to clean away first, the budget then counts the rest
     pictures : PictureFiles, optional; where pictures before and after go
     model : Model, optional; where the file does not say how splats are drawn, or is wrong
+    overwrite : bool, whether files may be replaced
     dry_run : bool, whether to decide as for the output and write no splats
+
+    Returns
+    -------
+    Result : its report is complete, see docs/report.md
+
+    Raises
+    ------
+    RefineError, Cancelled : see `read_splats`, `prune` and `write_splats`
     """
     if budget.max_mb is not None:
         refuse_unknown_size(None if output is None else expanded(output))
@@ -270,23 +298,23 @@ def clean_file(
 ) -> Result:
     """Clean a file of splats, and write the rest to another; see `prune_file` and `clean`."""
 
-    def decide(scene: Scene, clock: Clock, told: Progress) -> Result:
+    def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands = scene.demands
         cleaned = clean_splats(
             scene.splats, views, cleaning, protected=demands.protected, removed=demands.removed,
-            progress=told, threads=threads,
+            progress=progress, threads=threads,
         )  # fmt: skip
         clock.lap("clean_s")
-        facts: dict[str, Any] = {
+        report: dict[str, Any] = {
             **seen_by(cleaned.seen, cleaned.undrawable, cleaned.views_given, cleaned.views_used),
             "settings": asdict(cleaning),
             "volumes": list(demands.facts),
             "cleaned": cleaned.facts(),
             "notes": cleaned.notes(),
         }
-        facts["splats"] |= kept_and_removed(cleaned.keep) | demands.counts()
-        facts["splats"]["unseen"] -= facts["splats"]["removed_by_user"]
-        return Result(cleaned.keep, facts)
+        report["splats"] |= kept_and_removed(cleaned.keep) | demands.counts()
+        report["splats"]["unseen"] -= report["splats"]["removed_by_user"]
+        return Result(cleaned.keep, report)
 
     return _run_file(
         source, output, decide, zones, model,
@@ -297,7 +325,7 @@ def clean_file(
 def score_scene(
     views: ViewSet, method: Method, threads: int | None = None
 ) -> Callable[[Scene, Clock, Progress], Result]:
-    """For `run`: all splats are kept, with their scores as a property."""
+    """`decide` of `run` that keeps all splats, with their scores as a property."""
 
     def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands = scene.demands
@@ -307,7 +335,7 @@ def score_scene(
         )  # fmt: skip
         clock.lap("score_s")
         gone = demands.counts()["removed_by_user"]
-        facts: dict[str, Any] = {
+        report: dict[str, Any] = {
             **scored(scores),
             "settings": method.facts(),
             "volumes": list(demands.facts),
@@ -315,10 +343,10 @@ def score_scene(
             "prices": prices(scores, clock.timings["score_s"]),
             "notes": scoring_notes(scores),
         }
-        facts["splats"] |= {"removed_by_user": gone}
-        facts["splats"]["unseen"] -= gone
+        report["splats"] |= {"removed_by_user": gone}
+        report["splats"]["unseen"] -= gone
         keep = np.ones(len(scene.splats), np.bool_)
-        return Result(keep, facts, columns={PROPERTY: scores.values})
+        return Result(keep, report, columns={PROPERTY: scores.values})
 
     return decide
 
@@ -358,7 +386,7 @@ class Move:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """The move as (4, 4)."""
+        """The move as an affine matrix, (4, 4) float64."""
         turned = np.eye(3)
         for axis, degrees in enumerate(self.rotate):
             one, other = (axis + 1) % 3, (axis + 2) % 3
@@ -386,14 +414,14 @@ def convert_files(
 ) -> Result:
     """Write the splats of files to another, in the format that its suffix names.
 
-    A single file of which nothing else is asked keeps every property of a PLY.
+    A single file with no other option given keeps every property of a PLY.
 
     Parameters
     ----------
     sources : sequence of path-like, one at least; the first comes first
     moves : sequence of Move, one for each file, or none
     degree : int from 0 to 4, optional; harmonics above it are left out
-    morton : bool, whether splats are sorted along a Z-shaped (Morton) curve: near ones follow
+    morton : bool, whether splats are sorted along a Z-shaped (Morton) curve, near ones together
     level : int, of a streamed SOG; 0 is the finest
     model : Model, optional; see `prune_file`
 

@@ -1,7 +1,7 @@
-"""Splats picked by hand: visible ones, by area, place and colour; selections painted and grown.
+"""Splats selected by hand: visible ones by area, place and colour; selections painted and grown.
 
-A splat, at its centre, is visible unless it lies behind a surface: behind the depth at which a ray
-has lost all but `LIGHT_LEFT` of its light.
+A splat is visible if its centre is not behind a surface, which is where a ray from the view has
+lost all but `LIGHT_LEFT` of its light.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ from .visibility.rays import in_front
 from .visibility.scene import Scene
 
 LIGHT_LEFT = 0.1
-"""Transmittance at whose depth a surface ends: splats in front of 0.5 make up a third of the
-picture, of 0.1 two thirds, with `THICKNESS` four fifths."""
+"""Transmittance of a ray at a surface. Splats in front of the depth where it is 0.5 make up a third
+of the picture; at 0.1 these are two thirds, and with `THICKNESS` four fifths."""
 
-THICKNESS = 2.0  # standard deviations along the view's axis that a visible splat may lie behind it
+THICKNESS = 2.0  # how far behind a surface is visible: a splat's deviations along the view's axis
 
 RAYS = 25_000  # about how many rays find surfaces
 
 LEAST_STEP = 4  # pixels between two of these rays, at least
 
-_EMPTY = 0.1  # alpha of all that a ray hits, below which it meets nothing
+_EMPTY = 0.1  # a ray with less alpha in all hits nothing
 _PAIRS = 1 << 17  # see `hits`
 
 Mode = Literal["SET", "ADD", "SUBTRACT", "INTERSECT"]
-"""What becomes of a selection when some splats are taken."""
+"""How chosen splats change a selection."""
 
 NEIGHBOURS = 8  # nearest splats by which a selection grows and shrinks
 
 
 class Surface(NamedTuple):
-    """What lies under a pixel."""
+    """The surface under a pixel."""
 
-    place: NDArray[np.float64]  # (3,), in front of it half of the pixel; in the view's frame
+    place: NDArray[np.float64]  # (3,), in the splats' frame: before it is half of the pixel
     color: NDArray[np.float64]  # (3,), of constant harmonics, display-referred
     scale: float  # pixels of a length of 1 there
 
 
 class Prepared(NamedTuple):
-    """Splats ready to be looked at from anywhere."""
+    """Splats prepared for any view."""
 
     splats: Splats
     gaussians: Gaussians
@@ -62,7 +62,7 @@ class Prepared(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a view shows of N splats."""
+    """N splats in a view."""
 
     prepared: Prepared
     view: View
@@ -72,20 +72,23 @@ class Sight:
     visible: NDArray[np.bool_]  # (n,), see the top of this file
 
     def in_area(self, area: NDArray[np.bool_], *, hidden: bool = False) -> NDArray[np.bool_]:
-        """Splats, (N,) bool, with centres in an area, (H, W) bool; `hidden` ones if asked."""
+        """Splats, (N,) bool, with centres in an area, (H, W) bool; with `hidden`, also those."""
         return self._of(area[self.pixels[1], self.pixels[0]], hidden)
 
     def in_ball(
         self, center: NDArray[np.float64], radius: float, *, hidden: bool = False
     ) -> NDArray[np.bool_]:
-        """Splats in the image that lie in a ball in space, (N,) bool."""
+        """Splats in the image with centres in a ball, (N,) bool; `center`, (3,), in their frame."""
         away = self.prepared.splats.means[self.rows] - center
         return self._of(np.einsum("ij,ij->i", away, away) <= radius * radius, hidden)
 
     def of_color(
         self, color: NDArray[np.float64], tolerance: float, *, hidden: bool = False
     ) -> NDArray[np.bool_]:
-        """Splats in the image whose red, green and blue are within a tolerance, (N,) bool."""
+        """Splats in the image whose red, green and blue are within a tolerance, (N,) bool.
+
+        `color`, (3,), and `tolerance` are display-referred, 0..1.
+        """
         gaussians = self.prepared.gaussians
         place = np.full(len(self.prepared.splats), -1)
         place[gaussians.index] = np.arange(len(gaussians))
@@ -93,9 +96,10 @@ class Sight:
         return self._of(np.abs(colors - color).max(axis=1) <= tolerance, hidden)
 
     def piece(self, chosen: NDArray[np.bool_], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Chosen splats, (N,), that touch each other, in the largest piece near a place, (3,).
+        """The largest piece near a place, (3,), of chosen splats, (N,) bool, as such a mask.
 
-        Pieces are those of the `NEIGHBOURS` nearest to it; only neighbours can touch.
+        Splats of a piece touch, directly or by others, of which only neighbours are compared. A
+        piece is near if it has one of the `NEIGHBOURS` chosen splats that are nearest to the place.
         """
         gaussians = self.prepared.gaussians
         picked = gaussians.take(np.flatnonzero(chosen[gaussians.index]))
@@ -110,7 +114,7 @@ class Sight:
         return mask
 
     def surface(self, column: int, row: int) -> Surface | None:
-        """What lies under a pixel, None where there is next to nothing."""
+        """The surface under a pixel; None where a ray hits less than an alpha of `_EMPTY`."""
         pieces = list(hits(self.footprints, np.array([column]), np.array([row]), _PAIRS))
         if not pieces:
             return None
@@ -137,12 +141,12 @@ class Sight:
 
 
 def prepare(splats: Splats, view: View) -> Prepared:
-    """Splats ready to be looked at; the view is one of those to come."""
+    """Prepare splats for `look`; `view` is one of the views to come, which set the scene's size."""
     return Prepared(splats, *projection.prepare(splats, ViewSet((view,)))[:2])
 
 
 def look(prepared: Prepared, view: View) -> Sight:
-    """What a view shows of splats."""
+    """Find where the splats lie in a view, and which are visible."""
     gaussians = prepared.gaussians
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, prepared.scene, view)
@@ -164,9 +168,10 @@ def look(prepared: Prepared, view: View) -> Sight:
 def surfaces(
     footprints: Footprints, depths: NDArray[np.float32], view: View, step: int
 ) -> NDArray[np.float32]:
-    """Depth of the hit behind which a ray has `LIGHT_LEFT`, infinite without one, float32.
+    """Depths of surfaces along the view's axis, (rows, columns) float32, infinite without one.
 
-    One ray a cell of `step` pixels. `footprints` are front to back, `depths` theirs, (n,).
+    One ray for each cell of `step` pixels, whose surface is the first hit that leaves at most
+    `LIGHT_LEFT`. `footprints` are front to back, `depths`, (n,), are those of their centres.
     """
     columns, rows = (
         np.minimum(np.arange(0, size, step) + step // 2, size - 1)
@@ -188,17 +193,19 @@ def surfaces(
     return ends.reshape(len(rows), len(columns))
 
 
-def combined(before: NDArray[np.bool_], taken: NDArray[np.bool_], mode: Mode) -> NDArray[np.bool_]:
-    """A selection, (N,), once some splats were taken, (N,)."""
+def combined(before: NDArray[np.bool_], chosen: NDArray[np.bool_], mode: Mode) -> NDArray[np.bool_]:
+    """A selection, (N,) bool, changed by chosen splats, (N,) bool."""
     if mode == "ADD":
-        return before | taken
+        return before | chosen
     if mode == "SUBTRACT":
-        return before & ~taken
-    return before & taken if mode == "INTERSECT" else taken
+        return before & ~chosen
+    return before & chosen if mode == "INTERSECT" else chosen
 
 
 def polygon(corners: Sequence[tuple[float, float]], width: int, height: int) -> NDArray[np.bool_]:
-    """Pixels with centres in a polygon of (column, row) corners, (height, width), even-odd rule.
+    """Pixels with centres in a polygon, (height, width) bool, by the even-odd rule.
+
+    Corners are (column, row) in pixels, with the origin at the image's upper left.
 
     >>> polygon([(1, 0), (3, 0), (3, 2), (1, 2)], 4, 3).astype(int).tolist()
     [[0, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
@@ -219,7 +226,10 @@ def polygon(corners: Sequence[tuple[float, float]], width: int, height: int) -> 
 def paint(
     area: NDArray[np.bool_], start: tuple[float, float], end: tuple[float, float], radius: float
 ) -> None:
-    """Add to an area, (H, W) bool, in place, what a round brush covers on its way, pixels."""
+    """Add to an area, (H, W) bool, in place, the pixels that a round brush covers on its way.
+
+    `start`, `end` (column, row) and `radius` are in pixels.
+    """
     (left, right), (top, bottom) = (
         (max(math.floor(min(ends) - radius), 0), min(math.ceil(max(ends) + radius) + 1, size))
         for ends, size in zip(zip(start, end, strict=True), area.shape[::-1], strict=True)
@@ -236,19 +246,22 @@ def paint(
 
 
 def grown(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A selection, (N,), and its neighbours, in either direction of `neighbours`, (N, K)."""
+    """A selection, (N,) bool, and its neighbours, in either direction of `neighbours`, (N, K)."""
     more: NDArray[np.bool_] = selected | selected[neighbours].any(axis=1)
     more[neighbours[selected].ravel()] = True
     return more
 
 
 def shrunk(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A selection, (N,), without the splats that have a neighbour outside it."""
+    """A selection, (N,) bool, without the splats that have a neighbour outside it."""
     return ~grown(neighbours, ~selected)
 
 
 def neighbours_of(means: NDArray[Any], *, progress: Progress = silent) -> NDArray[np.int32]:
-    """`NEIGHBOURS` nearest of each splat, (N, K), of centres (N, 3); meaningless if not finite."""
+    """Rows of the `NEIGHBOURS` nearest splats of each, (N, K), by their centres, (N, 3).
+
+    Those of a splat whose centre is not finite are meaningless.
+    """
     places = np.asarray(means, np.float64)
     finite = np.isfinite(places).all(axis=1)
     if not finite.any():

@@ -1,7 +1,8 @@
-"""What views see of splats, drawn on the processor, also among meshes; before and after as files.
+"""Pictures of splats, alone or among meshes, drawn on the processor; before and after as files.
 
-Pixels are computed as rays are (`visibility.cast`): EWA footprints blended front to back, colours
-by direction of view. They agree with the benchmarks' reference renderer to 75 dB and more.
+Pixels are computed as rays are (`visibility.cast`): EWA footprints (Zwicker et al. 2001), blended
+front to back, with colours by direction. They agree with the benchmarks' reference renderer to
+75 dB and more.
 """
 
 from __future__ import annotations
@@ -51,7 +52,9 @@ _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """Pictures with a depth a pixel, such as meshes; splats with nearer centres are in front."""
+    """K pictures with a depth for each pixel, such as of meshes; splats with nearer centres are in
+    front.
+    """
 
     colors: NDArray[Any]  # (K, 3, H, W), display-referred, 0..1, premultiplied; top row first
     alphas: NDArray[Any]  # (K, H, W), 0..1
@@ -59,18 +62,21 @@ class Layers:
     background: NDArray[Any] | None = None  # (3, H, W), infinitely far away, display-referred
 
     def left(self) -> NDArray[np.float64]:
-        """Share seen of what is behind the first 0 to K layers, (K + 1, H, W)."""
+        """Transmittance of the first 0 to K layers together, (K + 1, H, W)."""
         left = np.ones((len(self.alphas) + 1, *self.alphas.shape[1:]))
         np.cumprod(1.0 - self.alphas, axis=0, out=left[1:])
         return left
 
     def over_nothing(self) -> NDArray[np.float64]:
-        """Their colours blended without the background, (3, H, W)."""
+        """The layers blended, premultiplied and without the background, (3, H, W)."""
         return np.asarray(np.einsum("kchw,khw->chw", self.colors, self.left()[:-1]))
 
 
 def in_order(layers: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]) -> Layers:
-    """Layers (colours, alphas, depths) sorted by depth in each pixel; ties keep their order."""
+    """Layers (colours, alphas, depths) sorted by depth in each pixel; ties keep their order.
+
+    Each is (3, H, W), (H, W) and (H, W), as in `Layers`.
+    """
     colors, alphas, depths = (np.stack(arrays) for arrays in zip(*layers, strict=True))
     order = np.argsort(depths, axis=0, kind="stable")
     alphas, depths = (np.take_along_axis(of_each, order, 0) for of_each in (alphas, depths))
@@ -86,10 +92,25 @@ def draw(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.float64]:
-    """What a view sees of splats and of layers among them, (4, H, W) float64 in 0..1.
+    """Draw splats, and layers among them, in a view.
 
-    Red, green and blue are display-referred and premultiplied; the layers' background adds to them
-    and not to alpha. `scene` is the frame to compute in, by default that of splats and view.
+    Parameters
+    ----------
+    splats : Splats, in the frame of the view
+    view : View
+    layers : Layers, optional, of the size of the view's image
+    scene : Scene, optional; the frame to compute in, by default that of splats and view
+    progress, threads : see `prune`
+
+    Returns
+    -------
+    (4, H, W) float64, 0..1
+        Red, green and blue, display-referred and premultiplied, and alpha, to which the layers'
+        background does not add.
+
+    Raises
+    ------
+    RefineError, Cancelled
     """
     gaussians, scene, _ = projection.prepare(
         splats, ViewSet((view,)), scene, progress=part(progress, 0.0, 0.1), threads=threads
@@ -99,7 +120,7 @@ def draw(
 
 
 def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
-    """Splats with the colours they show to a place, (3,), the same in all directions."""
+    """Splats with the colours they show towards a point, (3,) in their frame, in all directions."""
     if not splats.sh_degree:
         return splats
     with np.errstate(all="ignore"):  # of splats that cannot be drawn
@@ -140,7 +161,7 @@ def drawn(
 
 
 class _Cut:
-    """Layers between the splats of a strip of R rows, P pixels."""
+    """Layers among the splats in a strip of R rows, P pixels."""
 
     def __init__(self, layers, depths, rows):
         def flat(planes):
@@ -152,11 +173,11 @@ class _Cut:
         self._log_front = np.zeros(self._limits.shape)  # transmittance of splats in front of each
 
     def shows(self, footprint, pixel):
-        """Splats that they do not hide, (p,) bool."""
+        """Pairs of splat and pixel that the layers do not hide, (p,) bool."""
         return self._left[self._before(footprint, pixel), pixel] > 0.0
 
     def shares(self, footprint, pixel, alpha):
-        """Shares of each hit that they let through, (h,); notes what is before them."""
+        """Transmittance of the layers before each hit, (h,); adds hits to those before layers."""
         before = self._before(footprint, pixel)
         log_passed = np.log1p(-alpha)
         for layer, log_front in enumerate(self._log_front):
@@ -164,7 +185,7 @@ class _Cut:
         return self._left[before, pixel]
 
     def insert(self, image, log_left):
-        """Add them to the splats' picture, (4, P), and transmittance, (P,)."""
+        """Add the layers to the splats' picture, (4, P), of this transmittance, (P,)."""
         passed = np.exp(log_left)
         for layer, log_front in enumerate(self._log_front):
             image[:3] += self._left[layer] * np.exp(log_front) * self._colors[layer]
@@ -178,10 +199,8 @@ class _Cut:
 
 
 def _strip(footprints, colors, columns, rows, cut):
-    """`draw` in C columns and R rows, ascending, (4, R * C), with colours (3, n) float64.
-
-    Footprints come front to back, some at a time; opaque pixels are left out of those that follow.
-    """
+    """`draw` in C columns and R rows, ascending, (4, R * C), with colours (3, n) float64."""
+    # Footprints come front to back, some at a time; those behind are not computed in opaque pixels.
     pixels = len(columns) * len(rows)
     log_left, image = np.zeros(pixels), np.zeros((4, pixels))  # logarithm of the transmittance
 
@@ -205,10 +224,8 @@ def _strip(footprints, colors, columns, rows, cut):
 
 
 def _weights(pixel, alpha, log_left):
-    """Share of its pixel that each hit makes up, (h,); updates `log_left`, (P,), to behind them.
-
-    Hits come pixel by pixel, ascending, and front to back in each.
-    """
+    """Weight of each hit in its pixel, (h,); updates `log_left`, (P,), to that behind the hits."""
+    # Hits come pixel by pixel, ascending, and front to back in each.
     if not len(pixel):
         return np.empty(0)
     log_passed = np.log1p(-alpha).astype(np.float64)
@@ -223,7 +240,7 @@ def _weights(pixel, alpha, log_left):
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What a view sees before and after a change."""
+    """Pictures of a view before and after a change."""
 
     view: View  # in the size of the pictures
     before: NDArray[np.uint8]  # (H, W, 3), display-referred, top row first
@@ -245,7 +262,7 @@ def compare(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> list[Comparison]:
-    """Draw two states of a scene in each view; views longer than `LONGEST` are drawn smaller."""
+    """Draw two states of a scene in each view, at most `LONGEST` pixels long; see `draw`."""
     pictures: list[list[NDArray[np.float64]]] = []
     for splats, start in ((before, 0.0), (after, 0.5)):
         gaussians, scene, _ = projection.prepare(
@@ -296,7 +313,7 @@ def _psnr(after, before, view):
 
 @dataclass(frozen=True)
 class PictureFiles:
-    """Where the pictures of one prune go; `name`, that of the splats, begins the files' names."""
+    """Folder for the pictures of a prune; file names begin with `name`, that of the splats."""
 
     folder: Path
     name: str
@@ -304,7 +321,7 @@ class PictureFiles:
 
     @contextlib.contextmanager
     def opened(self, views: ViewSet) -> Iterator[None]:
-        """Make the folder, and refuse what could not be written, before the work."""
+        """Make the folder, and raise `RefineError` for files that could not be written."""
         with new_folder(self.folder):
             for paths in self._paths(views.spread(CAMERAS)):
                 for path in paths.values():
@@ -320,22 +337,22 @@ class PictureFiles:
         progress: Progress = silent,
         threads: int | None = None,
     ) -> dict[str, Any]:
-        """Draw and write `CAMERAS` of the views; returns PSNRs and files for the report."""
+        """Draw and write `CAMERAS` of the views; returns PSNRs in dB and files for the report."""
         views = views.spread(CAMERAS)
         comparisons = compare(before, after, views, progress=progress, threads=threads)
-        facts = []
+        entries = []
         try:
-            for made, files in zip(comparisons, self._paths(views), strict=True):
+            for pair, files in zip(comparisons, self._paths(views), strict=True):
                 for kind, path in files.items():
                     with whole_file(path, overwrite=self.overwrite) as stream:
-                        stream.write(png(getattr(made, kind)))
-                size, names = [made.view.width, made.view.height], {k: str(files[k]) for k in files}
-                camera = {"camera": made.view.name, "size": size, "psnr": round(made.psnr, 2)}
-                facts.append(camera | names)
+                        stream.write(png(getattr(pair, kind)))
+                size, names = [pair.view.width, pair.view.height], {k: str(files[k]) for k in files}
+                camera = {"camera": pair.view.name, "size": size, "psnr": round(pair.psnr, 2)}
+                entries.append(camera | names)
         except RefineError as error:
             raise RefineError(f"{error}; the pruning itself is done") from error
         mean = sum(comparison.psnr for comparison in comparisons) / len(comparisons)
-        return {"psnr": round(mean, 2), "amplified": AMPLIFIED, "views": facts}
+        return {"psnr": round(mean, 2), "amplified": AMPLIFIED, "views": entries}
 
     def _paths(self, views: ViewSet) -> list[dict[str, Path]]:
         return [
@@ -344,24 +361,24 @@ class PictureFiles:
         ]
 
 
-def measured_in_words(facts: dict[str, Any]) -> str:
-    """What was measured in pictures, as one sentence.
+def measured_in_words(report: dict[str, Any]) -> str:
+    """Sentence on the PSNR of pictures, from what `PictureFiles.write` returned.
 
     >>> views = [{"psnr": 38.0}, {"psnr": 36.0}]
     >>> measured_in_words({"psnr": 37.0, "amplified": 8, "views": views})
     '37.0 dB measured in 2 views (36.0 to 38.0); differences are shown 8 times as large'
     """
-    values = [view["psnr"] for view in facts["views"]]
+    values = [view["psnr"] for view in report["views"]]
     many = f"{len(values)} views ({min(values):.1f} to {max(values):.1f})"
     where = many if len(values) > 1 else "one view"
     return (
-        f"{facts['psnr']:.1f} dB measured in {where}; differences are shown {facts['amplified']} "
+        f"{report['psnr']:.1f} dB measured in {where}; differences are shown {report['amplified']} "
         "times as large"
     )
 
 
 def _labels(names: list[str]) -> list[str]:
-    """A different part of a file name for each camera.
+    """Part of a file name for each camera, different for each.
 
     >>> _labels(["left/0.png", "left/0.png", ""])
     ['left_0', 'left_0_2', 'view']
@@ -375,5 +392,5 @@ def _labels(names: list[str]) -> list[str]:
 
 
 def _plain(name: str) -> str:
-    """Name with only what every system takes in a file name."""
+    """Name with only characters that every system takes in a file name."""
     return re.sub(r"[^\w.() -]", "_", name)

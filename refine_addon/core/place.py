@@ -1,4 +1,4 @@
-"""What is refused in a file: a value at a place in it, or a file of another kind, with advice."""
+"""Checks of values in files, with errors that name the place, and names of other file formats."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LARGEST_NUMBER = 1e18  # largest number taken, such as a coordinate: its square 
 
 LARGEST_COUNT = 1 << 53  # largest whole number that is taken: floats hold every one up to it
 
-NEGLIGIBLE = 1e-30  # smaller numbers are read as 0, so products of two do not underflow
+NEGLIGIBLE = 1e-30  # smaller numbers are read as 0, so that products of two do not underflow
 
 _SHOWN = 40  # most characters of a value in a message
 
@@ -32,8 +32,8 @@ _ZIP = b"PK\x03\x04"
 class Place:
     """A file and a place in it, such as "camera 3"; "" for the whole file.
 
-    Each check of a JSON value is one method, which returns the value or raises `RefineError` with
-    file, place, what was got and what was expected.
+    Each method that checks a JSON value returns it, or raises `RefineError` with the file, the
+    place, what was expected and what was got.
     """
 
     path: Path
@@ -44,12 +44,12 @@ class Place:
         return type(self)(self.path, f"{self.where} {where}" if self.where else where)
 
     def fail(self, problem: str) -> NoReturn:
-        """Raise the error of this place."""
+        """Raise `RefineError` with this place."""
         where = f"{self.where}: " if self.where else ""
         raise RefineError(f"{self.path}: {where}{problem}")
 
     def expected(self, what: str, value: object) -> NoReturn:
-        """Raise the error of this place: what was expected there, and what was got."""
+        """Raise `RefineError` with this place, what was expected there, and what was got."""
         self.fail(f"expected {what}, got {described(value)}")
 
     def number(self, value: object) -> float:
@@ -98,7 +98,7 @@ class Place:
         return value
 
     def parsed(self, text: bytes | str) -> Any:
-        """Value of a text in JSON; errors name line and column."""
+        """Value of a JSON text; `RefineError` with line and column if it is none."""
         try:
             return json.loads(text)
         except json.JSONDecodeError as error:
@@ -133,7 +133,7 @@ def refuse_pointer(path: Path | Url, head: bytes) -> None:
 
 
 def foreign_kind(path: Path | Url, head: bytes) -> str:
-    """What a file in another format is and what to do with it, by a few hundred bytes; or ""."""
+    """Name of a known format other than plain PLY, and advice, by name and first bytes; or ""."""
     suffix, read = path.suffix.lower(), "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
     if suffix in (".splat", ".ksplat"):  # only the name tells: they have no signature
         return f"a {suffix} file: {read}"
@@ -152,7 +152,7 @@ def foreign_kind(path: Path | Url, head: bytes) -> str:
 
 
 def is_spz(head: bytes) -> bool:
-    """Whether these are the first bytes of an SPZ file, as it is or within gzip."""
+    """Whether these are the first bytes of an SPZ file, plain or in gzip."""
     if head.startswith(SPZ):
         return True
     try:

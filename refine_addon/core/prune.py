@@ -1,7 +1,7 @@
-"""From splats, views and a budget to the kept splats and their new values.
+"""Which splats are kept, and their new values, by views and a budget.
 
-Panel, command and Python code all call `prune`. Splats are scored, and the budget selects by score.
-Where kept splats may change, splats are merged until as many are left, then refitted if asked.
+Panel, command and Python code all call `prune`. It scores the splats, and the budget selects by
+score. Methods that may change kept splats merge until as many are left, and then refit, if asked.
 """
 
 from __future__ import annotations
@@ -42,13 +42,15 @@ TRIES = 3  # how often splats are merged at most to reach a PSNR
 CLOSE = 0.7  # how close to a PSNR a result's estimate must be, dB, or splats are merged again
 
 FIRST = 0.1
-"""Share of splats deleted before any merge: the lowest scores, which cost less than merges."""
+"""Share of splats deleted before any merge: deleting the lowest scores costs less than merging."""
 
 PARTS = 2
-"""Parts of the views, measured in turn while splats are merged; the others' values stay."""
+"""Parts of the views that are measured in turn while splats are merged; other parts keep their
+values meanwhile."""
 
 REFITTING = "refitting"
-"""Told during refitting: from then on a cancelled prune has a result (`Result.stopped`)."""
+"""What progress says during refitting, from which on a cancelled prune has a result, see
+`Result.stopped`."""
 
 
 def score(
@@ -68,13 +70,19 @@ def score(
     Parameters
     ----------
     splats : Splats or SplatFile, in the frame of the views
+    views : ViewSet; those used are chosen by `Method.views`
     method : Method; `ClosedForm` scores by its formula, all others by occlusion
     protected : (N,) bool, optional; only the estimated PSNR depends on it, no score does
     removed : (N,) bool, optional; the others are scored as if these were gone, these score 0
     quality : bool, whether the closed form estimates the PSNR, which takes longer than scoring
-    settled : int, optional; how many, besides `removed`, need their final order: fewer is faster
+    settled : int, optional
+        How many of the lowest scores, besides `removed`, need their final order: fewer is faster.
     progress : callable, optional; ``progress(fraction, what)``, returning ``False`` cancels
     threads : int, optional; by default the cores of this process, at most 8
+
+    Returns
+    -------
+    Scores : of all N splats
 
     Raises
     ------
@@ -120,7 +128,10 @@ def with_quality(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Scores with the curve of the estimated PSNR, if they have validation rays."""
+    """Scores with the curve of the estimated PSNR, if they have validation rays.
+
+    `protected`, (N,) bool, are taken to be kept; see `score` for the rest.
+    """
     if scores.ray_sample is None:
         return scores
     curve = quality_curve(
@@ -135,7 +146,7 @@ def _with_views(
 ) -> Scores:
     """Scores with alignment and notes on all views given, not only on those used."""
     notes = (*scores.notes, views.note) if views.note else scores.notes
-    # Beside the closed form, measuring would take as long as scoring.
+    # After the closed form, measuring would take as long as scoring did.
     measured = None if scores.ray_sample is None else used
     aligned = alignment(splats, views, measured, threads=threads)
     return replace(scores, views_given=len(views), notes=notes, alignment=aligned)
@@ -162,19 +173,26 @@ def prune(
 
     Parameters
     ----------
-    splats, views, progress, threads : see `score`; None where `scores` decide and none is merged
-    budget : Budget; where kept splats may change, only their number comes from it
+    splats, views, progress, threads
+        See `score`. Splats and views may be None if `scores` are given and `method` only deletes.
+    budget : Budget; if `method` merges, only the number of kept splats comes from it
+    method : Method
     protected : (N,) bool, optional; neither removed nor changed
     removed : (N,) bool, optional
-        Removed first, and counted, unless protected. The others are scored without them, compared
-        with pictures without them, and not merged with them.
-    scores : Scores, optional; merging measures anew and takes only what a threshold or deletion
-        keeps by them, if they are of occlusion
+        Removed first, unless protected; the budget counts them. The others are scored, merged and
+        compared with pictures as if these had never been there.
+    scores : Scores, optional
+        Of an earlier `score`. A merging method measures anew: it uses them, if of occlusion, for a
+        budget by score, and where deletion is as good.
     sizes : (float, int), optional; bytes of a splat and of the rest of the output, for `max_mb`
     origin : Origin, optional; the splats before an earlier merging prune, for comparing pictures
     reusable : bool, whether scores are to serve other budgets; else scoring ends at this one
-    partial : bool, whether a cancelled refit returns what it reached (`Result.stopped`)
+    partial : bool, whether a cancelled refit returns its last round (`Result.stopped`)
     clock : Clock, optional; gets the times of the steps
+
+    Returns
+    -------
+    Result
 
     Raises
     ------
@@ -205,19 +223,19 @@ def prune(
 
 
 class _Try(NamedTuple):
-    """Number of kept splats and the PSNR reached, dB."""
+    """Number of kept splats, and the estimated PSNR with them, dB."""
 
     kept: int
     psnr: float
 
     def misses(self, goal: float) -> tuple[bool, float]:
-        """By how much it misses a PSNR, as a key: above is better than below."""
+        """Sort key: by how much it misses a PSNR; a PSNR within `CLOSE` or above comes first."""
         return self.psnr < goal - CLOSE, abs(self.psnr - goal)
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
-    """What merging, and refitting if asked, made of splats."""
+class Outcome:
+    """Result of merging, and of refitting, if asked."""
 
     merged: Merged  # before refitting; by deletion where that is better to begin with
     done: Way
@@ -273,8 +291,8 @@ class _Prune:
             scores=None if self.scores is None else self.scores.of(rest),
         )
 
-    def delete(self, progress: Progress, tried: Made | None = None) -> Result:
-        """Decide by scores alone; `tried` is what merging made, if it was tried."""
+    def delete(self, progress: Progress, tried: Outcome | None = None) -> Result:
+        """Decide by scores alone; `tried` is the outcome of merging, if it was tried."""
         scores = self._scores(part(progress, 0.0, 0.94))
         report(progress, 0.94, "selecting")
         keep, psnr = self._select(scores)
@@ -284,36 +302,36 @@ class _Prune:
             between = psnr_kept(scores.between, keep, threads=self.threads)
         elif scores.quality is not None:
             between = scores.quality.at_between(1.0 - float(np.mean(keep)))
-        facts = reports.of_prune(
+        summary = reports.of_prune(
             scores, keep, self.budget, self.method, self.sizes, self.clock,
             psnr=psnr, between=between, measured={"delete": psnr}, tried=tried,
             timed=self.scores is None,
         )  # fmt: skip
-        return Result(keep, facts, scores)
+        return Result(keep, summary, scores)
 
     def merge(self, progress: Progress) -> Result:
         """Merge down to the budget, refit if asked; delete where that is as good."""
         views, goal = len(self.used), self.budget.psnr
         count = len(self.splats)
         refits = isinstance(self.method, Refit)
-        given = self.scores  # used where deletion is as good; whether it is, they do not decide
+        given = self.scores  # for deletion where that is as good, which they do not decide
         if given is not None and (
             given.method == ClosedForm.name
             or given.settled is not None
             or (goal and not given.quality)
         ):
-            given = None  # they were made for another method or budget
+            given = None  # they are of another method or budget
         gone = self.budget.removals(count, *self.sizes)
         left = count // 2 if gone is None else count - gone
         expected = sum(self._expected_seconds(left))
         scoring, making = stages(
             progress, seconds("measure", count, views), expected * (2.2 if goal else 1.0)
         )
-        known = None
+        measurement = None
         if self.budget.needs_scores:
             scores = self._scores(scoring)
         else:
-            scores, known = occlusion.score_once(
+            scores, measurement = occlusion.score_once(
                 self.splats, self.used, few_views=goal is None,
                 progress=scoring, threads=self.threads,
             )  # fmt: skip
@@ -333,37 +351,36 @@ class _Prune:
         )  # fmt: skip
         if will_do:
             return self._deleted(deletes.delete(making), None)
-        if known is None:
-            scores, known = occlusion.score_once(
+        if measurement is None:
+            scores, measurement = occlusion.score_once(
                 self.splats, self.used, few_views=True, progress=making, threads=self.threads
             )
         if goal is None:
-            made = self._to_count(keep, scores, known, making)
+            outcome = self._to_count(keep, scores, measurement, making)
         else:
-            made = self._to_psnr(goal, scores, known, making)
+            outcome = self._to_psnr(goal, scores, measurement, making)
         self.clock.lap("merge_s")
-        if not refits and self._deletion_is_as_good(keep, plain, made):
-            return self._deleted(deletes.delete(silent, made), made)
+        if not refits and self._deletion_is_as_good(keep, plain, outcome):
+            return self._deleted(deletes.delete(silent, outcome), outcome)
         # Where a PSNR is asked for, deletion keeps another number of splats.
-        measured = made.psnr if goal is not None else {"delete": plain, **made.psnr}
-        final = made.final
-        facts = reports.of_prune(
+        measured = outcome.psnr if goal is not None else {"delete": plain, **outcome.psnr}
+        final = outcome.final
+        summary = reports.of_prune(
             scores, final.keep, self.budget, self.method, self.sizes, self.clock,
-            psnr=made.reached, between=self._between(scores, made), measured=measured, made=made,
-            timed=True,
+            psnr=outcome.reached, between=self._between(scores, outcome), measured=measured,
+            outcome=outcome, timed=True,
         )  # fmt: skip
-        return Result(
-            final.keep, facts, scores, None if made.done == "delete" else final, made.stopped
-        )
+        merged = None if outcome.done == "delete" else final
+        return Result(final.keep, summary, scores, merged, outcome.stopped)
 
-    def _deleted(self, result: Result, tried: Made | None) -> Result:
+    def _deleted(self, result: Result, tried: Outcome | None) -> Result:
         """Result of deletion where merging was asked for."""
-        facts = result.report
-        facts["method"]["asked"] = self.method.name
-        facts["settings"] = self.method.facts()
-        if facts["splats"]["removed"]:
+        summary = result.report
+        summary["method"]["asked"] = self.method.name
+        summary["settings"] = self.method.facts()
+        if summary["splats"]["removed"]:
             reached = None if tried is None else tried.reached
-            facts["notes"].append(reports.deleted_note(facts["estimated_psnr"], reached))
+            summary["notes"].append(reports.deleted_note(summary["estimated_psnr"], reached))
         return result
 
     def _scores(self, progress: Progress) -> Scores:
@@ -402,14 +419,14 @@ class _Prune:
             return keep, scores.quality.at(1.0 - float(np.mean(keep)))
         return keep, None
 
-    def _deletion_is_as_good(self, keep, plain: float | None, made: Made) -> bool:
+    def _deletion_is_as_good(self, keep, plain: float | None, outcome: Outcome) -> bool:
         """Whether deletion, keeping (N,) at `plain` dB, is about as good."""
-        if plain is None or made.reached is None:
+        if plain is None or outcome.reached is None:
             return True
         if self.budget.psnr is None:
-            return plain > made.reached - AS_GOOD
-        missed = made.reached < self.budget.psnr - CLOSE and made.reached < plain
-        return missed or np.count_nonzero(keep) <= len(made.merged.splats)
+            return plain > outcome.reached - AS_GOOD
+        missed = outcome.reached < self.budget.psnr - CLOSE and outcome.reached < plain
+        return missed or np.count_nonzero(keep) <= len(outcome.merged.splats)
 
     def _expected_seconds(self, left: int) -> tuple[float, float, float]:
         """Of merging to so many splats, of the estimate then, and of refitting, if asked."""
@@ -421,43 +438,43 @@ class _Prune:
             refit = rounds * seconds("refit", count + left, views)
         return sum(stage_seconds(count, counts, views)), seconds("compare", left, views), refit
 
-    def _to_count(self, keep, scores: Scores, known: Measured, progress: Progress) -> Made:
+    def _to_count(self, keep, scores: Scores, measurement: Measured, progress: Progress) -> Outcome:
         """Merge until as many are left as deletion keeps, (N,); refit if asked."""
         origin, used, left = self.origin, self.used, int(np.count_nonzero(keep))
         truth = scores.ray_sample if origin is None else origin.ray_sample
         merging_progress, comparing, refitting = stages(progress, *self._expected_seconds(left))
 
-        def estimated(splats: Splats, told: Progress = silent) -> float | None:
+        def estimated(splats: Splats, progress: Progress = silent) -> float | None:
             if truth is None:
                 return None
-            return psnr_against(truth, splats, used, progress=told, threads=self.threads)
+            return psnr_against(truth, splats, used, progress=progress, threads=self.threads)
 
         merged = merge_down(
             self.splats, used, left,
-            known=(scores, known), protected=self.protected,
+            scored=(scores, measurement), protected=self.protected,
             began=None if origin is None else len(origin.splats),
             progress=merging_progress, threads=self.threads,
         )  # fmt: skip
         psnr = estimated(merged.splats, comparing)
         if not isinstance(self.method, Refit):
-            return Made(merged, "merge", {"merge": psnr})
+            return Outcome(merged, "merge", {"merge": psnr})
         deleted = _as_deleted(self.splats, keep, self.threads)
         plain = estimated(deleted.splats)
-        made = Made(merged, "merge", {"delete": plain, "merge": psnr})
+        outcome = Outcome(merged, "merge", {"delete": plain, "merge": psnr})
         if plain is not None and psnr is not None and plain > psnr:
-            made = replace(made, merged=deleted, done="delete")
+            outcome = replace(outcome, merged=deleted, done="delete")
         del merged, deleted  # one of them is not needed while splats are refitted
-        made = self._refitted(made, refitting)
-        if made.refitted is None or made.stopped is not None:
-            return made
-        return replace(made, psnr=made.psnr | {"refit": estimated(made.refitted.splats)})
+        outcome = self._refitted(outcome, refitting)
+        if outcome.refitted is None or outcome.stopped is not None:
+            return outcome
+        return replace(outcome, psnr=outcome.psnr | {"refit": estimated(outcome.refitted.splats)})
 
-    def _to_psnr(self, goal: float, scores: Scores, known: Measured, progress: Progress) -> Made:
-        """Merge to as few splats as keep a PSNR, dB.
-
-        Their number comes from the scores' curve, corrected by what the last try reached; between a
-        try that keeps the PSNR and one that does not, from these two.
-        """
+    def _to_psnr(
+        self, goal: float, scores: Scores, measurement: Measured, progress: Progress
+    ) -> Outcome:
+        """Merge to as few splats as keep a PSNR, dB."""
+        # Their number comes from the scores' curve, corrected by what the last try reached; between
+        # a try that keeps the PSNR and one that does not, from these two.
         total, curve = len(self.splats), quality_of(scores)
         way: Way = "refit" if isinstance(self.method, Refit) else "merge"
         lost = None if self.origin is None else self.origin.psnr
@@ -468,29 +485,29 @@ class _Prune:
             if count in (one.kept for one in tried):
                 break
             keep = select(scores, Budget(keep=count), protected=self.protected)
-            made = self._to_count(keep, scores, known, tries[number])
-            if made.stopped is not None:
-                return replace(best or made, stopped=made.stopped)
-            if made.reached is None:
-                return made
-            tried.append(_Try(count, made.reached))
+            outcome = self._to_count(keep, scores, measurement, tries[number])
+            if outcome.stopped is not None:
+                return replace(best or outcome, stopped=outcome.stopped)
+            if outcome.reached is None:
+                return outcome
+            tried.append(_Try(count, outcome.reached))
             if best is None or min(tried, key=lambda one: one.misses(goal)) is tried[-1]:
-                best = made
-            if abs(made.reached - goal) <= CLOSE:
+                best = outcome
+            if abs(outcome.reached - goal) <= CLOSE:
                 break
-            gone = 1.0 - len(made.merged.splats) / total
+            gone = 1.0 - len(outcome.merged.splats) / total
             gone = _share_between(tried, goal, total) or curve.share(
-                goal - made.reached + curve.at(gone, way), way
+                goal - outcome.reached + curve.at(gone, way), way
             )
         assert best is not None  # every try gives one
         return best
 
-    def _refitted(self, made: Made, progress: Progress) -> Made:
+    def _refitted(self, outcome: Outcome, progress: Progress) -> Outcome:
         """Refit to the views' pictures of the unpruned splats; if cancelled, the rounds so far."""
         assert isinstance(self.method, Refit)
-        merged, start = made.merged, time.perf_counter()
+        merged, start = outcome.merged, time.perf_counter()
         if merged.keep.all() and self.origin is None:
-            return made
+            return outcome
         done, stopped = None, None
         return_freed()
         try:
@@ -506,24 +523,24 @@ class _Prune:
             stopped = stop.with_traceback(None)  # without what was worked on
             if done is None or not done.rounds:
                 stop.add_note("refitting was stopped before its first round was done")
-                return replace(made, stopped=stopped)
+                return replace(outcome, stopped=stopped)
             stop.add_note(f"refitting was stopped after round {done.rounds}")
         assert done is not None  # what is to be refitted is yielded first
         return replace(
-            made, done="refit", psnr=made.psnr | {"refit": done.psnr}, refitted=done,
+            outcome, done="refit", psnr=outcome.psnr | {"refit": done.psnr}, refitted=done,
             seconds=time.perf_counter() - start, stopped=stopped,
         )  # fmt: skip
 
-    def _between(self, scores: Scores, made: Made) -> float | None:
+    def _between(self, scores: Scores, outcome: Outcome) -> float | None:
         """Estimate in views in between, dB; None where nothing tells it."""
         rays = scores.between if self.origin is None else self.origin.between
-        if rays is None or made.stopped is not None:
+        if rays is None or outcome.stopped is not None:
             return None
-        return psnr_against(rays, made.final.splats, self.used, threads=self.threads)
+        return psnr_against(rays, outcome.final.splats, self.used, threads=self.threads)
 
 
 def _as_deleted(splats: Splats, keep: NDArray[np.bool_], threads: int | None) -> Merged:
-    """What deletion leaves, as merging returns it."""
+    """Splats that deletion keeps, in the form of a merge that changed none."""
     left = copied(splats, np.flatnonzero(keep), threads)
     return Merged(left, keep, np.zeros(len(left), np.bool_), 0, len(keep) - len(left))
 
@@ -545,7 +562,7 @@ def merge_down(
     views: ViewSet,
     count: int,
     *,
-    known: tuple[Scores, Measured] | None = None,
+    scored: tuple[Scores, Measured] | None = None,
     began: int | None = None,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
@@ -553,13 +570,23 @@ def merge_down(
 ) -> Merged:
     """Merge splats until `count` are left, by all `views`.
 
-    `known` are the results of `occlusion.score_once` for them. `began` is their number before
-    earlier merging: what is deleted first, and the merge penalty, go by the share gone since.
+    Parameters
+    ----------
+    splats, views, progress, threads : see `score`
+    scored : (Scores, Measured), optional; results of `occlusion.score_once` for these splats
+    began : int, optional
+        Number of splats before earlier merges, by default now. The number deleted before merging,
+        and the merge penalty, depend on the share removed since then.
+    protected : (N,) bool, optional; neither removed nor changed
+
+    Raises
+    ------
+    RefineError, Cancelled : see `score`
     """
     total = len(splats)
-    if known is None:
-        known = occlusion.score_once(splats, views, few_views=True, threads=threads)
-    scores, measured = known
+    if scored is None:
+        scored = occlusion.score_once(splats, views, few_views=True, threads=threads)
+    scores, measured = scored
     began = total if began is None else began
     # How many of all are deleted before any are merged, and how many of those are still there.
     deleted = max(min(math.floor(FIRST * began), began - count), 0)
@@ -568,12 +595,14 @@ def merge_down(
     rest = select(scores, Budget(keep=total - first), protected=protected)
     # The deleted splats hid almost nothing, so the first stage need not measure again.
     sums = np.array([measured.contribution, measured.error])
-    del known, scores, measured
+    del scored, scores, measured
     turns = itertools.count()
 
-    def measure(now: Splats, expected: NDArray[np.float64], told: Progress) -> NDArray[np.float64]:
+    def measure(
+        now: Splats, expected: NDArray[np.float64], progress: Progress
+    ) -> NDArray[np.float64]:
         measured, share = occlusion.measure_part(
-            now, views, next(turns), PARTS, progress=told, threads=threads
+            now, views, next(turns), PARTS, progress=progress, threads=threads
         )
         return np.array([measured.contribution, measured.error]) + (1.0 - share) * expected
 

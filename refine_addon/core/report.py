@@ -25,8 +25,8 @@ NOT_PREDICTED = (
 MANY_UNSEEN = 0.05  # share of unseen splats from which on the report says how many of them go
 
 LITTLE_SEEN = 0.19
-"""Share of splats in at most one view from which on other views may lose more than predicted. On
-five scenes 8 views or 16 neighbours have 0.197 and more, 12 spread out at most 0.180."""
+"""Share of splats in at most one view from which on other views may lose more than predicted. In
+five scenes it is 0.197 or more for 8 views or 16 adjacent ones, at most 0.180 for 12 spread out."""
 
 PRICED = (0.3, 0.5, 0.7, 0.9)  # shares removed whose cost a scoring predicts
 
@@ -68,7 +68,7 @@ def sizes_in_words(first: int, between: str, second: int) -> str:
 
 
 def scoring_notes(scores: Scores) -> list[str]:
-    """What the user should know about a scoring, in sentences."""
+    """Notes on a scoring for the user, one sentence each."""
     notes = [*scores.notes, *(scores.alignment.notes() if scores.alignment else ())]
     if scores.undrawable:
         notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
@@ -78,7 +78,7 @@ def scoring_notes(scores: Scores) -> list[str]:
 def seen_by(
     seen: NDArray[np.int32], undrawable: int, given: int, used: int
 ) -> dict[str, dict[str, int]]:
-    """Counts of splats and views for every report; `seen`, (N,), counts views of each splat."""
+    """Counts of splats and views for every report; `seen`, (N,), counts the views of each splat."""
     unseen = int(np.count_nonzero(seen == 0))
     return {
         "splats": {"before": len(seen), "undrawable": undrawable, "unseen": unseen},
@@ -87,7 +87,7 @@ def seen_by(
 
 
 def scored(scores: Scores) -> dict[str, dict[str, int]]:
-    """`seen_by` of a scoring."""
+    """`seen_by` for the splats and views of a scoring."""
     return seen_by(scores.seen, scores.undrawable, scores.views_given, scores.views_used)
 
 
@@ -109,20 +109,26 @@ def of_prune(
     between: float | None,
     measured: Mapping[Way, float | None],
     timed: bool,
-    made: Any = None,
+    outcome: Any = None,
     tried: Any = None,
 ) -> dict[str, Any]:
-    """The report of a prune; it shares the clock's times, later laps too.
+    """Report of a prune as plain JSON values; it shares the clock's times, later laps too.
 
-    `psnr` and `between` are estimates in the views that decided and in views in between, `measured`
-    those on rays, dB; `timed`: the clock timed scoring, to predict other methods' times; `made` and
-    `tried` (`prune.Made`) are what merging made, where it won and where deletion did.
+    Parameters
+    ----------
+    scores, budget, method, sizes : as in `prune.prune`
+    keep : (N,) bool, kept splats
+    psnr, between : float, optional; estimates in the views that decided and in views in between, dB
+    measured : dict, estimates on rays by method, dB
+    timed : bool, whether `clock` timed the scoring, from which other methods' times are predicted
+    outcome : prune.Outcome, optional; of merging, if its splats are kept
+    tried : prune.Outcome, optional; of merging, if deletion was as good
     """
     count, curve = len(keep), scores.quality
-    facts: dict[str, Any] = {**scored(scores)}
-    facts["splats"] |= kept_and_removed(keep)
-    facts["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
-    removed = facts["splats"]["removed"]
+    report: dict[str, Any] = {**scored(scores)}
+    report["splats"] |= kept_and_removed(keep)
+    report["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
+    removed = report["splats"]["removed"]
     share, note, why = removed / count, None, ""  # why the budget is out of reach
     if budget.psnr is not None:
         why = out_of_reach(budget.psnr, removed, count, psnr)
@@ -135,7 +141,7 @@ def of_prune(
         *scoring_notes(scores),
         SEES_TOO_LITTLE if note == SEES_TOO_LITTLE else "",
         why,
-        "" if made is None else made.merged.note(),
+        "" if outcome is None else outcome.merged.note(),
     ]
     if between is not None and parted(psnr, between):
         notes.append(
@@ -144,26 +150,26 @@ def of_prune(
         )
     if between is not None:
         notes.append(little_seen(scores.seen))
-    told = dict(measured)
+    estimates = dict(measured)
     if tried is not None and budget.psnr is None:  # of as many kept splats
-        told = {**tried.psnr, **told}
-    if made is not None:
-        if made.refitted is not None:
-            notes.append(made.refitted.note(made.seconds))
-        began, merge = made.psnr.get("delete"), made.psnr.get("merge")
-        if began is not None and merge is not None and not made.merged.merged:
-            said = f"{in_words(began)}, merging {in_words(merge)}"
-            notes.append(f"refitting began with plain deletion: {said}")
-        notes += getattr(made.stopped, "__notes__", ())
+        estimates = {**tried.psnr, **estimates}
+    if outcome is not None:
+        if outcome.refitted is not None:
+            notes.append(outcome.refitted.note(outcome.seconds))
+        began, merge = outcome.psnr.get("delete"), outcome.psnr.get("merge")
+        if began is not None and merge is not None and not outcome.merged.merged:
+            both = f"{in_words(began)}, merging {in_words(merge)}"
+            notes.append(f"refitting began with plain deletion: {both}")
+        notes += getattr(outcome.stopped, "__notes__", ())
         plain = measured.get("delete")
-        if made.done == "merge" and plain is not None and plain > (psnr or plain):
+        if outcome.done == "merge" and plain is not None and plain > (psnr or plain):
             notes.append(f"plain deletion reaches more: {in_words(plain)}")
     deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
     seconds = None
     if timed and not isinstance(method, ClosedForm):
-        took = expected_seconds(clock.timings["score_s"], share, once=made is not None)
+        took = expected_seconds(clock.timings["score_s"], share, once=outcome is not None)
         seconds = {way: round(value, 1) for way, value in took.items()}
-    facts |= {
+    report |= {
         "budget": {budget.kind: getattr(budget, budget.kind)},
         "settings": method.facts(),
         "weights": scores.facts,
@@ -174,26 +180,28 @@ def of_prune(
         "estimated_psnr_between": None if between is None else round(between, 2),
         "method": {
             "asked": method.name,
-            "done": deletes if made is None or made.done == "delete" else made.done,
-            **predicted(scores, share, told),
+            "done": deletes if outcome is None or outcome.done == "delete" else outcome.done,
+            **predicted(scores, share, estimates),
             "seconds": seconds,
         },
         "quality": None if curve is None else curve.facts(),
         "budget_remark": why,
         "notes": [words for words in notes if words],
     }
-    if made is not None:
-        facts["merged"] = made.merged.facts()
-        if made.refitted is not None:
-            facts["refitted"] = {
-                "began": "merge" if made.merged.merged else deletes,
-                **made.refitted.facts(made.seconds),
+    if outcome is not None:
+        report["merged"] = outcome.merged.facts()
+        if outcome.refitted is not None:
+            report["refitted"] = {
+                "began": "merge" if outcome.merged.merged else deletes,
+                **outcome.refitted.facts(outcome.seconds),
             }
-    return facts
+    return report
 
 
 def deleted_note(plain: float | None, tried: float | None) -> str:
-    """Why splats are deleted where merging was asked for, by both estimates, dB."""
+    """Why splats are deleted though the method merges; `plain` and `tried` are the estimated PSNR
+    of deletion and of merging, dB, None if unknown.
+    """
     why = "the views see too little to tell what merging would gain"
     if tried is not None:
         more = "no more" if plain is not None and tried <= plain else "hardly more"
@@ -204,24 +212,28 @@ def deleted_note(plain: float | None, tried: float | None) -> str:
 
 
 def little_seen(seen: NDArray[np.int32]) -> str:
-    """What few views cannot know of others, by `seen`, (N,); "" where they are enough.
+    """Sentence if many splats lie in at most one view, so that other views may lose more; or "".
 
-    The share that exactly one view holds is about what the next one adds (Good 1953).
+    `seen`, (N,), counts the views of each splat. The share of splats in exactly one view is about
+    the share that one more view adds (Good 1953).
 
     >>> little_seen(np.array([0, 1, 2, 3]))
-    '50% of the splats lie in one view or none: views from elsewhere may lose more than is told'
+    '50% of the splats lie in one view or none: views from elsewhere may lose more than predicted'
     """
     share = np.count_nonzero(seen < 2) / max(len(seen), 1)
     if share < LITTLE_SEEN:
         return ""
     return (
         f"{share:.0%} of the splats lie in one view or none: views from elsewhere may lose more "
-        "than is told"
+        "than predicted"
     )
 
 
 def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
-    """Predicted cost of pruning by occlusion, by share and method; scoring took `took` seconds."""
+    """Predicted PSNR and seconds of each method at the shares `PRICED`, for the report.
+
+    `took` are the seconds of scoring. Empty for the closed form, and without a curve of the PSNR.
+    """
     curve = scores.quality
     if curve is None or scores.method == "closed-form":
         return []
@@ -239,9 +251,9 @@ def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
 
 
 def predicted(scores: Scores, share: float, measured: Mapping[Way, float | None]) -> dict[str, Any]:
-    """Estimated PSNR at a share removed, by method, dB, or why there is none.
+    """PSNR of each method at a share removed, dB, for the report, and why one is missing.
 
-    `measured` are estimates on rays; the scores' curve gives the others.
+    `measured` are estimates on rays; the curve of the scores predicts the others.
     """
     rays, many = scores.ray_sample, len(scores.values) >= FEWEST
     hits = rays.hits_of_ray() if rays is not None and many else None

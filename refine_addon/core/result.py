@@ -26,28 +26,28 @@ from .visibility.cast import RaySample
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Splats as they were before an earlier prune merged and refitted them."""
+    """Splats as they were before an earlier prune, which merged them."""
 
     splats: Splats
-    ray_sample: RaySample | None  # what the views saw of them: estimates are against that
-    between: RaySample | None  # likewise of views in between
-    psnr: float | None  # estimate that is left, dB
+    ray_sample: RaySample | None  # rays that hit them, with which results are compared
+    between: RaySample | None  # likewise in views in between
+    psnr: float | None  # estimated PSNR of the earlier result, dB
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result:
-    """What was decided of N splats.
+    """Which of N splats are kept, and their new values.
 
     Attributes
     ----------
     keep : (N,) bool, which splats are kept
     report : dict, ready for JSON; see docs/report.md
-    scores : Scores that decided; of kept splats they may tell less (`Scores.settled`)
-    merged : Merged, kept splats with their new values; None if all are as they were
-    stopped : what ended refitting early: the result is what it had reached
-    source : what was decided on
-    columns : dict of str to (N,), properties written otherwise than they are stored
-    matrix : (4, 4) float64, from the frame of the file to that of the views, if these differ
+    scores : Scores, optional; by them it was decided, those of kept splats may not be settled
+    merged : Merged, optional; kept splats with their new values, None if none changed
+    stopped : Cancelled or KeyboardInterrupt, optional; it ended refitting after some rounds
+    source : SplatFile or Splats, optional; all splats
+    columns : dict of str to (N,), values of properties that are written in place of stored ones
+    matrix : (4, 4) float64, optional; from the frame of the file to that of the views
     """
 
     keep: NDArray[np.bool_]
@@ -73,13 +73,13 @@ class Result:
         return self.all_splats().take(self.keep)
 
     def all_splats(self) -> Splats:
-        """All splats as they were; `RefineError` if only their scores were known."""
+        """All splats as they were; `RefineError` if only scores were given."""
         if self.source is None:
-            raise RefineError("only scores were known: there are no splats to return")
+            raise RefineError("only scores were given: there are no splats to return")
         return self.source.splats() if isinstance(self.source, SplatFile) else self.source
 
     def for_all(self, rest: NDArray[np.bool_]) -> Result:
-        """This result for the splats in `rest`, (N,) bool, as one for all N."""
+        """Result for all N splats, from this one for those in `rest`, (N,) bool: others go."""
         keep = among_all(self.keep, rest)
         total, kept = len(keep), int(np.count_nonzero(keep))
         self.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}
@@ -95,7 +95,8 @@ class Result:
     ) -> None:
         """Write the kept splats in the format that the suffix of `path` names, whole or not at all.
 
-        Unchanged rows equal those of the source file, to the bit where the format can.
+        Unchanged rows equal those of the source file, to the bit if the format can hold them.
+        `RefineError`: see `write_splats`.
         """
         file = self.source
         if not isinstance(file, SplatFile):
@@ -104,9 +105,10 @@ class Result:
         write_splats(path, file, self.keep, columns=columns, overwrite=overwrite, threads=threads)
 
     def changed(self, stored: Any) -> Mapping[str, NDArray[Any]]:
-        """Columns, (N,) by name, with new values in stored types, rounded once; none if unchanged.
+        """Properties, (N,) by name, with new values in the stored types; none if nothing changed.
 
-        `stored` has all properties, such as `SplatFile.rows`; other rows equal it to the bit.
+        `stored` has all properties by name, such as `SplatFile.rows`: rows that did not change
+        equal it to the bit.
         """
         merged = self.merged
         if merged is None:
@@ -119,7 +121,7 @@ class Result:
 
 
 def file_of(splats: Splats, path: Path = Path("splats.ply"), stored_bytes: int = 0) -> SplatFile:
-    """A file in memory of splats that came from none, or from several."""
+    """A plain PLY in memory, with `path` as its name, of splats that are not of one file."""
     file, copied = new_file(
         path, FileOrigin("arranged", stored_bytes), len(splats), splats.sh_degree, splats.model
     )

@@ -19,21 +19,23 @@ _DISTINCT = 1 << 24  # largest number of equal steps from 0 to 1 that are distin
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """How much each of N splats matters to the pictures of the views.
+    """How much each of N splats contributes to the pictures of the views.
 
     Attributes
     ----------
     values : (N,) float32, finite, >= 0, on the method's scale; 0 if undrawable or not scored
-    seen : (N,) int32, in how many of the views used the splat's centre lies
-    undrawable : int, how many splats cannot be drawn
+    seen : (N,) int32, number of the views used in which the splat's centre lies
+    views_used : int
+    undrawable : int, number of splats that cannot be drawn
     facts : dict, numbers of the method for the report
-    notes : tuple of str, what the user should know
-    views_given : int, of which those used were chosen
-    ray_sample : RaySample, validation rays: the PSNR of any choice of the splats scored
-    between : RaySample, of views in between
-    quality : Quality, the PSNR over the share removed in the order of the scores
-    alignment : Alignment, how the views stand to the splats
-    settled : int, how many of the lowest scores are in final order; None for all
+    notes : tuple of str, sentences for the user
+    method : str, name of the method
+    views_given : int, number of views from which those used were chosen
+    ray_sample : RaySample, validation rays, which estimate the PSNR of any choice of the splats
+    between : RaySample, likewise for views in between
+    quality : Quality, estimated PSNR by the share removed, in the order of the scores
+    alignment : Alignment, whether the views fit the splats
+    settled : int, number of the lowest scores that are in final order; None for all
     scored : (N,) bool, which splats were scored; None for all, see `for_all`
     """
 
@@ -53,7 +55,7 @@ class Scores:
     scored: NDArray[np.bool_] | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
-        """These scores for all N splats, of which those in `rest`, (N,), have one; others get 0."""
+        """Scores of all N splats, from these of the splats in `rest`, (N,) bool; others get 0."""
         values, seen = among_all(self.values, rest), among_all(self.seen, rest)
         settled = None if self.settled is None else self.settled + len(rest) - len(self.values)
         scored = rest if self.scored is None else among_all(self.scored, rest)
@@ -63,7 +65,7 @@ class Scores:
         """Scores of the splats in `rest`, (N,) bool; `RefineError` if some were not scored."""
         self.refuse_unscored(rest)
         count = int(np.count_nonzero(rest))
-        # Of a scene with other splats they tell nothing.
+        # Rays hold for one set of splats only.
         ray_sample, between = (
             None if rays is None or len(rays.splats) != count else rays
             for rays in (self.ray_sample, self.between)
@@ -87,7 +89,7 @@ class Scores:
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-    """Share of `count` splats removed at each place, (N,) from 1, in the order of removal, float32.
+    """Share of `count` splats removed up to each place in the order, (N,) from 1, as float32.
 
     Above 2^24 splats float32 has too few numbers near 1: the highest shares are then lowered to the
     nearest smaller ones, so that no two places tie; the lowest stay exact.

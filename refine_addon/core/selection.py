@@ -1,4 +1,4 @@
-"""Which splats stay, given scores: budgets, protected splats and ties."""
+"""Which splats are kept, by their scores: budgets, protected splats and ties."""
 
 from __future__ import annotations
 
@@ -22,11 +22,15 @@ class Budget:
     Attributes
     ----------
     ratio : float in [0, 1), share to remove: exactly ``floor(ratio * N)`` splats
-    keep : int, how many splats are kept, at least 1; all if there are fewer
+    keep : int, number of kept splats, at least 1; all if there are fewer
     max_mb : float, largest size of the file, megabytes of 1e6 bytes
     threshold : float, splats with a lower score are removed
     min_seen : float, splats in fewer than this percentage of the views are removed
     psnr : float, least estimated PSNR of the views' pictures against the unpruned splats', dB
+
+    Raises
+    ------
+    RefineError : unless exactly one is given, in its range
 
     >>> Budget(ratio=0.29).removals(100)
     29
@@ -68,7 +72,9 @@ class Budget:
         return self.threshold is not None or self.min_seen is not None
 
     def after(self, gone: int, count: int) -> Budget:
-        """Budget for the rest of `count` splats once `gone` are removed; these count.
+        """Budget for the rest of `count` splats, of which `gone` are removed already.
+
+        The removed ones count as removed by this budget.
 
         >>> Budget(ratio=0.5).after(20, 100), Budget(ratio=0.5).after(70, 100).removals(30)
         (Budget(ratio=None, keep=50, max_mb=None, threshold=None, min_seen=None, psnr=None), 0)
@@ -78,13 +84,13 @@ class Budget:
         return Budget(keep=count - max(self.removals(count) or 0, gone))
 
     def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
-        """How many of `count` splats to remove; None if that depends on the scores.
+        """Number of splats to remove, of `count`; None if that depends on the scores.
 
-        For `max_mb`, `row_bytes` is the size of a splat in the file, `fixed_bytes` that of the
-        rest; `RefineError` if not even one splat fits.
+        For `max_mb`, `row_bytes` is the size of a splat in the file and `fixed_bytes` that of the
+        rest; `RefineError` if a single splat does not fit.
         """
         if self.ratio is not None:
-            # The decimal as written; the nearest binary number would give floor(.29 * 100) = 28.
+            # The decimal as written: in binary, floor(0.29 * 100) is 28.
             return math.floor(Fraction(repr(float(self.ratio))) * count)
         if self.keep is not None:
             return max(count - int(self.keep), 0)
@@ -108,16 +114,24 @@ def select(
     row_bytes: float = 0.0,
     fixed_bytes: int = 0,
 ) -> NDArray[np.bool_]:
-    """Which splats are kept, (N,) bool: the lowest scores go, of equal ones the first in the file.
+    """Which splats are kept: the lowest scores are removed, of equal ones the first in the file.
 
     Parameters
     ----------
-    protected : (N,) bool, optional; always kept, others go instead as far as there are any
+    scores : Scores, of N splats
+    budget : Budget
+    protected : (N,) bool, optional; always kept, others are removed instead if there are any
     row_bytes, fixed_bytes : see `Budget.removals`
+
+    Returns
+    -------
+    (N,) bool
 
     Raises
     ------
-    RefineError : no estimate for a PSNR, more to go than `Scores.settled`, or none to keep
+    RefineError
+        If no splat would be kept, more would be removed than `Scores.settled`, or there is no curve
+        for a PSNR.
     """
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`
@@ -136,20 +150,20 @@ def select(
 
 
 def single(threshold: float) -> np.float32:
-    """A threshold in the precision of scores; beyond its range all of them are below."""
+    """A threshold as float32, like scores; infinite if it is larger than any of them can be."""
     with np.errstate(over="ignore"):
         return np.float32(threshold)
 
 
 def _removals(scores: Scores, budget: Budget, row_bytes: float, fixed_bytes: int) -> int | None:
-    """How many of the lowest scores a budget removes; None where each splat decides for itself."""
+    """Number of lowest scores that a budget removes; None if it decides on each splat alone."""
     if budget.psnr is not None:
         return math.floor(quality_of(scores).share(budget.psnr) * len(scores.values))
     return budget.removals(len(scores.values), row_bytes, fixed_bytes)
 
 
 def least_seen(percentage: float, views: int) -> int:
-    """In how many views a kept splat must lie, in exact fractions: 16 of 64 views are 25 %."""
+    """Least number of views in which a kept splat lies; exact: 25 % of 64 views are 16."""
     return math.ceil(Fraction(repr(float(percentage))) * views / 100)
 
 
@@ -195,9 +209,10 @@ def _remove_lowest(
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Each splat's place in the order of removal, (N,) float64, 0 (first) to 1 (last, or only).
+    """Place of each splat in the order of removal, (N,) float64, from 0 (first) to 1 (last).
 
-    For display in Blender, whose float32 ties above 2^24 splats; `select` uses scores and rows.
+    A single splat has 1. For display in Blender, whose float32 cannot tell more than 2^24 splats
+    apart; `select` uses scores and rows.
     """
     count = len(values)
     if count == 1:

@@ -16,16 +16,18 @@ _DIRECTIONS = 4096  # over which stretched harmonics are fitted; degree 4 has 25
 
 
 def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
-    """Values of all harmonics along unit vectors from view to splat, (..., (degree + 1)^2) float64.
+    """Values of all harmonics up to `degree` along directions, (..., (degree + 1)^2) float64.
 
-    The constant first, then band by band, m = -l .. l, with the Condon-Shortley phase as in 3DGS:
-    constants are sqrt((2l + 1) / 4 pi (l - m)! / (l + m)!) times those of the polynomials.
+    `directions`, (..., 3), are unit vectors from the view to the splat, in the frame of the
+    harmonics. The constant comes first, then each band l with m = -l .. l, with the Condon-Shortley
+    phase as in 3DGS (Kerbl et al. 2023). A harmonic is its polynomial in x, y, z times
+    sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!), and for m != 0 times sqrt(2).
     """
     return np.stack(_values(np.moveaxis(np.asarray(directions, np.float64), -1, 0), degree), -1)
 
 
 def _values(directions, degree):
-    """Values of `basis`, (...) each, along directions, (3, ...), in their type."""
+    """List of the values of `basis`, (...) each, along directions, (3, ...), in their dtype."""
     x, y, z = directions
     xx, yy, zz = x * x, y * y, z * z
     root = math.sqrt(1.0 / math.pi)
@@ -74,17 +76,24 @@ def _values(directions, degree):
 def colors(
     directions: NDArray[Any], sh_dc: NDArray[Any], sh_rest: NDArray[Any]
 ) -> NDArray[np.float64]:
-    """Colour of each splat along a direction as in `basis`, (N, 3), not clipped."""
+    """Colour of each splat along a direction as in `basis`, (N, 3) float64, not clipped.
+
+    ``0.5 + sum of harmonics times coefficients`` (Kerbl et al. 2023), display-referred;
+    `directions` and `sh_dc` are (N, 3), `sh_rest` is (N, K, 3).
+    """
     values = basis(directions, math.isqrt(sh_rest.shape[1] + 1) - 1)  # (N, K + 1)
     color = 0.5 + values[:, :1] * np.asarray(sh_dc, np.float64)
     if sh_rest.shape[1]:
-        # In one layout, since the order in which einsum sums depends on it.
+        # In one memory layout, since einsum sums in an order that depends on it.
         color += np.einsum("nk,nkc->nc", values[:, 1:], np.ascontiguousarray(sh_rest, np.float64))
     return np.asarray(color)
 
 
 def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`colors`, (3, N), of (3, N) and (N, 3, K), in float32 throughout: a tenth of the time."""
+    """`colors` in float32, (3, N), in a tenth of the time.
+
+    `directions` are (3, N), `harmonics`, with the constant, (N, 3, (degree + 1)^2).
+    """
     degree = math.isqrt(harmonics.shape[2]) - 1
     values = np.stack(_values(np.asarray(directions, np.float32), degree), axis=1)  # (N, K)
     result = np.einsum("nk,nck->cn", values, harmonics)
@@ -93,9 +102,9 @@ def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> N
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients, (N, K, 3), whose colour along ``rotation @ d`` is the old one along d.
+    """Coefficients, (N, K, 3) float64, whose colour along ``rotation @ d`` is the old one along d.
 
-    `rotation` is orthonormal and may be a reflection.
+    `sh_rest` is (N, K, 3); `rotation`, (3, 3), is orthonormal and may be a reflection.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     rotated = np.empty_like(sh_rest, np.float64)
@@ -121,9 +130,10 @@ def _map(matrix, coefficients, result):
 def stretched(
     sh_dc: NDArray[Any], sh_rest: NDArray[Any], linear: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coefficients whose colour along ``linear @ d`` is nearly the old colour along d.
+    """Coefficients, (N, 3) and (N, K, 3) float64, fitted to a non-uniform map.
 
-    Uneven scales bend the sphere of directions; least squares over directions. `rotate` is exact.
+    By least squares over directions d, the colour along ``linear @ d`` is the old colour along d,
+    which harmonics of the same degree cannot have exactly. `linear`, (3, 3), is invertible.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     here = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))

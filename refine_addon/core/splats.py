@@ -1,7 +1,7 @@
-"""3D Gaussian splats as 3DGS files store them, and the only place where they are activated.
+"""3D Gaussian splats as 3DGS files store them, and their activation, which is done only here.
 
 Constants are those of `diff-gaussian-rasterization` (Kerbl et al. 2023), except for the near plane.
-Splats are trained for one way of drawing, their *model*, named as by splat-transform and SOG.
+Splats are trained for one way of drawing, their *model*, with the names of splat-transform and SOG.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ Model = Literal["default", "antialiased", "2dgs"]
 covariance in the image (Yu et al. 2024, "Mip-Splatting"). ``2dgs``: a flat disc without third
 scale, hit where the ray meets its plane (Huang et al. 2024)."""
 
-MODELS: tuple[Model, ...] = get_args(Model)  # the first is meant where a file does not say
+MODELS: tuple[Model, ...] = get_args(Model)  # files that do not say have the first
 
 LOW_PASS = 0.3  # variance added to a footprint along both axes so that it covers a pixel, px^2
 
 DISC_LOW_PASS = 0.5
-"""Variance of the Gaussian that a disc is at least drawn as, px^2: the larger alpha counts (Huang
-et al. 2024, Eq. 11, sigma = sqrt(2) / 2)."""
+"""Variance of a Gaussian around the centre of a disc, px^2. A pixel gets the larger alpha of both:
+no disc is thinner (Huang et al. 2024, Eq. 11, sigma = sqrt(2) / 2)."""
 
 ALPHA_MAX = 0.99  # largest alpha of one splat at a pixel: none hides everything behind it
 
 ALPHA_CUT = 1.0 / 255.0  # least alpha that is drawn; a splat's footprint ends there
 
 NEAR_RELATIVE = 0.01
-"""Near plane over the size of the scene, for views without one. Renderers use 0.2 or 0.01 in the
-scene's unit; this does not depend on the unit."""
+"""Near plane over the size of the scene, for views without one. Unlike the 0.2 or 0.01 of renderers
+it does not depend on the scene's unit."""
 
-SH_C0 = 0.28209479177387814  # Value of the constant spherical harmonic, 1 / (2 sqrt(pi))
+SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi))
 
-_CHECKED = 1 << 15  # rows of which it is checked together whether they can be drawn
+_CHECKED = 1 << 15  # rows checked at a time by `drawable`
 _COPIED = 2048  # rows of a file copied at a time: 0.5 MB at degree 3, in the L2 cache
 
 ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
@@ -83,7 +83,7 @@ class Splats:
         return math.isqrt(self.sh_rest.shape[1] + 1) - 1
 
     def up_to_degree(self, degree: int) -> Splats:
-        """Splats without harmonics above a degree."""
+        """Splats without harmonics above `degree`; the arrays are views."""
         return replace(self, sh_rest=self.sh_rest[:, : above_constant(degree)])
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
@@ -91,7 +91,7 @@ class Splats:
         return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def by_columns(self) -> Splats:
-        """Copies with contiguous columns, faster to compute with; `sh_rest` as it is."""
+        """Copy with contiguous columns, faster to compute with; `sh_rest` is not copied."""
         rows = {name: getattr(self, name) for name in ARRAYS if name != "sh_rest"}
         columns: dict[str, Any] = {
             name: np.empty(values.shape, values.dtype, order="F") for name, values in rows.items()
@@ -103,7 +103,7 @@ class Splats:
 
 
 def with_model(splats: Splats, model: Model) -> Splats:
-    """Splats as drawn in another way; discs have no third scale."""
+    """Splats with another model; "2dgs" sets the third scale to `LOG_ZERO`."""
     if model != "2dgs":
         return replace(splats, model=model)
     flat = np.array(splats.log_scales)
@@ -112,7 +112,10 @@ def with_model(splats: Splats, model: Model) -> Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Splats of sets, in order, to the highest degree among them; missing harmonics are 0."""
+    """Several sets of splats as one, in order, of the highest degree; missing harmonics are 0.
+
+    `RefineError` if their models differ.
+    """
     if len(parts) == 1:
         return parts[0]
     models = dict.fromkeys(part.model for part in parts)
@@ -136,7 +139,7 @@ def above_constant(degree: int) -> int:
 
 
 def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
-    """Opacities (...) float64 in 0..1 of any logits, without overflow; NaN stays."""
+    """Opacities (...) float64 in 0..1 of any logits, ``1 / (1 + exp(-logit))``; NaN stays."""
     logits = np.asarray(logits, np.float64)
     # exp(-700) is 1e-304; the limit avoids underflow.
     decay = np.exp(-np.minimum(np.abs(logits), 700.0))
@@ -144,10 +147,10 @@ def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
 
 
 OPACITY_MARGIN = 1e-6
-"""Distance from 0 and 1, whose logits are infinite, of opacities read from formats that round; the
-step of 8 bits is 4,000 times as large."""
+"""Least distance from 0 and 1, whose logits are infinite, of opacities from formats that round: a
+4,000th of a step of 8 bits."""
 
-SINGLE_MARGIN = 2.0**-26  # distance from 1 of opacities read from float32; none is nearer
+SINGLE_MARGIN = 2.0**-26  # least distance from 1 of opacities read from float32: half its step
 
 LOG_ZERO = -104.0
 """Log scale and logit of 0 in float32: ``exp(-104)`` rounds to 0, ``exp(-103)`` does not."""
@@ -156,25 +159,28 @@ LOG_ZERO = -104.0
 def opacity_logits(
     opacities: NDArray[Any], margin: float = OPACITY_MARGIN, least: float | None = None
 ) -> NDArray[np.float64]:
-    """Inverse of `opacity`, (...) float64; clips to ``least..1 - margin``, NaN stays."""
+    """Inverse of `opacity`, (...) float64, of values clipped to ``least..1 - margin``; NaN stays.
+
+    `least` is `margin` by default.
+    """
     low = margin if least is None else least
     inside = np.clip(np.asarray(opacities, np.float64), low, 1.0 - margin)
     return np.asarray(np.log(inside) - np.log1p(-inside))
 
 
 def single_logits(opacities: NDArray[Any]) -> NDArray[np.float64]:
-    """Logits (...) float64 of float32 opacities; `opacity` of them, in float32, inverts it."""
+    """Logits (...) float64 of float32 opacities; `opacity`, rounded to float32, inverts it."""
     return opacity_logits(opacities, SINGLE_MARGIN, math.exp(LOG_ZERO))
 
 
 def scales(log_scales: NDArray[Any]) -> NDArray[np.float64]:
-    """Standard deviations in float64 of log scales; beyond its range 0 or infinite."""
+    """Standard deviations (...) float64 of log scales; 0 or infinite beyond its range."""
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(np.exp(np.asarray(log_scales, np.float64)))
 
 
 def single_log_scales(scales: NDArray[Any]) -> NDArray[np.float64]:
-    """Log scales (...) float64 of float32 scales, without signs: the covariance has squares."""
+    """Log scales (...) float64 of the absolute values of float32 scales; of 0 `LOG_ZERO`."""
     sizes = np.abs(np.asarray(scales, np.float64))
     return np.asarray(np.log(np.maximum(sizes, math.exp(LOG_ZERO))))
 
@@ -212,7 +218,7 @@ def single_unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
-    """Rotations (..., 3, 3) float64 of stored quaternions; columns are the splat's axes."""
+    """Rotations (..., 3, 3) float64 of quaternions w x y z; columns are the splat's axes."""
     w, x, y, z = np.moveaxis(unit_quaternions(quaternions), -1, 0)
     with np.errstate(under="ignore"):  # products of components near 0
         rows = [
@@ -226,8 +232,8 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
     """Which splats a renderer can draw, (N,) bool.
 
-    Not those with NaN or infinities (but logits, and minus infinity as log scale, may be infinite),
-    nor those with opacity 0, size 0 along all axes or an overflow in float32.
+    These have finite numbers, except that a logit may be infinite and a log scale minus infinite,
+    an opacity and a size along some axis that are not 0 in float32, and no overflow in float32.
     """
     good = np.empty(len(splats), np.bool_)
 
@@ -267,7 +273,7 @@ _LOG_SMALLEST = float(np.log(np.float64(np.finfo(np.float32).smallest_subnormal)
 
 
 def among_all(values: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
-    """Values of the splats in `rest`, (N,) bool, as values of all N: 0 for the others."""
+    """Values of all N splats, from those, (n,), of the ones in `rest`, (N,) bool; others get 0."""
     of_all = np.zeros(len(rest), values.dtype)
     of_all[rest] = values
     return of_all

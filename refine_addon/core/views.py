@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from .errors import RefineError
 
-ORTHONORMAL = 1e-3  # how far from orthonormal a rotation may be: four decimals in a file are enough
+ORTHONORMAL = 1e-3  # largest error of a rotation's entries: files may have only four decimals
 
-WIDEST = math.radians(90.0)  # views turned farther from each other have nothing in between
+WIDEST = math.radians(90.0)  # views turned farther from each other get no view in between
 
-MOST_BETWEEN = 1000  # views added at most: each is compared with all others, which takes minutes
+MOST_BETWEEN = 1000  # most views in between: each is compared with all others, which takes minutes
 
-FAR = 1000.0  # extents of the splats from which a view without perspective is looked at instead
+FAR = 1000.0  # distance, in extents of the splats, of a view that stands in for parallel rays
 
-_CANDIDATES = 64  # nearest views of each that are tried as neighbours
+_CANDIDATES = 64  # nearest views of each that may be its neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +108,13 @@ def is_orthonormal(matrix: NDArray[np.float64]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
-    """The views to score by.
+    """V views to score by.
 
     Attributes
     ----------
     views : tuple of View, at least one of positive weight
-    note : str, what is not modelled of their source, such as lens distortion
-    turn : int or None, quarters about x (`affine.QUARTER`) from the views to their files' splats
+    note : str, for the user: what their source says and is ignored, such as lens distortion
+    turn : int, optional; quarter turns about x (`affine.QUARTER`) from their frame to the splats'
     """
 
     views: tuple[View, ...]
@@ -142,7 +142,10 @@ class ViewSet:
         return replace(self, views=tuple(self.views[int(index)] for index in indices))
 
     def select(self, names: Sequence[str]) -> ViewSet:
-        """Views by name, in the order of `names`; of equal names the last. Or `RefineError`."""
+        """Views by name, in the order of `names`; of equal names the last.
+
+        `RefineError` if there is none of that name.
+        """
         by_name = {view.name: view for view in self.views}
         missing = [name for name in names if name not in by_name]
         if missing:
@@ -168,8 +171,8 @@ class ViewSet:
             return np.asarray(weights / weights.sum())
 
     def middle(self) -> tuple[NDArray[np.float64], float]:
-        """Weighted geometric median of the centres (Weiszfeld's iteration), (3,), and weighted
-        median of their squared distances to it; outliers hardly count.
+        """Weighted geometric median of the centres, (3,), by Weiszfeld's iteration (1937), and the
+        weighted median of their squared distances to it. Outliers hardly change either.
         """
         centers, weights = self.centers, self.weights
         with np.errstate(under="ignore"):
@@ -188,12 +191,13 @@ class ViewSet:
         return middle, _median(squared, weights)
 
     def spread(self, count: int) -> ViewSet:
-        """At most `count` views that cover the set evenly, in its order; 0 keeps all.
+        """At most `count` views of positive weight, spread evenly, in their order; 0 keeps all.
 
-        Farthest-point sampling by `places`, from the view farthest from the middle. Frame, unit
-        and, as far as names differ, order do not matter; a stray view takes one place.
+        Farthest-point sampling (Gonzalez 1985) of `places`, beginning with the view farthest from
+        the middle. The choice does not depend on frame and unit, nor on the order of views whose
+        names differ. A stray view takes one of the places.
         """
-        # Ties, of which regular rigs have many, go to the first name.
+        # Of views equally far away, of which regular rigs have many, the first by name is taken.
         usable = np.array([index for index in self.by_name() if self.views[index].weight > 0])
         if count <= 0 or len(usable) <= count:
             return self if len(usable) == len(self) else self.take(np.sort(usable))
@@ -208,18 +212,18 @@ class ViewSet:
         return self.take(np.sort(usable[chosen]))
 
     def places(self) -> NDArray[np.float64]:
-        """Positions from the middle over the root of its variance, then directions, (V, 6)."""
+        """Centres relative to `middle`, in units of its distance, and directions, (V, 6)."""
         middle, variance = self.middle()
         offset = (self.centers - middle) / (np.sqrt(variance) or 1.0)
         return np.hstack([offset, self.rotations[:, 2]])
 
     def by_name(self) -> list[int]:
-        """Indices by name, ties in order; no motion or reordering of distinct names changes it."""
+        """Indices in the order of names; views of one name stay in the order of the set."""
         return sorted(range(len(self)), key=lambda index: self.views[index].name)
 
     def by_distance(self) -> list[tuple[View, float]]:
-        """Views of positive weight and their weights, whatever frame and order the set has: by
-        distance from the middle, ties by distance from the farthest view, then by name.
+        """Views of positive weight with their weights, in an order that does not depend on the
+        set's: by distance from the middle, ties by distance from the farthest view, then by name.
         """
         centers = self.centers - self.middle()[0]
         order = np.array(self.by_name())
@@ -248,11 +252,11 @@ def refuse_other(views: object) -> None:
 
 
 def views_between(views: ViewSet, most: int) -> list[View]:
-    """At most `most` views halfway between neighbours, evenly from all, by `ViewSet.places`.
+    """At most `most` views halfway between neighbours, chosen as by `ViewSet.spread`.
 
-    Neighbours have no third view nearer to their middle than they are (Gabriel graph, Gabriel and
-    Sokal 1969). Positions and rotations are means, the lens is that of one. Neither the frame nor,
-    as far as names differ, the order matters.
+    By `ViewSet.places`, neighbours have no third view nearer to their middle than they are (Gabriel
+    graph, Gabriel and Sokal 1969). Centres and rotations are means, the lens is that of one of the
+    two. Neither the frame matters, nor the order of views whose names differ.
     """
     ordered = [view for view, _ in views.by_distance()]
     if most < 1 or len(ordered) < 2:
@@ -269,7 +273,10 @@ def views_between(views: ViewSet, most: int) -> list[View]:
 
 
 def with_views_between(views: ViewSet, count: int) -> ViewSet:
-    """Views with about `count` (0 to `MOST_BETWEEN`) more in between, if there are as many."""
+    """Views with up to `count` more in between, and views between those, until there are as many.
+
+    `RefineError` unless `count` is 0 to `MOST_BETWEEN`.
+    """
     if not 0 <= count <= MOST_BETWEEN:
         raise RefineError(f"views in between are {count:,}, expected 0 to {MOST_BETWEEN:,}")
     while count > 0:
@@ -322,9 +329,19 @@ def pinhole(
     size: tuple[int, int],
     means: NDArray[Any],
 ) -> View:
-    """View of a camera by OpenGL's matrices, (4, 4); `matrix` is world to camera, y up, z back.
+    """View of a camera given by OpenGL's matrices.
 
-    Without perspective it stands `FAR` extents of the splats away: rays are nearly parallel.
+    Parameters
+    ----------
+    matrix : (4, 4), world to camera, y up, z back
+    projection_matrix : (4, 4); of one without perspective, the view stands `FAR` extents of the
+        splats away, so that rays are nearly parallel
+    size : (int, int), width and height of the image, pixels
+    means : (N, 3), centres of the splats, world units
+
+    Raises
+    ------
+    RefineError : see `View`
     """
     flip = np.diag([1.0, -1.0, -1.0])
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)  # float32
@@ -346,9 +363,16 @@ def view_through(
     size: tuple[int, int],
     parallel: tuple[float, float] = (0.0, 1.0),
 ) -> View:
-    """View of a camera with one of OpenGL's projection matrices, (4, 4), at a rotation and centre.
+    """View of a camera with one of OpenGL's projection matrices.
 
-    `parallel`: without perspective, the depth of exact pixel size and how far from there it stands.
+    Parameters
+    ----------
+    projection_matrix : (4, 4)
+    pose : rotation, (3, 3), world to camera in the axes of `View`, and centre, (3,), world units
+    size : (int, int), width and height of the image, pixels
+    parallel : (float, float)
+        Without perspective: the depth at which pixels have their exact size, and the distance of
+        the view from there, world units.
     """
     p, (width, height), (rotation, center) = projection_matrix, size, pose
     fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0

@@ -1,8 +1,9 @@
 """Volumes that protect or remove the splats whose centres they hold.
 
-For a closed mesh, a ray upward from a point sums the triangles it crosses, 1 or -1 by their side:
-the winding number, 0 outside. Where neighbours turn differently, an odd number is inside. Points
-are halved into groups; one ray decides for a group whose box no triangle touches.
+Whether a point lies in a closed mesh is decided by the triangles that a ray upward from it crosses.
+Each counts 1 or -1, by the side it is crossed from; the sum is the winding number, 0 outside. In a
+mesh with triangles that face another way than their neighbours, an odd number is inside. Points are
+divided into groups, and one ray decides for a group if no triangle touches its box.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from .errors import RefineError
 
 Role = Literal["protect", "remove", "keep"]
 
-_LEAF = 1 << 14  # pairs of point and triangle that are compared one by one
+_LEAF = 1 << 14  # pairs of point and triangle below which a group is not divided further
 
 
 class Volume(Protocol):
     """A part of space."""
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which points, (N, 3), lie inside, (N,) bool; none that is not finite."""
+        """Which points, (N, 3), lie inside, (N,) bool; those that are not finite do not."""
         ...
 
 
@@ -38,7 +39,7 @@ class Box:
 
     Attributes
     ----------
-    low, high : three float, two corners; may be infinite
+    low, high : three float, the lower and the upper corner; may be infinite
     """
 
     low: tuple[float, float, float]
@@ -59,7 +60,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere with its surface."""
+    """A sphere with its surface; `center` and `radius` are finite, in the frame of the points."""
 
     center: tuple[float, float, float]
     radius: float
@@ -82,15 +83,19 @@ class Sphere:
 class Solid:
     """The inside of a closed mesh.
 
-    Of its surface it holds the side towards which x, y and z grow, but for rounding: solids side by
-    side share no point. Overlapping parts are joined; where one turns its faces the other way,
-    their overlap is outside, as in a hollow sphere.
+    Like `Box`, but for rounding, it holds the lower parts of its surface and not the upper ones, so
+    solids side by side share no point. Overlapping parts are joined; if the faces of one point
+    inward, the overlap is outside, as in a hollow sphere.
 
     Attributes
     ----------
-    vertices : (V, 3) float64, equal ones joined
-    triangles : (T, 3) int64, without those of two equal vertices
-    turned : bool, whether all triangles turn the same way as their neighbours
+    vertices : (V, 3) float64, without duplicates
+    triangles : (T, 3) int64, rows of vertices, three different ones each
+    turned : bool, whether all triangles face the same way as their neighbours
+
+    Raises
+    ------
+    RefineError : if there are no faces, a vertex is not finite, or the mesh is not closed
     """
 
     def __init__(self, vertices: NDArray[Any], triangles: NDArray[Any]) -> None:
@@ -137,7 +142,7 @@ class Solid:
             reach = (lows <= last[:, None]) & (highs >= first[:, None])
             above = reach[0] & reach[1] & (highs[2] >= first[2])
             triangles = triangles[above]
-            if not reach[2, above].any() or (first == last).all():  # all are where one is
+            if not reach[2, above].any() or (first == last).all():  # one stands for all
                 leader[group] = group[0]
                 group = group[:1]
             if len(group) * len(triangles) > _LEAF and len(group) > 1:
@@ -151,11 +156,9 @@ class Solid:
         return inside
 
     def _turns(self, points, triangles, low, high):
-        """Signed crossings of a ray upward from each point, (3, n); unsigned if not `turned`.
-
-        Both triangles of an edge take its vertices in one order, and rays through a vertex count
-        the edges that begin there: no ray slips between two triangles or hits both.
-        """
+        """Signed crossings of a ray upward from each point, (3, n); unsigned if not `turned`."""
+        # Both triangles of an edge take its vertices in one order, and rays through a vertex count
+        # the edges that begin there: no ray slips between two triangles or hits both.
         (left, bottom), (right, top) = low[:2, triangles], high[:2, triangles]
         x, y = points[:2, :, None]
         rows, columns = np.nonzero((x >= left) & (x < right) & (y >= bottom) & (y < top))
@@ -179,12 +182,12 @@ class Solid:
         return np.bincount(rows[above], signs[above], points.shape[1])
 
     def _cut(self, one, other, height):
-        """X and z where edges between vertices, (C,) each, have these y, (C,)."""
+        """X and z, (C,), of the points with y `height`, (C,), on edges between vertices, (C,)."""
         first, last = np.minimum(one, other), np.maximum(one, other)
         x, y, z = self.vertices.T
         share = (height - y[first]) / (y[last] - y[first])
         cut = x[first] + share * (x[last] - x[first])
-        # Within its ends, which the boxes of triangles go by.
+        # Not beyond the edge's ends, as the boxes of triangles are made of these.
         cut = np.clip(cut, np.minimum(x[first], x[last]), np.maximum(x[first], x[last]))
         return cut, z[first] + share * (z[last] - z[first])
 
@@ -207,7 +210,7 @@ class MovedVolume:
 
 
 def parse(text: str) -> Volume | None:
-    """The volume that a text gives in numbers, None where it is a name.
+    """The volume that a text describes by numbers; None if it is a name; or `RefineError`.
 
     >>> parse("sphere:0,0,1.5,2"), parse("box:0,0,0,1,1,inf").high
     (Sphere(center=(0.0, 0.0, 1.5), radius=2.0), (1.0, 1.0, inf))
@@ -239,7 +242,7 @@ class Zone:
     role : "protect", "remove", or "keep", which removes those in no volume of this role
     name : str, of the volume, for messages and the report
     volume : Volume, in the frame of the views
-    idle : bool, whether it may hold no splat, as a volume may from which they were removed
+    idle : bool, whether it may hold no splat, as after they were removed
     """
 
     role: Role
@@ -250,10 +253,10 @@ class Zone:
 
 @dataclass(frozen=True, eq=False)
 class Forced:
-    """What volumes decide of N splats."""
+    """Which of N splats volumes, or the user otherwise, protect and remove."""
 
-    protected: NDArray[np.bool_] | None = None  # (N,), also for other reasons
-    removed: NDArray[np.bool_] | None = None  # (N,), none that is protected
+    protected: NDArray[np.bool_] | None = None  # (N,)
+    removed: NDArray[np.bool_] | None = None  # (N,), none of the protected ones
     facts: tuple[dict[str, Any], ...] = ()  # ``role``, ``name``, ``splats`` of each volume
 
     def counts(self) -> dict[str, int]:
@@ -274,10 +277,17 @@ def forced(
     protected: NDArray[np.bool_] | None = None,
     removed: NDArray[np.bool_] | None = None,
 ) -> Forced:
-    """Which splats volumes protect and remove, by their centres, (N, 3), in the volumes' frame.
+    """Which splats volumes protect and remove, by their centres.
 
-    `protected` and `removed`, (N,) bool, are added. `RefineError` if a volume holds no splat and is
-    not `Zone.idle`, or all splats would be removed.
+    Parameters
+    ----------
+    zones : sequence of Zone
+    means : (N, 3), centres in the frame of the volumes
+    protected, removed : (N,) bool, optional; splats that are so whatever the volumes
+
+    Raises
+    ------
+    RefineError : if a volume that is not `Zone.idle` holds no centre, or all splats are removed
     """
     inside = [(zone, zone.volume.inside(means)) for zone in zones]
     for zone, mask in inside:
@@ -307,7 +317,7 @@ def _any(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
 def must_go(
     removed: NDArray[np.bool_] | None, protected: NDArray[np.bool_] | None = None
 ) -> NDArray[np.bool_] | None:
-    """Which splats are removed and not protected, (N,) bool, None if none; `RefineError` if all."""
+    """Splats that are removed and not protected, (N,) bool; None if none, `RefineError` if all."""
     gone = removed if protected is None or removed is None else removed & ~protected
     if gone is None or not gone.any():
         return None

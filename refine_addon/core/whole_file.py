@@ -1,4 +1,4 @@
-"""Files that are written completely or not at all, and URLs, which fsspec opens for tiles."""
+"""Files that are written completely or not at all, and URLs of tiles, which fsspec opens."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from .execute import REPLACES_MAPPED, checkpoint
 ABANDONED = 86_400.0  # seconds after which a temporary file is deleted: a killed run left it
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.:-]+://")
-"""A scheme has two letters at least: one would be a drive of Windows."""
+"""Scheme of a URL: two letters at least, since one would be a drive of Windows."""
 
 
 class Url(str):
-    """Address of a file or folder, such as ``s3://bucket/a.ply``, with `Path`'s names."""
+    """Address of a file or folder, such as ``s3://bucket/a.ply``, with attributes of `Path`."""
 
     __slots__ = ()
 
     @property
     def name(self) -> str:
-        """Part after the last slash; of ``https:`` without a query."""
+        """Part after the last slash, for ``http`` and ``https`` without a query."""
         whole = self.partition("?")[0] if self.startswith("http") else self
         return whole.rpartition("/")[2]
 
@@ -49,7 +49,7 @@ def is_url(text: Path | str) -> bool:
 
 
 def refuse_url(text: Path | str) -> None:
-    """Raise `RefineError` if a URL stands where only a path can."""
+    """Raise `RefineError` if this is a URL, where only a path is accepted."""
     if is_url(text):
         raise RefineError(
             f"{text}: is a URL, expected a local path; only the tiles and the folder of "
@@ -67,7 +67,7 @@ def expanded(path: Path | str) -> Path:
 
 
 def mode_of(path: Path) -> int:
-    """``st_mode`` of `path`, 0 if missing; raises if the system cannot tell (pathlib: missing)."""
+    """``st_mode`` of `path`, 0 if it is missing; unlike in `pathlib`, other errors are raised."""
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -93,7 +93,7 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
 
 
 def refuse_one_file(paths: Iterable[Path]) -> None:
-    """Raise `RefineError` if two of some outputs lead to one file, by links."""
+    """Raise `RefineError` if two of the outputs are one file by links."""
     first: dict[str, Path] = {}
     for path in paths:
         other = first.setdefault(os.path.realpath(path), path)
@@ -115,17 +115,17 @@ def refuse_mapped(path: Path, source: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[None]:
-    """Make a folder and its parents; new ones that are empty at the end are deleted."""
-    made: list[Path] = []
+    """Make a folder and its parents within the block; new ones that are empty then are deleted."""
+    new: list[Path] = []
     try:
         try:
-            made += itertools.takewhile(lambda folder: not mode_of(folder), (path, *path.parents))
+            new += itertools.takewhile(lambda folder: not mode_of(folder), (path, *path.parents))
             path.mkdir(parents=True, exist_ok=True)
         except (OSError, ValueError) as error:
             raise RefineError(f"{path}: cannot be made ({reason_of(error)})") from error
         yield
     finally:
-        for folder in made:
+        for folder in new:
             with contextlib.suppress(OSError):  # it holds something
                 folder.rmdir()
 
@@ -134,21 +134,22 @@ def new_folder(path: Path) -> Iterator[None]:
 def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     """Open a temporary file beside `path`, which is renamed to `path` when the block ends.
 
-    If the block is interrupted (error, kill, full disk), `path` stays as it was. Of a symbolic
-    link, the target is replaced. Nobody else may read it until it is whole; a replaced file hands
-    on its permissions. `RefineError` if it may not be replaced or the system refuses.
+    If the block is interrupted (error, kill, full disk), `path` stays as it was. If it is a
+    symbolic link, its target is replaced. Other users cannot read the file until it is whole; then
+    it gets the permissions of the file that it replaces. `RefineError` if `path` exists and is not
+    to be replaced, or the system refuses.
     """
     refuse_existing(path, overwrite=overwrite)
     target = Path(os.path.realpath(path))
     for left in target.parent.glob(".refine-*.tmp"):
-        with contextlib.suppress(OSError):  # others remove it, too
+        with contextlib.suppress(OSError):  # another process may remove it meanwhile
             if left.lstat().st_mtime < time.time() - ABANDONED:
                 left.unlink()
     temporary = target.with_name(f".refine-{secrets.token_hex(8)}.tmp")
     with _explained(path):
         try:
             old = mode_of(target)
-            # A new file shows which permissions the user wants; it is made private while empty.
+            # A new file gets the permissions that the user wants; it is made private while empty.
             first = 0o600 if old else 0o666
             with open(temporary, "xb", opener=lambda name, how: os.open(name, how, first)) as file:
                 mode = (old or os.fstat(file.fileno()).st_mode) & 0o777
@@ -166,27 +167,27 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
 
 
 def publish(finished: Path, path: Path, *, overwrite: bool) -> None:
-    """Rename a finished file on the same disk to `path`, as `whole_file` does."""
+    """Rename a finished file to `path` on the same disk, with the rules of `whole_file`."""
     refuse_existing(path, overwrite=overwrite)
     with _explained(path):
         target = Path(os.path.realpath(path))
         if mode := mode_of(target):
             finished.chmod(mode & 0o777)
         _rename(finished, target, overwrite)
-        finished.unlink(missing_ok=True)  # which may be a second name now
+        finished.unlink(missing_ok=True)  # after a hard link it is a second name of the file
 
 
-def _rename(made: Path, target: Path, overwrite: bool) -> None:
+def _rename(finished: Path, target: Path, overwrite: bool) -> None:
     """Rename a file; without `overwrite`, `FileExistsError` if the target exists by now."""
     if overwrite:
-        made.replace(target)
+        finished.replace(target)
         return
     try:
-        os.link(made, target)
+        os.link(finished, target)
     except OSError as error:
         if target.exists():
             raise FileExistsError from error
-        made.rename(target)  # this file system has no hard links
+        finished.rename(target)  # this file system has no hard links
 
 
 @contextlib.contextmanager

@@ -227,7 +227,7 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         ]
         text = f"Made '{collection.name}', hidden: {', '.join(counts)} splats"
         self.report({"INFO"}, f"{text}; show one by its eye in the Outliner")
-        for note in wanted.notes({level.asked: level.remark for level in levels}):
+        for note in wanted.notes({level.goal: level.remark for level in levels}):
             self.report({"WARNING"}, note)
 
 

@@ -34,7 +34,6 @@ SOG = f"a SOG file: {READ}"
 LONG = zipped("a.txt", *(f"{'x' * 200}{i}.webp" for i in range(500)), "meta.json")
 
 FOREIGN = [
-    ("in.gltf", b' {"asset": {}}', "a glTF file, whose splats lie in another: save it as"),
     ("in.splat", bytes(64), f"a .splat file: {READ}"),
     ("IN.SPLAT", bytes(64), f"a .splat file: {READ}"),
     ("in.splat", b"\x1f\x8b" + bytes(62), "a .splat file"),  # as gzip begins
@@ -60,6 +59,11 @@ def test_a_known_format_is_named_and_so_is_what_to_do(tmp_path, case):
     file, data, expected = FOREIGN[case]
     refused(tmp_path / file, f": {expected}", data, read=read_ply)
     refused(tmp_path / file, f": not a camera file: {expected.split(':')[0]}", read=read_cameras)
+
+
+def test_a_gltf_is_named(tmp_path):
+    words = ": a glTF file, whose splats lie in another: save it as one file, .glb"
+    refused(tmp_path / "in.gltf", words, b' {"asset": {}}', read=read_ply)
 
 
 def test_a_ply_is_one_whatever_it_is_called(tmp_path):

@@ -11,7 +11,7 @@ import codecs
 import contextlib
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -33,13 +33,13 @@ POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
 IMAGE_FIELDS = ("IMAGE_ID", *POSE, "CAMERA_ID", "NAME")
 
 SHORT_LINE = 400
-"""Only shorter lines of points are checked, bytes: one may be the next image's, if points are
-missing."""
+"""Bytes; only shorter lines of points are checked, since without points a line is the next image's,
+and that is short."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A camera model. Its parameters are the focal lengths, cx, cy, then those of distortion."""
+    """A camera model, whose parameters are the focal lengths, cx, cy, then those of distortion."""
 
     name: str  # as in ``cameras.txt``
     focals: int  # number: 2, 1 if fx = fy, 0 for a panorama
@@ -77,7 +77,7 @@ def counted(count: int, thing: str) -> str:
 
 
 def lens_note(counts: Mapping[Model, int], thing: str) -> str:
-    """Note about lenses that are no pinholes, by model, or ""; `thing` is "camera" or "frame"."""
+    """Note on lenses that are no pinholes, counted by model, or ""; `thing` has one of them."""
     ways = (
         "distortion of {} ignored (model {})",
         "{} (fisheye, {}) taken as pinhole: wrong away from the centre",
@@ -96,7 +96,10 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
 
 
 def read_colmap(folder: Path, suffix: str) -> ViewSet:
-    """Views of a COLMAP model, sorted by image name, as text and binary may differ in order."""
+    """Views of a COLMAP model, sorted by image name, as text and binary may differ in order.
+
+    `RefineError`, with the place in the file, if `cameras` or `images` is missing or wrong.
+    """
     cameras, images = (CameraPlace(folder / f"{stem}{suffix}") for stem in MODEL_FILES[:2])
     binary = suffix == ".bin"
     lenses: dict[int, tuple[Any, ...]] = {}
@@ -141,7 +144,7 @@ def _lens(place: CameraPlace, model: Model, size: Sequence[Any], values: Sequenc
 
 @dataclass
 class _Binary:
-    """A little-endian file, read from start to end; refused where it is truncated."""
+    """A little-endian file, read from start to end; `RefineError` where it is truncated."""
 
     file: CameraPlace
     data: mmap
@@ -171,7 +174,7 @@ class _Binary:
 
 
 def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, str, CameraPlace]]:
-    """Yield file, name and place of each row, of at least `least` bytes."""
+    """Yield the file, name and place of each row; rows have `least` bytes or more."""
     # Memory-mapped, since images.bin is mostly observations, which are skipped.
     with opened(file) as (stream, _), mmap(stream.fileno(), 0, access=ACCESS_READ) as mapped:
         data = _Binary(file, mapped)
@@ -189,7 +192,7 @@ def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, 
 
 
 def _binary_cameras(file: CameraPlace) -> Iterator[Any]:
-    """Place, id and `_lens` of each camera."""
+    """Yield place, id and `_lens` of each camera."""
     for data, row, place in _rows(file, "camera", 24 + 8 * 2):
         camera_id, model_id, *size = data.take("IiQQ", row)
         if model_id not in MODELS:
@@ -200,7 +203,7 @@ def _binary_cameras(file: CameraPlace) -> Iterator[Any]:
 
 
 def _binary_images(file: CameraPlace) -> Iterator[Any]:
-    """Name, id, place, pose (world to camera) and camera of each registered image."""
+    """Yield name, id, place, pose (world to camera) and camera id of each registered image."""
     for data, row, place in _rows(file, "image", 73):
         image_id, *pose, camera_id = data.take("I7dI", row)
         name = data.name(f"name of {row}")
@@ -209,7 +212,7 @@ def _binary_images(file: CameraPlace) -> Iterator[Any]:
         yield name, image_id, place, pose, camera_id
 
 
-def _lines(file):
+def _lines(file: CameraPlace) -> Generator[tuple[CameraPlace, bytes], None, None]:
     """Yield place and bytes of each line that is no comment."""
     with opened(file) as (stream, _):
         for number, text in enumerate(stream, 1):

@@ -1,9 +1,9 @@
 """``transforms.json`` of nerfstudio, instant-ngp and the NeRF synthetic scenes.
 
-``transform_matrix`` is camera to world in OpenGL axes (x right, y up, z back), used as stored:
-``applied_*``, ``scale``, ``offset`` and ``aabb*`` do not count. nerfstudio trains and exports in
-another frame; a ``dataparser_transforms.json`` beside the file is applied. Principal points are
-measured from the upper left corner, pixel centres are at k + 0.5.
+``transform_matrix`` is camera to world in OpenGL axes (x right, y up, z back) and used as stored;
+``applied_*``, ``scale``, ``offset`` and ``aabb*`` are ignored. nerfstudio trains and exports in
+another frame, to which a ``dataparser_transforms.json`` beside the file leads: it is applied.
+Principal points are measured from the upper left corner; pixel centres are at k + 0.5.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ DATAPARSER_FILE = "dataparser_transforms.json"
 
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # factors on axes: y up to down, z back to forward
 
-LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6  # scales removed from a ``transform_matrix``
+LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6  # of a ``transform_matrix``; in between it is taken out
 
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PANORAMA_KEYS = ("equirectangular", "latlong")  # of instant-ngp
@@ -45,7 +45,11 @@ LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
 
 
 def read_transforms(path: Path, data: object) -> ViewSet:
-    """Views of a ``transforms.json``, in order; sizes may come from images beside `path`."""
+    """Views of a ``transforms.json``, in its order.
+
+    `data` is its parsed JSON. Missing image sizes are read from the images beside `path`.
+    `RefineError`, with the place in the file, if something is missing or wrong.
+    """
     place = CameraPlace(path)
     shared = place.members(data, ("frames",))
     frames = place.at("'frames'").items(shared["frames"])
@@ -79,7 +83,7 @@ def _view(place, values, name, world, remarks):
 
 
 def _pose(place, value, remarks):
-    """Camera axes (x right, y down, z forward) as columns, and centre; uniform scales go."""
+    """Camera axes (x right, y down, z forward) as columns, without a scale, and centre."""
     matrix = place.matrix(value, (3, 4), 4)
     if len(matrix) > 3 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         place.at("row 3").fail(f"expected [0, 0, 0, 1], got {matrix[3].tolist()}")
@@ -136,8 +140,8 @@ def _lens(place: CameraPlace, values: Mapping[str, Any]) -> list[Model]:
         what = name if name in PANORAMAS else panorama
         place.fail(f"{what!r} cameras are not pinholes, expected a perspective camera")
     if name not in LENSES:
-        known = ", ".join(model for model in LENSES if model not in PANORAMAS)
-        at.fail(f"unknown model {name[:40]!r}, expected one of {known}")
+        models = ", ".join(model for model in LENSES if model not in PANORAMAS)
+        at.fail(f"unknown model {name[:40]!r}, expected one of {models}")
     model = LENSES[name]
     return [model] if model.fisheye or distorted else []
 

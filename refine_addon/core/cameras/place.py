@@ -1,4 +1,4 @@
-"""Reading and checks that all camera formats share."""
+"""Reading of files, and checks of values, that all camera formats share."""
 
 from __future__ import annotations
 
@@ -31,32 +31,32 @@ class CameraPlace(Place):
     """A place in a file of cameras."""
 
     def positive(self, value: object, what: str) -> float:
-        """The value, if it is a number of 1e-6 to 1e18; `what` names it in messages."""
+        """A number from 1e-6 to 1e18; `what` names it in messages."""
         number = self.number(value)
         if number < SMALLEST_LENGTH:
             self.expected(f"a positive {what}", value)
         return number
 
     def focal(self, value: object) -> float:
-        """The value, if it can be a focal length in pixels."""
+        """A number that can be a focal length in pixels."""
         return self.positive(value, "focal length in pixels")
 
     def side(self, value: object) -> int:
-        """The value, if it is a whole number of pixels; it may be written as 800.0."""
+        """A whole number of pixels, which may be written as 800.0."""
         number = self.number(value)
         if not (number.is_integer() and 1 <= number <= LARGEST_SIDE):
             self.expected(f"a whole number of pixels from 1 to {LARGEST_SIDE}", value)
         return int(number)
 
     def principal(self, values: Mapping[str, object], size: Sequence[int]) -> list[float]:
-        """``cx`` and ``cy`` in pixels; the middle of the image without them."""
+        """``cx`` and ``cy`` of a JSON object in pixels; by default the middle of the image."""
         return [
             self.at(repr(key)).number(values.get(key, side / 2))
             for key, side in zip(("cx", "cy"), size, strict=True)
         ]
 
     def matrix(self, value: object, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
-        """The value, if it is a list of rows of numbers; `rows` are the allowed counts."""
+        """A list of rows of numbers as float64; `rows` are the allowed numbers of rows."""
         if not isinstance(value, list) or len(value) not in rows:
             sizes = " or ".join(f"{count} x {columns}" for count in rows)
             self.expected(f"a {sizes} matrix", value)
@@ -64,16 +64,19 @@ class CameraPlace(Place):
         return np.array(table, np.float64)
 
     def rotation(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The matrix (3, 3), if it is orthonormal up to the rounding of a text file."""
+        """The matrix, (3, 3), if it is orthonormal up to `views.ORTHONORMAL`."""
         if not is_orthonormal(matrix):
             self.fail(f"expected an orthonormal rotation, got {np.round(matrix, 6).tolist()}")
         return matrix
 
     def view(self, name: str, pose: Pose, lens: Lens) -> View:
-        """View of a camera; surrogates in `name`, which cannot be printed, become "?".
+        """View of a camera; characters of `name` that cannot be printed become "?".
 
-        `pose`: rotation (3, 3), world to camera, and centre; `lens`: two focal lengths, the
-        principal point, width and height, pixels.
+        Parameters
+        ----------
+        name : str
+        pose : rotation, (3, 3), world to camera in the axes of `View`, and centre, (3,)
+        lens : two focal lengths, the principal point, and width and height, pixels
         """
         (rotation, center), ((fx, fy), (cx, cy), (width, height)) = pose, lens
         if np.abs(center).max() > LARGEST_NUMBER:
@@ -105,7 +108,7 @@ def is_folder(path: Path) -> bool:
 
 @contextmanager
 def opened(place: Place) -> Iterator[tuple[BinaryIO, bytes]]:
-    """Yield a file at its start, and its first bytes; refuses empty files and LFS pointers."""
+    """Open a file; yields it with its first bytes. Refuses empty files and LFS pointers."""
     try:
         with place.path.open("rb") as stream:
             head = stream.read(SNIFFED_BYTES)
@@ -119,7 +122,7 @@ def opened(place: Place) -> Iterator[tuple[BinaryIO, bytes]]:
 
 
 def read_json(path: Path) -> object:
-    """Content of a UTF-8 JSON file, byte order mark or not; errors name line and column."""
+    """Parsed content of a JSON file in UTF-8; `RefineError` with line and column if it is none."""
     place = Place(path)
     with opened(place) as (stream, head):
         if head[:1] not in b"{[\xef \t\r\n":  # so that a large splat file is not read

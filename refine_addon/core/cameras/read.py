@@ -1,6 +1,6 @@
 """Cameras from files: Inria ``cameras.json``, ``transforms.json`` and COLMAP models.
 
-Values are read as stored and checked; nothing that would move a camera is guessed.
+Values are checked and used as stored: nothing that would move a camera is guessed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .place import CameraPlace, is_file, is_folder, kind_of, read_json
 INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")  # required
 
 JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
-"""Looked for in a folder, in this order; a COLMAP model comes last."""
+"""Names of camera files in the order in which a folder is searched; a COLMAP model comes last."""
 
 
 def read_cameras(path: Path | str) -> ViewSet:
@@ -52,27 +52,27 @@ def read_cameras(path: Path | str) -> ViewSet:
 
 
 def cameras_in(folder: Path) -> list[Path]:
-    """JSON files and COLMAP folder of a folder, by name; `read_cameras` reads the first."""
+    """JSON files and the COLMAP model in a folder; `read_cameras` reads the first of them."""
     files = [folder / name for name in JSON_NAMES if is_file(folder / name)]
     colmap = find_colmap(folder)
     return [*files, colmap[0]] if colmap else files
 
 
 def _read_folder(folder: Path) -> ViewSet:
-    found, colmap = cameras_in(folder), find_colmap(folder)
-    if not found:
+    sources, colmap = cameras_in(folder), find_colmap(folder)
+    if not sources:
         CameraPlace(folder).fail(
             f"no cameras in this folder, expected {', '.join(JSON_NAMES)}, or a COLMAP model "
             "(cameras and images, both .bin or both .txt) in it, sparse/0 or sparse"
         )
-    if colmap and found == [colmap[0]]:
+    if colmap and sources == [colmap[0]]:
         return read_colmap(*colmap)
-    views = _read_json_cameras(found[0])
+    views = _read_json_cameras(sources[0])
     others = [
         f"COLMAP model in {each.relative_to(folder).as_posix()}" if is_folder(each) else each.name
-        for each in found[1:]
+        for each in sources[1:]
     ]
-    unused = f"read {found[0].name}, not {', '.join(others)}" if others else ""
+    unused = f"read {sources[0].name}, not {', '.join(others)}" if others else ""
     return replace(views, note="; ".join(filter(None, (views.note, unused))))
 
 

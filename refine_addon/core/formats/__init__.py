@@ -1,1 +1,1 @@
-"""Splat files: reading and writing; one module a format, or for those that only a name tells."""
+"""Reading and writing splat files: one module a format, and one for those known only by name."""

@@ -1,4 +1,4 @@
-"""``.splat`` and ``.ksplat``, formats known only by the file's name.
+"""``.splat`` and ``.ksplat``, formats that only the file's name tells.
 
 ``.splat`` (antimatter15) is 32 bytes a splat. ``.ksplat`` (GaussianSplats3D by mkkellogg), levels
 0 to 2, is only read; in levels 1 and 2 a coordinate is 16 bits around the centre of a bucket.
@@ -43,7 +43,7 @@ def _read_splat(path, data):
         Place(path).fail(f"truncated: {where} has {beyond} bytes, expected {size}")
     stored = data.view(_SPLAT)
     file, splats = new_file(path, (".splat", len(data)), count, 0)
-    # Scales that are 0 or no sizes at all become logarithms that are not finite, as in a PLY.
+    # Scales that are 0, negative or NaN become logarithms that are not finite, as in a PLY.
     with np.errstate(divide="ignore", invalid="ignore"):
         for piece in pieces(count):
             rows, target = stored[piece], splats.take(piece)
@@ -112,7 +112,7 @@ def _read_ksplat(path, data):
     splats.sh_rest[:] = 0.0
     limits = np.float32(least or -_HARMONICS), np.float32(largest or _HARMONICS)
     start = 0
-    # Any bits may stand in a file: scales that are no sizes, ranges that are no numbers.
+    # Files may hold any bits, such as negative scales, and ranges that are NaN.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
         for section in sections:
             _fill(splats.take(slice(start, start + section.splats)), level, limits, section, data)
@@ -121,7 +121,7 @@ def _read_ksplat(path, data):
 
 
 def _sections(path, data, count, level):
-    """Yield the sections; refuse those that reach beyond the end of the file."""
+    """Yield the sections; `RefineError` for one that reaches beyond the end of the file."""
     start = _HEADER_BYTES + count * _SECTION_BYTES
     refuse_short(path, start, len(data), f"the headers of {count} sections")
     for number in range(count):

@@ -1,7 +1,7 @@
-"""SuperSplat's compressed PLY: 16 bytes a splat, in chunks of 256 that share their ranges.
+"""SuperSplat's compressed PLY: 16 bytes a splat, in chunks of 256 splats that share ranges.
 
-Position and log scale (11, 10, 11 bits) and colour (8 each) are fractions of the chunk's ranges;
-opacity has 8 bits, the smaller components of the rotation 10 each, harmonics 8 each.
+Position and log scale (11, 10 and 11 bits) and colour (8 each) are fractions of their chunk's
+ranges. Opacity has 8 bits, the three smaller components of the rotation 10 each, harmonics 8 each.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ _NAMES = [(end, axis) for end in ("min", "max") for axis in "xyz"]
 _POSITION = tuple(f"{end}_{axis}" for end, axis in _NAMES)
 _SCALE = tuple(f"{end}_scale_{axis}" for end, axis in _NAMES)
 _COLOR = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
-"""Properties of a chunk: in each group the three lower ends, then the three upper."""
+"""Properties of a chunk: in each group the three lower ends of ranges, then the upper ones."""
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 _PLACES = ((21, 0x7FF), (11, 0x3FF), (0, 0x7FF))  # of x, y, z: shift, largest code
 
-_CHANNELS = ((24, 0xFF), (16, 0xFF), (8, 0xFF), (0, 0xFF))  # of red, green, blue, opacity: likewise
+_CHANNELS = ((24, 0xFF), (16, 0xFF), (8, 0xFF), (0, 0xFF))  # likewise red, green, blue, opacity
 
 _TURNS = ((20, 0x3FF), (10, 0x3FF), (0, 0x3FF))
-"""Of a rotation likewise; the two bits above name the largest component."""
+"""Likewise of a rotation; the two bits above are the number of the largest component."""
 
 SCALE_LIMIT = 20.0  # log scales are clipped to ±20
 
@@ -58,7 +58,7 @@ def _read(path, data):
         elements[element.name] = stored.view(kind) if len(stored) else np.empty(0, kind)
 
     def rows_of(name, properties, kind):
-        """Rows of an element that has these properties, all of one type."""
+        """Rows of an element; `RefineError` unless it has these properties, of type `kind`."""
         if name not in elements:
             place.fail(f"a compressed PLY without an element '{name}'")
         rows = elements[name]
@@ -112,7 +112,7 @@ def _chunks_of(piece):
 
 
 def _unpacked(values, fields):
-    """Bit fields of 32-bit numbers (n,) as shares of their largest codes, (n, F)."""
+    """F bit fields of 32-bit numbers, (n,), as shares of their largest codes, (n, F)."""
     shares = np.empty((len(values), len(fields)))
     for index, (shift, largest) in enumerate(fields):
         shares[:, index] = ((values >> np.uint32(shift)) & np.uint32(largest)) / largest
@@ -129,7 +129,7 @@ def _packed(shares, fields):
 
 
 def _between(shares, chunks, names):
-    """Vectors (n, 3) from shares of their chunks' ranges; overwrites the shares."""
+    """Vectors, (n, 3), from shares of their chunks' ranges; the shares are overwritten."""
     for axis, share in enumerate(shares.T):
         ends = (chunks[name].astype(np.float64) for name in (names[axis], names[axis + 3]))
         low, high = (np.repeat(end, SPLATS)[: len(shares)] for end in ends)
@@ -138,7 +138,7 @@ def _between(shares, chunks, names):
 
 
 _REST = np.concatenate([[0.0], (np.arange(1, 255) + 0.5) / 256.0, [1.0]]) * REST_RANGE - 4.0
-"""Code -> coefficient: the middle of its step; codes 0 and 255 are the ends of the range."""
+"""Code -> coefficient: the middle of its step, or for codes 0 and 255 the ends of the range."""
 
 
 def _write(stream, splats):
@@ -163,14 +163,14 @@ def _write(stream, splats):
         shares[:, 3] = opacity(batch.opacity_logits)
         packed[piece, 3] = _packed(shares, _CHANNELS)
         planes = np.asarray(batch.sh_rest, np.float64).transpose(0, 2, 1).reshape(len(batch), rest)
-        # Each code stands for the middle of its step, so that it is the whole part, not rounded.
+        # Cut off, not rounded, since a code stands for the middle of its step.
         harmonics[piece] = np.clip((planes / REST_RANGE + 0.5) * 256.0, 0.0, 255.0)
     stream.writelines(part.data for part in (ranges, packed, harmonics))
 
 
 def _places(values, ranges):
-    """Values (n, 3) as fractions of their chunks' ranges; sets `ranges` (C, 6)."""
-    # Rounded once: of ends in float32, all values in between are in between.
+    """Values, (n, 3), as fractions of the ranges of their C chunks; sets `ranges`, (C, 6)."""
+    # In float32 like the ranges, so that no value lies beyond the end of its range.
     with np.errstate(under="ignore"):
         values = np.asarray(values, np.float32)
     starts = np.arange(0, len(values), SPLATS)
@@ -192,7 +192,7 @@ def _header(count, rest):
 
 
 def _sizes(count, degree):
-    """Largest size: the last chunk may be shorter, and the default model needs no comment."""
+    """Bytes of a splat, and at most of the rest: with a full last chunk and the longest header."""
     rest = 3 * above_constant(degree)
     chunk, header = 18 * 4, ply.with_model(_header(count, rest), "antialiased")
     return 16 + rest + chunk / SPLATS, len(header) + chunk

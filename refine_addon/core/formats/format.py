@@ -1,4 +1,4 @@
-"""The interface of a splat format other than plain PLY, and conversions that formats share."""
+"""Interface of a splat format other than plain PLY, and conversions that formats share."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class Format:
     suffix: str  # in lower case
     matches: Callable[[Path, bytes], bool]
     read: Callable[[Path, NDArray[np.uint8]], SplatFile]
-    # Gets splats that can be drawn; None if the format is only read.
+    # Gets splats that can all be drawn; None if the format is only read.
     write: Callable[[BinaryIO, Splats], None] | None = None
     degree: int = 0  # highest of the harmonics
-    loss: str = ""  # what it does to splats, as a sentence without its subject
-    # Of a count and a degree: bytes of one splat, and of the rest at most; None if compressed.
+    loss: str = ""  # what is lost, as a sentence whose subject is the suffix
+    # From count and degree, bytes of a splat and at most of the rest; None if all is compressed.
     sizes: Callable[[int, int], tuple[float, int]] | None = None
     models: tuple[Model, ...] = MODELS[:1]  # those that a file can name
 
@@ -41,7 +41,10 @@ class Format:
 def new_file(
     path: Path, origin: tuple[str, int], count: int, degree: int, model: Model = "default"
 ) -> tuple[SplatFile, Splats]:
-    """New plain PLY of `count` splats in memory, and the splats, with third scale, to be set."""
+    """New plain PLY of `count` splats in memory, and these splats, whose arrays are to be filled.
+
+    `origin` are format and bytes of the file that is read. The splats have a third scale.
+    """
     rows, splats = empty_rows(count, degree)
     header = with_model(new_header(rows.dtype, count), model)
     return SplatFile(path, rows, header, origin=Origin(*origin)), splats
@@ -53,32 +56,33 @@ def pieces(count: int) -> list[slice]:
 
 
 def codes(shares: NDArray[Any]) -> NDArray[np.uint8]:
-    """Shares as the nearest of 0..255, clipped to 0..1 before."""
+    """Shares, (...), clipped to 0..1, as codes 0..255, uint8, rounded to the nearest."""
     return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * 255), np.uint8)
 
 
 def color_codes(splats: Splats) -> NDArray[np.uint8]:
-    """Colours and opacities in 8 bits each, (N, 4)."""
+    """Colours and opacities in 8 bits each, (N, 4) uint8."""
     return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
 
 
 def set_colors(splats: Splats, shares: NDArray[Any]) -> None:
-    """Set colours and opacities from shares of 0..1, (N, 4)."""
+    """Set the constant harmonics and logits of splats from colours and opacities, (N, 4), 0..1."""
     splats.sh_dc[:] = (shares[:, :3] - 0.5) / SH_C0
     splats.opacity_logits[:] = opacity_logits(shares[:, 3])
 
 
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
-    """Raise `RefineError` if a file of `available` bytes is shorter than it announces."""
+    """Raise `RefineError` if `what` needs more bytes than the `available` ones of the file."""
     if needed > available:
         problem = f"{what} need {needed} bytes, the file has {available}"
         raise RefineError(f"{path}: truncated: {problem}")
 
 
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Index (N,) of the largest component of unit quaternions (N, 4), and the others (N, 3).
+    """Index, (N,), of the largest component of unit quaternions, (N, 4), and the others, (N, 3).
 
-    The first of equals counts. Signs are flipped where the largest is negative.
+    Of equal components the first is the largest. Signs are flipped where the largest is negative,
+    so that `join_largest` gives the same rotation.
     """
     largest = np.abs(q).argmax(axis=1)
     others = np.take_along_axis(q, _OTHERS[largest], axis=1)
@@ -87,7 +91,7 @@ def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def join_largest(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternions (N, 4), the reverse of `split_largest`."""
+    """Unit quaternions, (N, 4) float64, of what `split_largest` returns."""
     left = np.maximum(1.0 - np.einsum("ij,ij->i", others, others), 0.0)
     q = np.empty((len(others), 4))
     np.put_along_axis(q, _OTHERS[largest], others, axis=1)
@@ -99,7 +103,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # left-out com
 
 
 def nearby_order(means: NDArray[Any]) -> NDArray[np.int64]:
-    """Order (N,) of finite positions (N, 3) along a curve that keeps neighbours together."""
+    """Order, (N,), of finite positions, (N, 3), along a Z-shaped (Morton) curve."""
     sample = np.asarray(means[:: max(len(means) // _SAMPLE, 1)], np.float64)
     middle = np.median(sample, axis=0)
     size = float(np.median(np.abs(sample - middle))) or 1.0
@@ -108,5 +112,5 @@ def nearby_order(means: NDArray[Any]) -> NDArray[np.int64]:
         return spatial_order(np.clip(place, -_FARTHEST, _FARTHEST))
 
 
-_SAMPLE = 10_000  # positions, at least, that tell middle and size: medians of more differ little
-_FARTHEST = 1e100  # in sizes: the order knows only directions by far, and squares must be finite
+_SAMPLE = 10_000  # least positions for the medians of middle and size; more change them little
+_FARTHEST = 1e100  # in sizes; positions are clipped to it, so that their squares are finite

@@ -1,7 +1,7 @@
 """Binary glTF (``.glb``) with KHR_gaussian_splatting: plain accessors, activated values.
 
-Rotations are x y z w. glTF's y points up where that of captures points down: half a turn about z,
-which changes signs only, takes one to the other. The transforms of nodes are applied.
+Rotations are x y z w. In glTF y points up, in captures down; half a turn about z, which changes
+signs only, leads from one to the other. The transforms of nodes are applied.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _READ = (EXTENSION, "KHR_mesh_quantization")  # extensions that a file may requi
 _DRAWN = {"colorSpace": "srgb_rec709_display", "projection": "perspective"}
 """How splats are drawn, whatever the extension says."""
 
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # between the frames of captures and glTF, either way
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # from the frame of captures to glTF's, and back
 
 
 class _Document(NamedTuple):
@@ -54,7 +54,7 @@ class _Document(NamedTuple):
     binary: NDArray[np.uint8]
 
     def item(self, group: str, index: Any, place: Place) -> tuple[dict[str, Any], Place]:
-        """Item of a list such as ``nodes``, and its place; `place` names the index."""
+        """Item of a list such as ``nodes``, and its place; `place` is where the index stands."""
         items = self.content.get(group, [])
         count = len(items) if isinstance(items, list) else 0
         if not is_whole(index) or not 0 <= index < count:
@@ -63,7 +63,7 @@ class _Document(NamedTuple):
         return where.members(items[index]), where
 
     def values(self, index: Any, place: Place, width: int) -> tuple[NDArray[Any], float]:
-        """Stored values of an accessor, (n, width), and the unit they count in."""
+        """Stored values of an accessor, (n, width), and the number that stands for 1."""
 
         def whole(key: str, default: int | None = None) -> int:
             return where.at(key).whole(view.get(key, default))
@@ -100,7 +100,7 @@ class _Part(NamedTuple):
     degree: int
     logs: bool  # whether scales are held as their logarithms, as in drafts of the extension
     remarks: tuple[str, ...]  # what is not as the file says, behind "FILE has"
-    values: Callable[[str, slice], NDArray[Any]]  # of an attribute without its prefix
+    values: Callable[[str, slice], NDArray[Any]]  # of an attribute, named without its prefix
 
 
 def _read(path, data):
@@ -118,7 +118,7 @@ def _read(path, data):
             place.fail("belongs to two nodes, expected a tree")
         visited.add(index)
         if not node.keys().isdisjoint(_MOVES):
-            moves.append((node, place, frame))
+            moves.append((node, place, frame))  # the number of the frame that it stands in
             frame = len(moves)
         if "children" in node:
             left += [(child, place, frame) for child in _listed(node, "children", place)[::-1]]
@@ -131,7 +131,7 @@ def _read(path, data):
         parts = [part for part in meshes[node["mesh"]] if part.splats]
         shown += [(part, frame, place) for part in parts]
         count += sum(part.splats for part in parts)
-        if count > len(data):  # many nodes may show one mesh
+        if count > len(data):  # nodes may share a mesh: few bytes, many splats
             wanted = f"expected at most {len(data)}, the bytes of the file"
             document.place.fail(f"its nodes show {count} splats or more, {wanted}")
     if not every:
@@ -139,7 +139,7 @@ def _read(path, data):
     origin, degree = (f"{NAME} with {EXTENSION}", len(data)), max(part.degree for part in every)
     file, splats = new_file(path, origin, count, degree)
     start = 0
-    with np.errstate(all="ignore"):  # any number may stand in a file
+    with np.errstate(all="ignore"):  # files may hold any numbers
         frames = _frames(moves)
         for part, frame, place in shown:
             for piece in pieces(part.splats):
@@ -185,10 +185,7 @@ def _listed(holder, key, place):
 
 
 def _frames(moves):
-    """Frames of the scene and of M nodes, (M + 1, 4, 4), in that of the scene.
-
-    `moves`: of each, JSON object, place, and number of the frame in which it stands.
-    """
+    """Frames of the scene and of M nodes, (M + 1, 4, 4), in that of the scene."""
 
     def numbers(key, *default):
         values = np.tile(default, (len(moves), 1))
@@ -259,7 +256,7 @@ def _part(document, attributes, place):
 
 
 def _fill(target, part, piece):
-    """Set splats to those of a piece of a primitive; absent harmonics are 0."""
+    """Set splats to a piece of a primitive; harmonics that it lacks are 0."""
     target.means[:] = part.values("POSITION", piece)
     sizes = part.values("SCALE", piece)
     target.log_scales[:] = sizes if part.logs else np.log(sizes, dtype=np.float32)
@@ -272,7 +269,7 @@ def _fill(target, part, piece):
 
 
 def _half_turned(splats):
-    """Splats turned by `_HALF_TURN`, exact to the bit."""
+    """Splats turned by `_HALF_TURN`, without rounding."""
     w, x, y, z = splats.quaternions.T
     # Half a turn multiplies the harmonic of order m by (-1)^m.
     bands = range(1, splats.sh_degree + 1)
@@ -289,7 +286,7 @@ def _harmonics(degree):
 
 
 def _attributes(degree):
-    """Name, type, width and values (n, width) of each attribute, in file order and glTF's frame."""
+    """Name, type, width and function for values, (n, width), of each attribute, in file order."""
     constant, *others = (f"{EXTENSION}:{name}" for name in _harmonics(degree))
     harmonics = [lambda splats, k=k: splats.sh_rest[:, k] for k in range(len(others))]
     return [
@@ -308,7 +305,7 @@ def _rotations(splats):
 
 
 def _write(stream, splats):
-    """Write splats as a file with one node; refuse more than 4 GiB, the format's limit."""
+    """Write splats as a file with one node; `RefineError` above 4 GiB, the format's limit."""
     attributes = _attributes(splats.sh_degree)
     with np.errstate(under="ignore", over="ignore"):  # doubles that are no floats
         means = np.asarray(splats.means, np.float32) * np.array([-1.0, -1.0, 1.0], np.float32)
@@ -327,7 +324,7 @@ def _write(stream, splats):
 
 
 def _json(attributes, count, low, high):
-    """JSON padded with spaces to a multiple of 4 bytes, and the bytes behind it."""
+    """JSON, padded with spaces to a multiple of 4 bytes, and the bytes of the values."""
     views, accessors, at = [], [], 0
     for index, (_, kind, width, _) in enumerate(attributes):
         length = width * np.dtype(_KINDS[kind]).itemsize * count

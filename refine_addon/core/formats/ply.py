@@ -1,7 +1,8 @@
 """Plain 3DGS PLY: read through a memory map, written with the kept rows unchanged.
 
-plyfile parses the header, without comments (of any encoding), with plain line ends and with row
-counts of 0, since it would allocate memory for the rows. ASCII is written as binary.
+plyfile parses the header. It gets it without comments, which have any encoding, with plain line
+ends, and with row counts of 0, since it would allocate memory for the rows. ASCII is written as
+binary.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, Cha
 
 HEADER_LIMIT = 1 << 20  # longest header that is read, bytes
 
-TEXT = "="  # "byte order" of ASCII files: numbers in memory have the machine's
+TEXT = "="  # stands for ASCII among byte orders: once parsed, numbers have the machine's
 
 PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort"}
 PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # NumPy's names -> PLY's
@@ -51,19 +52,19 @@ _MODEL_COMMENT = re.compile(
 
 _ENDS = {b"\n": rb"\n[ \t]*end_header[ \t]*\r?\n"}
 _ENDS |= {end: end + rb"[ \t]*end_header[ \t]*" + end for end in (b"\r\n", b"\r")}
-"""Line end -> end of a header. Only the first line's kind counts: the body may hold others."""
+"""Line end -> end of a header. The first line tells the kind, since the body may hold others."""
 
 _ROWS = 1 << 12
-"""Rows copied at a time: 1 MB at degree 3, which stays in the L2 cache until it is written."""
+"""Rows copied at a time: 1 MB at degree 3, still in the L2 cache when they are written."""
 
 _CHANGED_ROWS = 1 << 14
-"""Rows copied at a time where columns are set, at a few calls a column."""
+"""Rows copied at a time where columns are set, which takes a few calls for each column."""
 
-_AHEAD = 16  # chunks that may wait for earlier ones to be written
+_AHEAD = 16  # chunks that are copied before the first of them is written
 
 
 class Origin(NamedTuple):
-    """Format and bytes of the source file, where it is no binary PLY."""
+    """Format and bytes of a source file that is no binary PLY."""
 
     format: str
     size: int
@@ -71,7 +72,7 @@ class Origin(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """An opened 3DGS PLY file, or the PLY that holds the splats of a file of another format."""
+    """An opened 3DGS PLY file of N splats, or one in memory for a file of another format."""
 
     path: Path
     rows: NDArray[Any]  # (N,) structured, one field a property; read-only and mapped if binary
@@ -81,7 +82,7 @@ class SplatFile:
     after: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     indexing: tuple[str, ...] = ()  # other elements whose rows hold indices of splats
     origin: Origin | None = None  # set where the file is no binary PLY
-    remarks: tuple[str, ...] = ()  # for the user, about how it was read
+    remarks: tuple[str, ...] = ()  # sentences for the user on how it was read
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -112,10 +113,9 @@ class SplatFile:
         return stated_model(self.header, self.rows.dtype) or "default"
 
     def drawn_as(self, model: Model | None) -> SplatFile:
-        """The file with its splats drawn as another model; None keeps that of the file.
+        """The file with another model in its header; None keeps that of the file.
 
-        `RefineError` if the model is unknown, or splats without a third scale are to be other than
-        discs.
+        `RefineError` if the model is unknown, or splats without a third scale are not to be "2dgs".
         """
         if model is None or model == self.model:
             return self
@@ -135,7 +135,7 @@ class SplatFile:
         return replace(self, rows=rows, header=header)
 
     def splats(self) -> Splats:
-        """Rows as splats; the arrays are views of the file if its layout permits."""
+        """The rows as splats; the arrays are views of the file if its layout permits."""
         return drawn_as(ply_columns.splats_from_columns(self.rows), self.model)
 
     def size(self, keep: Keep = None, columns: Changes = None) -> int:
@@ -152,7 +152,7 @@ class SplatFile:
         overwrite: bool = False,
         threads: int | None = 1,
     ) -> None:
-        """Write the kept rows in order as binary; their bytes stay as they were read.
+        """Write the kept rows as binary, in order; their bytes stay as they were read.
 
         Parameters
         ----------
@@ -222,7 +222,7 @@ def read_ply(path: Path | str) -> SplatFile:
 
 
 def file_bytes(path: Path) -> NDArray[np.uint8]:
-    """Bytes of a file, memory-mapped; `RefineError` if it is no file or may not be read."""
+    """Bytes of a file, memory-mapped, (n,); `RefineError` if it is no file or cannot be read."""
     try:
         state = path.stat()
         if not stat.S_ISREG(state.st_mode):  # opening a pipe would wait for a writer
@@ -237,7 +237,7 @@ def file_bytes(path: Path) -> NDArray[np.uint8]:
 
 
 def read_plain(path: Path, data: NDArray[np.uint8]) -> SplatFile:
-    """Read a file that `file_bytes` has opened; see `read_ply`."""
+    """Plain PLY of the bytes that `file_bytes` returned, (n,); see `read_ply`."""
     header, vertex = splat_header(path, data[:HEADER_LIMIT].tobytes())
     body = data[len(header.raw) :]
     at = row_ranges(header, len(body))[vertex]
@@ -260,7 +260,10 @@ class Header(NamedTuple):
 
 
 def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
-    """Header of a file of splats from its first bytes, and the index of the element of splats."""
+    """Header of a file of splats from its first bytes, and the index of the element ``vertex``.
+
+    `RefineError` names the problem if these are no splats.
+    """
     header = read_header(path, head)
     names = [element.name for element in header.elements]
     if "vertex" not in names:
@@ -299,7 +302,7 @@ def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
 
 
 def read_header(path: Path | Url, head: bytes) -> Header:
-    """Header from a file's first `HEADER_LIMIT` bytes; errors name the line."""
+    """Header from a file's first `HEADER_LIMIT` bytes; `RefineError`, with its line, if wrong."""
     raw, problem = raw_header(head), ""
     if not head:
         problem = "the file is empty, expected a PLY"
@@ -331,7 +334,7 @@ def raw_header(head: bytes) -> bytes | None:
 
 
 def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
-    """The header that plyfile gets (see the top of this file), and the counts of rows."""
+    """Header for plyfile (see the top of this file), and the counts of rows."""
     lines: list[bytes] = []
     counts: list[int] = []
     names, elements = set[bytes](), set[bytes]()
@@ -343,28 +346,28 @@ def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
         elif not re.fullmatch(rb"[\t -~]*\r?", line):
             raise RefineError(f"{where}: expected ASCII text, got {line[:80]!r}")
         elif keyword == b"property" or (keyword == b"element" and len(words) == 3):
-            known, name = (names, words[-1]) if keyword == b"property" else (elements, words[1])
-            if known is elements:
+            taken, name = (names, words[-1]) if keyword == b"property" else (elements, words[1])
+            if taken is elements:
                 if not re.fullmatch(rb"[0-9]{1,30}", words[2]):
                     raise RefineError(f"{where}: expected a number of rows, got {shown(words[2])}")
                 counts.append(int(words[2]))
                 names, words[2] = set(), b"0"
-            if name in known:
+            if name in taken:
                 raise RefineError(f"{where}: {shown(name)} is declared twice, expected once")
-            known.add(name)
+            taken.add(name)
         lines.append(b" ".join(words) or b" ")  # an empty line would end the header for plyfile
     return b"\n".join([*lines[:-1], b""]), counts
 
 
 def has_lists(element: Any) -> bool:
-    """Whether an element has lists, so that its rows differ in length."""
+    """Whether an element of plyfile has lists, so that its rows may differ in length."""
     return any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties)
 
 
 def row_ranges(header: Header, available: int) -> list[slice]:
-    """Bytes of each element's rows in a binary body, up to the first element with lists.
+    """Range of bytes of each element's rows in a body, exact up to the first element with lists.
 
-    Refuses more rows than `available` bytes can hold, before memory is allocated for them.
+    `RefineError` if `available` bytes cannot hold as many rows, before memory is allocated.
     """
     ranges, least, text = [], 0, header.order == TEXT
     for element, count in zip(header.elements, header.counts, strict=True):
@@ -400,7 +403,7 @@ def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> S
 
 
 def _numbers(path, dtype, lines):
-    """Numbers in lines of text; refuse the first wrong line."""
+    """Numbers in lines of text, (n,) of `dtype`; `RefineError` names the first wrong line."""
     if (rows := _parsed(lines, dtype)) is not None:
         return rows
     wrong = next(part for part in chunks(len(lines), _ROWS) if _parsed(lines[part], dtype) is None)
@@ -421,7 +424,7 @@ _NO_SPACES = bytes.maketrans(b"\x1c\x1d\x1e\x1f", b"????")
 
 
 def _parsed(lines: Sequence[bytes], dtype: np.dtype[Any]) -> NDArray[Any] | None:
-    """Numbers in lines of text; None if a line is wrong, or empty, which NumPy would skip."""
+    """Numbers in lines of text, or None if a line is wrong, or empty, which NumPy would skip."""
     if not lines:
         return np.empty(0, dtype)
     text = (line.translate(_NO_SPACES).decode("ascii") for line in lines)
@@ -436,7 +439,7 @@ def _parsed(lines: Sequence[bytes], dtype: np.dtype[Any]) -> NDArray[Any] | None
 
 
 def shown(word: bytes | str) -> str:
-    """Word of the file for a message: in quotes, at most 40 characters."""
+    """Word of a file for a message: in quotes, at most 40 characters."""
     return repr((word if isinstance(word, str) else word.decode("ascii", "backslashreplace"))[:40])
 
 
@@ -462,7 +465,7 @@ def format_of(raw: bytes) -> str:
 
 
 def vertex_header(raw: bytes) -> bytes:
-    """Header without the elements other than ``vertex``, and binary."""
+    """Header of a binary file with ``vertex`` as its only element, otherwise unchanged."""
     kept, wanted = [], True
     for line in _lines(raw):
         words = line.split()
@@ -484,7 +487,7 @@ def with_count(raw: bytes, count: int) -> bytes:
 
 
 def model_of(raw: bytes) -> Model | None:
-    """Model in the comments of a header; the last counts, as in Brush and splat-transform."""
+    """Model in the comments of a header; None without; the last counts, as in other programs."""
     model: Model | None = None
     for match in filter(None, map(_MODEL_COMMENT.fullmatch, _lines(raw))):
         word = match[1].lower() if match[1] else (b"default", b"mip")[int(match[2])]
@@ -493,12 +496,12 @@ def model_of(raw: bytes) -> Model | None:
 
 
 def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:
-    """Model that a PLY states, or None; discs if `rows`, the dtype of a row, has no third scale."""
+    """Model that a PLY states, or None; "2dgs" if `rows`, dtype of a row, has no third scale."""
     return model_of(header) if THIRD_SCALE in (rows.names or ()) else "2dgs"
 
 
 def with_model(raw: bytes, model: Model) -> bytes:
-    """Header that states the model in a comment; unchanged where it has this model already."""
+    """Header that states a model in a comment; unchanged if it has this model already."""
     if (model_of(raw) or "default") == model:
         return raw
     lines = [line for line in _lines(raw) if not _MODEL_COMMENT.fullmatch(line)]
@@ -521,7 +524,12 @@ def _lines(raw: bytes) -> list[bytes]:
 def write_rows(
     stream: BinaryIO, rows: NDArray[Any], keep: Keep, columns: Changes, threads: int | None = 1
 ) -> None:
-    """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended."""
+    """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended.
+
+    rows : (N,) structured
+    keep : (N,) bool, or None for all
+    columns : see `SplatFile.write`
+    """
     columns = columns or {}
     plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
     changed = columns if isinstance(columns, ChangedColumns) else None
@@ -541,18 +549,18 @@ def write_rows(
             with np.errstate(over="ignore", under="ignore", invalid="ignore"):
                 for name, values in columns.items():
                     chunk[name] = values[piece][kept]
-        # As bytes: NumPy hands out no buffer of rows with a name such as a:b.
+        # As bytes, since NumPy gives no buffer of rows that have a field such as a:b.
         return np.ascontiguousarray(chunk).view(np.dtype((np.void, row.itemsize)))
 
     pieces = chunks(len(plain), _CHANGED_ROWS if columns else _ROWS)
     for batch in chunks(len(pieces), _AHEAD):
         here = pieces[batch]
-        made = map(bytes_of, here) if threads == 1 else run(bytes_of, here, threads=threads)
-        stream.writelines(chunk.data for chunk in made)
+        copies = map(bytes_of, here) if threads == 1 else run(bytes_of, here, threads=threads)
+        stream.writelines(chunk.data for chunk in copies)
 
 
 def _grown(dtype, columns):
-    """Row dtype with columns appended, in the byte order of x, which has several bytes."""
+    """Row dtype with columns appended, in the byte order of x."""
     names, order = dtype.names or (), dtype["x"].byteorder
     more = [(name, values.dtype.newbyteorder(order)) for name, values in columns.items()]
     fields = [(name, dtype[name]) for name in names]

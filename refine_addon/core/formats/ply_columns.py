@@ -20,9 +20,10 @@ REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}  # number of ``f_rest_*`` -> deg
 
 
 def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> Splats:
-    """Splats from all of `REQUIRED` and any ``f_rest_*``, (N,) each; discs without ``scale_2``.
+    """Splats of properties by name, (N,) each: all of `REQUIRED`, and any ``f_rest_*``.
 
-    Harmonics are all of red, then green, then blue. Views of adjacent fields, otherwise copies.
+    Harmonics are all of red, then green, then blue. Without ``scale_2`` the splats are discs. The
+    arrays are views where properties lie side by side, else copies.
     """
     names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
     count = sum(name.startswith("f_rest_") for name in names)
@@ -45,13 +46,13 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
 
 
 def other_properties(names: Iterable[str]) -> list[str]:
-    """Names that belong neither to splats nor to normals."""
-    known = ("nx", "ny", "nz", *REQUIRED)
-    return [name for name in names if name not in known and not name.startswith("f_rest_")]
+    """Names of properties that belong neither to splats nor to normals."""
+    usual = ("nx", "ny", "nz", *REQUIRED)
+    return [name for name in names if name not in usual and not name.startswith("f_rest_")]
 
 
 def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
-    """Unset float32 rows (count,) of a 3DGS PLY without normals, and their splats as views."""
+    """Rows, (count,), of a 3DGS PLY in float32, not filled yet, and their splats as views."""
     rest = 3 * above_constant(degree)
     names = [*REQUIRED[:6], *(f"f_rest_{index}" for index in range(rest)), *REQUIRED[6:]]
     table = np.empty((count, len(names)), "<f4")
@@ -63,7 +64,10 @@ def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
 
 
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
-    """Views of splats, (N,) each, by name in the order of a 3DGS PLY; discs have two scales."""
+    """Views of splats as properties, (N,) each, by name, in the order of a 3DGS PLY.
+
+    Discs have two scales.
+    """
     coefficients = splats.sh_rest.shape[1]
     axes = 2 if splats.model == "2dgs" else 3
     planes = [splats.sh_rest[:, k, channel] for channel in range(3) for k in range(coefficients)]
@@ -89,9 +93,10 @@ class Columns(Protocol):
 
 
 class ChangedColumns(Mapping[str, "NDArray[Any]"]):
-    """Stored columns with new values in `rows`, ascending, rounded once to the stored type.
+    """Properties with new values in `rows`, (n,) ascending, rounded once to the stored type.
 
-    A column is copied when it is read; `put` writes a binary PLY without such copies.
+    `stored` are the old values, `splats` the n new ones. A column is copied when it is read; `put`
+    serves to write a binary PLY without such copies.
     """
 
     def __init__(self, stored: Columns, rows: NDArray[np.int64], splats: Splats) -> None:
@@ -111,7 +116,7 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
         return len(self._values)
 
     def put(self, chunk: NDArray[Any], dtype: np.dtype[Any], piece: slice, kept: Keep) -> None:
-        """Put the values into `chunk`, kept rows of a piece as bytes (n,); `dtype` is a row's."""
+        """Set new values in `chunk`, (n,), kept rows of a piece as bytes; `dtype` is a row's."""
         low, high = np.searchsorted(self._rows, (piece.start, piece.stop))
         rows, taken = self._rows[low:high] - piece.start, np.arange(low, high)
         if kept is not None:

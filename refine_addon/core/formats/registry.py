@@ -1,4 +1,4 @@
-"""All splat formats: an input is known by its content, an output by its suffix."""
+"""All splat formats. An input is told by its content, an output by its suffix."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from .format import Format
 from .ply import SplatFile, file_bytes, read_plain
 from .ply_columns import Changes, Keep, other_properties, splats_from_columns
 
-# ``.splat`` is known by its name alone, if a file is none of the others.
+# Last ``.splat``, since only the name tells it.
 FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, by_name.SPLAT)
-"""Every format that is written, but plain PLY."""
+"""Formats that are written, but for plain PLY."""
 
-# Streamed SOG before SOG, whose name its own ends in.
+# Streamed SOG comes before SOG: ``lod-meta.json`` ends in ``meta.json``.
 READERS = (*FORMATS, by_name.KSPLAT, streamed_sog.READER, sog.META_READER)
-"""Every format that is read, but plain PLY, in the order in which an input is tried."""
+"""Formats that are read, but for plain PLY, in the order in which an input is tried."""
 
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))  # of outputs
 
@@ -34,13 +34,13 @@ INDEX_NAMES = (streamed_sog.INDEX, sog.META)  # files that stand for their folde
 
 NOT_WRITTEN: tuple[str, ...] = (".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
 NOT_WRITTEN += tuple(form.suffix for form in READERS if form.write is None)
-"""Suffixes of other splat formats and of compressed files: a PLY of such a name would mislead."""
+"""Suffixes of outputs that are refused: a PLY of such a name would mislead."""
 
-_HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed PLY has fewer
+_HEAD = 1 << 16  # first bytes, which tell the format; the header of a compressed PLY has fewer
 
 
 def read_splats(path: Path | str, model: Model | None = None, level: int = 0) -> SplatFile:
-    """Open a file of splats of any format, known by its content.
+    """Open a file of splats of any format, which its content tells.
 
     A plain PLY is mapped. Other formats become the plain PLY of the same splats, in memory.
 
@@ -50,9 +50,13 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
     model : {"default", "antialiased", "2dgs"}, optional; overrides what the file states
     level : int, of a streamed SOG, 0 is the finest; other files have only 0
 
+    Returns
+    -------
+    SplatFile
+
     Raises
     ------
-    RefineError : if the file is missing, damaged or of no known format
+    RefineError : if the file is missing, damaged, of no format that is read, or lacks the level
     """
     path = expanded(path)
     data = file_bytes(path)
@@ -68,7 +72,7 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
 
 
 def format_named(path: Path | Url) -> Format | None:
-    """Format of an output of this name, None for plain PLY; `RefineError` if it is not written."""
+    """Format of an output by its name, None for plain PLY; `RefineError` if it is not written."""
     name = path.name.lower()
     form = next((form for form in FORMATS if name.endswith(form.suffix)), None)
     if form is None and name.endswith(NOT_WRITTEN):
@@ -80,7 +84,7 @@ def format_named(path: Path | Url) -> Format | None:
 
 
 def names_file(path: Path | Url) -> bool:
-    """Whether an output is a file of splats, by its name; any other name is a folder's."""
+    """Whether an output is named like a file of splats; other names are those of folders."""
     return path.name.lower().endswith((*SUFFIXES, *NOT_WRITTEN))
 
 
@@ -91,7 +95,7 @@ def without_suffix(name: str) -> str:
 
 
 def scene_name(path: Path) -> str:
-    """Name of the splats of a file: that of the file, or of the folder of an index.
+    """Name of the scene in a file: that of the file, or for an index that of its folder.
 
     >>> from pathlib import Path
     >>> [scene_name(Path(name)) for name in ("a/b.compressed.ply", "a/b", "a/lod-meta.json")]
@@ -112,8 +116,19 @@ def write_splats(
 ) -> None:
     """Write the kept splats of a file in the format that the suffix of `path` names.
 
-    A plain PLY keeps all rows and properties, see `SplatFile.write` also for parameters and errors.
-    Other formats leave out splats that cannot be drawn.
+    A plain PLY keeps all properties. Other formats leave out splats that cannot be drawn.
+
+    Parameters
+    ----------
+    path, keep, columns, overwrite : see `SplatFile.write`
+    file : SplatFile
+    threads : int, optional
+
+    Raises
+    ------
+    RefineError
+        See `SplatFile.write`; also if a format is not written, lacks a property of `columns`, or no
+        kept splat can be drawn.
 
     Examples
     --------
@@ -133,7 +148,7 @@ def write_splats(
 
 
 def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: Changes) -> Splats:
-    """Splats that an output of a format holds, see `write_splats`; errors name `path`."""
+    """Splats that an output in a format gets, see `write_splats`; errors name `path`."""
     rows = file.rows if keep is None else file.rows[keep]
     if columns:
         rows = rows.copy()
@@ -150,14 +165,17 @@ def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: 
 
 
 def _tame(colors):
-    """Colours clipped to the largest number that formats with numbers in text may hold."""
+    """Colours clipped to the largest number that is read from JSON."""
     if not colors.size or -LARGEST_NUMBER <= colors.min() <= colors.max() <= LARGEST_NUMBER:
         return colors
     return np.clip(colors, -LARGEST_NUMBER, LARGEST_NUMBER)
 
 
 def row_sizes(file: SplatFile, form: Format | None, count: int | None = None) -> tuple[float, int]:
-    """Bytes of one splat in a format, and of the rest at most; both 0 if compressed as a whole."""
+    """Bytes of a splat in a format, and at most of the rest; both 0 if compressed as a whole.
+
+    `count` is the number of splats written, by default all.
+    """
     if form is None:
         return file.row_bytes, file.fixed_bytes
     degree, count = min(file.splats().sh_degree, form.degree), len(file) if count is None else count
@@ -167,7 +185,7 @@ def row_sizes(file: SplatFile, form: Format | None, count: int | None = None) ->
 def written_size(
     file: SplatFile, form: Format | None, keep: NDArray[np.bool_], columns: Changes = None
 ) -> int | None:
-    """Bytes that `write_splats` would write, at most; None if compressed as a whole."""
+    """Bytes that `write_splats` would write at most; None for a format compressed as a whole."""
     if form is None:
         return file.size(keep, columns)
     count = int(np.count_nonzero(keep))
@@ -176,7 +194,7 @@ def written_size(
 
 
 def left_out(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> int:
-    """Number of kept splats that cannot be drawn, which formats other than plain PLY leave out."""
+    """Number of kept splats that a format leaves out: only plain PLY has those not drawable."""
     return 0 if form is None else int(np.count_nonzero(keep & ~drawable(file.splats())))
 
 

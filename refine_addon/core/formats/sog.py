@@ -1,8 +1,9 @@
 """SOG by PlayCanvas: ``meta.json`` and WebP images, in a ZIP archive or in a folder.
 
-A splat is a pixel in each image: logarithms of coordinates in 16 bits, rotation and opacity in 8,
-scales, colours and a palette of harmonics by tables of 256 values. Version 1, only read and not
-named in the file, has even steps between two ends as tables, and opacity logits.
+A splat is a pixel in each image: logarithms of coordinates in 16 bits, rotation and opacity in 8.
+Scales, colours and a palette of harmonics are places in tables of 256 values. Version 1, which is
+only read and does not say its number, has tables of even steps between two ends, and logits as
+opacities.
 """
 
 from __future__ import annotations
@@ -40,25 +41,25 @@ _ACROSS = 64  # entries of the palette in a row of its image
 _LABEL_BITS = 16  # of the number of an entry of the palette: two channels of an image
 _TABLE = 256  # values of a table, whose places are a byte
 _COORDINATE = 65535.0  # largest code of a coordinate: two bytes, in two images
-_ROTATIONS = 252  # in the alpha of a rotation: this, and which component is the largest
+_ROTATIONS = 252  # the alpha of a rotation is this plus the number of the largest component
 _NO_SIZE = -20.0  # log scale written for anything smaller, since tables hold finite numbers
 _MOST_PIXELS = 16383  # of a side of a WebP image
 
 _META_LIMIT = 1 << 20
-"""Bytes of the longest ``meta.json`` that is read; with four tables it has some 20,000."""
+"""Most bytes of a ``meta.json`` that is read; with four tables it has about 20,000."""
 
 _SPARE_PIXELS = 1 << 16
-"""An image has at most four times the pixels needed, and these: writers pad images."""
+"""Images may have four times the pixels needed and these, since writers pad them."""
 
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, ArithmeticError)
-_BROKEN = (*_DAMAGED, RuntimeError, KeyError, OSError)  # raised by damaged archives
+_BROKEN = (*_DAMAGED, RuntimeError, KeyError, OSError)  # errors of damaged archives
 
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Compressions accepted in an archive: the others take any memory and raise anything."""
+"""Compressions accepted in an archive; others may take any memory and raise any error."""
 
 
 class Bundle:
-    """A ``meta.json`` and its files: `files` has sizes, ``opened(name, limit)`` gives bytes."""
+    """A ``meta.json`` and its files: their sizes by path, and ``opened(name, limit)`` for bytes."""
 
     def __init__(
         self, place: Place, meta: dict[str, Any], opened: Callable, files: dict[Path, int]
@@ -75,7 +76,7 @@ class Bundle:
 
     @property
     def count(self) -> int:
-        """Number of splats; each takes more than a byte."""
+        """Number of splats, at most that of bytes, or `RefineError`."""
         if self.version == VERSION:
             return self.place.at("count").whole(self.meta.get("count"), 1, self.size)
         section, place = self.section("means")
@@ -84,7 +85,7 @@ class Bundle:
 
     @property
     def degree(self) -> int:
-        """Highest degree of its harmonics."""
+        """Degree of the harmonics, 0 to 3."""
         if "shN" not in self.meta:
             return 0
         section, place = self.section("shN")
@@ -102,12 +103,12 @@ class Bundle:
         return place.members(self.meta.get(name)), place
 
     def numbers(self, name: str, key: str, count: int) -> NDArray[np.float64]:
-        """`count` numbers under a key of an attribute."""
+        """`count` numbers under a key of an attribute, (count,)."""
         section, place = self.section(name)
         return np.array(place.at(key).numbers(section.get(key), count))
 
     def tables(self, name: str, channels: int) -> NDArray[np.float64]:
-        """Table to which the pixels of an attribute point, (256, channels)."""
+        """Table for the codes in the pixels of an attribute, (256, channels)."""
         if self.version == VERSION:
             return self.numbers(name, "codebook", _TABLE)[:, None].repeat(channels, axis=1)
         low, high = (self.numbers(name, key, channels) for key in ("mins", "maxs"))
@@ -135,12 +136,12 @@ class Bundle:
             place.fail(f"cannot be read ({str(error)[:100]})")
 
     def rows(self, name: str, index: int) -> NDArray[np.uint8]:
-        """Pixels of all splats, (N, 4), of an image; far more pixels are refused."""
+        """Pixels of all splats, (N, 4), in an image; `RefineError` if it has far more."""
         image = self.pixels(name, index, self.count, 4 * self.count + _SPARE_PIXELS)
         return image.reshape(-1, 4)[: self.count]
 
     def read(self) -> SplatFile:
-        """Read its splats."""
+        """Read the splats; `RefineError` if an image is missing or wrong."""
         origin = f"{NAME} version {self.version}", self.size
         file, splats = new_file(self.place.path, origin, self.count, self.degree, self.model)
         first, axes = self.version == 1, np.arange(3)
@@ -171,7 +172,7 @@ class Bundle:
         return file
 
     def _harmonics(self):
-        """Palette of harmonics, (P, K, 3), and the entry of each splat."""
+        """Palette of harmonics, (P, K, 3), and the entry of each splat, (N,)."""
         coefficients, most = above_constant(self.degree), 1 << _LABEL_BITS
         width, (section, place) = _ACROSS * coefficients, self.section("shN")
         if self.version == VERSION:
@@ -195,7 +196,7 @@ class Bundle:
 
 
 def _held(place, label, limit, opened):
-    """Bytes of a file; refuse one that cannot be read or has more than `limit`."""
+    """Bytes of a file; `RefineError` if it cannot be read or has more than `limit`."""
     try:
         with opened() as stream:
             content = stream.read(limit + 1)
@@ -248,7 +249,7 @@ def bundle_beside(path: Path) -> Bundle:
 
 
 def beside(place: Place, name: str) -> Path:
-    """Path of a file named in a JSON file; refused unless in its folder or one below."""
+    """Path of a file named in a JSON file; `RefineError` unless in its folder or one below."""
     steps = PurePosixPath(name).parts
     if not steps or name.startswith("/") or ".." in steps or not set("\\:\0").isdisjoint(name):
         place.fail(f"{described(name)}, expected a file in this folder or one below")
@@ -263,21 +264,24 @@ def beside(place: Place, name: str) -> Path:
 
 
 def named_json(end: str) -> Callable[[Path, bytes], bool]:
-    """`Format.matches` of JSON files whose names end so: no reader looks further."""
+    """`Format.matches` for JSON files by the `end` of their names; nothing else tells them."""
     return lambda path, head: path.name.lower().endswith(end) and head.lstrip().startswith(b"{")
 
 
 def _write(stream, splats):
     """Write splats, sorted so that neighbours in space are neighbours in images."""
     path = Path(str(getattr(stream, "name", NAME)))
-    # A ZipInfo has no date of today, so a file is the same whenever it is made.
+    # A ZipInfo has a fixed date, so equal splats give equal files.
     with zipfile.ZipFile(stream, "w") as archive:
         for name, data in contents(path, splats.take(nearby_order(splats.means))):
             archive.writestr(zipfile.ZipInfo(name), data)
 
 
 def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
-    """Yield name and bytes of `META`, then of the images, with rows in the order of `splats`."""
+    """Yield name and bytes of `META`, then of the images, with pixels in the order of the splats.
+
+    `RefineError`, naming `path`, if no codec is there or images would be too large.
+    """
     count, codec = len(splats), codec_for(path)
     across = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)  # nearly square, divisible by 4
     if across > _MOST_PIXELS:
@@ -335,7 +339,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
 
 
 def _tabulated(values):
-    """Table of 256 values, half even steps, half quantiles, and each value's nearest place."""
+    """Table of 256 values, half in even steps and half quantiles, and the nearest to each value."""
     flat = np.sort(values, axis=None)
     half = _TABLE // 2
     shares = np.linspace(0.0, 1.0, half)
@@ -347,10 +351,8 @@ def _tabulated(values):
 
 
 def _grouped(rows):
-    """Group from 0 on for each of N rows (N, D): similar rows share one.
-
-    Groups are halved at the mean of their widest axis, up to 65,536 or half as many as rows.
-    """
+    """Number of a group, from 0 on, for each of N rows, (N, D); similar rows share a group."""
+    # Groups are halved at the mean of their widest axis, up to 65,536 or half as many as rows.
     columns = np.ascontiguousarray(np.asarray(rows, np.float32).T)  # (D, N)
     labels = np.zeros(rows.shape[0], np.int64)
     for _ in range(min(_LABEL_BITS, int(rows.shape[0]).bit_length() - 1)):

@@ -1,7 +1,7 @@
-"""SPZ files by Niantic: 16 to 20 bytes a splat and one for each harmonic, compressed as a whole.
+"""SPZ files by Niantic: 19 or 20 bytes a splat and one for each coefficient, compressed as a whole.
 
-Versions 2 and 3 (written) are one gzip stream. Version 4 (only read) has a zstd stream for each
-attribute, which needs a module that Blender brings.
+Versions 2 and 3 (3 is written) are a gzip stream. Version 4 (only read) has a zstd stream for each
+attribute, for which Python needs a module that Blender has.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from .format import Format, codes, join_largest, new_file, pieces, refuse_short,
 NAME, SUFFIX = "SPZ", ".spz"
 
 _HEADER = struct.Struct("<4sIIBBBB")
-"""Magic, version, splats, degree, fractional bits, flags, streams (version 4, else 0)."""
+"""Magic, version, splats, degree, fractional bits, flags, streams (0 before version 4)."""
 
-_TABLE_AT = struct.Struct("<I12x")  # behind it in version 4: byte of the table of streams
+_TABLE_AT = struct.Struct("<I12x")  # behind the header in version 4: byte of the table of streams
 
-_STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, and of what is in it
+_STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, packed and unpacked
 
 _ANTIALIASED = 1  # bit of the flags: trained with antialiasing
 
 _VERSIONS = (2, 3, 4)
-_ONE_TURN, _ZSTD = 2, 4  # versions: rotations without the smallest three, streams by zstd
+_ONE_TURN, _ZSTD = 2, 4  # versions with rotations as x y z, and with zstd streams
 _DEGREES = 5
 
-_COLOR_STEP = 0.15  # of f_dc: colours a bit outside of 0..1 have codes too
+_COLOR_STEP = 0.15  # share of the codes for 1 of f_dc: also for colours a bit outside of 0..1
 _SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
-_BUCKETS = (8, 16)  # / 128: harmonics are rounded to multiples of it: degree 1, all others
+_BUCKETS = (8, 16)  # / 128: steps to which harmonics of degree 1, and of others, are rounded
 
 _USUAL_FRACTION, _LEAST_STEPS = 12, 18
-"""Bits of a position behind the point in most files; least bits of the largest coordinate."""
+"""Bits of a position behind the point in most files; least bits of a scene's largest coordinate."""
 
 _LARGEST_CODE = (1 << 23) - 1  # of a position: of its 24 bits, one is the sign
 
 _INFLATION = 1032
-"""Most bytes unpacked from one: gzip's limit; zstd exceeds it only for equal splats."""
+"""Most bytes unpacked from a byte: gzip's limit, which zstd exceeds only for equal splats."""
 
 _PIECE = 1 << 20  # bytes that a zstd stream is unpacked to at a time
 
@@ -71,7 +71,7 @@ class _Header(NamedTuple):
 
 
 def _matches(path, head):
-    """Whether it has the signature, or is a gzip file of this name, maybe a damaged one."""
+    """Whether it has the signature, or is a gzip file, maybe damaged, with this suffix."""
     return is_spz(head) or (path.suffix.lower() == SUFFIX and head.startswith(GZIP))
 
 
@@ -102,7 +102,7 @@ def _read(path, data):
 
 
 def _parsed(path, head, size):
-    """Header of a file of `size` bytes; refuse more than such a file can hold."""
+    """Header of a file of `size` bytes; `RefineError` for more splats than it can hold."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
     header = _Header(*_HEADER.unpack(head))
     problem = ""
@@ -167,7 +167,7 @@ def _streams(path, data, header):
 
 
 def _zstd(path, name, packed, length):
-    """Bytes of a zstd stream; refuse another length."""
+    """Bytes of a zstd stream; `RefineError` if they are not `length`."""
     try:
         try:
             module = importlib.import_module("compression.zstd")  # Python 3.14 and later

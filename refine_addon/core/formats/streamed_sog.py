@@ -1,8 +1,9 @@
 """Streamed SOG by PlayCanvas: levels of detail of a scene in chunks, as viewers load them.
 
-``lod-meta.json`` holds a tree over space. Each leaf, a chunk, names for each level its rows of a
-SOG folder. As in splat-transform, consecutive chunks share a folder of up to `UNIT` splats. Viewers
-choose a level by a chunk's size in the image, so none is wider than the cameras' distance.
+``lod-meta.json`` holds a tree over space. Each leaf, a chunk, has for each level a range of rows in
+a folder, which is a SOG. As in splat-transform, consecutive chunks share a folder until it has more
+than `UNIT` splats. Viewers choose a chunk's level by its size in the image, so no chunk is wider
+than its distance from the cameras.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ NAME, VERSION = "streamed SOG", 1
 INDEX = "lod-meta.json"
 
 UNIT = 1 << 19
-"""A folder is closed beyond this; most splats of a chunk in the finest level. As
+"""Most splats of a chunk in the finest level, and number above which a folder is closed, as in
 splat-transform."""
 
 LEAST = 1 << 13
-"""Smaller chunks are not split for width, as in splat-transform: each costs viewers the same."""
+"""Smaller chunks are not split for width, as in splat-transform: viewers take as long for each."""
 
 _MOST_LEVELS = 1 << 10
 
@@ -45,7 +46,10 @@ _FOLDER = re.compile(rf"(\d+_\d+)/{re.escape(META)}")  # LEVEL_NUMBER, as in spl
 
 
 def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
-    """Read a level of a streamed SOG (0 is the finest), with the environment."""
+    """Read a level of a streamed SOG, 0 is the finest, with the environment.
+
+    `data` are the bytes of the index, (n,). `RefineError` if it or a folder is damaged.
+    """
     place = Place(path)
     meta = place.members(place.parsed(data.tobytes()))
     if meta.get("version", VERSION) != VERSION:
@@ -105,7 +109,7 @@ def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[tuple[Bun
 
 
 def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[range]]:
-    """Rows of a level by the number of their file, without empty ones."""
+    """Ranges of rows of a level by the number of their file, without empty ones."""
     spans: dict[int, list[range]] = {}
     left, number = [tree], 0
     while left:
@@ -123,16 +127,16 @@ def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[ra
     return spans
 
 
-def _planted(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
-    """Tree over positions (N, 3), and its number of chunks.
+def _tree_over(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
+    """Tree over positions, (N, 3), and its number of chunks.
 
-    A leaf is a chunk's number; a branch is axis, value, subtree below, subtree of the rest. Chunks
-    above `UNIT`, or above `LEAST` and wider than `width`, are halved at the median of the longest
-    side.
+    A leaf is a chunk's number; a branch is an axis, a value, the subtree below it and that of the
+    rest. Chunks of more than `UNIT` splats, or of more than `LEAST` and wider than `width`, are
+    halved at the median along the longest side.
     """
     numbers = itertools.count()
 
-    def grown(rows):
+    def subtree(rows):
         here = means[rows]
         low, high = here.min(axis=0), here.max(axis=0)
         axis = int(np.argmax(high - low))
@@ -144,20 +148,20 @@ def _planted(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
         if value == low[axis]:  # more than half of them lie there
             value = along[along > value].min()
         below = along < value
-        return axis, float(value), grown(rows[below]), grown(rows[~below])
+        return axis, float(value), subtree(rows[below]), subtree(rows[~below])
 
-    return grown(np.arange(len(means))), next(numbers)
+    return subtree(np.arange(len(means))), next(numbers)
 
 
 class StreamedSog:
-    """A streamed SOG, written level by level into `folder`, see `folder_for`, until `publish`.
+    """A streamed SOG, written level by level into a folder of `folder_for`, then published.
 
-    Chunks follow the `finest` level's positions (N, 3); those of many splats are at most `width`
-    wide.
+    Chunks are made of the `finest` level's positions, (N, 3); those of many splats are at most
+    `width` wide, in the unit of these.
     """
 
     def __init__(self, finest: NDArray[Any], width: float, folder: Path) -> None:
-        self._tree, count = _planted(np.asarray(finest, np.float64), width)
+        self._tree, count = _tree_over(np.asarray(finest, np.float64), width)
         self._low, self._high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
         self._rows: list[dict[str, dict[str, int]]] = [{} for _ in range(count)]
         self._folder = folder
@@ -165,7 +169,7 @@ class StreamedSog:
         self._counts: list[int] = []  # splats of each level
 
     def add(self, splats: Splats) -> int:
-        """Write the next level, the finest first: the bytes of its files."""
+        """Write the next level, the finest first; returns the bytes of its files."""
         level, size = len(self._counts), 0
         self._counts.append(len(splats))
         means, unit = np.asarray(splats.means, np.float64), np.empty(0, np.intp)
@@ -178,7 +182,7 @@ class StreamedSog:
                 left += [(sides[1], rows[~below]), (sides[0], rows[below])]
             elif len(rows):
                 rows = rows[nearby_order(splats.means[rows])]
-                for piece in pieces(len(rows)):  # boxes around ellipsoids of one deviation
+                for piece in pieces(len(rows)):  # box around ellipsoids of one standard deviation
                     batch = splats.take(rows[piece])
                     turns = np.abs(rotation_matrices(batch.quaternions))
                     half = np.einsum("nij,nj->ni", turns, scales(batch.log_scales))
@@ -198,9 +202,10 @@ class StreamedSog:
         return size
 
     def publish(self, path: Path, *, overwrite: bool) -> None:
-        """Move the folders beside `path`, under free names, and write the index there.
+        """Move the folders beside `path`, under free names, and write the index to `path`.
 
-        A replaced index and its folders stay until the new one is in place: one is always whole.
+        An index that is replaced stays whole, with its folders, until the new one is in place.
+        `RefineError` if it may not be replaced.
         """
         checkpoint()
         refuse_existing(path, overwrite=overwrite)
@@ -253,15 +258,18 @@ class StreamedSog:
 
 @contextlib.contextmanager
 def folder_for(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Yield an empty folder beside `path`, removed at the end; refuses what may not be replaced."""
+    """Make a folder beside `path`, the index to come, which is removed after the block.
+
+    `RefineError` if `path` is a link, or exists and is no index or not to be replaced.
+    """
     with new_folder(path.parent):
         if path.is_symlink():
             raise RefineError(f"{path}: is a link, expected the index itself, beside its folders")
         refuse_existing(path, overwrite=overwrite)
         _folders_of(path)
         try:
-            with tempfile.TemporaryDirectory(prefix=".refine-", dir=path.parent) as made:
-                yield Path(made)
+            with tempfile.TemporaryDirectory(prefix=".refine-", dir=path.parent) as folder:
+                yield Path(folder)
         except OSError as error:
             raise RefineError(f"{path}: cannot be written ({reason_of(error)})") from error
 
@@ -277,8 +285,8 @@ def _folders_of(path: Path) -> list[str]:
     except RefineError as error:
         error.add_note("it is no index of levels: write to another folder")
         raise
-    found = (_FOLDER.fullmatch(name) for name in names if isinstance(name, str))
-    return [name[1] for name in found if name]
+    matches = (_FOLDER.fullmatch(name) for name in names if isinstance(name, str))
+    return [match[1] for match in matches if match]
 
 
 READER = Format(NAME, INDEX, named_json(INDEX), read)

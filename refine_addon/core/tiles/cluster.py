@@ -1,7 +1,7 @@
 """Work done on the workers of a Dask cluster, on this machine or on others.
 
-Arrays in files travel as names, so workers must see the job's folder under the same path. Dask
-repeats the work of a lost worker elsewhere.
+Arrays in files are sent as names, so workers must see the job's folder under the same path. Dask
+repeats the work of a lost worker on another.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from ..mapped import Interrupted
 from .source import Tile, bytes_of
 from .writing import waiting_in
 
-_AHEAD = 3  # groups of items for each thread that are handed out ahead and may wait here
+_AHEAD = 3  # groups of items for each thread that are sent ahead, whose results may wait here
 
 _TOGETHER = 16  # most items in a group: each group takes scheduler and coordinator about 15 ms
 
-_TURNS = 4  # groups a thread at least, so that all end at about one time
+_TURNS = 4  # least groups for each thread, so that all end at about the same time
 
 _INTERVAL = 0.2  # seconds between two looks whether to go on
 
@@ -42,12 +42,12 @@ _MEMORY = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
     "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
 }
-"""Dask makes glibc give memory back at once; page faults in each chunk's arrays would then take
-longer than the work. Bytes."""
+"""Bytes. With Dask's own values glibc returns memory at once, and page faults in the arrays of each
+chunk take longer than the work."""
 
 _CONNECT = 10  # seconds to find a scheduler, and a worker
 
-_TRIES = 3  # times that workers are checked if all of them get lost
+_TRIES = 3  # times that workers are checked if all are lost meanwhile
 
 
 @contextlib.contextmanager
@@ -108,7 +108,10 @@ class Cluster:
         self._client = client
 
     def check(self, job: Path, tiles: Sequence[Tile]) -> None:
-        """Refuse workers that miss files or differ in version; `Interrupted` if all were lost."""
+        """Raise `RefineError` if a worker lacks files or has another version of this program.
+
+        `Interrupted` if all workers are lost.
+        """
         for _ in range(_TRIES):
             try:
                 self._client.wait_for_workers(1, timeout=_CONNECT)
@@ -117,7 +120,7 @@ class Cluster:
                 raise RefineError("the scheduler has no workers") from error
             except Exception as error:
                 raise Interrupted(f"the workers do not answer: {error}") from error
-            # Others were lost meanwhile.
+            # An OSError is of a worker that was lost meanwhile.
             there = [pair for pair in answers.items() if not isinstance(pair[1], OSError)]
             for worker, answer in there:
                 if isinstance(answer, BaseException):
@@ -134,7 +137,7 @@ class Cluster:
     def run(
         self, packed: bytes, items: Sequence[Any], progress: Progress, what: str
     ) -> Iterator[Any]:
-        """Yield results of pickled work on items, in order; `Interrupted` if all workers go."""
+        """Yield results of pickled work on items, in order; `Interrupted` if workers are lost."""
         from distributed import CancelledError, KilledWorker
         from distributed.comm import CommClosedError
 
@@ -158,7 +161,7 @@ class Cluster:
             self._client.cancel([*waiting])
 
     def _wait(self, future: Any, look: Callable[[], None]) -> None:
-        """Wait for a future; meanwhile `look` may cancel."""
+        """Wait for a future; meanwhile ``look()`` may raise `Cancelled`."""
         ended, seen = threading.Event(), time.monotonic()
         future.add_done_callback(lambda _: ended.set())
         look()

@@ -53,25 +53,26 @@ def prune_tiles(
 ) -> dict[str, Any]:
     """Prune files of splats as one scene, by one budget over all of them; none is held in memory.
 
-    The kept splats are those of one file with all rows in the given order. All files are written,
-    or none. The job's folder lies beside the outputs until the end; after an interruption the same
-    call goes on.
+    The same splats are kept as of one file with all rows in the given order. Either all files are
+    written or none. Until the end the folder of the job lies beside the outputs, and after an
+    interruption the same call goes on where it was.
 
     Parameters
     ----------
     sources : sequence of path-like, plain binary PLY files in one frame, or URLs that fsspec opens
-    folder : path-like or None
-        Where each goes under its own name. For a URL the job's folder is in the current directory.
+    folder : path-like, a URL, or None, which writes nothing
+        For the outputs, each under its own name. For a URL, the job's folder is in the current
+        directory.
     views, budget, method, model, overwrite, dry_run, progress, threads : see `prune_file`
     workers : Cluster, optional, runs the large steps; by default this machine
 
     Returns
     -------
-    dict : the report, with ``tiles``: name, counts and bytes of each
+    dict : the report, see docs/report.md, with ``tiles``: name, counts and bytes of each
 
     Raises
     ------
-    RefineError, Cancelled : as in `prune`, or if two files have one name; nothing is kept
+    RefineError, Cancelled : see `prune`; also if two files have one name; the job's folder goes
     Interrupted : if a disk, a storage or all workers fail, or a file takes an output's place
 
     Notes
@@ -100,7 +101,7 @@ def prune_tiles(
             progress, seconds("read", count), scoring, seconds("write", count)
         )
         decided = partial(_decided, job, tiles, views, budget, method, clock)
-        kept, counts, facts = once(job, "kept", lambda: decided(reading, deciding, threads))
+        kept, counts, report = once(job, "kept", lambda: decided(reading, deciding, threads))
         if outputs is None:
             sizes = [
                 tile.size - tile.header + len(header_of(tile, count))
@@ -113,20 +114,20 @@ def prune_tiles(
         clock.lap("write_s")
     clock.stop()
     target = None if outputs is None else str(output)
-    facts["files"] = {
+    report["files"] = {
         "input": f"{len(tiles)} tiles", "output": target,
         "input_bytes": size, "output_bytes": sum(sizes),
     }  # fmt: skip
     written = sum(count for count, _ in counts) if outputs else None
-    facts["splats"] |= {"written": written, "left_out": 0}
+    report["splats"] |= {"written": written, "left_out": 0}
     names = ("input", "output", "before", "kept", "unseen", "input_bytes", "output_bytes")
     targets = [str(each) for each in outputs.targets] if outputs else [None] * len(tiles)
-    facts["tiles"] = [
+    report["tiles"] = [
         dict(zip(names, (t.path, to, t.splats, kept, unseen, t.size, after), strict=True))
         for t, to, (kept, unseen), after in zip(tiles, targets, counts, sizes, strict=True)
     ]
-    facts["timings"] = clock.timings
-    return facts
+    report["timings"] = clock.timings
+    return report
 
 
 def _check(workers: Cluster, job: Path, tiles: Sequence[Tile]) -> None:
@@ -140,7 +141,7 @@ def _check(workers: Cluster, job: Path, tiles: Sequence[Tile]) -> None:
 
 
 def _decided(job, tiles, views, budget, method, clock, reading, deciding, threads):
-    """Kept splats; kept and unseen counts of each tile; the report."""
+    """Kept splats, numbers of kept and unseen splats of each tile, and the report."""
     splats = once(job, "splats", lambda: copied(tiles, job / "splats", reading, threads))
     clock.lap("read_s")
     row_bytes = max(tile.dtype.itemsize for tile in tiles)
@@ -152,24 +153,24 @@ def _decided(job, tiles, views, budget, method, clock, reading, deciding, thread
     assert result.scores is not None
     begins = np.cumsum([tile.splats for tile in tiles])[:-1]
     masks = result.keep, result.scores.seen == 0
-    told = [[int(part.sum()) for part in np.split(mask, begins)] for mask in masks]
+    counts = [[int(part.sum()) for part in np.split(mask, begins)] for mask in masks]
     result.report["splats"].pop("unseen_removed", None)
-    return _stored(job, result), [*zip(*told, strict=True)], result.report
+    return _stored(job, result), [*zip(*counts, strict=True)], result.report
 
 
 def _stored(job: Path, result: Result) -> Kept:
     rows, became = np.empty(0, np.int64), None
     if result.merged is not None:
         changed = np.flatnonzero(result.merged.changed)
-        rows, made = np.flatnonzero(result.keep)[changed], result.merged.splats
-        became = on_disk(job / "became", pieces(made, changed)) if len(changed) else None
+        rows, merged = np.flatnonzero(result.keep)[changed], result.merged.splats
+        became = on_disk(job / "became", pieces(merged, changed)) if len(changed) else None
     arrays = write(job / "keep", [{"keep": result.keep, "changed": rows}])
     return Kept(**arrays, became=became)
 
 
 @contextlib.contextmanager
 def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
-    """Make and lock the folder of a job; it stays if the job can go on."""
+    """Make and lock the folder of a job within the block; it stays if the job can go on."""
     try:
         waiting_in(job).mkdir(parents=True, exist_ok=True)
         lock = (job / "lock").open("wb")
@@ -188,8 +189,8 @@ def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
                 stays = outputs is not None
                 if outputs is None:
                     raise
-                told = f"{error}; the same command goes on where this one was"
-                raise Interrupted(told) from error
+                advice = "the same command goes on where this one was"
+                raise Interrupted(f"{error}; {advice}") from error
             except (RefineError, Cancelled):
                 stays = False
                 if outputs:
@@ -212,7 +213,7 @@ def _lock(job: Path, lock: Any) -> None:
 
 
 def _remove(job: Path) -> None:
-    """Remove a folder with its content; Ctrl-C meanwhile comes too late."""
+    """Remove a folder with its content, also if Ctrl-C comes meanwhile."""
     try:
         shutil.rmtree(job, ignore_errors=True)
     except KeyboardInterrupt:

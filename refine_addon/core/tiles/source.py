@@ -1,4 +1,4 @@
-"""Tiles: their state when the job began, and their rows as splats."""
+"""Tiles: files as they were when the job began, and their rows as splats."""
 
 from __future__ import annotations
 
@@ -58,7 +58,10 @@ class Tile(NamedTuple):
 
 
 def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
-    """Look at the files of a scene; refuses doubles, which would count twice, and mixed models."""
+    """Tiles of a scene, by the headers of its files; see `tile_at`.
+
+    `RefineError` also if a file is given twice, models differ, or there are no splats.
+    """
     tiles: list[Tile] = []
     given: dict[Hashable, Tile] = {}
     for path in paths:
@@ -79,7 +82,10 @@ def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Ti
 
 
 def tile_at(path: Path | str, model: Model | None = None) -> Tile:
-    """Look at a plain binary PLY; only its header is read."""
+    """Tile of a plain binary PLY, of which only the header is read.
+
+    `model` says how its splats are drawn if the file does not. `RefineError` if it is no such file.
+    """
     place = storage.located(path)
     size, changed = storage.state(place)
     if place.name in ("", ".", ".."):
@@ -105,12 +111,15 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
 
 
 def rows_of(tile: Tile, start: int, stop: int) -> NDArray[Any]:
-    """Rows of a tile, read, since mapped pages stay in memory; refuses changed files."""
+    """Rows of a tile, (stop - start,) structured; `RefineError` if the file has changed.
+
+    They are read, not mapped, since mapped pages would stay in memory.
+    """
     return _read(tile, tile.dtype, stop - start, tile.begin + start * tile.dtype.itemsize)
 
 
 def bytes_of(tile: Tile, start: int, stop: int) -> Iterator[NDArray[np.uint8]]:
-    """Bytes of a tile, some at a time; errors as in `rows_of`."""
+    """Yield the bytes of a tile from `start` to `stop`, some at a time; errors as in `rows_of`."""
     for begin in range(start, stop, _PIECE):
         yield _read(tile, np.dtype(np.uint8), min(_PIECE, stop - begin), begin)
 
@@ -128,7 +137,10 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
 
 
 def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
-    """All splats of some tiles, in files of a new folder: widest types, missing harmonics 0."""
+    """Copy all splats of some tiles to files of a new folder.
+
+    They get the widest types and the highest degree among the tiles; missing harmonics are 0.
+    """
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
     kinds = [splats_from_columns(np.empty(0, each)) for each in dtypes] if len(dtypes) > 1 else []
     pieces = [(tile, part.start, part.stop) for tile in tiles for part in chunks(tile.splats, ROWS)]

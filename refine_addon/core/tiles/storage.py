@@ -1,7 +1,7 @@
 """Files of tiles: on disks of this machine, or behind URLs, which fsspec opens.
 
-All functions raise `RefineError` if a file cannot be looked for, read or written; behind a URL
-`Interrupted`, since that may pass.
+All functions raise `RefineError` if a file cannot be looked for, read or written. For a URL it is
+`Interrupted`, since the storage may answer later.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from ..mapped import Interrupted
 from ..whole_file import Url, expanded, is_url
 
 _FLEETING = ("url", "access")
-"""In names of facts that change though the file does not: redirect targets, times of access."""
+"""In names of entries that change though the file does not: redirect targets, times of access."""
 
 _LOCAL = "file://"
 _NO_SUCH = "there is no such file"
 
 
 def located(path: Path | str) -> Path | Url:
-    """URL, or path with ``~`` replaced."""
+    """The URL, or the path with ``~`` replaced by the home folder."""
     return Url(path) if is_url(path) else expanded(path)
 
 
 def identity(path: Path | Url) -> str:
-    """Name of a file that is the same however the file is named."""
+    """Absolute URL of a file or folder, the same for all its names but hard links."""
     if isinstance(path, Url):
         with _opened(path, "cannot be looked for") as (system, inner):
             name: str = system.unstrip_protocol(inner)
@@ -45,7 +45,7 @@ def identity(path: Path | Url) -> str:
 
 
 def file_key(path: Path | Url) -> Hashable:
-    """Key that all names of an existing file share, hard links included."""
+    """Key that is the same for all names of an existing file, hard links included."""
     name = identity(path)
     if not name.startswith(_LOCAL):
         return name
@@ -55,7 +55,7 @@ def file_key(path: Path | Url) -> Hashable:
 
 
 def state(path: Path | Url) -> tuple[int, int | str]:
-    """Bytes of a file, and a time in ns or facts that change with its content."""
+    """Bytes of a file, and what changes with its content: a time in ns, or a storage's entries."""
     if not isinstance(path, Url):
         with _explained(path, "cannot be read"):
             status = path.stat()
@@ -64,21 +64,24 @@ def state(path: Path | Url) -> tuple[int, int | str]:
             raise RefineError(f"{path}: is a {kind}, expected a PLY file")
         return status.st_size, status.st_mtime_ns
     with _opened(path, "cannot be read") as (system, inner):
-        facts = system.info(inner)
-        if facts.get("type") == "directory":
+        info = system.info(inner)
+        if info.get("type") == "directory":
             raise RefineError(f"{path}: is a folder, expected a PLY file")
-        if facts.get("size") is None:
+        if info.get("size") is None:
             raise RefineError(f"{path}: the server does not say how long it is, which a tile needs")
         lasting = {
-            name: str(fact)
-            for name, fact in facts.items()
+            name: str(value)
+            for name, value in info.items()
             if not any(word in name.lower() for word in _FLEETING)
         }
-        return int(facts["size"]), repr(sorted(lasting.items()))
+        return int(info["size"]), repr(sorted(lasting.items()))
 
 
 def beginning(path: Path | Url, size: int, whole: int) -> bytes:
-    """First bytes of a file of `whole` bytes; refuses URLs that `array` would download entirely."""
+    """First `size` bytes of a file of `whole` bytes.
+
+    The last byte behind a URL is read, too, which fails where `array` would download the file.
+    """
     if not isinstance(path, Url):
         with _explained(path, "cannot be read"), path.open("rb") as stream:
             return stream.read(size)
@@ -93,7 +96,7 @@ def beginning(path: Path | Url, size: int, whole: int) -> bytes:
 
 
 def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
-    """Elements from byte `begin` on, and nothing else of the file; fewer where the file ends."""
+    """`count` elements from byte `begin` on, fewer if the file ends; nothing else is read."""
     if not isinstance(path, Url):
         with _explained(path, "cannot be read"):
             return np.fromfile(path, dtype, count, offset=begin)
@@ -107,9 +110,10 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
 
 @contextlib.contextmanager
 def new_folder(folder: Path | Url) -> Iterator[None]:
-    """Make a folder if it is missing; remove it if it is empty at the end.
+    """Make a folder if it is missing; remove it after the block if it is empty.
 
-    Behind a URL an empty file is written, moved and removed first, since long work follows.
+    Behind a URL, an empty file is written, moved and removed to see that this works, since long
+    work follows.
     """
     if not isinstance(folder, Url):
         with whole_file.new_folder(folder):
@@ -137,22 +141,22 @@ def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
             raise RefineError(f"{path}: exists already; choose another name, or set overwrite")
 
 
-def upload(made: Path, url: Url) -> None:
-    """Copy a file to a URL, unless one of that size is there."""
+def upload(file: Path, url: Url) -> None:
+    """Copy a file to a URL, unless one of the same size is there."""
     with _opened(url, "cannot be written") as (system, inner):
-        if not system.exists(inner) or system.size(inner) != made.stat().st_size:
-            system.put_file(str(made), inner)
+        if not system.exists(inner) or system.size(inner) != file.stat().st_size:
+            system.put_file(str(file), inner)
 
 
-def publish(made: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
+def publish(finished: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
     """`whole_file.publish` within one storage; refuses to replace unless `overwrite`."""
-    if isinstance(made, Path) and isinstance(path, Path):
-        whole_file.publish(made, path, overwrite=overwrite)
+    if isinstance(finished, Path) and isinstance(path, Path):
+        whole_file.publish(finished, path, overwrite=overwrite)
         return
     assert isinstance(path, Url)
     refuse_existing(path, overwrite=overwrite)
     with _opened(path, "cannot be written") as (system, inner):
-        system.mv(_split(Url(made))[1], inner)
+        system.mv(_split(Url(finished))[1], inner)
 
 
 def size_of(path: Path | Url) -> int | None:
@@ -171,7 +175,7 @@ def discard(url: Url) -> None:
 
 @contextlib.contextmanager
 def _opened(url: Url, problem: str) -> Iterator[tuple[Any, str]]:
-    """Yield the current file system of a URL, and the path there; see `_explained`."""
+    """Yield the file system of a URL, without cached listings, and the path there."""
     with _explained(url, problem):
         system, inner = _split(url)
         system.invalidate_cache()
@@ -191,7 +195,7 @@ def _split(url: Url) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def _explained(path: Path | Url, problem: str) -> Iterator[None]:
-    """Raise `RefineError` for any error of the storage; for a URL `Interrupted`: it may pass."""
+    """Raise `RefineError`, or `Interrupted` for a URL, in place of any error of the storage."""
     try:
         yield
     except (RefineError, MemoryError):

@@ -1,4 +1,4 @@
-"""Writing tiles: each into the folder of the job, and then all into their places."""
+"""Writing tiles: each into the folder of the job, then all renamed to their final names."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from . import storage
 from .source import ROWS, Tile, bytes_of, rows_of
 
 RENAMED = "renamed"
-"""Stage in which tiles are renamed; noted before the first: their bytes and times."""
+"""Stage in which tiles are renamed. Its result, noted before the first is, has their `_state`."""
 
 
 def waiting_in(job: Path) -> Path:
@@ -35,14 +35,14 @@ def waiting_in(job: Path) -> Path:
 
 @dataclass(frozen=True)
 class Kept:
-    """Kept splats of N, in files of the job."""
+    """Kept splats of all N, in files of the job."""
 
     keep: Mapped  # (N,)
     changed: Mapped  # rows of the kept splats with new values, ascending
     became: Splats | None  # these values
 
     def columns(self, rows: NDArray[Any], begin: int) -> Mapping[str, NDArray[Any]]:
-        """Columns of rows of a tile with their changes; `begin` splats are before them."""
+        """New values of rows of a tile, which are those of the scene from `begin` on."""
         if self.became is None:
             return {}
         first, end = (bisect_left(self.changed, row) for row in (begin, begin + len(rows)))
@@ -52,14 +52,17 @@ class Kept:
 
 
 def header_of(tile: Tile, kept: int) -> bytes:
-    """Header of a tile of which `kept` splats stay."""
+    """Header of the output of a tile that keeps `kept` splats."""
     header = with_count(b"".join(map(bytes, bytes_of(tile, 0, tile.header))), kept)
     return with_model(header, tile.model) if THIRD_SCALE in (tile.dtype.names or ()) else header
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """Places of a job's tiles in an existing `folder`, each under its own name; refuses doubles."""
+    """Outputs of a job in an existing `folder`, each with the name of its tile.
+
+    `RefineError` if two are one file, one is a tile, or one exists and is not to be replaced.
+    """
 
     job: Path
     tiles: Sequence[Tile]
@@ -87,7 +90,7 @@ class Outputs:
 
     @property
     def waiting(self) -> list[Path | Url]:
-        """Where tiles wait, in the same storage, until all are written."""
+        """Files in the same storage in which finished tiles wait until all are written."""
         if isinstance(self.folder, Url):
             name = self.job.name
             return [self.folder / f"{name}-{number:06d}" for number in range(len(self.tiles))]
@@ -102,17 +105,17 @@ class Outputs:
         }
 
     def write(self, kept: Kept, progress: Progress, threads: int | None) -> list[int]:
-        """Write each tile where it waits, unless it is in place; bytes of each."""
+        """Write each tile to its waiting file, unless it is in place; returns bytes of each."""
         sizes = self.in_place()
         numbers = [number for number in range(len(self.tiles)) if number not in sizes]
         work = partial(_write_tile, self.job, self.tiles, kept, self.waiting)
         cost = seconds("write", sum(self.tiles[number].splats for number in numbers))
-        made = run(work, numbers, progress=progress, what="writing", threads=threads, cost=cost)
-        sizes |= dict(zip(numbers, made, strict=True))
+        new = run(work, numbers, progress=progress, what="writing", threads=threads, cost=cost)
+        sizes |= dict(zip(numbers, new, strict=True))
         return [sizes[number] for number in range(len(self.tiles))]
 
     def publish(self) -> None:
-        """Rename all tiles not yet in place; none if another file is in the way from the start."""
+        """Rename all tiles not yet in place; none, and `Interrupted`, if a file is in the way."""
         there, before = self.in_place(), noted(self.job, RENAMED)[1]
         try:
             self._refuse_existing(there)
@@ -134,7 +137,7 @@ class Outputs:
                 storage.discard(place)
 
     def _refuse_existing(self, there: Mapping[int, int]) -> None:
-        """Raise `RefineError` if a tile could not get to its place."""
+        """Raise `RefineError` if a tile that is not in place could not be renamed to its target."""
         for number, target in enumerate(self.targets):
             if number in there:
                 continue
@@ -147,7 +150,7 @@ class Outputs:
                     )
 
     def _is_renamed(self, number: int, size: int, changed: int) -> bool:
-        """Whether a tile is in place; URLs' storages give renamed files another time."""
+        """Whether a tile is in place; behind URLs by its size, as renaming changes times there."""
         target, waiting = self.targets[number], self.waiting[number]
         if isinstance(target, Path):
             return target.is_file() and _state(target) == (size, changed)
@@ -155,7 +158,7 @@ class Outputs:
 
 
 def _write_tile(job, tiles, kept, places, number):
-    """Write a tile's kept rows, unless an earlier run has, and upload it: its bytes."""
+    """Write a tile's kept rows, unless an earlier run has, and upload it; returns its bytes."""
     waiting = waiting_in(job) / tiles[number].name
     if not waiting.exists():
         unfinished = waiting_in(job) / f"{number:06d}-{secrets.token_hex(8)}.tmp"
