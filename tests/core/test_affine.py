@@ -48,27 +48,33 @@ def seen(splats, where, degree):
 ROTATION = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
 
 
-def test_the_basis_is_orthonormal_over_the_sphere_with_the_signs_of_the_reference():
-    """A Gauss-Legendre x equidistant rule of 12 x 24 points integrates degree 8 exactly.
+def test_the_basis_holds_the_real_harmonics_with_the_signs_of_the_reference():
+    """From Legendre's polynomials, at (1, 2, 2) / 3 and (-6, 2, 3) / 7, degrees 0 to 4.
 
-    At (1, 2, 2) / 3, with the constants as printed in 3DGS code, degree 1 and 2.
+    Y = sqrt((2l + 1) / 4 pi (l - m)! / (l + m)!) (-sin)^m P_l^(m)(cos), times sqrt(2) cos or sin
+    of m phi for m > 0. Degree 1 in 3DGS code is -0.4886 y, 0.4886 z, -0.4886 x.
     """
-    z, weight = np.polynomial.legendre.leggauss(12)
-    phi = np.arange(24) * 2 * np.pi / 24
-    ring = np.sqrt(1 - z * z)[:, None]
-    points = np.stack([ring * np.cos(phi), ring * np.sin(phi), np.tile(z[:, None], 24)], axis=-1)
-    values = basis(points.reshape(-1, 3), 4)
-    x, y, z = 1 / 3, 2 / 3, 2 / 3
-    expected = np.append(0.28209479177387814, 0.4886025119029199 * np.array([-y, z, -x]))
-    second = [x * y, y * z, 2 * z * z - x * x - y * y, x * z, x * x - y * y]
-    constants = [1.0925484305920792, -1.0925484305920792, 0.31539156525252005,
-                 -1.0925484305920792, 0.5462742152960396]  # fmt: skip
-    gram = values.T @ (np.repeat(weight * 2 * np.pi / 24, 24)[:, None] * values)
+    for point in np.array([[1, 2, 2], [-6, 2, 3]]) / [[3], [7]]:
+        x, y, z = point
+        expected = []
+        for order in range(5):
+            for m in range(-order, order + 1):
+                size, legendre = abs(m), np.polynomial.legendre.Legendre.basis(order)
+                ratio = math.factorial(order - size) / math.factorial(order + size)
+                value = math.sqrt((2 * order + 1) / (4 * math.pi) * ratio) * (-1) ** size
+                value *= (legendre.deriv(size) if size else legendre)(z)
+                turn = complex(x, y) ** size
+                expected.append(value * (math.sqrt(2) * (turn.imag if m < 0 else turn.real)
+                                         if m else 1.0))  # fmt: skip
 
-    np.testing.assert_allclose(gram, np.eye(25), atol=1e-14)
-    found = basis(np.array([x, y, z]), 2)
-    np.testing.assert_allclose(found[:4], expected, rtol=1e-14)
-    np.testing.assert_allclose(found[4:], np.multiply(constants, second), rtol=1e-14)
+        np.testing.assert_allclose(basis(point, 4), expected, rtol=1e-12)
+        np.testing.assert_allclose(basis(point, 1)[1:], 0.4886025 * np.array([-y, z, -x]), 1e-6)
+
+
+def test_a_colour_is_a_half_where_all_coefficients_are_zero():
+    zero = np.zeros((3, 3)), np.zeros((3, 15, 3))
+
+    np.testing.assert_array_equal(colors(directions(3), *zero), 0.5)
 
 
 def test_colours_do_not_depend_on_how_harmonics_lie_in_memory():
