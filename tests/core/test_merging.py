@@ -400,3 +400,17 @@ def test_extreme_splats_raise_no_warning_and_stay_drawable():
             changed = result.splats.take(result.changed)
             assert all(np.isfinite(getattr(changed, name)).all() for name in ARRAYS)
             assert (opacity(changed.opacity_logits) < 1.0).all()
+
+
+def test_a_flattened_covariance_is_the_covariance_without_its_shortest_axis():
+    """The other two axes alone, from near spheres to discs and needles, over 24 decades of size."""
+    generator = np.random.default_rng(5)
+    deviations = 10.0 ** np.sort(generator.uniform(-3.0, 0.0, (200, 3)), axis=1)
+    deviations[:20, 0] = 1e-12
+    size = 10.0 ** generator.uniform(-12.0, 12.0, (200, 1))
+    roots = np.linalg.qr(generator.normal(size=(200, 3, 3)))[0] * deviations[:, None, :]
+    upper = (slice(None), *np.triu_indices(3))
+    whole = (roots @ roots.transpose(0, 2, 1))[upper]
+    expected = (roots[:, :, 1:] @ roots[:, :, 1:].transpose(0, 2, 1))[upper]
+
+    np.testing.assert_allclose(merging.flat(whole * size) / size, expected, atol=1e-8)
