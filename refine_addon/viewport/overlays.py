@@ -21,7 +21,8 @@ from .arrays import GOES, MARKS, STAYS, ramp
 
 _OPAQUE = 0.995  # Opacity from which on Blender draws a mesh with depth
 
-_COLORS = {"PROTECT": MARKS[STAYS], "REMOVE": MARKS[GOES], "KEEP": MARKS[GOES]}  # By role
+_COLORS = {"PROTECT": MARKS[STAYS], "REMOVE": MARKS[GOES], "KEEP": MARKS[STAYS]}
+"""Role of a volume -> colour of its edges, by what becomes of the splats inside."""
 
 _FILLED = {"SOLID", "TEXTURED"}  # Display types with drawn faces
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import tempfile
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -83,6 +85,24 @@ def command(addon, words):
     if not bpy.data.filepath:
         bpy.ops.wm.save_as_mainfile(filepath=tempfile.mkdtemp() + "/scene.blend")
     return addon.command.main(words, scene=True)
+
+
+def test_edges_of_volumes_are_violet_only_where_the_inside_goes(addon, monkeypatch):
+    """What *Keep Inside* holds stays, as what *Protect Inside* holds."""
+    overlays, drawn = addon.viewport.overlays, []
+    monkeypatch.setattr(overlays, "gpu", MagicMock())  # there is no graphics card
+    shape = lambda _kind, _ends, colors: lambda: drawn.append(tuple(colors[0, :3]))  # noqa: E731
+    monkeypatch.setattr(overlays, "_shape", shape)
+    for role in ("PROTECT", "REMOVE", "KEEP"):
+        volume(empty((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), role)
+    areas = (area for screen in bpy.data.screens for area in screen.areas)
+    space = next(area.spaces.active for area in areas if area.type == "VIEW_3D")
+    context = SimpleNamespace(space_data=space, scene=bpy.context.scene)
+
+    overlays.draw(context, mixed=False, has_depths=True)
+
+    green, violet = addon.viewport.arrays.MARKS.values()
+    assert drawn == [green, violet, green]
 
 
 @pytest.fixture
