@@ -50,8 +50,6 @@ def view_from_camera(
 ) -> View:
     """View of a camera object as Blender renders it, at the scene's size; named after the object.
     Imported ones keep their file's image size and, until moved or changed, its numbers."""
-    if obj.type != "CAMERA":
-        raise RefineError(f"object '{obj.name}': is of type {obj.type}, expected a camera")
     evaluated = obj.evaluated_get(depsgraph)
     data = evaluated.data if evaluated.is_evaluated else obj.data
     if data.type != "PERSP":
@@ -275,7 +273,7 @@ class CameraChoice:
         if self.source == "COLLECTION" and self.collection is None:
             raise RefineError("no cameras: choose the collection that holds them")
         context.view_layer.update()  # or the list of objects holds gaps where some were removed
-        cameras = [_active_camera(scene)] if self.source == "ACTIVE" else self.cameras(context)
+        cameras = [active_camera(scene)] if self.source == "ACTIVE" else self.cameras(context)
         if not cameras:
             where = {"SELECTED": "selected", "VISIBLE": f"visible in scene '{scene.name}'"}
             if self.collection:
@@ -337,7 +335,7 @@ def views_from_frames(
         for frame in frames:
             scene.frame_set(frame)
             depsgraph = context.evaluated_depsgraph_get()
-            view = view_from_camera(_active_camera(scene), scene, depsgraph)
+            view = view_from_camera(active_camera(scene), scene, depsgraph)
             if now is not None:
                 view = _against(view, splats, now, world_matrix(splats, depsgraph))
             views.append(replace(view, name=f"{view.name}, frame {frame}"))
@@ -369,11 +367,11 @@ def _turn(
     return turns[0] if alike else None
 
 
-def _active_camera(scene: bpy.types.Scene) -> bpy.types.Object:
-    if scene.camera is None:
+def active_camera(scene: bpy.types.Scene) -> bpy.types.Object:
+    """The active camera. `RefineError` without one; Blender lets any object be it."""
+    if scene.camera is None or scene.camera.type != "CAMERA":
         raise RefineError(
-            f"no cameras: scene '{scene.name}' has no active camera at frame "
-            f"{scene.frame_current}; set one, or choose other cameras"
+            f"no active camera at frame {scene.frame_current}: make a camera the active one"
         )
     return scene.camera
 

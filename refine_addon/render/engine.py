@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import main_thread
-from ..cameras import pose
+from ..cameras import active_camera, pose
 from ..core.affine import is_flat, transformed
 from ..core.errors import RefineError
 from ..core.execute import Cancelled, checked_by, checkpoint, report
@@ -85,7 +85,7 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
 
     def _picture(self, depsgraph: bpy.types.Depsgraph, shared: Shared) -> NDArray[np.float64]:
         scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
-        view, away = _place(depsgraph, self.camera_override or scene.camera, size)
+        view, away = _place(depsgraph, active_camera(scene), size)
         splats = _splats(depsgraph, view.center)
         camera = ViewSet((replace(view, center=view.center + away * view.rotation[2]),))
         view = _cropped(view, scene.render)
@@ -176,8 +176,7 @@ def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
 def refuse(scene: bpy.types.Scene) -> None:
     """Raise `RefineError` for scenes that cannot be rendered."""
     label = f"scene '{scene.name}'"
-    if scene.camera is None:
-        raise RefineError(f"{label}: has no camera; add one, or make one the active camera")
+    active_camera(scene)
     instanced = {obj.instance_collection for obj in bpy.data.objects} - {None}
     members = [member for collection in instanced for member in collection.all_objects]
     if not any(meshes.drawn_by_us(obj) for obj in (*scene.objects, *members)):
@@ -188,17 +187,18 @@ def refuse(scene: bpy.types.Scene) -> None:
 
 def left_out(scene: bpy.types.Scene) -> list[str]:
     """Sentences on scene settings that a render with splats ignores."""
-    render, told = scene.render, []
-    asked = {"depth of field": scene.camera.data.dof.use_dof, "motion blur": render.use_motion_blur}
-    if blurred := [name for name, is_asked in asked.items() if is_asked]:
-        told.append(f"Splats are drawn without {' and '.join(blurred)}")
+    render, sentences = scene.render, []
+    dof = getattr(scene.camera and scene.camera.data, "dof", None)  # the camera may be gone by now
+    blurs = {"depth of field": dof and dof.use_dof, "motion blur": render.use_motion_blur}
+    if blurred := [name for name, is_on in blurs.items() if is_on]:
+        sentences.append(f"Splats are drawn without {' and '.join(blurred)}")
     new = hasattr(scene, "compositing_node_group")  # since 5.0
     nodes = scene.compositing_node_group if new else scene.use_nodes and scene.node_tree
     if render.use_compositing and nodes:
-        told.append("Compositing nodes are left out")
+        sentences.append("Compositing nodes are left out")
     if sum(layer.use for layer in scene.view_layers) > 1:
-        told.append("Of several view layers the first is rendered")
-    return told
+        sentences.append("Of several view layers only the first is rendered")
+    return sentences
 
 
 def steps(

@@ -17,6 +17,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras import active_camera
 from ..core.execute import Cancelled
 from ..core.images import read_exr
 from ..core.pictures import Layers, in_order
@@ -120,7 +121,7 @@ class Meshes:
                 opaque = yield from self._rendered(self._meshes, frame, "opaque")
             files.append((opaque, opaque))
         world = (yield from self._rendered(self._world, frame, "world")) if self._world else None
-        far = min(_FARTHEST * existing(self._any).camera.data.clip_end, _INFINITE)
+        far = min(_FARTHEST * active_camera(existing(self._any)).data.clip_end, _INFINITE)
         with ThreadPoolExecutor(1, "refine-render") as pool:
             future = pool.submit(_layers_of, files, world, far)
             while not wait([future], _MOMENT).done:

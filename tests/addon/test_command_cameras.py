@@ -127,7 +127,7 @@ def test_what_is_refused_and_a_dry_run_change_nothing(addon, tmp_path, capsys, u
         scene.collection.objects.link(bpy.data.objects.new(name, data))
     unchanged.start()
     for name, source, options, expected in (
-        ("room", "ACTIVE", [], "room: no cameras: scene 'Scene' has no active camera"),
+        ("room", "ACTIVE", [], "room: no active camera at frame"),
         ("room", "ACTIVE", ["--source", "frames:1:2"], "no active camera at frame 1"),
         ("room", "COLLECTION", [], "room: no cameras: choose the collection"),
         ("room", "COLLECTION", ["--source", "collection:fwe"],

@@ -295,7 +295,7 @@ def test_the_pictures_are_those_of_what_apply_leaves(addon, few, room_cameras, m
     scene.refine.method, scene.refine.views = method, 16
     assert not bpy.ops.refine.compare.poll()
     bpy.ops.refine.score()
-    with pytest.raises(RuntimeError, match="has no active camera"):
+    with pytest.raises(RuntimeError, match="no active camera"):
         bpy.ops.refine.compare()
     scene.camera, measured = room_cameras.objects[24], addon.ui.operators.measured
     before, told = splats_of(addon, few), measured(few, scene.refine)

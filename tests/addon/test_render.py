@@ -226,7 +226,8 @@ def test_a_movie_is_written_as_one_file(shot, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda scene: setattr(scene, "camera", None), "has no camera"),
+        (lambda scene: setattr(scene, "camera", None), "no active camera at frame 1"),
+        (lambda scene: setattr(scene, "camera", bpy.data.objects["room"]), "no active camera"),
         (lambda scene: setattr(scene.camera.data, "type", "PANO"), "is a panorama"),
         (lambda scene: setattr(scene.camera, "scale", (0.0, 0.0, 0.0)), "is sheared or flat"),
         (lambda scene: setattr(scene.render, "use_multiview", True), "not drawn in stereo"),
@@ -240,6 +241,18 @@ def test_what_cannot_be_rendered_is_said_and_nothing_is_left(shot, change, messa
         bpy.ops.refine.render()
     assert settings(shot) == before
     assert not hasattr(bpy.types, "REFINE_engine")
+
+
+def test_a_camera_that_goes_as_a_render_ends_is_no_error(shot):
+    def drop(*_):
+        shot.camera = None
+
+    bpy.app.handlers.render_complete.append(drop)
+    try:
+        assert bpy.ops.refine.render() == {"FINISHED"}
+    finally:
+        bpy.app.handlers.render_complete.remove(drop)
+    assert shot.camera is None
 
 
 def test_a_render_that_is_stopped_leaves_nothing(addon, shot, monkeypatch):
@@ -309,4 +322,4 @@ def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys)
     shot.camera = None
     code, told = main("--source", "frames")
     assert code == 1
-    assert "has no camera" in told.err
+    assert "no active camera" in told.err

@@ -161,7 +161,7 @@ def test_blender_lives_on_where_an_operator_that_waits_refuses(binary: Binary, b
 
     assert found.pop("not tried") == ["refine.watch_render"]
     said = {what: text for what, (text, _) in found.items()}
-    assert "has no camera" in said.pop("render: no camera")
+    assert "no active camera" in said.pop("render: no camera")
     assert "has no splats" in said.pop("render: no splats")
     assert "in stereo" in said.pop("render: stereo")
     assert "got 2 files" in said.pop("import_cameras")
