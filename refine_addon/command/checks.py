@@ -111,7 +111,7 @@ def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
 def _refuse_report(options: argparse.Namespace, made: Sequence[Path | Url]) -> None:
     """Refuse a report that would replace an input or output, even with --overwrite."""
     report, pictures = options.report, options.pictures
-    others = [*options.inputs, *made, options.output, options.cameras, options.blend]
+    others = [*options.inputs, *made, options.output, options.cameras, options.blend, pictures]
     path = os.path.realpath(report)
     for other in filter(None, others):
         # Unlike pathlib's, these two never fail, whatever the name.

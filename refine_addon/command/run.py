@@ -38,22 +38,23 @@ def complain(text: str) -> None:
     _write("stderr", f"{start}refine: error: {printable(text)}\n")
 
 
-def flush() -> None:
-    """Flush argparse's help; its reader may be gone."""
-    _write("stdout", "")
+def flush() -> bool:
+    """Flush argparse's help; whether it could not be written."""
+    return _write("stdout", "")
 
 
 class Terminal:
-    """Output of a run; `quiet`: errors only."""
+    """Output of a run; `quiet`: errors only. `failed`: some of it could not be written."""
 
     def __init__(self, *, quiet: bool) -> None:
+        self.failed = False
         self._quiet = quiet
         self._draws = not quiet and _is_terminal(sys.stderr)
 
     def say(self, *lines: str) -> None:
         """Print lines, unless quiet."""
         if not self._quiet:
-            _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
+            self.failed |= _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
 
     def draw(self, text: str) -> None:
         """Show a line until the next replaces it; on terminals only."""
@@ -147,14 +148,14 @@ class Run:
             complain(message)
 
     def finish(self) -> bool:
-        """Write the report if wanted; whether an input failed."""
+        """Write the report if wanted; whether an input or the output failed."""
         options, seconds = self.options, time.perf_counter() - self._started
         done = [entry for entry in self.entries if entry["status"] == "done"]
         if options.report is not None:
             made = [entry for entry in done if options.save or entry.get("files", {}).get("output")]
             splats = bool(made) and not options.dry_run
             _write_report(options.report, self.entries, seconds, options.overwrite, splats)
-        return len(done) < len(self.entries)
+        return len(done) < len(self.entries) or self.terminal.failed
 
     def _named(self, name: str) -> str:
         count = len(self._sizes)
@@ -197,16 +198,20 @@ def _is_terminal(stream: TextIO | None) -> bool:
     return stream is not None and stream.isatty()
 
 
-def _write(name: Literal["stdout", "stderr"], text: str) -> None:
+def _write(name: Literal["stdout", "stderr"], text: str) -> bool:
+    """Write text; whether standard output failed. A reader that has left is no failure."""
     stream: TextIO | None = getattr(sys, name)
     if stream is None:  # closed before Python began
-        return
+        return False
     try:
         stream.write(text)
         stream.flush()
     except UnicodeEncodeError:  # a name that this terminal's encoding cannot show
-        _write(name, text.encode("ascii", "backslashreplace").decode())
-    except OSError:
-        # Whoever read this has gone, or its disk is full: the work goes on. Python would try once
-        # more as it exits, and make that the exit code.
+        return _write(name, text.encode("ascii", "backslashreplace").decode())
+    except OSError as error:
+        # The work goes on. Python would flush again at exit and set an exit code of its own.
         setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        if name == "stdout" and not isinstance(error, BrokenPipeError):
+            complain(f"standard output: {reason_of(error)}")
+            return True
+    return False

@@ -49,8 +49,7 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
         _run(work)
         return int(work.finish())
     except SystemExit as leaving:  # argparse leaves the process; Blender wants a number
-        flush()
-        return int(leaving.code or 0)
+        return int(flush() or leaving.code or 0)
     except (RefineError, OSError, MemoryError) as error:
         complain(described(error))
     return 1
