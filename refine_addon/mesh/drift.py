@@ -1,6 +1,7 @@
-"""Drift: Blender moved positions, but not scales, rotations and harmonics.
-*Apply*, *Join*, mirror modifiers and transforms in edit mode do so. Each splat notes where it was
-when these were written; the note stays with its vertex in Blender and in files."""
+"""Drift: positions moved while scales, rotations and harmonics stayed.
+Blender's *Apply*, *Join*, mirror modifiers and transforms in edit mode cause it. Each splat notes
+where it was when its scales, rotation and harmonics were written. The notes are point attributes,
+which Blender keeps with their vertices, also in files."""
 
 from __future__ import annotations
 
@@ -17,40 +18,41 @@ from ..core.formats.ply_columns import THIRD_SCALE
 from . import attributes as mesh_attributes
 from .layout import ROTATION, SCALE, has, is_native, sh_degree
 
-HOME = "refine_home"  # Point vector: position when scales, rotation and harmonics were written
+HOME = "refine_home"
+"""Point vector: the splat's position when its scales, rotation and harmonics were written."""
 
 SHAPE = "refine_shape"
-"""Point integer by bits, 0 without a note: 3 degree of the object's harmonics; 13 the object
-(checksum of positions); 16 checksum of the splat's scales and rotation, to see them change."""
+"""Point integer, 0 without a note. From the lowest bit: 3 bits SH degree of the splat's object,
+13 bits its object (checksum of positions), 16 bits checksum of the splat's scales and rotation."""
 
 _DEGREE, _OBJECT, _ORIGIN, _CHECKSUM = 0x7, 0xFFF8, 0xFFFF, 16
-"""Bits of `SHAPE`: degree, object, both; and the checksum's shift."""
+"""Masks of `SHAPE`: degree, object, both; and the shift of the checksum."""
 
 _MIX = np.uint32(0x9E3779B1)
 """Odd number near 2^32 over the golden ratio, for multiplicative hashing."""
 
-_FEW, _FEW_SHARE = 100, 0.01  # Splats that may each move without a warning: number, share of all
+_FEW, _FEW_SHARE = 100, 0.01  # Splats moved singly without a warning: number, share of all
 
-_SHOWN = 1 << 15  # Splats sampled evenly for the panel's text
+_SAMPLE = 1 << 15  # Splats looked at for the panel's text, spread evenly
 
 
 class Drift(NamedTuple):
-    """Sentences on what others did to splats; whether Mend Splats helps."""
+    """Sentences on drift (`told`), and whether Mend Splats repairs it."""
 
     told: list[str]
     mendable: bool
 
 
 class Mending(NamedTuple):
-    """Repair: `moves`, the maps that only positions followed, with their splats; `regrouped`, (N,),
-    the degree under whose names a splat's harmonics stand, 0 where it is right."""
+    """What repairs drift. `moves`: maps that positions alone followed, with their splats;
+    `regrouped`: (N,) SH degree under whose attribute names a splat's harmonics are, 0 if right."""
 
     moves: list[Move]
     regrouped: NDArray[np.int64]
 
 
 def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Note that all splats of a mesh are as they should be."""
+    """Note the present state of all splats as free of drift."""
     position = mesh_attributes.read_attribute(mesh, "position")
     mesh_attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", position)
     number = (zlib.crc32(position.data) << 3 & _OBJECT) or 1 << 3
@@ -59,76 +61,68 @@ def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
 
 
 def is_stamped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
-    """Whether a mesh has notes of its splats' positions."""
+    """Whether a mesh has notes."""
     return has(mesh, HOME, "FLOAT_VECTOR") and has(mesh, SHAPE, "INT")
 
 
 def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
-    """Drift of a mesh; None without changes or notes.
-    10 ms per million splats if nothing changed; else counts are estimates from a sample."""
+    """Drift of a mesh; None without drift or notes. Counts are estimates from a sample.
+    Takes 10 ms per million splats if nothing changed."""
     if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
         return None
-    moves, looked, loose = notes.moves(max(1, len(notes.codes) // _SHOWN))
-    share = len(notes.codes) / max(looked, 1)
-    turned, bent = (round(share * n) for n in (sum(len(move.rows) for move in moves), loose))
+    moves, sampled, single = notes.moves(max(1, len(notes.codes) // _SAMPLE))
+    share = len(notes.codes) / max(sampled, 1)
+    moved, bent = (round(share * n) for n in (sum(len(move.rows) for move in moves), single))
     strangers = int(np.count_nonzero(notes.codes == 0))
     regrouped = int(np.count_nonzero(notes.regrouped()))
-    told = []
-    if turned:
-        mirrored = any(np.linalg.det(move.matrix[:3, :3]) < 0.0 for move in moves)
-        joined = len(notes.objects()) > 1
-        how = "joined" if joined else "mirrored" if mirrored else "transformed"
-        told.append(
-            f"{turned:,} splats were {how} without their sizes, rotations and colours, "
-            "as Blender's own tools do"
+    sentences = []
+    if moved:
+        sentences.append(
+            f"{moved:,} splats were transformed without their sizes, rotations and colours, "
+            "as by Blender's own Apply, Join, Mirror or edit mode"
         )
     if regrouped:
-        told.append(
+        sentences.append(
             f"{regrouped:,} splats were joined with others of another SH degree: their "
             "colours are mixed up"
         )
     if bent > max(_FEW, _FEW_SHARE * len(notes.codes)):
-        told.append(
-            f"{bent:,} splats were moved each by itself, as by a modifier, without their "
-            "sizes and rotations: undo that, or Mend Splats takes it as it is"
+        sentences.append(
+            f"{bent:,} splats were moved one by one, as by a modifier, without their sizes "
+            "and rotations: undo that, or accept it by Mend Splats"
         )
-    mendable = bool(told)
+    mendable = bool(sentences)
     if strangers:
-        told.append(
-            f"{strangers:,} vertices that are no splats, or of an object never seen here, "
-            "were joined: undo that"
+        sentences.append(
+            f"{strangers:,} vertices were joined that are no splats, or of an object that "
+            "REFINE never saw: undo that"
         )
-    return Drift(told, mendable) if told else None
+    return Drift(sentences, mendable) if sentences else None
 
 
 def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Callable[[], Mending] | None:
-    """Read the notes now; a thread-safe callable computes the repair. None if nothing changed."""
+    """Read the notes now; return a thread-safe callable that computes the repair, None if nothing
+    changed."""
     if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
         return None
     return lambda: Mending(notes.moves()[0], notes.regrouped())
 
 
 def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Renew the notes of splats whose scales and rotations were just written, as by merging."""
-    if not is_stamped(mesh):
-        return
-    notes, checksums = _Notes(mesh), _checksums(_shapes(mesh))
-    rows = notes.codes >> _CHECKSUM != checksums
-    notes.home[rows] = notes.position[rows]
-    codes = np.where(rows, checksums << _CHECKSUM | notes.codes & _ORIGIN, notes.codes)
-    mesh_attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", notes.home)
-    mesh_attributes.write_attribute(mesh, SHAPE, "INT", codes.view(np.int32))
+    """Note all splats anew after some were merged, unless others drifted before that."""
+    if is_stamped(mesh) and found(mesh) is None:
+        stamp(mesh)
 
 
 class _Notes:
-    """Notes of a mesh and its present values, for any thread."""
+    """Notes and present values of a mesh, read once, usable on any thread."""
 
     def __init__(self, mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
         self.home, self.position, codes = (
             mesh_attributes.read_attribute(mesh, name) for name in (HOME, "position", SHAPE)
         )
         self.codes = codes.view(np.uint32)
-        # Names of harmonics in Blender's own splats do not depend on the degree.
+        # In Blender's own splats the attribute names of harmonics do not depend on the degree.
         self.degree = None if is_native(mesh) else sh_degree(mesh)
         origins = self.codes & _ORIGIN
         self.undisturbed = bool(
@@ -138,40 +132,38 @@ class _Notes:
         )
         self.shapes = [] if self.undisturbed else _shapes(mesh)
 
-    def objects(self) -> list[int]:
-        """Numbers of the objects that the splats came from."""
-        return [int(number) for number in np.unique(self.codes & _OBJECT) if number]
-
     def moves(self, step: int = 1) -> tuple[list[Move], int, int]:
-        """Maps that splats did not follow, from one of `step`; numbers looked at and moved alone.
-        These go with most of their object."""
+        """Maps that positions alone followed, from every `step`-th splat; number of these splats,
+        and of those moved singly, which are put to the map of most splats of their object."""
         rows = np.arange(0, len(self.codes), step)
-        looked, codes = len(rows), self.codes[rows]
+        sampled, codes = len(rows), self.codes[rows]
         rows = rows[(codes >> _CHECKSUM == _checksums(self.shapes, step)) & (codes != 0)]
-        found, lost = [], 0
-        for number in self.objects():
-            own = rows[self.codes[rows] & _OBJECT == number]
+        all_moves, single = [], 0
+        objects = self.codes[rows] & _OBJECT
+        for number in np.unique(objects):
+            own = rows[objects == number]
             home, position = self.home[own], self.position[own]
             moves = affine_moves(home, position)
             finite = np.isfinite(home + position).all(axis=1)
-            lost += int(np.count_nonzero(finite)) - sum(len(move.rows) for move in moves)
+            single += int(np.count_nonzero(finite)) - sum(len(move.rows) for move in moves)
             most = np.argmax([len(move.rows) for move in moves]) if moves else 0
             labels = np.full(len(own), most)
             for label, move in enumerate(moves):
                 labels[move.rows] = label
-            found += [Move(own[labels == label], m.matrix) for label, m in enumerate(moves)]
-        still = np.eye(3)  # or shifted alike
-        return [m for m in found if not np.array_equal(m.matrix[:3, :3], still)], looked, lost
+            all_moves += [Move(own[labels == label], m.matrix) for label, m in enumerate(moves)]
+        no_turn = np.eye(3)  # shifts need no repair
+        turns = [move for move in all_moves if not np.array_equal(move.matrix[:3, :3], no_turn)]
+        return turns, sampled, single
 
     def regrouped(self) -> NDArray[np.int64]:
-        """The degree under whose names each splat's harmonics stand, 0 where it is right."""
+        """SH degree under whose attribute names each splat's harmonics are, (N,), 0 if right."""
         degrees = np.asarray(self.codes & _DEGREE, np.int64)
         degrees[degrees == self.degree] = 0
         return degrees if self.degree is not None else np.zeros_like(degrees)
 
 
 def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.float32]]:
-    """Attributes with scales and rotations, (N,) or (N, width) each."""
+    """Attributes that hold scales and rotations, (N,) or (N, width) each."""
     names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
     if THIRD_SCALE not in mesh.attributes:  # discs
         names.remove(THIRD_SCALE)
@@ -181,7 +173,7 @@ def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.floa
 
 
 def _checksums(shapes: Sequence[NDArray[np.float32]], step: int = 1) -> NDArray[np.uint32]:
-    """16-bit checksums of scales and rotation of one splat of `step`."""
+    """16-bit checksums of the scales and rotation of every `step`-th splat."""
     total = np.zeros(len(range(0, len(shapes[0]), step)), np.uint32)
     for values in shapes:
         for plane in values[::step].reshape(len(total), -1).T:

@@ -168,7 +168,7 @@ def test_join_of_blender_is_named_and_mended(addon, make_splats, tmp_path, stand
     bpy.ops.object.join()
     told = told_of(addon, one)
     assert bpy.ops.refine.mend() == {"FINISHED"}
-    assert "200 splats were joined without their sizes, rotations and colours" in told[0]
+    assert "200 splats were transformed without their sizes, rotations and colours" in told[0]
     assert ("another SH degree" in " ".join(told)) == (degrees[0] != degrees[1])
     assert_alike(stand(one), expected)
     assert told_of(addon, one) == []
@@ -213,7 +213,7 @@ def test_an_applied_mirror_is_mended(addon, imported, stand, merge):
     (told,) = told_of(addon, imported)
     assert bpy.ops.refine.mend() == {"FINISHED"}
 
-    assert "splats were mirrored" in told
+    assert "splats were transformed" in told
     assert (merged >= 6) == bool(merge)
     assert told_of(addon, imported) == []
     rows = addon.mesh.attributes.read_attribute(imported.data, "row")
@@ -231,7 +231,7 @@ def test_splats_that_are_bent_and_what_is_no_splat_are_named(addon, imported):
     """No map explains them, and the click takes them; a few that are moved are not mentioned."""
     checked = addon.mesh.layout.check(imported)
     places = addon.mesh.attributes.read_attribute(imported.data, "position")
-    for share, said in ((0.005, []), (0.5, ["4,970 splats were moved each by itself"])):
+    for share, said in ((0.005, []), (0.5, ["4,970 splats were moved one by one"])):
         which = np.arange(COUNT) < share * COUNT
         bent = places + which[:, None] * np.sin(7.0 * places[:, ::-1])
         set_places(imported, bent)
@@ -245,7 +245,7 @@ def test_splats_that_are_bent_and_what_is_no_splat_are_named(addon, imported):
     select(imported, bpy.context.object)
     bpy.ops.object.join()
     (told,) = told_of(addon, imported)
-    assert "8 vertices that are no splats" in told
+    assert "8 vertices were joined that are no splats" in told
     assert not addon.ui.transforms.of(imported).mendable
 
 
