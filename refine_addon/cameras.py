@@ -1,6 +1,6 @@
-"""Blender cameras to views and back, the only place that flips axes; and the sets of cameras that a
-user can choose.
-Blender's camera looks along -z with y up, a view along +z with y down."""
+"""Blender cameras to views and back, and the sets of cameras that a user can choose.
+Axes are flipped here only: Blender's camera looks along -z with y up, a view along +z with y
+down."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .mesh.layout import LAYOUT, is_native
 
 WEIGHT = "refine_weight"  # Custom property of a camera object: the weight of its view, 1 without it
 
-SOURCE = "refine_view"  # Custom property of an imported camera: the file's view, exact, as JSON
+SOURCE = "refine_view"  # Custom property of an imported camera: its view in the file, exact, JSON
 
 UPRIGHT = np.eye(4)
 UPRIGHT[:3, :3] = QUARTER
@@ -33,23 +33,23 @@ SENSOR = 36.0
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
-_RESIDUE = 3e-7  # Error that float32 leaves in the zeros and ones of a quarter turn
+_RESIDUE = 3e-7  # Largest error of float32 in the zeros and ones of a quarter turn
 
 SHEAR = 1e-4  # Largest deviation of a camera's axes from orthonormal
 
 _SIZES = ("fx", "fy", "cx", "cy", "width", "height")
-_NOTED = (*_SIZES, *["rotation", "center", "near", "far", "matrix", "lens", "clip", "upright"])
+_FIELDS = (*_SIZES, *["rotation", "center", "near", "far", "matrix", "lens", "clip", "upright"])
 
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.01, 1000.0
 
-_FEW = 16  # Cameras looked at, at most, to tell whether all are to be turned
+_FEW = 16  # Cameras looked at, at most, to know whether all must be turned
 
 
 def view_from_camera(
     obj: bpy.types.Object, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
 ) -> View:
-    """View of a camera object as Blender renders it, at the scene's size; named after the object.
-    Imported ones keep their file's image size and, until moved or changed, its numbers."""
+    """View of a camera object as Blender renders it, at the scene's size, named after the object.
+    Of an imported camera the image size and all unchanged numbers are those of the file."""
     evaluated = obj.evaluated_get(depsgraph)
     data = evaluated.data if evaluated.is_evaluated else obj.data
     if data.type != "PERSP":
@@ -75,7 +75,7 @@ def view_from_camera(
     )
     if not source:
         return view
-    changes: dict[str, Any] = {}  # the file's own numbers wherever nothing was changed
+    changes: dict[str, Any] = {}  # the file's own numbers, for all that is unchanged
     if np.array_equal(matrix, np.array(source["matrix"])):
         changes.update(rotation=np.array(source["rotation"]), center=np.array(source["center"]))
     if _lens(data) == source["lens"]:
@@ -87,7 +87,7 @@ def view_from_camera(
 
 
 def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
-    """Rendered size, pixels, and a pixel's height over its width."""
+    """Width and height of renders, pixels, and a pixel's height over its width."""
     render = scene.render
     width = max(render.resolution_x * render.resolution_percentage // 100, 1)
     height = max(render.resolution_y * render.resolution_percentage // 100, 1)
@@ -95,8 +95,9 @@ def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
 
 
 def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArray[np.float64]:
-    """An object's matrix to the world, (4, 4), quarter turns exact: float32 leaves 4e-8 at zeros.
-    `RefineError` if it is not evaluated (disabled, excluded), and animated or constrained."""
+    """An object's matrix to the world, (4, 4), with quarter turns made exact.
+    `RefineError` if Blender does not evaluate it (disabled, excluded) though it is animated or
+    constrained."""
     evaluated = obj.evaluated_get(depsgraph)
     if evaluated.is_evaluated:
         return snapped(np.array(evaluated.matrix_world, np.float64))
@@ -114,8 +115,8 @@ def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArr
 
 
 def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
-    """Camera object with a view's frame, in no collection; `upright` turns it by `UPRIGHT`.
-    The render size must have the view's aspect; of pixels that are not square, fx counts."""
+    """New camera object of a view, in no collection; `upright`: turned by `UPRIGHT`.
+    Frames the view's image if the render size has its aspect; uses fx where fy differs."""
     view = view.turned(QUARTER) if upright else view
     name = PurePosixPath(view.name).name or "view"
     data = bpy.data.cameras.new(name)
@@ -137,19 +138,19 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     obj.location = view.center
     if view.weight != 1.0:
         obj[WEIGHT] = view.weight
-    # The view, and what Blender's float32 made of it, to tell if it is touched.
-    noted = {name: getattr(view, name) for name in ("near", *_SIZES)}
-    noted |= {"rotation": view.rotation.tolist(), "center": view.center.tolist()}
-    noted["far"] = view.far if math.isfinite(view.far) else None
-    noted["matrix"] = snapped(np.array(obj.matrix_basis, np.float64)).tolist()
-    noted |= {"lens": _lens(data), "clip": [data.clip_start, data.clip_end], "upright": upright}
-    obj[SOURCE] = json.dumps(noted)
+    # The view, and Blender's float32 values of it, by which changes are noticed.
+    source = {name: getattr(view, name) for name in ("near", *_SIZES)}
+    source |= {"rotation": view.rotation.tolist(), "center": view.center.tolist()}
+    source["far"] = view.far if math.isfinite(view.far) else None
+    source["matrix"] = snapped(np.array(obj.matrix_basis, np.float64)).tolist()
+    source |= {"lens": _lens(data), "clip": [data.clip_start, data.clip_end], "upright": upright}
+    obj[SOURCE] = json.dumps(source)
     return obj
 
 
 def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -> int | None:
-    """Quarters about x (0, 1, -1) that put an imported camera back as in its file, else None.
-    `axes`: (3, 3) rotation to the world of an object that holds splats as their file does."""
+    """Quarter turns about x (0, 1, -1) that turn an imported camera as its file has it; None if
+    none does. `axes`: (3, 3) rotation to the world of an object with splats as in their file."""
     source = _source(obj)
     if not source:
         return None
@@ -167,7 +168,7 @@ def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) ->
     fit = data.sensor_fit
     if fit == "AUTO":
         fit = "HORIZONTAL" if width >= height * aspect else "VERTICAL"
-    # AUTO always means the sensor's width, laid along the image's longer side.
+    # AUTO uses the sensor's width along the image's longer side.
     sensor = data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width
     fitted = width if fit == "HORIZONTAL" else height * aspect
     focal = data.lens / sensor * fitted
@@ -182,8 +183,8 @@ def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) ->
 
 
 def pose(name: str, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """World-to-camera rotation and centre of a (4, 4) camera-to-world matrix with Blender's axes.
-    Its scale is ignored; `RefineError` if it is sheared or flat."""
+    """World-to-camera rotation, (3, 3), and centre, (3,), of a (4, 4) camera-to-world matrix with
+    Blender's axes. Its scale is ignored; `RefineError` if it is sheared or flat."""
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     axes = matrix[:3, :3] / np.where(lengths > 0.0, lengths, 1.0)
     if lengths.min() <= 0.0 or np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:
@@ -206,7 +207,7 @@ def _weight(obj: bpy.types.Object) -> float:
 
 
 def snapped(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A (4, 4) matrix, its linear part made exact if it is quarter turns and a scale."""
+    """A (4, 4) matrix, its linear part made exact if it is quarter turns times a scale."""
     linear = matrix[:3, :3]
     scale = np.abs(linear).max()
     signs = np.round(linear / (scale or 1.0))
@@ -226,17 +227,17 @@ def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
         return None
     try:
         source = json.loads(obj[SOURCE])
-        return {name: source[name] for name in _NOTED}
+        return {name: source[name] for name in _FIELDS}
     except (TypeError, ValueError, KeyError):
         raise RefineError(
-            f"camera '{obj.name}': custom property {SOURCE} is damaged; delete it, and the camera "
-            "is used as Blender shows it"
+            f"camera '{obj.name}': custom property {SOURCE} is damaged; delete it to use the "
+            "camera as Blender shows it"
         ) from None
 
 
 @dataclass(frozen=True)
 class CameraChoice:
-    """The cameras that decide, as panel and command name them and a .blend keeps them.
+    """Which cameras of a scene decide; `source`: VISIBLE, ACTIVE, SELECTED, COLLECTION or FRAMES.
     COLLECTION uses `collection` with its children, hidden or not; FRAMES uses `frames`."""
 
     source: str
@@ -250,7 +251,7 @@ class CameraChoice:
         return cls(settings.source, settings.collection, settings.to_frames(scene))
 
     def cameras(self, context: bpy.types.Context) -> list[bpy.types.Object]:
-        """The cameras, of any type; for FRAMES all of the scene. Quick enough to draw."""
+        """The cameras, of any lens type; for FRAMES all of the scene. Cheap enough to draw."""
         layer = context.view_layer
         if self.source == "ACTIVE":
             objects = [context.scene.camera]
@@ -266,13 +267,13 @@ class CameraChoice:
         return cameras
 
     def views(self, context: bpy.types.Context, splats: bpy.types.Object | None = None) -> ViewSet:
-        """Views of these cameras, one at least; `splats` as in `views_from_frames`."""
+        """Views of these cameras, at least one; `splats` as in `views_from_frames`."""
         scene = context.scene
         if self.source == "FRAMES":
             return views_from_frames(context, self.frames, splats)
         if self.source == "COLLECTION" and self.collection is None:
             raise RefineError("no cameras: choose the collection that holds them")
-        context.view_layer.update()  # or the list of objects holds gaps where some were removed
+        context.view_layer.update()  # else the list of objects may hold None for removed ones
         cameras = [active_camera(scene)] if self.source == "ACTIVE" else self.cameras(context)
         if not cameras:
             where = {"SELECTED": "selected", "VISIBLE": f"visible in scene '{scene.name}'"}
@@ -287,8 +288,8 @@ class CameraChoice:
 
 
 def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
-    """Quarters about x that deciding cameras must turn (`ViewSet.turn`); 0 if unknown or a shot.
-    Known from how splats and cameras were imported; the context must be evaluated."""
+    """Quarter turns about x that the deciding cameras need to fit the splats (`ViewSet.turn`), from
+    how both were imported; 0 if unknown or for FRAMES. The context must be evaluated."""
     choice = CameraChoice.of_scene(context.scene)
     if choice.source == "FRAMES":
         return 0
@@ -298,7 +299,7 @@ def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
     try:
         views = [view_from_camera(camera, context.scene, depsgraph) for camera in cameras]
         return (_turn(cameras, views, splats, depsgraph) if cameras else None) or 0
-    except RefineError:  # which scoring reports
+    except RefineError:  # scoring reports it
         return 0
 
 
@@ -309,7 +310,7 @@ def create_cameras(
     spread = float(np.sqrt(np.mean(np.var(views.centers, axis=0))))
     cameras = [camera_from_view(view, upright=upright) for view in views]
     for camera in cameras:
-        # Small enough to tell neighbours apart; a millimetre at least, to be seen at all.
+        # Smaller than the distance of neighbours, but at least 1 mm.
         camera.data.display_size = min(max(0.1 * spread, 1e-3), 1.0) if len(views) > 1 else 0.25
         collection.objects.link(camera)
     return cameras
@@ -321,8 +322,8 @@ def views_from_frames(
     splats: bpy.types.Object | None = None,
 ) -> ViewSet:
     """Views of the active camera at each frame; markers switch cameras as in a render.
-    Where `splats` moves (a turntable), views move against it. Frame and active camera are put back.
-    `RefineError` without frames or a camera, or if the object's scale is animated."""
+    Where the object `splats` moves (a turntable), the views move instead. Frame and active camera
+    are restored. `RefineError` without frames or a camera, or if the object's scale is animated."""
     scene = context.scene
     if not len(frames):
         raise RefineError(
@@ -351,8 +352,8 @@ def _turn(
     splats: bpy.types.Object | None,
     depsgraph: bpy.types.Depsgraph,
 ) -> int | None:
-    """Quarters about x that these cameras need; None if unknown: unless splats and at least half of
-    the cameras were imported, and all are turned alike."""
+    """Quarter turns about x that these cameras need, the same for all; None if unknown: the splats
+    or more than half of the cameras were not imported, or cameras differ."""
     data = None if splats is None else splats.data
     if splats is None or data is None or not (LAYOUT in data or is_native(data)):
         return None
@@ -379,7 +380,7 @@ def active_camera(scene: bpy.types.Scene) -> bpy.types.Object:
 def _against(
     view: View, obj: bpy.types.Object, now: NDArray[np.float64], then: NDArray[np.float64]
 ) -> View:
-    """A view of another frame, moved to see the object where it stands now."""
+    """A view of another frame, moved so that it sees the object where it is `now`."""
     if np.array_equal(now, then):
         return view
     motion = now @ np.linalg.inv(then)

@@ -1,5 +1,5 @@
-"""Calls that other threads leave to Blender's main thread: only there its data may be touched.
-Core's formats have WebP images read and written so, by Blender's library."""
+"""Calls from other threads on Blender's main thread, the only one that may touch Blender's data.
+With them core's formats read and write WebP images through Blender."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from numpy.typing import NDArray
 
 from .core.execute import Cancelled, checkpoint
 
-_STEP = 0.1  # Seconds between two checks of waiting work for cancelling
+_STEP = 0.1  # Seconds between two checks of a waiting thread for cancelling
 
 _LOSSLESS = 100  # Quality at which Blender compresses WebP without loss
 
-_asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
+_calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
 
 
 def call(function: Callable[[], Any]) -> Any:
-    """Call a function on the main thread, at once or when `serve` runs; its result.
-    Raises its error, or `Cancelled`, when it may have been called or not."""
+    """Result of a function called on the main thread: at once if this is it, else by `serve`.
+    Raises the function's error, or `Cancelled`, after which it may run or not."""
     if threading.current_thread() is threading.main_thread():
         return function()
     answer: Future[Any] = Future()
-    _asked.put((function, answer))
+    _calls.put((function, answer))
     while not wait([answer], _STEP).done:
         try:
             checkpoint()
@@ -46,7 +46,7 @@ def serve() -> None:
     """Run the waiting calls on the main thread."""
     with contextlib.suppress(queue.Empty):
         while True:
-            function, answer = _asked.get_nowait()
+            function, answer = _calls.get_nowait()
             if not answer.set_running_or_notify_cancel():
                 continue
             try:
@@ -59,13 +59,13 @@ class BlenderImages:
     """A codec (`refine_addon.core.images.Codec`) on Blender's main thread."""
 
     def size(self, data: bytes) -> tuple[int, int]:
-        """Width and height from the file's first bytes, a RIFF container.
-        Its first chunk is ``VP8X`` (24 bits each, less 1), ``VP8L`` (14 bits, less 1, behind a
-        byte) or ``VP8 `` (14 bits, behind 6 bytes)."""
+        """Width and height from the file's first bytes, a RIFF container, whose first chunk is
+        ``VP8X`` (sizes less 1 in 24 bits each, after 4 bytes), ``VP8L`` (sizes less 1 in 14 bits
+        each, after 1 byte) or ``VP8 `` (sizes in 14 bits each, after 6 bytes)."""
         kind, start = data[12:16], data[20:30]
         if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(start) < 10:
-            raise ValueError("no WebP image")
-        # Blender shows a black image where the data of one cannot be unpacked.
+            raise ValueError("not a WebP image")
+        # Of such a file Blender makes a black image.
         if int.from_bytes(data[4:8], "little") + 8 > len(data):
             raise ValueError("truncated")
         if kind == b"VP8X":

@@ -1,6 +1,6 @@
 """Registration with Blender, in order; `unregister` undoes it in reverse.
-A module lists its classes in `CLASSES`, its entries of Blender's menus in `MENUS`, and what hears
-Blender's events, by function, in `HANDLERS`."""
+Modules list their classes in `CLASSES`, functions that draw into Blender's menus in `MENUS`, and
+handlers of Blender's events, with the events, in `HANDLERS`."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ MODULES = [importlib.import_module(f".{name}", __package__) for name in _NAMES.s
 CLASSES = tuple(cls for module in MODULES for cls in getattr(module, "CLASSES", ()))
 MENUS = [pair for module in MODULES for pair in getattr(module, "MENUS", {}).items()]
 _HANDLERS = [
-    (getattr(bpy.app.handlers, event), heard)
+    (getattr(bpy.app.handlers, event), handler)
     for module in MODULES
-    for heard, events in getattr(module, "HANDLERS", {}).items()
+    for handler, events in getattr(module, "HANDLERS", {}).items()
     for event in events
 ]
 
@@ -39,8 +39,8 @@ def register() -> None:
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
     for name, entry in MENUS:
         getattr(bpy.types, name).append(entry)
-    for handlers, heard in _HANDLERS:
-        handlers.append(heard)
+    for handlers, handler in _HANDLERS:
+        handlers.append(handler)
     for module in MODULES:
         if hasattr(module, "register"):
             module.register()
@@ -55,8 +55,8 @@ def unregister() -> None:
     for module in reversed(MODULES):
         if hasattr(module, "unregister"):
             module.unregister()
-    for handlers, heard in _HANDLERS:
-        handlers.remove(heard)
+    for handlers, handler in _HANDLERS:
+        handlers.remove(handler)
     for name, entry in MENUS:
         getattr(bpy.types, name).remove(entry)
     del bpy.types.Scene.refine

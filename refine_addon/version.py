@@ -8,7 +8,7 @@ from pathlib import Path
 
 def _version() -> str:
     package = Path(__file__).parent
-    # Installed as an extension, the manifest lies in the package; in the checkout, beside it.
+    # The manifest is in the package of an installed extension, and beside it in the repository.
     for folder in (package, package.parent):
         manifest = folder / "blender_manifest.toml"
         if manifest.is_file():

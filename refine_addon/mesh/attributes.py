@@ -1,7 +1,6 @@
-"""Splats as point attributes of a mesh, named as the PLY properties.
-Log scales, logit opacities and raw harmonics stay as in the file, as Blender's importer and KIRI's
-3DGS Render (`vert` form) store them; meshes of either can be read. Blender's own splats
-are converted to and from such columns."""
+"""Splats as point attributes of a mesh, with the names and values of the PLY properties.
+Scales are logarithms, opacities logits, as Blender's PLY importer and KIRI's 3DGS Render (`vert`
+form) store them too. Blender's own splats (5.3) are converted to such columns and back."""
 
 from __future__ import annotations
 
@@ -25,16 +24,16 @@ from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_cou
 
 _GROUP = 16  # Columns transposed together: float32 numbers in a cache line of 64 bytes
 
-_ROWS = 4096  # Rows of so many columns transposed at a time: 256 kB, which caches hold
+_ROWS = 4096  # Rows transposed at a time: 256 kB, which fits a cache
 
 
 def file_size(checked: SplatObject) -> tuple[int, int]:
-    """Bytes of one splat in the exported file, and bytes of all else."""
+    """Bytes of one splat in the exported file, and bytes of its header."""
     return checked.layout.row_dtype.itemsize, len(checked.layout.header)
 
 
 def import_notes(source: SplatFile) -> tuple[str, ...]:
-    """Sentences on what a mesh cannot hold of a file."""
+    """Sentences on the parts of a file that a mesh cannot hold."""
     notes = []
     names = source.rows.dtype.names or ()
     doubles = [name for name in names if source.rows.dtype[name].str[1:] == "f8"]
@@ -49,12 +48,12 @@ def import_notes(source: SplatFile) -> tuple[str, ...]:
 
 
 def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
-    """Mesh without users: a vertex for each splat, an attribute for each property."""
+    """New mesh with a vertex for each splat and an attribute for each property."""
     rows = source.rows
     mesh = bpy.data.meshes.new(scene_name(source.path))
     try:
         mesh.vertices.add(len(rows))
-        remove_attribute(mesh, ".select_vert")  # Blender's default selects all
+        remove_attribute(mesh, ".select_vert")  # with which Blender selects all
         columns = add_attributes(mesh, rows.dtype, source.header)
         _fill(mesh, rows, columns)
         mesh.update()
@@ -65,8 +64,8 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
 
 
 def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
-    """Splats of an object, in its own frame. Without `sh_rest`, one coefficient stands for all:
-    NaN where any is not finite, else 0, enough for scoring (0.5 GB less at 3 M of degree 3)."""
+    """Splats of an object, in its own frame. Without `sh_rest` one coefficient replaces all above
+    the constant: NaN if any is not finite, else 0. Scoring needs no more (saves 0.5 GB at 3 M)."""
     read = _Reader(checked)
     rest = [f"f_rest_{index}" for index in range(rest_count(checked.mesh))]
     count = len(checked)
@@ -107,7 +106,7 @@ def read_for_file(
     """Read the object now; the thread-safe callable builds its PLY file.
     Properties in `replaced` take the values that `columns` gives then, (N,) each."""
     groups = deque(_groups_of(checked, frozenset(replaced)))
-    one_by_one = (groups.popleft() for _ in range(len(groups)))  # to be forgotten when written
+    one_by_one = (groups.popleft() for _ in range(len(groups)))  # freed once written
     return partial(_file, checked.obj.name, checked.layout, len(checked), one_by_one, columns)
 
 
@@ -118,13 +117,12 @@ def _file(
     groups: Iterable[tuple[list[str], Sequence[Any]]],
     columns: Callable[[], Mapping[str, NDArray[Any]]],
 ) -> SplatFile:
-    rows, made = np.empty(count, layout.row_dtype), columns()
+    rows, replaced = np.empty(count, layout.row_dtype), columns()
     for names, planes in groups:
-        given = made.keys() & set(names)
-        pairs = zip(names, planes, strict=True)
-        _interleave(
-            rows, names, [made.get(name, plane) for name, plane in pairs] if given else planes
-        )
+        if replaced.keys() & set(names):
+            pairs = zip(names, planes, strict=True)
+            planes = [replaced.get(name, plane) for name, plane in pairs]
+        _interleave(rows, names, planes)
     no_elements = np.empty(0, np.uint8)
     return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
 
@@ -136,7 +134,7 @@ def _groups_of(
     read, dtype = _Reader(checked), checked.layout.row_dtype
     for names in _groups([column.name for column in checked.layout.columns], dtype):
         if dtype[names[0]].str == "<f4" and not replaced & set(names):
-            yield names, read.planes(names)  # as one array, which Linux gives large pages
+            yield names, read.planes(names)  # one array, for which Linux uses large pages
         else:
             yield names, [None if name in replaced else read[name] for name in names]
 
@@ -160,7 +158,7 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
             continue
         if place.attribute not in vectors:
             vectors[place.attribute] = read_attribute(mesh, place.attribute)
-        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # float64 to float32
             vectors[place.attribute][:, place.component] = values
     for attribute, values in vectors.items():
         kind = mesh.attributes[attribute].data_type
@@ -173,8 +171,8 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
 def write_rows(
     checked: SplatObject, rows: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Store columns, (M,) each, in M rows; other rows stay to the bit.
-    One column at a time: allocating memory takes longest."""
+    """Store columns, (M,) each, in M rows; other rows keep every bit.
+    One attribute at a time, as allocating memory takes longest."""
     attributes: dict[str, list[str]] = {}
     for column in checked.layout.columns:
         if column.name in columns:
@@ -217,7 +215,7 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
 
 
 def digest(checked: SplatObject) -> int:
-    """Checksum of an object's splats and drawing model, without view-dependent colour."""
+    """Checksum of an object's splats and model; harmonics above the constant do not count."""
     columns = (column for column in checked.layout.columns if column.name in REQUIRED)
     checksum = 0
     for name in dict.fromkeys(column.attribute for column in columns):
@@ -234,7 +232,7 @@ def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:
 
 
 class _Reader:
-    """Reads columns of one mesh; caches the last vector attribute."""
+    """Columns of a mesh by name; caches the last vector attribute."""
 
     def __init__(self, checked: SplatObject) -> None:
         self.mesh = checked.mesh
@@ -242,8 +240,8 @@ class _Reader:
         self.vectors: dict[str, NDArray[np.float32]] = {}
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """A column as in the file, unsigned integers by their bits.
-        Activated values come in float64, so that they can be written back unchanged."""
+        """A column with the file's values, (N,); unsigned integers by their bits.
+        Values of Blender's own splats come in float64, so that writing them back changes none."""
         column = self.columns[name]
         place = column.place
         values = self.vectors.get(place.attribute)
@@ -259,7 +257,7 @@ class _Reader:
     def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
         values = np.empty((len(names), splat_count(self.mesh)), np.float32)
         pairs = zip(values, names, strict=True)
-        # Components of one attribute together: it is read once.
+        # Sorted by attribute, so that each vector attribute is read once.
         for row, name in sorted(pairs, key=lambda pair: self.columns[pair[1]].attribute):
             attribute = self.mesh.attributes[self.columns[name].attribute]
             if KINDS[attribute.data_type].width == 1:
@@ -281,15 +279,15 @@ def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -
                 continue
             kind = KINDS[place.kinds[0]]
             values = plane.view(np.int32) if plane.dtype == np.uint32 else plane
-            with np.errstate(over="ignore"):  # doubles beyond the range become infinite, as noted
+            with np.errstate(over="ignore"):  # large doubles become infinite; see `import_notes`
                 values = np.ascontiguousarray(values, kind.dtype)
             mesh.attributes[place.attribute].data.foreach_set(kind.field, values)
     mesh.attributes["position"].data.foreach_set("vector", position.ravel())
 
 
 def _groups(names: list[str], dtype: np.dtype[Any]) -> list[list[str]]:
-    """Runs of columns of one type, transposed together.
-    Read one by one, each would fetch the whole file: a row fills several cache lines."""
+    """Adjacent columns of one type, at most `_GROUP`, to be transposed together.
+    One by one, each would read the whole file: a row fills several cache lines."""
     groups: list[list[str]] = []
     for name in names:
         if groups and len(groups[-1]) < _GROUP and dtype[groups[-1][0]] == dtype[name]:

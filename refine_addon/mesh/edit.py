@@ -1,4 +1,4 @@
-"""Changes to a splat object's data: what may change, and fast deletion of points."""
+"""Changes to a splat object's data: refusals, deletion of splats, marks on splats."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MUST_GO = "refine_must_go"  # Boolean point attribute, set by hand: splats remov
 
 FORCE = "refine_force"  # Integer point attribute, for display: 1 protected, 2 removed by user
 
-MARKING = ("BOOLEAN", "FLOAT")  # Types of point attributes that can mark splats by name
+MARKING = ("BOOLEAN", "FLOAT")  # Types of point attributes that can protect splats by name
 
 _GROUP_VALUES = "refine_group_values"
 
@@ -39,7 +39,7 @@ def check_writable(obj: bpy.types.Object) -> None:
 
 
 def check_changeable(obj: bpy.types.Object) -> None:
-    """Raise `RefineError` if the splats of an object cannot be changed as a whole."""
+    """Raise `RefineError` if the values of an object's splats cannot be changed."""
     check_writable(obj)
     label = f"object '{obj.name}'"
     if obj.mode != "OBJECT":
@@ -48,7 +48,7 @@ def check_changeable(obj: bpy.types.Object) -> None:
         )
     if getattr(obj.data, "shape_keys", None):  # point clouds have none
         raise RefineError(
-            f"{label}: has shape keys, which hold every vertex again; apply or delete them first"
+            f"{label}: has shape keys, which store every vertex again; apply or delete them first"
         )
 
 
@@ -66,8 +66,8 @@ def check_deletable(obj: bpy.types.Object) -> None:
 
 @contextmanager
 def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
-    """Undo a block's changes to an object's data, for all its users, if the block fails.
-    The copy costs nothing: Blender shares attributes until one is changed."""
+    """Undo a block's changes to an object's data if the block fails.
+    The copy is cheap: Blender shares attributes until one changes."""
     mesh = obj.data
     before = mesh.copy()
     try:
@@ -82,7 +82,7 @@ def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
 
 
 def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
-    """Delete the marked vertices, (N,) bool, and nothing else; `all_or_nothing` undoes a failure.
+    """Delete the marked vertices, (N,) bool; `all_or_nothing` undoes a failure.
     An applied geometry-nodes modifier is the fastest way, and keeps attributes of every type,
     vertex groups, materials and custom properties."""
     check_deletable(obj)
@@ -94,10 +94,10 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
     tree, _ = _tree("GeometryNodeDeleteGeometry", REMOVE, "BOOLEAN", "Selection")
     modifier = obj.modifiers.new("REFINE delete", "NODES")
     name = modifier.name
-    modifier.show_viewport = False  # or Blender runs it once more, before it applies it
+    modifier.show_viewport = False  # else Blender evaluates it twice
     try:
         modifier.node_group = tree
-        # First, or Blender warns that those before it are not applied.
+        # First in the stack, else Blender warns of those before it.
         obj.modifiers.move(len(obj.modifiers) - 1, 0)
         with bpy.context.temp_override(object=obj, active_object=obj, selected_objects=[obj]):
             bpy.ops.object.modifier_apply(modifier=name)
@@ -113,12 +113,13 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
     left = splat_count(obj.data)
     if left != expected:
         raise RefineError(
-            f"object '{obj.name}': {left} splats were left, expected {expected}; report this"
+            f"object '{obj.name}': {left} splats were left, expected {expected}; please report this"
         )
 
 
 def mark(obj: bpy.types.Object, name: str, values: NDArray[Any], *, even_none: bool = True) -> None:
-    """Mark exactly these splats by a point attribute, (N,) bool or int32."""
+    """Set a point attribute to `values`, (N,) bool or int32.
+    Without `even_none` it is removed where all values are 0."""
     check_writable(obj)
     if even_none or values.any():
         kind = "BOOLEAN" if values.dtype == np.bool_ else "INT"
@@ -131,13 +132,13 @@ def mark(obj: bpy.types.Object, name: str, values: NDArray[Any], *, even_none: b
 
 
 def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
-    """Mark splats, (N,), as removed for all previews; see `mark`."""
+    """Mark splats, (N,) bool, as those that the previews show as removed."""
     mark(obj, REMOVE, remove)
 
 
 def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Splats protected by `PROTECT` or by the attribute or vertex group `name` ("" for none), (N,).
-    Weights count above 0. None without a name and marks; `RefineError` if the name is missing."""
+    """Splats protected by `PROTECT` or by the attribute or vertex group `name`, where it is above
+    0, (N,). None with neither; `RefineError` if the object has no such name."""
     marked = marks(obj, PROTECT)
     if not name:
         return marked
@@ -147,7 +148,7 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None
 
 def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     attribute = obj.data.attributes.get(name)
-    # What a splat is made of marks nothing.
+    # A splat's own properties protect nothing.
     if has(obj.data, name, *MARKING) and name not in REQUIRED:
         return mesh_attributes.read_attribute(obj.data, name) > 0
     if name in obj.vertex_groups:
@@ -172,10 +173,10 @@ def mark_by_hand(obj: bpy.types.Object, marked: NDArray[np.bool_], name: str = P
 
 
 def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
-    """Weights of a vertex group, read at once by geometry nodes."""
+    """Weights of a vertex group, (N,), through geometry nodes, as Python reads one by one."""
     tree, storing = _tree("GeometryNodeStoreNamedAttribute", name, "FLOAT", "Value")
     storing.inputs["Name"].default_value = _GROUP_VALUES
-    # On a second object with the same mesh: the user's modifiers stay out of it.
+    # On a second object with the same mesh, so that modifiers of the first do not take part.
     helper = bpy.data.objects.new("REFINE read", obj.data)
     try:
         bpy.context.scene.collection.objects.link(helper)
@@ -188,7 +189,7 @@ def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
 
 
 def _tree(kind: str, name: str, data_type: str, target: str) -> tuple[Any, bpy.types.Node]:
-    """A geometry-nodes tree around one node, whose input `target` reads an attribute; the node."""
+    """A geometry-nodes tree of one node, whose input `target` reads attribute `name`; the node."""
     tree = bpy.data.node_groups.new("REFINE", "GeometryNodeTree")
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")

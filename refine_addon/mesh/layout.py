@@ -1,7 +1,8 @@
-"""The table of which attribute holds which property of a 3DGS PLY, checked here.
+"""Which attribute of a mesh holds which property of a 3DGS PLY file, and the check of an object.
 "Mesh" means a mesh with a vertex for each splat, or a point cloud. Blender 5.3 imports 3DGS files
-as point clouds of type ``GAUSSIAN_SPLAT`` with activated values under other names
-(docs/conventions.md). Attributes alone decide, so older versions and geometry nodes work too."""
+as point clouds of type ``GAUSSIAN_SPLAT``, with activated values under other names
+(docs/conventions.md); they are recognized by their attributes, not by that type, so that output of
+geometry nodes and older versions are, too."""
 
 from __future__ import annotations
 
@@ -27,17 +28,17 @@ NATIVE = "GAUSSIAN_SPLAT"  # Type of point clouds that Blender draws as splats, 
 
 _NATIVE_NAMES = f"{BASE}, {SCALE}, {ROTATION}"
 
-_FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")  # Types of `BASE`: 5.3's, and that of 5.0 without it
+_FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")  # Types of `BASE`: in 5.3, and in older versions
 
 _MOST = 24  # Harmonics of degree 4, without the constant
 
 LAYOUT = "refine_layout"  # Custom property of the mesh: layout of its file, JSON
 
-MODEL = "refine_model"  # Custom property: one of `rendering.MODELS`, if the file named none
+MODEL = "refine_model"  # Custom property of the mesh: one of `splats.MODELS`, set by the user
 
 
 class Coding(NamedTuple):
-    """Conversion of a file's values to those of an attribute and back, float64."""
+    """Conversions between a file's values and those of an attribute, float64."""
 
     to_file: Callable[[NDArray[Any]], NDArray[Any]]
     to_attribute: Callable[[NDArray[Any]], NDArray[Any]]
@@ -48,8 +49,8 @@ _LOGIT = Coding(single_logits, opacity)
 
 
 class Place(NamedTuple):
-    """Attribute, vector component (0 for plain ones), allowed types (the first is made), and coding
-    (None where stored as in the file) of a property."""
+    """Where a property is stored: attribute, vector component (0 for scalars), allowed attribute
+    types, and coding (None if stored as in the file)."""
 
     attribute: str
     component: int
@@ -58,7 +59,7 @@ class Place(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """How an attribute type of Blender is read and written."""
+    """Field for `foreach_get`, element type, and numbers in an element of an attribute type."""
 
     field: str
     dtype: type
@@ -75,14 +76,13 @@ KINDS = {
     "FLOAT4": Kind("vector", np.float32, 4),
     "QUATERNION": Kind("value", np.float32, 4),
 }
-"""Attribute type -> field for `foreach_get`, element type, numbers in an element."""
 
 STORAGE = dict.fromkeys(("u1", "i2", "u2", "i4", "u4"), "INT")
 STORAGE |= {"i1": "INT8", "f4": "FLOAT", "f8": "FLOAT"}
-"""Type of a PLY property -> type of its attribute; u4 by its bits, f8 rounded."""
+"""Type of a PLY property -> type of its attribute; u4 is stored by its bits, f8 is rounded."""
 
 PLACES = {name: Place("position", axis, ("FLOAT_VECTOR",)) for axis, name in enumerate("xyz")}
-"""Properties that Blender keeps as vector components."""
+"""Properties that are components of Blender's positions."""
 
 NORMAL_PLACES = {
     f"n{axis}": Place("normal", index, ("FLOAT_VECTOR",)) for index, axis in enumerate("xyz")
@@ -91,16 +91,10 @@ NORMAL_PLACES = {
 
 _LONGEST_NAME = 63  # Bytes of Blender's longest attribute name
 
-_MOST_NAMES = 8  # Attribute names listed by an error, at most
+_MOST_NAMES = 8  # Attribute names in an error message, at most
 
-_TAKEN = {
-    *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
-    *("refine_score", "refine_rank", "refine_seen", "refine_scored"),
-    *("refine_color", "refine_remove"),
-    *("refine_protect", "refine_must_go", "refine_force", "refine_floats"),
-    *("refine_home", "refine_shape"),
-}
-
+_TAKEN = {"position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"}
+"""Attribute names that mean something to Blender."""
 
 _TYPES = ("MESH", "POINTCLOUD")
 
@@ -133,14 +127,14 @@ class Layout:
 
     @property
     def model(self) -> Model:
-        """One of `rendering.MODELS`."""
+        """How the splats are drawn, one of `splats.MODELS`."""
         return stated_model(self.header, self.row_dtype) or MODELS[0]
 
 
 @dataclass(frozen=True)
 class SplatObject:
-    """Checked splat object with its layout, made once per operation by `check`.
-    Out of date as soon as splats or attributes come or go."""
+    """A splat object that `check` accepted, and its layout.
+    Valid until splats or attributes are added or removed."""
 
     obj: bpy.types.Object
     layout: Layout
@@ -155,15 +149,15 @@ class SplatObject:
 
 
 def recorded(mesh: bpy.types.ID, name: str, read: Callable[[Any], Any]) -> Any:
-    """What `read` makes of a JSON record, read-only, in a custom property; None if it cannot.
-    Another program may have written there."""
+    """`read` of a JSON record in a custom property; None where that fails, as another program may
+    have written there. `read` must not change the record, which is cached."""
     try:
         return read(_parsed(mesh[name]))
     except (AttributeError, KeyError, StopIteration, TypeError, ValueError):
         return None
 
 
-@lru_cache(maxsize=16)  # for panels
+@lru_cache(maxsize=16)  # panels read records at each redraw
 def _parsed(text: str) -> Any:
     return json.loads(text)
 
@@ -180,32 +174,32 @@ def splat_count(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> int:
 
 
 def looks_like_splats(obj: bpy.types.Object | None) -> bool:
-    """Whether to offer an object to the splat tools; cheap enough for a poll."""
+    """Whether an object seems to hold splats; cheap enough for a poll."""
     if obj is None or obj.type not in _TYPES:
         return False
     return holds_splats(obj.data)
 
 
 def holds_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
-    """The same for an object's data."""
+    """Whether an object's data seems to hold splats."""
     attributes = data.attributes
     return ("opacity" in attributes and "f_dc_0" in attributes) or is_native(data)
 
 
 def is_native(data: bpy.types.ID) -> bool:
-    """Whether an object's data is a point cloud with the attributes of Blender's splats."""
+    """Whether an object's data is a point cloud with the attributes of Blender's own splats."""
     attributes = getattr(data, "attributes", ())
     return hasattr(data, "points") and BASE in attributes and SCALE in attributes
 
 
 def _harmonics(cloud: bpy.types.PointCloud) -> int:
-    """Attributes of a point cloud for harmonics, without the constant."""
+    """Number of harmonics attributes of a point cloud, without the constant."""
     return sum(f"{HARMONIC}{index}" in cloud.attributes for index in range(_MOST))
 
 
 def _native_places(data: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Place]:
-    """Places of a splat's properties in a point cloud of Blender's own splats, else none.
-    ``sh_10`` follows ``sh_9``; each holds RGB, where a file has all of red first."""
+    """Property -> place in a point cloud of Blender's own splats; empty for other data.
+    Each ``radiance:sh_*`` holds RGB of one harmonic; a file has all of red first."""
     if not is_native(data):
         return {}
     count = _harmonics(data)
@@ -223,7 +217,7 @@ def _native_places(data: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Pla
 
 
 def lost_base(obj: bpy.types.Object) -> bool:
-    """Whether an object is what an older Blender leaves of 5.3's splats: all but `BASE`."""
+    """Whether an object holds splats of Blender 5.3 whose `BASE` an older version dropped."""
     if obj.type != "POINTCLOUD":
         return False
     attributes = obj.data.attributes
@@ -232,7 +226,7 @@ def lost_base(obj: bpy.types.Object) -> bool:
 
 
 def check(obj: bpy.types.Object) -> SplatObject:
-    """The object with its layout: the one of its import, or the standard one.
+    """The object with the layout of its import, or the standard one.
     `RefineError` in edit mode, with four vertices a splat, or for a missing or wrong attribute."""
     label = f"object '{obj.name}'"
     if obj.type not in _TYPES:
@@ -248,11 +242,11 @@ def check(obj: bpy.types.Object) -> SplatObject:
         )
     if not splat_count(obj.data):
         points = "points" if obj.type == "POINTCLOUD" else "vertices"
-        raise RefineError(f"{label}: has no {points}, expected one a splat")
+        raise RefineError(f"{label}: has no {points}, expected one for each splat")
     if lost_base(obj):
         raise RefineError(
             f"{label}: has no attribute {BASE}, which holds colour and opacity: Blender 5.0 and "
-            "older drop it where they open a file of 5.3; use 5.2 or later"
+            "older drop it when they open a file of 5.3; use 5.2 or later"
         )
     layout = layout_of(obj)
     attributes = obj.data.attributes
@@ -281,7 +275,7 @@ def check(obj: bpy.types.Object) -> SplatObject:
 
 
 def layout_of(obj: bpy.types.Object) -> Layout:
-    """Layout of a splat object, attribute types unchecked."""
+    """Layout of a splat object, without a check of its attributes."""
     layout = _remembered(obj.data) or _standard(obj)
     model = obj.data.get(MODEL)
     if model in MODELS and THIRD_SCALE in (column.name for column in layout.columns):
@@ -295,7 +289,7 @@ def sh_degree(mesh: bpy.types.Mesh) -> int:
 
 
 def export_bytes(obj: bpy.types.Object) -> int | None:
-    """Size of the exported file, bytes, None if there is none; cheap enough to draw."""
+    """Size of the exported file, bytes; None if it cannot be exported. Cheap enough to draw."""
     try:
         layout = layout_of(obj)
     except RefineError:
@@ -311,17 +305,17 @@ def rest_count(mesh: bpy.types.Mesh) -> int:
 
 
 def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
-    """Layout noted by the import, None if there is none or it cannot be read."""
+    """Layout that the import stored, None without one or if it cannot be read."""
     places = _native_places(mesh)
 
-    def read(noted: Any) -> Layout | None:
+    def read(record: Any) -> Layout | None:
         columns = tuple(
             Column(name, dtype, places.get(name) or _plain(dtype, attribute, component))
-            for name, dtype, attribute, component in noted["columns"]
+            for name, dtype, attribute, component in record["columns"]
         )
-        # Splats come and go, and Join adds harmonics of a higher degree.
+        # Splats may have been deleted, and Join may have added harmonics of a higher degree.
         count, names = splat_count(mesh), [column.name for column in columns]
-        layout = Layout(columns, with_count(noted["header"].encode("latin-1"), count))
+        layout = Layout(columns, with_count(record["header"].encode("latin-1"), count))
         rest = [n for i in range(rest_count(mesh)) if (n := f"f_rest_{i}") not in names]
         if rest:
             layout = _with_harmonics(layout, count, _floats(rest, places))
@@ -331,11 +325,11 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
 
 
 def _with_harmonics(layout: Layout, count: int, rest: Sequence[Column]) -> Layout:
-    """A layout with further harmonics, after the others."""
+    """A layout with the columns `rest` after its other colours."""
     colors = [c.name.startswith(("f_dc_", "f_rest_")) for c in layout.columns]
     end = len(colors) - colors[::-1].index(True)
     columns = [*layout.columns[:end], *rest, *layout.columns[end:]]
-    # Of one byte order, since the header names but one.
+    # All little-endian, as a header has one byte order.
     plain = tuple(Column(c.name, c.dtype.replace(">", "<"), c.place) for c in columns)
     header = new_header(_row(plain), count)
     comments = re.findall(rb"^(?:comment|obj_info)\b[^\r\n]*", layout.header, re.MULTILINE)
@@ -379,7 +373,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
 
 
 def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
-    """Columns of plain point attributes, neither taken nor ours."""
+    """Columns of other scalar point attributes, but for those of `taken` and of this add-on."""
     dtypes = {"FLOAT": "<f4", "INT": "<i4", "INT8": "<i1"}
     return [
         Column(attribute.name, dtype, _plain(dtype, attribute.name))
@@ -392,22 +386,22 @@ def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
 
 
 def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> tuple[Column, ...]:
-    """Add an attribute for each property of a file, note its layout; places in file order."""
+    """Add an attribute for each property of a file and store the layout; columns in file order."""
     columns = []
     for name in rows.names or ():
         kind = rows[name].str
         if name in PLACES:
             columns.append(Column(name, kind, PLACES[name]))
             continue
-        # Blender keeps some names for itself, we others.
-        plain = name not in _TAKEN and len(name.encode()) <= _LONGEST_NAME and name[0] != "."
+        plain = name not in _TAKEN and not name.startswith((".", "refine_"))
+        plain = plain and len(name.encode()) <= _LONGEST_NAME
         other = f"ply_{name}".encode()[:_LONGEST_NAME].decode(errors="ignore")
         attribute = mesh.attributes.new(name if plain else other, STORAGE[kind[1:]], "POINT")
         attribute = attribute or mesh.attributes.new(other, STORAGE[kind[1:]], "POINT")
         columns.append(Column(name, kind, _plain(kind, attribute.name)))
-    noted = [[c.name, c.dtype, c.attribute, c.place.component] for c in columns]
+    record = [[c.name, c.dtype, c.attribute, c.place.component] for c in columns]
     text = vertex_header(header).decode("latin-1")
-    mesh[LAYOUT] = json.dumps({"header": text, "columns": noted})
+    mesh[LAYOUT] = json.dumps({"header": text, "columns": record})
     return tuple(columns)
 
 

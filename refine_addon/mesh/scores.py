@@ -1,4 +1,4 @@
-"""Scores and floaters on a mesh: point attributes, and records of how they were found."""
+"""Scores and floaters on a mesh: point attributes, and records of how they were computed."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from . import edit as mesh_edit
 from .layout import SplatObject, has, recorded, splat_count
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
-"""Point attributes: score, rank from 0 (removed first) to 1, number of views that hold it."""
+"""Point attributes: score, rank from 0 (removed first) to 1, number of views with the splat."""
 
 SCORED = "refine_scored"
-"""Boolean point attribute: has a score. False if removed by the user, and, by Blender's default, if
-added later."""
+"""Boolean point attribute: whether the splat has a score. False if it was removed by the user, or
+added later, as false is Blender's default."""
 
 RECORD = "refine_scores"  # Custom property of the mesh: record of its scoring, JSON
 
-REASON = "refine_floats"  # Integer point attribute: 0, or the splat's place in `REASONS`, from 1
+REASON = "refine_floats"  # Integer point attribute: 0, or 1 + the index of a reason in `REASONS`
 
-FOUND = "refine_floaters"  # Custom property of the mesh: floaters by reason, and how sure, JSON
+FLOATERS = "refine_floaters"  # Custom property of the mesh: floaters by reason, and how sure, JSON
 
 
 def store(
@@ -46,9 +46,9 @@ def store(
     together: tuple[str, int, NDArray[np.float64]] | None = None,
     seconds: float | None = None,
 ) -> None:
-    """Write scores and their record to an object's mesh. `cameras`: name and splats of each view;
-    `protected`: (N,) bool, protected in the curve; `together`, if scored with other objects: its
-    name, splats of all, and ranks among all, (N,); `origin`: see `plans.origin`."""
+    """Write scores and their record to an object's mesh. `origin`: see `plans.origin`. `cameras`:
+    name and number of splats of each view. `protected`: (N,) bool, as the quality curve has it.
+    `together`, if scored with other objects: its id, splats of all, ranks among all, (N,)."""
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
     if len(checked) != len(scores.values):
@@ -86,7 +86,7 @@ def store(
 
 
 def forget(checked: SplatObject) -> None:
-    """Remove an object's scores and all that shows or uses them."""
+    """Remove an object's scores, their record, and the preview of what goes."""
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
     for name in (SCORE, RANK, SEEN, SCORED, mesh_edit.REMOVE):
@@ -96,22 +96,23 @@ def forget(checked: SplatObject) -> None:
 
 
 def digest(mask: NDArray[np.bool_] | None) -> list[int]:
-    """Number of splats in a mask, (N,) bool, and a checksum of which; [0, 0] if none."""
+    """Number of splats in a mask, (N,) bool, and the mask's checksum; [0, 0] if empty."""
     if mask is None or not mask.any():
         return [0, 0]
     return [int(np.count_nonzero(mask)), zlib.crc32(np.packbits(mask).tobytes())]
 
 
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
-    """Record of a mesh's scoring, None without."""
+    """Record of a mesh's scoring; None without one, or if it is damaged."""
     needed = {"splats", "settings", "views_given", "views_used"}
-    return recorded(mesh, RECORD, lambda found: found if found.keys() >= needed else None)
+    return recorded(mesh, RECORD, lambda content: content if content.keys() >= needed else None)
 
 
 def move_origin(
     mesh: bpy.types.Mesh, before: NDArray[np.float64], after: NDArray[np.float64]
 ) -> None:
-    """Keep scores valid for an object whose (4, 4) matrix changed while its splats stayed."""
+    """Keep scores valid for an object whose (4, 4) matrix changed while its splats stayed in place
+    in the world."""
     scoring = record(mesh) or {}
     origin = scoring.get("origin")
     if origin and np.allclose(origin.get("matrix", np.nan), before, rtol=0.0, atol=1e-6):
@@ -123,8 +124,8 @@ _KINDS = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
 
 
 def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | None = None) -> Scores:
-    """Scores of several objects as of one; splats of `removed`, (N,) of all, need none.
-    `RefineError` if others have none, or objects were not scored together."""
+    """Scores of several objects, concatenated; splats in `removed`, (N,) bool of all, need none.
+    `RefineError` if others have none, or if the objects were not scored together."""
     records, columns, start = [], [], 0
     removed = np.zeros(sum(map(len, group)), np.bool_) if removed is None else removed
     for checked in group:
@@ -149,7 +150,7 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
             f"the {len(group)} selected objects were not scored together: score them as they are "
             "selected, or select only one"
         )
-    # The curve is that of all splats that were scored, with the same removed.
+    # The quality curve holds only for all scored splats, with the same ones removed.
     first = records[0]
     total = together[0].get("splats", first["splats"])
     whole = len(values) == total and np.array_equal(removed, ~scored)
@@ -168,51 +169,51 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
 
 
 def store_floaters(checked: SplatObject, cleaned: Cleaned) -> None:
-    """Write the cleaning result to an object's mesh."""
+    """Write floaters and their record to an object's mesh."""
     mesh_edit.check_writable(checked.obj)
     if len(checked) != len(cleaned.keep):
         raise RefineError(
-            f"object '{checked.obj.name}': has {len(checked)} splats, floaters were looked for "
-            f"among {len(cleaned.keep)}; look again"
+            f"object '{checked.obj.name}': has {len(checked)} splats, but had {len(cleaned.keep)} "
+            "when floaters were found; find them again"
         )
     reasons = np.zeros(len(cleaned.keep), np.int32)
     for number, name in enumerate(REASONS, start=1):
         reasons[cleaned.by_reason[name]] = number
     mesh_attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
     counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.by_reason.items()}
-    noted = {"splats": len(reasons), "counts": counts, "sure": cleaned.surety()}
-    checked.mesh[FOUND] = json.dumps(noted)
+    content = {"splats": len(reasons), "counts": counts, "sure": cleaned.surety()}
+    checked.mesh[FLOATERS] = json.dumps(content)
     mesh_attributes.updated(checked.mesh)
 
 
 def floater_counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None:
-    """Floaters for each reason; None without a search since the last change."""
+    """Number of floaters for each reason; None without a search since splats were deleted."""
 
-    def read(noted: Any) -> dict[str, int] | None:
-        current = noted["splats"] == splat_count(mesh) and REASON in mesh.attributes
-        return {name: int(noted["counts"][name]) for name in REASONS} if current else None
+    def read(content: Any) -> dict[str, int] | None:
+        current = content["splats"] == splat_count(mesh) and REASON in mesh.attributes
+        return {name: int(content["counts"][name]) for name in REASONS} if current else None
 
-    return recorded(mesh, FOUND, read)
+    return recorded(mesh, FLOATERS, read)
 
 
 def floater_surety(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, float]:
-    """Share of further views that see past the splats of each reason, 0..1, where known."""
+    """Share of further views that see past the splats of a reason, 0 to 1; unknown ones absent."""
 
-    def read(noted: Any) -> dict[str, float]:
-        return {name: float(sure) for name, sure in noted["sure"].items() if sure is not None}
+    def read(content: Any) -> dict[str, float]:
+        return {name: float(sure) for name, sure in content["sure"].items() if sure is not None}
 
-    return recorded(mesh, FOUND, read) or {}
+    return recorded(mesh, FLOATERS, read) or {}
 
 
 def floater_mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
-    """Floaters of these reasons, (N,); `RefineError` without a search since the splats changed."""
+    """Floaters of these reasons, (N,) bool; `RefineError` where `floater_counts` is None."""
     if floater_counts(checked.mesh) is None:
-        raise RefineError(f"object '{checked.obj.name}': look for floaters first")
+        raise RefineError(f"object '{checked.obj.name}': find floaters first")
     numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
     return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)
 
 
 def forget_floaters(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Remove the cleaning result."""
+    """Remove floaters and their record."""
     mesh_attributes.remove_attribute(mesh, REASON)
-    mesh.pop(FOUND, None)
+    mesh.pop(FLOATERS, None)

@@ -1,6 +1,6 @@
-"""Selected and hidden splats: Blender's vertex selection, kept by undo and files.
-Meshes use ``.select_vert`` and ``.hide_vert``, in edit mode the vertices there; point clouds
-``.selection`` and the same for hidden, which Blender itself ignores."""
+"""Selected and hidden splats, stored where Blender stores them, so that undo and files keep them.
+Meshes: ``.select_vert`` and ``.hide_vert``, in edit mode the flags of its vertices. Point clouds:
+``.selection``, and ``.hide_vert``, which Blender ignores there."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def name_of(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> str:
 
 
 def selected(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    """Selected splats of an object, (N,)."""
+    """Selected splats of an object, (N,) bool."""
     return _in_edit(obj, "select") if _in_edit_mode(obj) else _chosen(obj)
 
 
 def hidden(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    """Hidden splats of an object, (N,)."""
+    """Hidden splats of an object, (N,) bool."""
     return _in_edit(obj, "hide") if _in_edit_mode(obj) else _flags(obj.data, HIDDEN)
 
 
@@ -41,7 +41,7 @@ def _in_edit(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
 
 
 def select(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
-    """Select exactly these splats, (N,) bool; hidden ones stay unselected."""
+    """Select exactly these splats, (N,) bool, except hidden ones."""
     away = hidden(obj)
     _store(obj, wanted & ~away, away)
 
@@ -52,7 +52,7 @@ def hide(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
 
 
 def count(obj: bpy.types.Object) -> int:
-    """Number of selected splats; quick enough to draw."""
+    """Number of selected splats; cheap enough to draw."""
     if _in_edit_mode(obj):
         return int(obj.data.total_vert_sel)
     return int(np.count_nonzero(_chosen(obj)))
@@ -60,7 +60,7 @@ def count(obj: bpy.types.Object) -> int:
 
 @contextmanager
 def readable(obj: bpy.types.Object) -> Iterator[SplatObject]:
-    """The object, or in edit mode a copy of its present state, in no scene, untransformed."""
+    """The object; in edit mode a copy of its present state, without transform and in no scene."""
     if obj.mode != "EDIT" or obj.type != "MESH":
         yield check(obj)
         return
@@ -103,7 +103,7 @@ def _in_edit_mode(obj: bpy.types.Object) -> bool:
 def _chosen(obj: bpy.types.Object) -> NDArray[np.bool_]:
     name = name_of(obj.data)
     if obj.mode == "EDIT" and name not in obj.data.attributes:
-        return np.ones(splat_count(obj.data), np.bool_)  # Blender's way to say all
+        return np.ones(splat_count(obj.data), np.bool_)  # without it Blender selects all
     return _flags(obj.data, name)
 
 

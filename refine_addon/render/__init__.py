@@ -1,4 +1,4 @@
-"""Renders with splats, drawn by our own renderer among what the scene's engine renders.
-A frame takes up to three of Blender's renders, of copies of the scene: the meshes with their depth
-(`meshes`), the world behind them, and the picture, in which our `engine` draws the splats. So
-Blender shows progress, stops at Esc and writes files. `frames` goes through the steps."""
+"""Renders with splats: our own renderer draws them among what the scene's engine renders.
+Each frame takes several of Blender's renders, of copies of the scene: meshes with their depth and
+the world behind them (`meshes`), then the picture, in which our `engine` draws the splats. All are
+renders of Blender, so that it shows progress, stops at Esc and writes files."""

@@ -1,5 +1,5 @@
-"""Splats of a render drawn on the graphics card, on Blender's main thread.
-`core.pictures` does the same without a card."""
+"""The splats of a render drawn on the graphics card, on Blender's main thread.
+`core.pictures` does the same on the processor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..core.views import View
 from ..viewport import shader
 from ..viewport.arrays import Eye, as_texture, colors, farthest_first, in_front, pack
 
-_FARTHEST = 1e6  # Far plane over the near plane, if a view has none nearer
+_FARTHEST = 1e6  # Largest ratio of the far plane to the near plane
 
 
 def available() -> bool:
@@ -25,8 +25,8 @@ def available() -> bool:
 
 
 def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], NDArray[np.float64]]:
-    """Draws splats on the card as `core.pictures.draw` does, on the main thread; arguments alike.
-    Perspective and constant colours only. Sorting and packing happen here, on any thread."""
+    """Return a function that draws like `core.pictures.draw`, to be called on the main thread.
+    Sorting and packing happen at once, on any thread. Perspective and constant colours only."""
     matrix = np.empty((3, 4))  # world to camera: x right, y up, z back
     matrix[:, :3] = np.array([1.0, -1.0, -1.0])[:, None] * view.rotation
     matrix[:, 3] = -matrix[:, :3] @ view.center
@@ -44,7 +44,7 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
     rows, depths = in_front(packed.means, eye, near)
     rows = rows[depths < view.far]
     order = rows[farthest_first(depths[depths < view.far], perspective=True)]
-    limits = []  # depths in the window that part the splats, the lowest row first
+    limits = []  # window depths of the layers, which part the splats, the lowest row first
     for depth in () if layers is None else layers.depths:
         away = np.maximum(depth[::-1], near)
         ndc = (projection[2, 2] * -away + projection[2, 3]) / away
@@ -63,17 +63,17 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
     }
 
     def paint() -> NDArray[np.float64]:
-        given = {name: shader.texture(*values) for name, values in textures.items()}
+        shared = {name: shader.texture(*values) for name, values in textures.items()}
         walls = [shader.texture(limit, 1, "R32F") for limit in limits]
 
         def between(number: int) -> NDArray[np.float64]:
-            """Splats between two walls, (4, H, W), colours times alpha, top row first."""
+            """Splats before a wall and behind the one before it, (4, H, W), premultiplied."""
             numbers = (view.width, view.height, view.near, 1.0)
             numbers += (True, number < len(walls), number > 0)
             ends = {"near_depths": walls[number - 1]} if number else {}
             ends |= {"depths": walls[number]} if walls[number:] else {}
             picture = gpu.types.GPUTexture((view.width, view.height), format="RGBA32F")
-            frame = shader.blend(picture, {**given, **ends}, projection, numbers, len(order))
+            frame = shader.blend(picture, {**shared, **ends}, projection, numbers, len(order))
             values = gpu.types.Buffer("FLOAT", view.width * view.height * 4)
             frame.read_color(0, 0, view.width, view.height, 4, 0, "FLOAT", data=values)
             pixels = np.frombuffer(memoryview(values), np.float32).reshape(*size, 4)

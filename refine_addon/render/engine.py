@@ -1,6 +1,6 @@
-"""From a scene to rendered frames: Blender's renders, one after another; and the render engine that
-draws splats among the layers of `meshes`, for copies of scenes only.
-Blender calls it on a thread of its own, with the data evaluated for this render."""
+"""From a scene to rendered frames: the sequence of Blender's renders, and the render engine that
+draws splats among the layers of `meshes`. The engine renders copies of scenes only; Blender calls
+it on a thread of its own, with the data evaluated for that render."""
 
 from __future__ import annotations
 
@@ -30,16 +30,18 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh.layout import SplatObject, check, splat_count
 from . import card, meshes
 
-_FAR = 1e4  # Scene sizes to a camera without perspective: an error below 0.1 of 1000 pixels
+_FAR = 1e4
+"""Distance of the pinhole that replaces an orthographic camera, in units of its scale: the error is
+below 0.1 pixels of 1000."""
 
 
 @dataclass(eq=False)
 class Shared:
-    """State shared with a render, settings first.
-    `layers`: gives the next frame's other layers. `card`: draw on the main thread
-    (`main_thread.serve`). `finished`: folder of pictures to show again. `splats`: of the last
-    frame. `renders`: Blender's for each frame. `engine`: of all else, or "". `picture`: the last
-    one, (4, H, W). `stopped`: Esc; Blender forgets one pressed as its render began."""
+    """State shared with the engine. Settings: `layers` reads the frame's layers of other objects;
+    `card`: draw on the graphics card, by `main_thread.serve`; `finished`: folder of pictures drawn
+    before. Results: `splats` and `picture`, (4, H, W), of the last frame; `frames` drawn;
+    `renders`: Blender's renders for each frame; `engine` of other objects, or "". `stopped`: by
+    Esc, which Blender forgets where a render begins."""
 
     layers: Callable[[], Layers | None] | None = None
     transparent: bool = False
@@ -63,15 +65,15 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
     shared: Shared | None = None
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
-        """Draw a frame; called by Blender."""
+        """Draw a frame. Blender calls this."""
         shared = self.shared
         if shared is None:
-            self.error_set("Use Render > Render with Splats: this engine is a part of it")
+            self.error_set("Use Render > Render with Splats, which runs this engine")
             return
         try:
             frame = depsgraph.scene.frame_current
-            drawn = shared.finished and np.load(shared.finished / f"{frame}.npy") / 65535.0
-            picture = self._picture(depsgraph, shared) if drawn is None else drawn
+            before = shared.finished and np.load(shared.finished / f"{frame}.npy") / 65535.0
+            picture = self._picture(depsgraph, shared) if before is None else before
             result = self.begin_result(0, 0, *picture.shape[:0:-1])
             result.layers[0].passes["Combined"].rect.foreach_set(_linear(picture).ravel())
             self.end_result(result)
@@ -112,8 +114,8 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
 
 
 def _place(depsgraph, camera, size):
-    """View of a camera, and how far it stands back.
-    A view is a pinhole, so that of a camera without perspective stands far away."""
+    """View of a camera, and how far it was moved back, 0 in perspective.
+    A view is a pinhole: for an orthographic camera one that is far away."""
     data, render = camera.data, depsgraph.scene.render
     if data.type not in {"PERSP", "ORTHO"}:
         raise RefineError(
@@ -132,7 +134,7 @@ def _place(depsgraph, camera, size):
 def _cropped(view: View, render: bpy.types.RenderSettings) -> View:
     if not render.use_border:
         return view
-    # In the precision of Blender: 0.7 of 240 columns are 168, and 167 with more digits.
+    # In float32 like Blender: 0.7 of 240 columns are 168 there, and 167 in float64.
     across = np.array([render.border_min_x, render.border_max_x], np.float32)
     left, right = (across * np.float32(view.width)).astype(int).tolist()
     up = np.array([render.border_max_y, render.border_min_y], np.float32)
@@ -142,7 +144,7 @@ def _cropped(view: View, render: bpy.types.RenderSettings) -> View:
 
 
 def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
-    """All splats of a render in the world, with instances, in the colours that `eye` sees.
+    """All splats of a render in the world, instances too, in their colours seen from `eye`.
     Modifiers are ignored, as in the 3D views."""
     parts = []
     for instance in depsgraph.object_instances:
@@ -151,7 +153,7 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
             continue
         checkpoint()
         matrix = np.array(instance.matrix_world, np.float64)
-        if not np.isfinite(matrix).all() or is_flat(matrix):  # shows nothing, as a mesh would
+        if not np.isfinite(matrix).all() or is_flat(matrix):  # such meshes show nothing either
             continue
         evaluated = SimpleNamespace(data=obj.data.evaluated_get(depsgraph))
         checked = SplatObject(evaluated, check(obj).layout)
@@ -163,8 +165,8 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
 
 
 def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
-    """A picture, (4, H, W) display-referred, as linear pixels, (H * W, 4), lowest row first.
-    By the sRGB curve (IEC 61966-2-1), which the copy's view transform inverts."""
+    """A display-referred picture, (4, H, W), as linear pixels, (H * W, 4), lowest row first.
+    By the sRGB curve (IEC 61966-2-1), which the view transform of the copied scene inverts."""
     colors, alphas = picture[:3], picture[3]
     straight = (colors / np.maximum(alphas, 1e-6)).clip(0.0, 1.0)
     curved = ((straight + 0.055) / 1.055) ** 2.4
@@ -186,7 +188,7 @@ def refuse(scene: bpy.types.Scene) -> None:
 
 
 def left_out(scene: bpy.types.Scene) -> list[str]:
-    """Sentences on scene settings that a render with splats ignores."""
+    """Sentences on settings of a rendered scene that splats ignore."""
     render, sentences = scene.render, []
     dof = getattr(scene.camera and scene.camera.data, "dof", None)  # the camera may be gone by now
     blurs = {"depth of field": dof and dof.use_dof, "motion blur": render.use_motion_blur}
@@ -204,17 +206,17 @@ def left_out(scene: bpy.types.Scene) -> list[str]:
 def steps(
     scene: bpy.types.Scene, frames: Sequence[int], shared: Shared, *, write: bool
 ) -> Generator[meshes.Step | None, None, None]:
-    """Yield Blender's renders for some frames; the caller renders each before the next.
-    At None Blender may do other things. Cleans up at the end or when closed. `write`: pictures go
-    to the scene's output. `RefineError` if a step failed, `Cancelled` if one was stopped."""
+    """Yield Blender's renders for some frames; the caller runs each before it takes the next.
+    None: Blender may do other things first. Cleans up at the end or when closed. `write`: pictures
+    go to the scene's output. `RefineError` if a step failed, `Cancelled` if one was stopped."""
     refuse(scene)
-    with _made(shared) as folder:
+    with _session(shared) as folder:
         others, whole = meshes.Meshes(scene, folder), _whole(scene, "whole")
         shared.engine, shared.renders = others.engine, others.renders + 1
         shared.transparent = scene.render.film_transparent
         movie = write and scene.render.is_movie_format
         kept = not scene.render.use_overwrite, scene.render.use_placeholder
-        if movie:  # it is written as one, when all frames are drawn
+        if movie:  # written by one render, after all frames are drawn
             written = _whole(scene, "movie")
             meshes.write_exr(meshes.existing(whole), folder / "whole_######")
         for frame in frames:
@@ -248,7 +250,7 @@ def _check(shared: Shared, frame: int) -> None:
 
 
 def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
-    """Whether a frame's file exists and stays; else make a placeholder if wanted."""
+    """Whether a frame's file exists and is to stay; else make a placeholder if wanted."""
     path = Path(bpy.path.abspath(meshes.existing(name).render.frame_path(frame=frame)))
     there = path.exists()
     if placeholder and not there:
@@ -258,8 +260,8 @@ def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
 
 
 @contextmanager
-def _made(shared: Shared) -> Iterator[Path]:
-    """Yield a folder; afterwards remove it, and all else that a render made."""
+def _session(shared: Shared) -> Iterator[Path]:
+    """Register the engine and yield a temporary folder; remove both and all copies afterwards."""
     folder = Path(tempfile.mkdtemp(prefix="refine-"))
     meshes.remove_all()
     bpy.utils.register_class(REFINE_engine)

@@ -1,6 +1,6 @@
-"""Everything but splats: rendered by the scene's own engine, with depths, in copies of the scene,
-so that its settings stay untouched; and the rendered passes, from files to layers.
-Layers blend as splats do, in shown colours; so Blender's view transform comes before them."""
+"""All but splats: rendered with depths by the scene's own engine, in copies of the scene, whose
+settings so stay untouched; and the rendered passes, read from files and made layers.
+Layers blend as splats do, in display-referred colours, so after Blender's view transform."""
 
 from __future__ import annotations
 
@@ -30,30 +30,30 @@ _RENDERED = {
     *("GPENCIL", "EMPTY"),  # an empty may stand for a collection
 }
 
-_HIDDEN_BY = (
-    "refine_out_of_sight"  # Custom property of a hidden object: the property that was changed
-)
+_HIDDEN_BY = "refine_out_of_sight"
+"""Custom property of a hidden object: the name of the property that hides it."""
 
 _BY_RAYS = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES"}
 """Types that can be hidden from cameras; EEVEE ignores that for instances."""
 
-_TILE = 128  # Largest tile side rendered by the processor, pixels
+_TILE = 128  # Largest side of a tile that Cycles renders on the processor, pixels
 
-_WORLD_SAMPLES = 16  # Rays in each pixel of the world, at most
+_WORLD_SAMPLES = 16  # Samples for a pixel of the world, at most
 
-_FARTHEST = 0.999  # Share of the range beyond which there is nothing: EEVEE of 4.3 says so
+_FARTHEST = 0.999  # Share of the clip end from which on depths mean nothing (EEVEE of 4.3)
 
-_INFINITE = 1e9  # Depth beyond which there is nothing: Cycles reports 1e10
+_INFINITE = 1e9  # Depth from which on depths mean nothing: Cycles stores 1e10
 
-_PIXELS = 1 << 18  # Pixels per call of the view transform
+_PIXELS = 1 << 18  # Pixels for each call of the view transform
 
-_ROUNDS = 2  # Pixels that known depths spread into edges without one
+_ROUNDS = 2  # Pixels by which depths spread into edges without one
 
-_MOMENT = 0.01  # Seconds that Blender may stand still
+_MOMENT = 0.01  # Seconds to wait for the thread before Blender may do other things
 
 
 class Step(NamedTuple):
-    """A render for Blender: its scene's name, whether an animation (writes files), a label."""
+    """A render for Blender: name of its scene, whether it is an animation (these write files), and
+    a label for the progress."""
 
     scene: str
     animation: bool
@@ -64,16 +64,16 @@ Steps = Generator[Step | None, None, Callable[[], Layers] | None]
 
 
 def drawn_by_us(obj: bpy.types.Object) -> bool:
-    """Whether an object holds splats that Blender does not draw itself."""
+    """Whether an object holds splats that Blender does not draw as such."""
     return mesh_layout.looks_like_splats(obj) and not (
         obj.type == "POINTCLOUD" and getattr(obj.data, "type", "") == mesh_layout.NATIVE
     )
 
 
 class Meshes:
-    """A scene without its splats, rendered frame by frame through files in `folder`.
-    See-through objects are rendered apart, so that splats behind them are seen. `engine`: what
-    renders them, "" if there is nothing; `renders`: Blender's renders for each frame."""
+    """A scene without its splats, rendered frame by frame into files in `folder`.
+    See-through objects are rendered apart, so that splats show behind them. `engine`: the renderer,
+    "" if there is nothing to render; `renders`: Blender's renders for each frame."""
 
     def __init__(self, scene: bpy.types.Scene, folder: Path) -> None:
         self._folder = folder
@@ -81,7 +81,7 @@ class Meshes:
         layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
         objects = [obj for obj in layer.objects if obj.type in _RENDERED and not obj.hide_render]
         shown = [obj for obj in objects if not drawn_by_us(obj)]
-        # Older Blenders show the points of point clouds as balls.
+        # Blender renders the points of point clouds as balls.
         self._hidden = [o for o in objects if drawn_by_us(o) and o.type == "POINTCLOUD"]
         self._clear = self._opaque = []
         if shown:
@@ -92,10 +92,10 @@ class Meshes:
             self._clear = [obj for obj in shown if _lets_through(obj, glass)]
             self._opaque = [obj for obj in shown if obj not in self._clear]
             if self._clear and engine.startswith("BLENDER_EEVEE") and hasattr(meshes, "cycles"):
-                # It knows no depth of what it blends.
+                # EEVEE gives no depth of see-through surfaces.
                 self._depths = self._copy(scene, "depths", cycles=True, samples=1).name
         if not scene.render.film_transparent and scene.world is not None:
-            # Cycles is quicker to begin, and needs no graphics card.
+            # Without other objects by Cycles, which starts faster and needs no graphics card.
             world = self._copy(scene, "world", cycles=not shown, samples=_WORLD_SAMPLES)
             world.render.film_transparent, self._world = False, world.name
             for linked in (world.collection.children, world.collection.objects):
@@ -106,7 +106,8 @@ class Meshes:
         self.engine = bpy.data.scenes[self._any].render.engine if self._any else ""
 
     def layers(self, frame: int) -> Steps:
-        """Yield a frame's renders (None: Blender may work); a thread-safe reader of its layers."""
+        """Yield a frame's renders, or None where Blender may do other things. Returns a thread-safe
+        function that gives the frame's layers, None if there are none."""
         if not self._any:
             return None
         files = []
@@ -130,8 +131,8 @@ class Meshes:
         return partial(blended, (yield from self._shown(pictures)))
 
     def _rendered(self, name, frame, label):
-        """Render a frame of a copy; the renamed file.
-        Blender handles Esc itself, and writes no unfinished file."""
+        """Render a frame of a copy; path of the file, renamed.
+        `Cancelled` if there is none: after Esc Blender writes no file."""
         set_frames(name, [frame])
         yield Step(name, animation=True, what="meshes")
         try:
@@ -141,13 +142,14 @@ class Meshes:
             raise Cancelled from None
 
     def _copy(self, scene, what, *, cycles=False, samples=0):
-        """Make a copy: by Cycles if needed or asked for, with few rays if asked for."""
+        """Make a copy that writes EXR files, by Cycles if `cycles` or if EEVEE has no card, with at
+        most `samples` if not 0."""
         copy = copied(scene, what)
         write_exr(copy, self._folder / f"{what}_######")
         copy.render.film_transparent = True
         for layer in copy.view_layers:
             layer.use_pass_combined = layer.use_pass_z = True
-            # Cycles: the depth of what is nearest, seen through or not.
+            # Cycles: depths of the nearest surface, however see-through.
             layer.pass_alpha_threshold = 0.0
         settings, most = getattr(copy, "cycles", None), copy.eevee.taa_render_samples
         copy.eevee.taa_render_samples = few = min(samples or most, most)
@@ -160,7 +162,7 @@ class Meshes:
             settings.samples = few if instead else min(settings.samples, samples)
             settings.use_denoising = False
         if samples == 1:
-            settings.device = "CPU"  # whose kernels are there already
+            settings.device = "CPU"  # whose kernels need no compiling
         if settings.device == "CPU":  # Cycles looks for Esc between tiles
             tile = settings.tile_size if settings.use_auto_tile else _TILE
             settings.use_auto_tile, settings.tile_size = True, min(tile, _TILE)
@@ -168,7 +170,7 @@ class Meshes:
 
     def _shown(self, pictures):
         """Linear colours, (3, H, W) each, after the scene's view transform.
-        Only Blender knows it, for saved images; each stretch stops it for 0.1 s."""
+        Blender applies it only where it saves an image. Each band of rows takes it 0.1 s."""
         tall = np.concatenate(pictures, axis=1)
         rows = max(_PIXELS // tall.shape[2], 1)
         bands = []
@@ -198,7 +200,7 @@ class Meshes:
 
 
 def _has_card() -> bool:
-    """Whether EEVEE has a graphics card; without one it takes minutes."""
+    """Whether there is a graphics card for EEVEE, which takes minutes without."""
     if not bpy.app.background or not sys.platform.startswith("linux"):
         return True
     return Path("/dev/dri").exists() or Path("/dev/nvidia0").exists()
@@ -234,11 +236,11 @@ def _is_clear(node: bpy.types.Node, glass: bool) -> bool:
 @contextmanager
 def out_of_sight(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
     """Hide objects from cameras in the block; shadows and light stay.
-    Each is marked until restored: an undo or a file may bring it back hidden."""
+    Hidden objects are marked, so that `restore` finds those that an undo or a file brings back."""
     for obj in objects:
         seen_by_rays = obj.type in _BY_RAYS and obj.instance_type == "NONE"
         name = "visible_camera" if seen_by_rays else "hide_render"
-        if getattr(obj, name) == seen_by_rays:  # else the scene leaves it out already
+        if getattr(obj, name) == seen_by_rays:  # else it is hidden already
             obj[_HIDDEN_BY] = name
             setattr(obj, name, not seen_by_rays)
     try:
@@ -248,7 +250,7 @@ def out_of_sight(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
 
 
 def restore() -> None:
-    """Show all hidden objects again."""
+    """Show again all objects that `out_of_sight` hid."""
     for obj in bpy.data.objects:
         name = obj.get(_HIDDEN_BY)
         if name is not None:
@@ -258,8 +260,8 @@ def restore() -> None:
 
 
 def copied(scene: bpy.types.Scene, what: str) -> bpy.types.Scene:
-    """A copy that renders what the scene does, without compositor and sequencer, one view layer.
-    Its name begins with a dot, so menus leave it out."""
+    """Copy of a scene with one view layer rendered, without compositor and sequencer.
+    Its name begins with a dot, which hides it in menus."""
     copy = scene.copy()
     copy.name = f".REFINE {what}"
     copy[COPY_OF] = scene
@@ -272,7 +274,7 @@ def copied(scene: bpy.types.Scene, what: str) -> bpy.types.Scene:
 
 
 def existing(name: str) -> bpy.types.Scene:
-    """A copy by its name; raises `Cancelled` if an undo has removed it."""
+    """Copy of a scene by its name; `Cancelled` if an undo has removed it."""
     scene = bpy.data.scenes.get(name)
     if scene is None:
         raise Cancelled
@@ -280,7 +282,7 @@ def existing(name: str) -> bpy.types.Scene:
 
 
 def set_frames(name: str, frames: Sequence[int]) -> bpy.types.Scene:
-    """Make a copy render evenly spaced frames, and go to the first."""
+    """Make a copied scene render evenly spaced frames, and go to the first."""
     scene = existing(name)
     scene.frame_start, scene.frame_end = frames[0], frames[-1]
     scene.frame_step = frames[1] - frames[0] if frames[1:] else 1
@@ -290,20 +292,20 @@ def set_frames(name: str, frames: Sequence[int]) -> bpy.types.Scene:
 
 
 def remove_all() -> None:
-    """Remove all copies; windows that show one show its scene again."""
+    """Remove all copied scenes; windows that show one show the original again."""
     for window in bpy.context.window_manager.windows:
         if COPY_OF in window.scene:
             window.scene = window.scene[COPY_OF]
-    found = [scene for scene in bpy.data.scenes if COPY_OF in scene]
+    copies = [scene for scene in bpy.data.scenes if COPY_OF in scene]
     if bpy.context.window is None:  # as in a command: `remove` of 4.3 crashes without a window
-        bpy.data.batch_remove(found)
-        found = []
-    for scene in found:
+        bpy.data.batch_remove(copies)
+        copies = []
+    for scene in copies:
         bpy.data.scenes.remove(scene)
 
 
 def write_exr(scene: bpy.types.Scene, path: Path) -> None:
-    """Make a copy write images with all passes for `core.images`."""
+    """Make a copied scene write images with all passes, as `core.images` reads them."""
     render, settings = scene.render, scene.render.image_settings
     _set_format(settings, "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER")
     settings.color_depth, settings.exr_codec = "32", "NONE"
@@ -316,14 +318,14 @@ def write_exr(scene: bpy.types.Scene, path: Path) -> None:
 
 
 def write_png(scene: bpy.types.Scene) -> None:
-    """Make a copy save 16-bit PNG, as fast as possible."""
+    """Make a copied scene save 16-bit PNG, as fast as possible."""
     settings = scene.render.image_settings
     _set_format(settings, "IMAGE", "PNG")
     settings.color_mode, settings.color_depth, settings.compression = "RGB", "16", 0
 
 
 def show_as_stored(scene: bpy.types.Scene) -> None:
-    """Give a copy the view transform that shows sRGB colours as they are."""
+    """Give a copied scene the view transform that only encodes colours as sRGB."""
     view = scene.view_settings
     view.view_transform, view.look = "Standard", "None"
     view.exposure, view.gamma, view.use_curve_mapping = 0.0, 1.0, False
@@ -340,7 +342,7 @@ def _set_format(settings: bpy.types.ImageFormatSettings, media_type: str, file_f
 
 
 class Pass(NamedTuple):
-    """Rendered together: colours times alpha, (3, H, W), alphas and depths, (H, W)."""
+    """One render: colours times alpha, (3, H, W), alphas and depths, (H, W)."""
 
     colors: NDArray[np.float32]
     alphas: NDArray[np.float32]
@@ -351,19 +353,19 @@ Blended = tuple[list[NDArray[np.float32]], Callable[[Sequence[NDArray[np.float32
 
 
 def _layers_of(files: Sequence[tuple[Path, Path]], world: Path | None, far: float) -> Blended:
-    """Read and remove files, (colours, depths) of each pass and of the world behind.
-    The pictures, (3, H, W) float32, for the view transform, and a callable that makes layers of the
-    transformed ones. Depths from `far` on hold nothing."""
+    """Read and remove files: of each pass those with colours and with depths, and of the world.
+    Gives the pictures, (3, H, W) float32, for the view transform, and a callable that makes layers
+    of the transformed ones. Depths from `far` on count as empty."""
     passes = []
     for colors, depths in files:
         one = _read(colors)
         away = one.depths if depths == colors else _read(depths).depths
-        passes.append(one._replace(depths=_known(away, one.alphas, far)))
+        passes.append(one._replace(depths=_filled(away, one.alphas, far)))
     return _blended(passes, _read(world).colors if world else None)
 
 
 def _blended(passes: Sequence[Pass], world: NDArray[np.float32] | None) -> Blended:
-    """Each pass as if opaque, and all blended without splats; see `_layers_of`."""
+    """Pictures of each pass as if opaque and of all blended; see `_layers_of`."""
     nothing = np.zeros_like(passes[0].colors if passes else world)
     seen = [each for each in passes if each.alphas.any()]
     passes = seen or [Pass(nothing, nothing[0], nothing[0])]
@@ -373,7 +375,7 @@ def _blended(passes: Sequence[Pass], world: NDArray[np.float32] | None) -> Blend
     over = over / np.maximum(share, 1e-6) if world is None else over + left * world
 
     def layers(shown: Sequence[NDArray[np.float32]]) -> Layers:
-        """Layers that look like Blender's without splats: the background corrects the blending."""
+        """Layers that without splats give Blender's picture, by a correction in the background."""
         pairs = zip(seen, shown, strict=False)
         opaque = [each._replace(colors=each.alphas * colors) for each, colors in pairs]
         layers = in_order(opaque or passes)
@@ -391,12 +393,13 @@ def _read(path: Path) -> Pass:
     return Pass(colors, channels["Combined.A"].clip(0.0, 1.0), depths)
 
 
-def _known(depths, alphas, far):
+def _filled(depths, alphas, far):
     """Depth of each pixel, (H, W), 0 where empty.
-    Engines trace one ray, which may miss: edges take the nearest depth, others are in front."""
-    known = np.where(depths >= far, np.float32(np.inf), depths)
+    An engine's depth is of one ray, which may miss what the pixel shows: such edges take the
+    nearest depth around, or without any 0, which is in front of all splats."""
+    filled = np.where(depths >= far, np.float32(np.inf), depths)
     for _ in range(_ROUNDS):
-        padded = np.pad(known, 1, constant_values=np.inf)
+        padded = np.pad(filled, 1, constant_values=np.inf)
         around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).min(axis=(2, 3))
-        known = np.where(np.isinf(known), around, known)
-    return np.where(np.isinf(known) | (alphas <= 0.0), np.float32(0.0), known)
+        filled = np.where(np.isinf(filled), around, filled)
+    return np.where(np.isinf(filled) | (alphas <= 0.0), np.float32(0.0), filled)

@@ -81,7 +81,7 @@ def mark_again(context: bpy.types.Context) -> None:
     active = getattr(context, "object", None)
     objects = [obj for obj in context.scene.objects if mesh_layout.looks_like_splats(obj)]
     first = [active] if active in objects else [obj for obj in objects if obj.visible_get()][:1]
-    noted = {demands.RECORD, mesh_scores.RECORD, mesh_scores.FOUND}
+    noted = {demands.RECORD, mesh_scores.RECORD, mesh_scores.FLOATERS}
     others = [obj for obj in objects if obj.select_get() or noted & set(obj.data.keys())]
     if bpy.app.background:
         _refresh(context.scene, [*first, *others])

@@ -1,1 +1,1 @@
-"""Splats drawn in Blender's 3D views, over what Blender itself draws there."""
+"""Splats drawn in Blender's 3D views, over Blender's own picture."""

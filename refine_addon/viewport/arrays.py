@@ -1,5 +1,5 @@
-"""Arrays of splats for the 3D view: uploads, order, colours. No Blender here.
-The rules are those of the reference implementation (`core.splats`)."""
+"""Arrays of splats for the 3D view: order, colours, textures. Without Blender.
+Opacities and cuts are those of the reference implementation (`core.splats`)."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ from ..core.splats import (
 
 WIDTH = 4096  # Columns of a texture with one value for each splat, row by row
 
-MOST = 1 << 24  # Splats drawn at most: float32, which holds their order, counts no further
+MOST = 1 << 24  # Splats drawn at most: their order is stored as float32, exact up to this
 
-STAYS, GOES = 1, 2  # Protected and removed, as in `mesh.edit.FORCE`
+STAYS, GOES = 1, 2  # Protected, and removed by the user, as in `mesh.edit.FORCE`
 
 MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (0.45, 0.0, 1.0)}
-"""Tints, visible on white and black, unlike the heat map, the budget's tint, and `SELECTED`."""
+"""Green and violet tints. They show on white and black, and differ from the heat map, from the tint
+of the budget, and from `SELECTED`."""
 
 SELECTED, SELECTED_SHARE = (1.0, 0.1, 0.75), 0.6  # Tint of selected splats, and its share
 
-SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}  # Share of the tint, by mode
+SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}  # Share of `MARKS`, by mode
 
 _LARGEST_KEY = 65535.0
 
@@ -74,8 +75,8 @@ class Packed:
 
 
 class Eye(NamedTuple):
-    """Eye of a view in a mesh's frame: depth of p is ``row[:3] @ p + row[3]``.
-    `place`: the centre of projection, (3,); without perspective the view's direction."""
+    """Eye of a view in a mesh's frame: the depth of p is ``row[:3] @ p + row[3]``.
+    `place`: centre of projection, (3,); in an orthographic view its direction."""
 
     row: NDArray[np.float64]
     place: NDArray[np.float64]
@@ -83,7 +84,7 @@ class Eye(NamedTuple):
 
 
 def pack(splats: Splats) -> Packed:
-    """The drawable splats, packed."""
+    """The drawable splats of a mesh, as `Packed`."""
     opacities = opacity(splats.opacity_logits).astype(np.float32)  # (N,)
     shown = drawable(splats) & (opacities >= ALPHA_CUT)
     vertices = np.flatnonzero(shown).astype(np.int32)
@@ -103,8 +104,8 @@ def pack(splats: Splats) -> Packed:
 
 
 def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> NDArray[np.int32]:
-    """Splats by importance, (M,): fewer are drawn by taking the first.
-    By ranks of scores, else by opacity times the sum of squared deviations: about the seen area."""
+    """Rows of `packed` by importance, (M,), so that the first few look most like all.
+    By ranks of scores, else by opacity times summed variances, which grows with the drawn area."""
     if ranks is None:
         sizes = packed.covariances[:, 0] + packed.covariances[:, 3] + packed.covariances[:, 5]
         worth = packed.opacities * sizes
@@ -114,7 +115,8 @@ def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> N
 
 
 def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
-    """Display-referred colours with opacity, (M, 4), seen from `eye`, else the constant colour."""
+    """Display-referred colours with opacity, (M, 4), seen from `eye`; without it, harmonics of
+    degree 0 alone."""
     rgba = np.empty((len(packed), 4), np.float32)
     rgba[:, 3] = packed.opacities
     for chunk in pieces(len(packed)):
@@ -153,14 +155,14 @@ def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDAr
 def tinted(
     rgba: NDArray[np.float32], tint: tuple[float, float, float], share: float
 ) -> NDArray[np.float32]:
-    """Colours, (M, 4), mixed with a share of the tint."""
+    """Colours, (M, 4), of which `share` is the tint."""
     mixed = rgba.copy()
     mixed[:, :3] = (1.0 - share) * np.clip(rgba[:, :3], 0.0, 1.0) + share * np.array(tint)
     return mixed
 
 
 def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> NDArray[np.float32]:
-    """Colours, (M, 4), tinted for protected and removed splats, (M,)."""
+    """Colours, (M, 4), tinted where `force`, (M,), is one of `MARKS`."""
     if force is None or mode not in SHARES:
         return rgba
     mixed = rgba.copy()
@@ -173,7 +175,7 @@ def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> 
 def in_front(
     means: NDArray[np.float32], eye: Eye, near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Means, (M, 3), beyond the near plane, (V,) rows, and their depths."""
+    """Rows of the means, (M, 3), beyond the near plane, (V,), and their depths, (V,)."""
     with np.errstate(over="ignore", invalid="ignore"):
         depths = means @ eye.row[:3].astype(np.float32) + np.float32(eye.row[3])
     shown = np.flatnonzero((depths > near) & (depths < np.inf))
@@ -181,9 +183,9 @@ def in_front(
 
 
 def farthest_first(depths: NDArray[np.float32], *, perspective: bool) -> NDArray[np.int64]:
-    """Order of finite depths, (V,), largest first; nearly equal ones keep theirs.
-    Depths, or in perspective their logarithms (steps of 1e-4), are rounded to 16 bits: NumPy's
-    radix sort is 8 times as fast as its float32 sort."""
+    """Indices that sort finite depths, (V,), largest first; nearly equal ones stay in order.
+    Depths (in perspective their logarithms, in steps of about 1e-4) are rounded to 16 bits, since
+    NumPy's radix sort of these is 8 times as fast as its sort of float32."""
     if not len(depths):
         return np.empty(0, np.int64)
     values = np.log(depths) if perspective else depths
@@ -205,7 +207,7 @@ def as_texture(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def first_of_each(counts: list[int], most: int) -> list[int]:
-    """Splats drawn of each object if `most` are drawn in all: equal shares."""
+    """Splats drawn of each object if at most `most` are drawn in all: equal shares."""
     total = sum(counts)
     if total <= most:
         return list(counts)

@@ -1,7 +1,7 @@
-"""The drawn data: splats of meshes, packed once, and their textures; and places of splats in a
-view: objects of the view layer, and instances of collections.
-Blender draws a mesh without faces as points, and has no switch for that. So its evaluated copy,
-which no file, undo step or script sees, is shown as its bounding box; the object is untouched."""
+"""The drawn data: splats of meshes, packed once, and their textures; and placements of splats:
+objects of the view layer, and instances of collections.
+Blender draws the points of a mesh without faces, and has no switch for that. So the evaluated copy
+of the object, which files, undo and scripts do not see, gets the display type *Bounds*."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from ..mesh.layout import SplatObject, check, has, looks_like_splats, sh_degree,
 from . import shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
 
-_DEEPEST = 8  # Deepest nesting of instances; Blender draws no more
+_DEEPEST = 8  # Nesting of instances up to which Blender draws
 
 
 class Marks(NamedTuple):
-    """Marks of a mesh's splats, each one value for each splat, or None."""
+    """Marks of a mesh's splats: arrays with a value for each splat, or None."""
 
     ranks: NDArray[Any] | None = None
     going: NDArray[Any] | None = None
@@ -41,9 +41,9 @@ class Marks(NamedTuple):
 
 @dataclass(eq=False)
 class MeshSplats:
-    """The splats of a mesh, its N vertices packed to M drawable ones.
-    `signature`: what was packed; `future`, while packing; `read`: marks of the N; `marks`: of the
-    M; `important`: (M,), most important first; `scored`, `marked`: counters of changes."""
+    """The splats of a mesh, its N vertices packed to M drawable ones. `signature`: of the packed
+    values; `future`: while packing; `read`: marks of the N; `marks`: of the M; `important`: (M,),
+    most important first; `scored`, `marked`: counters of changes; `kinds`: `MARKS` among them."""
 
     signature: tuple[Any, ...] = ()
     future: Future[Packed] | None = None
@@ -59,7 +59,7 @@ class MeshSplats:
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """Place of an object in the textures: rows ``start`` to ``start + count``."""
+    """An object's splats in the textures: rows `start` to `start + count`."""
 
     held: MeshSplats
     packed: Packed
@@ -75,9 +75,9 @@ class Slot:
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """Splats of several objects in shared textures, so that they blend as one.
-    `slots`: by keys of `Placing`. Texels: `means`: place and slot; `covariances`: xx, xy, xz, yy;
-    `more_covariances`: yz, zz, model, 0."""
+    """Splats of several objects in shared textures, so that they are sorted and blended together.
+    `slots`: by keys of `Placing`. Texels: `means`: mean and slot number; `covariances`: xx, xy, xz,
+    yy; `more_covariances`: yz, zz, model, 0."""
 
     slots: dict[tuple[int, int], Slot]
     means: gpu.types.GPUTexture | None
@@ -91,8 +91,8 @@ class Atlas:
 
 
 class Content:
-    """Data shared by all views. `pool`: one thread for array work longer than a frame.
-    `refused`: meshes that only looked like splats; `changes`, `selections`: counters of changes."""
+    """Data shared by all views. `pool`: a thread for array work that takes longer than a frame.
+    `refused`: meshes that looked like splats and are none; `changes`, `selections`: counters."""
 
     def __init__(self) -> None:
         self.pool = ThreadPoolExecutor(1, "refine-view")
@@ -104,16 +104,16 @@ class Content:
         self.refused: set[int] = set()
 
     def has_changed(self, mesh: int | None = None) -> None:
-        """Look at a mesh again before it is drawn, by default at all."""
+        """Read a mesh, or all, again before it is drawn."""
         self._stale.update(self._held if mesh is None else [mesh])
         self.refused.difference_update(list(self.refused) if mesh is None else [mesh])
 
     def marks(self) -> set[int]:
-        """The `arrays.MARKS` among drawn splats."""
+        """Keys of `arrays.MARKS` that drawn splats have."""
         return {mark for slot in self.atlas.slots.values() for mark in slot.held.kinds}
 
     def select(self, mesh: int, chosen: NDArray[np.bool_]) -> None:
-        """Show splats of a mesh, (N,), as selected until it changes."""
+        """Show splats of a mesh, (N,) bool, as selected until it changes."""
         held = self._held.get(mesh)
         if held is not None and held.packed is not None and held.signature[0] == len(chosen):
             held.read = held.read._replace(selected=chosen)
@@ -121,7 +121,7 @@ class Content:
             self.selections += 1
 
     def selection(self) -> gpu.types.GPUTexture:
-        """A texel for each row of the atlas: 1 if selected, else 0."""
+        """Texture with a texel for each row of the atlas: 1 if selected, else 0."""
         key = (self.atlas, self.selections)
         if self._selection is None or self._selection[0] != key:
             flags = np.zeros(self.atlas.rows, np.float32)
@@ -136,15 +136,16 @@ class Content:
         return any(held.future for held in self._held.values())
 
     def ready(self) -> bool:
-        """Whether packed splats wait for a view."""
+        """Whether splats were packed that no view has drawn yet."""
         return any(held.future and held.future.done() for held in self._held.values())
 
     def update(
         self, places: Iterable[Placing], existing: Callable[[], set[tuple[int, int]]]
     ) -> dict[tuple[int, int], NDArray[np.float64]]:
-        """Prepare splats; (4, 4) world matrices of those ready, by key. In edit mode as last read.
-        `existing` gives keys of all splats of the file."""
-        for held in self._held.values():  # also of meshes that have gone since it began
+        """Prepare placed splats; (4, 4) world matrices of those ready, by key.
+        Splats in edit mode are those of the last `read_edited`. `existing`: keys of all splats of
+        the file, whose textures are kept."""
+        for held in self._held.values():  # of deleted meshes, too
             if held.future and held.future.done():
                 held.packed, held.future, held.important = held.future.result(), None, None
                 self._mark(held)
@@ -155,7 +156,7 @@ class Content:
                 continue
             if is_edited(obj):
                 if mesh not in self._held:
-                    continue  # `read_edited` is to come
+                    continue  # until `read_edited`
             elif mesh not in self._held or mesh in self._stale:
                 self._stale.discard(mesh)
                 try:
@@ -169,13 +170,13 @@ class Content:
         return wanted
 
     def read_edited(self, obj: bpy.types.Object) -> None:
-        """Read an object in edit mode; not while Blender draws, as it updates the mesh."""
+        """Read an object in edit mode; not while Blender draws, as this updates the mesh."""
         self._stale.discard(obj.data.session_uid)
         with mesh_selection.readable(obj) as checked:
             self._read(checked, obj.data.session_uid)
 
     def _read(self, checked: SplatObject, uid: int) -> None:
-        """Read a mesh's changes; `uid` identifies the drawn mesh."""
+        """Read a mesh, and pack it anew if its splats changed; `uid` identifies the drawn mesh."""
         mesh = checked.mesh
         held = self._held.setdefault(uid, MeshSplats())
         held.degree = sh_degree(mesh)
@@ -254,8 +255,8 @@ def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | Non
 
 
 class Placing(NamedTuple):
-    """An object with splats and its (4, 4) matrix to the world.
-    `key`: identity of the object and its instancers in one number, and of the mesh."""
+    """An object with splats and its (4, 4) matrix to the world. `key`: a number that identifies the
+    object and its instancers, and one that identifies the mesh."""
 
     key: tuple[int, int]
     obj: bpy.types.Object
@@ -263,13 +264,13 @@ class Placing(NamedTuple):
 
 
 def placings(objects: list[bpy.types.Object]) -> Iterator[Placing]:
-    """Splats among some objects of a scene, and among their instances."""
+    """Placings of the splats among some objects of a scene, and among their instances."""
     for obj in objects:
         yield from _placed(obj, obj.matrix_world, 0, 0)
 
 
 def instanced(objects: list[bpy.types.Object]) -> set[bpy.types.Object]:
-    """Splat objects that some objects instance."""
+    """Splat objects that some objects instance and that are not among these."""
     return {place.obj for place in placings(objects)} - set(objects)
 
 
@@ -279,7 +280,7 @@ def every() -> set[tuple[int, int]]:
 
 
 def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> Iterator[Placing]:
-    """An object's own splats, or those of its instances, given its matrix to the world."""
+    """Placings of an object's own splats, or of its instances', by its matrix to the world."""
     chain = (chain << 32) + obj.session_uid
     if looks_like_splats(obj):
         if splat_count(obj.data):
@@ -295,7 +296,7 @@ def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> It
 
 
 def hide_points(depsgraph: bpy.types.Depsgraph | None, refused: Container[int] | None) -> None:
-    """Show a view layer's splats as bounding boxes, but for refused meshes; None: as points."""
+    """Show a view layer's splats as bounding boxes, except `refused` meshes; if None, as points."""
     if depsgraph is None or depsgraph.mode != "VIEWPORT":
         return
     objects = [obj.original for obj in depsgraph.scene.objects]

@@ -1,4 +1,4 @@
-"""Drawing of splats, on and off, and what keeps it true to the scene."""
+"""Drawing of splats in 3D views: switched on and off, and updated when the scene changes."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ from .content import Content, every, graphs, hide_points, is_edited, placings
 from .view import Camera, View
 
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
-"""Nothing, all splats, colours by rank, what Apply keeps, what it removes."""
+"""Draw nothing, all splats, colours by rank, the splats that Apply keeps, those it removes."""
 
-SHOWN = "refine_shown"  # Custom property of the scene: the mode shown when the file was saved
+SHOWN = "refine_shown"  # Custom property of the scene: the mode when the file was saved
 
 _TICK = 0.03  # Seconds between two looks at the sorting thread
 
-_EDIT_REST = 0.3  # Seconds without a change in edit mode before splats are drawn anew
+_EDIT_REST = 0.3  # Seconds without a change in edit mode before splats are read again
 
 _VIEWS = 16  # Regions whose pictures stay on the graphics card
 
 
-warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []  # Give warnings for the view
+warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []  # Sources of a view's warnings
 
 
 _state: Any = SimpleNamespace(
     mode="OFF", failure="", content=Content(), views={}, handles=[], edited_at=0.0, reads=False
 )
-"""State while splats are drawn, in memory only; `views` by region."""
+"""State while splats are drawn, not saved; `views`: by region."""
 
 
 def mode() -> str:
-    """The one of `MODES` shown."""
+    """The current one of `MODES`."""
     return _state.mode
 
 
 def failure() -> str:
-    """Why nothing can be drawn here, or ""."""
+    """Why splats cannot be drawn, or ""."""
     return _state.failure
 
 
@@ -117,7 +117,7 @@ def _forget(*_: object) -> None:
 
 
 def _guarded(work: Callable[[], None]) -> None:
-    """Draw; after a failure stop, and show points again."""
+    """Draw; after an error stop, and let Blender draw its points again."""
     if _state.mode == "OFF" or _state.failure:
         return
     try:
@@ -134,7 +134,7 @@ def _draw() -> None:
     visible = [obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)]
     refused = len(_state.content.refused)
     placed = _state.content.update(placings(visible), every)
-    if len(_state.content.refused) > refused:  # Blender shows these as it did before
+    if len(_state.content.refused) > refused:  # Blender is to draw these
         bpy.app.timers.register(_hide_points, first_interval=0.0)
     key = region.as_pointer()
     view = _state.views.pop(key, None) or View()
@@ -155,7 +155,7 @@ def _draw() -> None:
 
 
 def _draw_legend() -> None:
-    warnings = [text for tell in warned_by for text in tell(bpy.context)]
+    warnings = [text for source in warned_by for text in source(bpy.context)]
     overlays.draw_legend(bpy.context, _state.mode, _state.content.marks(), warnings)
 
 
@@ -175,7 +175,7 @@ def _read_edited() -> float | None:
     if waits > 0.0:
         return waits
     layers = [window.view_layer for window in bpy.context.window_manager.windows]
-    _state.reads = True  # which counts as a change of its own
+    _state.reads = True  # reading makes Blender report a change
     for obj in {obj for layer in layers for obj in layer.objects}:
         if is_edited(obj) and looks_like_splats(obj) and splat_count(obj.data):
             with contextlib.suppress(RefineError):
@@ -193,7 +193,7 @@ def _redraw() -> None:
 
 
 def _hide_points() -> None:
-    """Hide the plain points of drawn splats in all windows, or show them."""
+    """Hide Blender's points of drawn splats in all windows, or show them again."""
     for depsgraph in graphs():
         hide_points(depsgraph, None if _state.mode == "OFF" else _state.content.refused)
 
@@ -205,7 +205,7 @@ def _areas() -> list[bpy.types.Area]:
 
 @persistent
 def _saving(*_: object) -> None:
-    """Note the mode in the file, if that says anything of its splats."""
+    """Store the mode in scenes with splats."""
     if bpy.app.background:
         return
     for scene in bpy.data.scenes:
@@ -220,7 +220,7 @@ def _opened(*_: object) -> None:
         show(wanted)
     if _state.mode != "OFF":
         for window in bpy.context.window_manager.windows:
-            window.view_layer.update()  # what is not evaluated yet would be drawn as points once
+            window.view_layer.update()  # else unevaluated splats are drawn as points once
         _hide_points()
         _redraw()
 

@@ -1,5 +1,6 @@
 """Overlays over splats: see-through meshes, edges of volumes, the legend.
-Blender draws such meshes without depth, so they are mixed over all splats, lit from the viewer."""
+Blender draws see-through meshes without depth, so they are drawn here once more, over all splats,
+lit from the viewer."""
 
 from __future__ import annotations
 
@@ -19,18 +20,18 @@ from numpy.typing import NDArray
 from ..mesh.layout import looks_like_splats
 from .arrays import GOES, MARKS, STAYS, ramp
 
-_OPAQUE = 0.995  # Opacity from which on Blender draws a mesh with depth
+_OPAQUE = 0.995  # Least opacity at which Blender draws a mesh with depth
 
 _COLORS = {"PROTECT": MARKS[STAYS], "REMOVE": MARKS[GOES], "KEEP": MARKS[STAYS]}
 """Role of a volume -> colour of its edges, by what becomes of the splats inside."""
 
-_FILLED = {"SOLID", "TEXTURED"}  # Display types with drawn faces
+_FILLED = {"SOLID", "TEXTURED"}  # Display types of objects whose faces are drawn
 
 WORDS = {"HEAT": ("goes first", "goes last"), "STAYS": ("What stays",), "GOES": ("What goes",)}
 
 MARKED = {STAYS: "Protected", GOES: "Must go"}  # Text beside tints of protected and removed splats
 
-_REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}  # Marks that no splat has in a mode
+_REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}  # Marks and modes that show no splat with them
 
 _WIDE, _HIGH, _EDGE, _FONT = 220, 10, 16, 12  # pixels at scale 1
 _GAP = 6  # between the bar and the words above it
@@ -42,14 +43,14 @@ _TURN = np.linspace(0.0, 2.0 * np.pi, 49)
 
 
 def is_xray(shading: bpy.types.View3DShading) -> bool:
-    """Whether a view sees through all meshes."""
-    seen = {"SOLID": shading.show_xray, "WIREFRAME": shading.show_xray_wireframe}
-    return bool(seen.get(shading.type))
+    """Whether a view shows all meshes see-through."""
+    switches = {"SOLID": shading.show_xray, "WIREFRAME": shading.show_xray_wireframe}
+    return bool(switches.get(shading.type))
 
 
 def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
-    """Draw edges of volumes into a view, and meshes to be mixed with it.
-    Without `has_depths`, depths are those of something else; see `view.View`."""
+    """Draw edges of volumes into a view, and if `mixed` see-through meshes.
+    Without `has_depths` the view's depths are cleared first; see `view.View`."""
     shading = context.space_data.shading
     if mixed and shading.type != "WIREFRAME":
         if not has_depths:
@@ -126,7 +127,7 @@ def _color(
 
 
 def _edges(shape: str) -> NDArray[np.float64]:
-    """Ends of a cube's edges, (24, 3), or of the pieces of three circles, (288, 3)."""
+    """End points of a cube's edges, (24, 3), or of the segments of three circles, (288, 3)."""
     if shape == "SPHERE":
         circle = np.stack([np.cos(_TURN), np.sin(_TURN), np.zeros_like(_TURN)], axis=1)
         pieces = np.stack([circle[:-1], circle[1:]], axis=1).reshape(-1, 3)
@@ -143,7 +144,7 @@ def draw_legend(
     warnings: Collection[str] = (),
 ) -> None:
     """Draw the legend of a mode and of marks (`MARKED`) into a view, warnings above it.
-    At the lower right, since Blender opens *Adjust Last Operation* at the lower left."""
+    It is at the lower right: Blender opens *Adjust Last Operation* at the lower left."""
     if mode not in WORDS and not marks and not warnings:
         return
     scale = context.preferences.system.ui_scale
@@ -179,7 +180,7 @@ def _write(text: str, x: float, y: float) -> None:
 
 
 def _right(context: bpy.types.Context) -> int:
-    """Left edge of the sidebar, pixels of the view's region."""
+    """Right end of the room for the legend: the sidebar or the region's end, pixels."""
     left, region = context.region.x, context.region
     sidebars = (each for each in context.area.regions if each.type == "UI" and each.width > 1)
     return min([region.width, *(each.x - left for each in sidebars if each.x > left)])

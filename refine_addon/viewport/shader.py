@@ -1,6 +1,6 @@
-"""The two shaders: splats into a picture of their own, and that picture into the view.
-EWA splatting (Zwicker et al. 2002, Eq. 31) by the reference implementation's rules. Colours blend
-display-encoded, as in training; a view's framebuffer would decode them, hence the picture."""
+"""Two shaders: one draws splats into a picture of their own, the other that picture into the view.
+EWA splatting (Zwicker et al. 2002, Eq. 31) with the constants of the reference implementation.
+Colours blend display-encoded, as in training; a view's framebuffer blends linear ones."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ vec2 tilt_of(mat3 covariance, vec3 seen, float depth, vec2 focal, vec3 x, vec3 y
 
 void main()
 {
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); /* Not drawn. */
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); /* Outside, so that a return draws nothing. */
   place = vec2(0.0);
   axes = vec4(0.0);
   plane = vec4(0.0);
@@ -118,7 +118,7 @@ void main()
     return;
   }
 
-  /* Its axes: eigenvectors times standard deviations. */
+  /* Axes of the ellipse: eigenvectors times standard deviations. */
   float mean_square = 0.5 * (xx + yy);
   float radius = length(vec2(0.5 * (xx - yy), xy));
   float longest = mean_square + radius;
@@ -207,7 +207,7 @@ void main()
 }
 """
 
-# The view's framebuffer encodes what it is given by the curve of sRGB (IEC 61966-2-1).
+# Linear colours: the view's framebuffer encodes them by the sRGB curve (IEC 61966-2-1).
 _PICTURE_FRAGMENT = """
 void main()
 {
@@ -249,7 +249,7 @@ def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
 
 @cache
 def picture() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
-    """Shader that puts a picture into a view, and the quad that covers it."""
+    """Shader that draws a picture into a view, and the quad that covers the view."""
     info = gpu.types.GPUShaderCreateInfo()
     info.sampler(0, "FLOAT_2D", "picture")
     between = gpu.types.GPUStageInterfaceInfo("refine_picture")

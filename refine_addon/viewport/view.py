@@ -1,5 +1,6 @@
-"""One 3D view: its order of splats, their colours from its eye, its picture.
-While it moves, the most important are sorted at once; at rest, a thread sorts and colours all."""
+"""One 3D view: the order of its splats, their colours from its eye, its picture.
+While it moves, the most important splats are sorted at once; at rest a thread sorts and colours
+all."""
 
 from __future__ import annotations
 
@@ -28,15 +29,17 @@ from .arrays import (
 )
 from .content import Atlas, Content, Marks, Slot
 
-REST = 0.2  # Seconds without a change after which a view rests
+REST = 0.2  # Seconds without a change after which a view counts as resting
 
 TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55  # Tint of splats that the budget removes, and its share
 
-BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)  # Splats drawn while moving, at most; pixels each
+BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)
+"""Splats drawn at most while a view moves, and side of a drawn pixel in pixels of the view."""
 
 
 class Camera(NamedTuple):
-    """World to camera, (4, 4), x right, y up, z back; projection; pixels across and up."""
+    """`view`: world to camera, (4, 4), x right, y up, z back; `projection`: (4, 4) as in OpenGL;
+    `size`: width and height, pixels."""
 
     view: NDArray[np.float64]
     projection: NDArray[np.float64]
@@ -44,12 +47,12 @@ class Camera(NamedTuple):
 
     @property
     def perspective(self) -> bool:
-        """Whether farther things look smaller."""
+        """Whether the view is in perspective, not orthographic."""
         return bool(self.projection[3, 3] == 0.0)
 
     @property
     def near(self) -> float:
-        """Depth of the near plane."""
+        """Depth of the near plane, in units of the world."""
         p = self.projection
         return float(p[2, 3] / (p[2, 2] - 1.0) if self.perspective else (p[2, 3] + 1.0) / p[2, 2])
 
@@ -66,7 +69,7 @@ class _Part(NamedTuple):
 
 
 _Sorted = tuple[NDArray[np.float32], int, NDArray[np.float32] | None]
-"""The thread's result: order as a texture, number drawn, colours."""
+"""What the thread makes: order as a texture, number of splats, colours as a texture or None."""
 
 
 class _Order(NamedTuple):
@@ -76,8 +79,8 @@ class _Order(NamedTuple):
 
 
 class View:
-    """One region of a 3D view. `complete`: shows all it should; `count`: splats shown.
-    `depths`: (H, W) that Blender drew; None if none hide (Blender 5 keeps depths of X-ray)."""
+    """One region of a 3D view. `complete`: all splats are shown, in full; `count`: splats shown;
+    `depths`: (H, W) that Blender drew, None where nothing hides splats."""
 
     def __init__(self) -> None:
         self._picture: gpu.types.GPUTexture | None = None
@@ -108,8 +111,8 @@ class View:
         *,
         solid: bool,
     ) -> None:
-        """Draw objects (matrices of `Content.update`) into the view, by a mode of `draw.MODES`.
-        `solid`: whether anything else in the view hides what is behind it."""
+        """Draw splats into the view, in one of `draw.MODES`. `places`: from `Content.update`;
+        `solid`: whether other objects hide splats behind them."""
         atlas = content.atlas
         if not places:
             self.complete, self.count = not content.pending(), 0
@@ -135,7 +138,7 @@ class View:
         _put(self._picture)
 
     def _moves(self, key: bytes) -> bool:
-        """Whether the view, or an object in it, moved in the last moments."""
+        """Whether the view or an object in it moved within `REST` seconds."""
         now = time.monotonic()
         if key != self._camera_key:
             self._changed = now if self._camera_key else 0.0
@@ -154,8 +157,8 @@ class View:
             self._colors_key, self._colored = colors_key, order_key[0]
 
     def _start(self, pool, key, parts, near, mode, few):
-        """Sort and recolour all splats on the thread, if needed.
-        If nothing is shown yet, only the most important ones, in constant colours."""
+        """Start the thread that sorts all splats, and colours them if colours changed.
+        For the first picture only the most important ones, in constant colours."""
         objects = [(p.slot.number, p.slot.held.marked) for p in parts]
         colors_key: tuple[Any, ...] = (key[0], mode, objects)
         if mode == "HEAT":
@@ -176,7 +179,7 @@ class View:
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
 
     def _paint(self, content, shown, camera, pixels, solid):
-        """Draw the splats into the picture, unless it shows them already."""
+        """Draw the splats into the picture, unless it is up to date."""
         depths = _depths(camera.size) if solid else None
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
         look = (self._order.key, self._colors_key, self._camera_key)
@@ -203,7 +206,7 @@ class View:
             "matrices": shader.texture(rows, 4, "RGBA32F"),
             "depths": farthest,
             "near_depths": farthest,
-        }  # held until they are drawn: the shader does not keep what it is given
+        }  # referenced until drawn, which the shader does not do
         numbers = (*size, camera.near, camera.size[0] / size[0])
         numbers += (camera.perspective, depths is not None, False)
         shader.blend(self._picture, textures, camera.projection, numbers, self._order.count)
@@ -222,8 +225,8 @@ def _parts(shown: list[tuple[Slot, NDArray[Any]]], camera: Camera) -> list[_Part
 def _sort_and_color(
     parts: list[_Part], near: float, mode: str, rows: int | None, few: int | None = None
 ) -> _Sorted:
-    """Sort splats, and colour them in textures of `rows`; on the thread.
-    With `few`, only so many, in constant colours."""
+    """Sort splats and, if `rows` is given, colour them in a texture for that many; on the thread.
+    With `few`, at most so many, in constant colours."""
     order = _order(parts, near, mode, few)
     if rows is None:
         return as_texture(order), len(order), None
@@ -259,7 +262,7 @@ def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) 
 def _in_view(
     part: _Part, count: int, near: float, mode: str
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Rows of an object's most important splats that a view draws, and their depths."""
+    """Rows of an object's `count` most important splats that the view draws, and their depths."""
     slot, important = part.slot, part.important
     if count == slot.count or important is None:
         shown, depths = in_front(slot.packed.means[:count], part.eye, near)
@@ -268,7 +271,7 @@ def _in_view(
         places, depths = in_front(slot.packed.means[chosen], part.eye, near)
         shown = chosen[places].astype(np.int64)
     going, hidden = part.marks.going, part.marks.hidden
-    wanted = np.full(len(shown), mode != "GOES")  # without a plan all stay
+    wanted = np.full(len(shown), mode != "GOES")  # without a preview all stay
     if mode in {"STAYS", "GOES"} and going is not None:
         wanted = going[shown] == (mode == "GOES")
     if hidden is not None:
@@ -277,8 +280,8 @@ def _in_view(
 
 
 def _depths(size: tuple[int, int]) -> NDArray[np.float32] | None:
-    """Depths that Blender drew in the view, (H, W), None where it kept none.
-    EEVEE of 4.3 leaves zeros where overlays are off."""
+    """Depths that Blender drew in the view, (H, W); None if it kept none, as EEVEE of 4.3 without
+    overlays."""
     width, height = size
     buffer = gpu.types.Buffer("FLOAT", width * height)
     gpu.state.active_framebuffer_get().read_depth(0, 0, width, height, data=buffer)

@@ -49,10 +49,10 @@ def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
     scores = addon.mesh.scores
     obj.data.vertices.add(1)  # the note says of how many splats it is; a damaged one counts as none
     assert scores.floater_counts(obj.data) is None
-    with pytest.raises(addon.core.RefineError, match="look for floaters first"):
+    with pytest.raises(addon.core.RefineError, match="find floaters first"):
         scores.floater_mask(addon.mesh.layout.check(obj), ("front",))
     for text in ("", "{", "[]", '{"splats": 3977}'):
-        obj.data[scores.FOUND] = text
+        obj.data[scores.FLOATERS] = text
         assert scores.floater_counts(obj.data) is None
 
 
@@ -100,5 +100,5 @@ def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     np.testing.assert_array_equal(read(addon, obj, "opacity"), opacities[~goes | spared])
     assert scores.record(obj.data) is None
     assert scores.floater_counts(obj.data) is None
-    with pytest.raises(RuntimeError, match="look for floaters first"):
+    with pytest.raises(RuntimeError, match="find floaters first"):
         delete(what="FLOATERS")

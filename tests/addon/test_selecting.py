@@ -98,7 +98,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(addon, quarter, unchanged):
         (operators.select, {"action": "ISOLATE"}, "no splat is selected"),
         (operators.grow_selection, {}, "no splat is selected"),
         (operators.select_by, {"what": "GOING"}, "score the splats first"),
-        (operators.select_by, {"what": "FLOATERS"}, "look for floaters first"),
+        (operators.select_by, {"what": "FLOATERS"}, "find floaters first"),
         (operators.separate_selected, {}, "none would be left"),
     ):
         choose(addon, quarter, range(COUNT if "separate" in operator.idname() else 0))
