@@ -6,12 +6,11 @@ import sys
 def main() -> int:
     """Run the command on this process's arguments; exit code as of `refine_addon.command.main`."""
     try:
-        # Only here: Ctrl-C may come while these load.
+        # Inside the try: Ctrl-C may come while it loads.
         from . import command
 
-        # Afterwards a signal would only break into Python's own tidying up.
         code = command.main(sys.argv[1:], last=True)
-    except KeyboardInterrupt:  # when the command does not listen yet, or no more
+    except KeyboardInterrupt:  # before the command handles signals, or after
         print("refine: error: cancelled; nothing was left half-written", file=sys.stderr)
         return 130
     return code

@@ -1,6 +1,6 @@
 """The command: ``blender -b [scene.blend] --command refine ...``, ``python -m refine_addon ...``.
-Both run the same pipeline; only ``--object`` and `scene` need Blender. In order: this file listens
-for Ctrl-C, `options` parses, `checks` refuses, `subcommands` works input by input with `run`."""
+Both do the same; only ``--object``, ``--source`` and ``render`` need Blender. This file handles
+Ctrl-C, `options` parses, `checks` refuses, and `subcommands` does each input's work with `run`."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from typing import Any
 
 _WORDS = {"SIGINT": "cancelled", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 REASONS = {getattr(signal, name): words for name, words in _WORDS.items() if hasattr(signal, name)}
-"""Name of each signal in messages; Windows lacks the last."""
+"""Signal -> what it did, in messages; Windows lacks SIGHUP."""
 
 
 class Stopped(KeyboardInterrupt):
-    """Raised wherever the command is when a signal asks it to stop; holds its number."""
+    """Raised by a signal that stops the command; its argument is the signal's number."""
 
 
 def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -> int:
-    """Run the command on the words after ``refine``; exit code 0, 1 failed on an input, 2 usage.
-    A signal gives 128 and its number. `scene`: whether an open Blender scene has objects and
-    cameras. `last`: the process ends afterwards, so late signals are ignored."""
+    """Run the command on the words after ``refine``. Exit codes: 0 done, 1 failed, 2 wrong usage,
+    128 + n stopped by signal n. `scene`: Blender is there, with an open scene. `last`: the process
+    ends afterwards, so later signals are ignored."""
     with _listening(last=last) as raise_now:
         try:
-            # Loads all of core, and with it NumPy: a signal waits until that is there.
+            # These load NumPy; signals wait until that is done.
             from ..core.execute import share_heap
             from . import subcommands
 
@@ -37,18 +37,18 @@ def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -
         except KeyboardInterrupt as stop:
             from .run import complain
 
-            # Python's own comes where nobody listens: from a thread, from whoever calls this.
+            # A plain KeyboardInterrupt comes from a caller's handler, or on another thread.
             number = stop.args[0] if isinstance(stop, Stopped) else signal.SIGINT
-            told = "".join(f" {note};" for note in getattr(stop, "__notes__", ()))
-            complain(f"{REASONS[number]};{told} nothing was left half-written")
+            notes = "".join(f" {note};" for note in getattr(stop, "__notes__", ()))
+            complain(f"{REASONS[number]};{notes} nothing was left half-written")
             return 128 + number  # as in shells: 130 for Ctrl-C
 
 
 @contextlib.contextmanager
 def _listening(*, last: bool) -> Iterator[Callable[[], None]]:
-    """Handle signals not ignored, and restore them, or ignore them if `last`.
-    Yields a function; signals before its call wait for it: an exception amid an import can get
-    lost, or come out as NumPy's advice on a broken NumPy."""
+    """Handle signals that are not ignored; afterwards restore the handlers, or ignore if `last`.
+    Yields a function that makes signals raise, also those before its call: an exception during an
+    import can get lost, or become NumPy's message about a broken installation."""
     arrived: list[int] = []
     before: dict[int, Any] = {}
     raises = False
@@ -65,12 +65,12 @@ def _listening(*, last: bool) -> Iterator[Callable[[], None]]:
             raise_now()
 
     try:
-        # On another thread Python allows no handlers.
+        # Python allows handlers on the main thread only.
         main = threading.current_thread() is threading.main_thread()
         for number in REASONS if main else ():
             if signal.getsignal(number) is not signal.SIG_IGN:
-                # None: Blender's own for Ctrl-C, which Python cannot set again. It only asks for a
-                # second Ctrl-C to end Blender, as the default does at the first.
+                # None: a handler that is not Python's, as Blender's for Ctrl-C. Python cannot set
+                # it again; the default ends Blender at the first Ctrl-C, Blender's at the second.
                 before[number] = signal.signal(number, arrive) or signal.SIG_DFL
         yield raise_now
     finally:
@@ -79,7 +79,7 @@ def _listening(*, last: bool) -> Iterator[Callable[[], None]]:
 
 
 def _stopping() -> bool:
-    """Whether `Stopped` is being cleaned up after, which a second one must not stop."""
+    """Whether a `Stopped` is being handled; a second one must not interrupt its cleaning up."""
     error = sys.exception()
     while error is not None and not isinstance(error, Stopped):
         error = error.__context__

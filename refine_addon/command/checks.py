@@ -1,4 +1,4 @@
-"""Refusals before anything is read or written, beyond those of single values."""
+"""What is refused before anything is read or written: combinations of options, and outputs."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from .options import BLENDER, ROLES
 
 
 def check(options: argparse.Namespace) -> None:
-    """Refuse options that exclude each other, and outputs that would replace something else."""
+    """Refuse options that exclude each other, and outputs that would replace inputs or others."""
     together, inputs = options.together, options.inputs
     places = [options.cameras, options.report, options.pictures]
     for place in filter(None, places if together else [*places, *inputs, options.output]):
         refuse_url(place)
-    made = _outputs(options)
-    for why, wrong in _rules(options).items():
-        if wrong:
-            raise RefineError(why)
-    for path in made:
+    outputs = _outputs(options)
+    for message, broken in _rules(options).items():
+        if broken:
+            raise RefineError(message)
+    for path in outputs:
         if not format_named(path) and path.suffix.lower() != ".ply":
             raise RefineError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
     if options.command not in ("lod", "convert"):
-        _refuse_doubles(inputs, made, read=() if together else inputs)
+        _refuse_doubles(inputs, outputs, read=() if together else inputs)
     if options.pictures:
         names = [without_suffix(path.name) for path in inputs]
         _refuse_doubles(inputs, [options.pictures / f"{n}-CAMERA-after.png" for n in names])
     if options.report:
-        _refuse_report(options, made)
+        _refuse_report(options, outputs)
 
 
 def check_report(path: Path, *, overwrite: bool) -> None:
@@ -52,39 +52,41 @@ def check_report(path: Path, *, overwrite: bool) -> None:
 
 
 def _rules(options: argparse.Namespace) -> dict[str, object]:
-    """Message -> whether the options break this rule."""
-    name, scene, one, output = options.command, options.scene, options.object, options.output
+    """Message of each rule -> whether the options break it."""
+    name, scene, obj, output = options.command, options.scene, options.object, options.output
     together, many = options.together, len(options.inputs) > 1
     needs = f"needs Blender: {BLENDER} {name}"
     decides = name in ("prune", "score", "clean", "lod")
     file = output is not None and decides and names_file(output)
     flags = {o: f"--{o.replace('_', '-')}" for o in ("object", "clean", "pictures", *ROLES)}
-    nameless = "objects have names in Blender alone; here give box:... or sphere:x,y,z,radius"
+    nameless = "objects can be named in Blender only; here give box:... or sphere:x,y,z,radius"
     return {
         f"render {needs}": name == "render" and not scene,
         "render takes --source frames or frames:A:B:STEP": (
             name == "render" and options.source and options.source[0] != "FRAMES"
         ),
-        "expected INPUT files or --object NAME, not both": (
-            name in ("prune", "score") and bool(options.inputs) == bool(one)
+        "expected either INPUT files or --object NAME": (
+            name in ("prune", "score") and bool(options.inputs) == bool(obj)
         ),
-        "--model goes with INPUT files; an object has it in the panel": one and options.model,
-        "--clean goes with INPUT files, not with --object": one and options.clean,
-        f"--object {needs} ...": one and not scene,
-        "--save goes with --object": options.save and not one,
+        "--model goes with INPUT files; an object's model is set in the panel": (
+            obj and options.model
+        ),
+        "--clean goes with INPUT files, not with --object": obj and options.clean,
+        f"--object {needs} ...": obj and not scene,
+        "--save goes with --object": options.save and not obj,
         "--workers goes with --together": options.workers and not together,
         **{f"{flags[o]} does not go with --together": together and vars(options)[o] for o in flags},
         "lod takes one INPUT": name == "lod" and many,
-        "expected -o OUT; instead of it prune takes --save or --dry-run": (
+        "expected -o OUT (or, for prune, --save or --dry-run)": (
             decides and name != "clean" and not (output or options.save or options.dry_run)
         ),
-        f"-o {output}: expected the name of a file for --object": one and output and not file,
+        f"-o {output}: expected the name of a file for --object": obj and output and not file,
         f"-o {output} is one file, expected a folder for the inputs": file and (many or together),
         f"-o {output}: only a .ply holds scores": (
             name == "score" and file and format_named(output)
         ),
         f"--source {needs} ...": options.source and not scene,
-        "expected --cameras or --source, and not both": options.source and options.cameras,
+        "expected --cameras or --source, not both": options.source and options.cameras,
         "no cameras: give --cameras, or open a .blend that has some": (
             decides and not options.cameras and not options.blend
         ),
@@ -108,31 +110,31 @@ def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
     return [output / path.name for path in options.inputs]
 
 
-def _refuse_report(options: argparse.Namespace, made: Sequence[Path | Url]) -> None:
+def _refuse_report(options: argparse.Namespace, outputs: Sequence[Path | Url]) -> None:
     """Refuse a report that would replace an input or output, even with --overwrite."""
     report, pictures = options.report, options.pictures
-    others = [*options.inputs, *made, options.output, options.cameras, options.blend, pictures]
+    others = [*options.inputs, *outputs, options.output, options.cameras, options.blend, pictures]
     path = os.path.realpath(report)
     for other in filter(None, others):
-        # Unlike pathlib's, these two never fail, whatever the name.
+        # These two never raise, as pathlib's do for some names.
         if os.path.realpath(os.path.expanduser(other)) == path:
-            raise RefineError(f"--report {report} is {other}, expected a file of its own")
+            raise RefineError(f"--report {report}: {other} is an input or output already")
     if pictures and path.endswith(".png") and os.path.dirname(path) == os.path.realpath(pictures):
-        raise RefineError(f"--report {report} may be one of the pictures; choose another name")
+        raise RefineError(f"--report {report}: may be one of the pictures; choose another name")
     if options.overwrite and os.path.isfile(report):
         with report.open("rb") as stream:
             words = stream.read(64).split()
-            if words and not b"".join(words).startswith(b'{"refine":'):  # not a report, nor empty
-                raise RefineError(f"{report} exists and is no report: write to another name")
+            if words and not b"".join(words).startswith(b'{"refine":'):
+                raise RefineError(f"{report}: exists and is no report; choose another name")
 
 
-def _refuse_doubles(inputs, made, read=()):
-    """Refuse two inputs with the same output, and outputs that replace inputs."""
+def _refuse_doubles(inputs, outputs, read=()):
+    """Refuse inputs with the same output, and outputs that are links to another file of `read`."""
     first: dict[str, Path] = {}
     linked = {os.path.realpath(path): path for path in read}
-    for path, output in zip(inputs, made, strict=False):
+    for path, output in zip(inputs, outputs, strict=False):
         real = os.path.realpath(output)
         if (other := first.setdefault(real, path)) is not path:
             raise RefineError(f"{other} and {path} would both be {output}: rename one of them")
         if (other := linked.get(real, path)) is not path:
-            raise RefineError(f"{output} is {other} by a link, which is read too")
+            raise RefineError(f"{output} is a link to {other}, which is an input too")

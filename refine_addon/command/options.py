@@ -1,4 +1,4 @@
-"""The options of all subcommands, each once, and the settings they make."""
+"""The options of all subcommands, each once, and the settings made from them."""
 
 from __future__ import annotations
 
@@ -24,56 +24,61 @@ _SOURCES = "visible, active, selected, collection:NAME, frames or frames:A:B:STE
 
 _TABLE = f"""
 inputs INPUT            files of splats: {", ".join(READ_SUFFIXES)}
-output FILE             the file to make, by its suffix: {", ".join(SUFFIXES)}
---object NAME           in place of INPUT: this splat object of the open .blend, by the cameras that
-                        are chosen in the panel there, with what it protects and crops
+output FILE             the file to write, in the format of its suffix: {", ".join(SUFFIXES)}
+--object NAME           instead of INPUT: a splat object of the open .blend, with the cameras, marks
+                        and volumes of the panel there
 --source WHICH          which cameras of the open scene decide: {_SOURCES}, the active one
-                        at frame A and every STEP-th after it to B; frames are the panel's range
-render --source WHICH   frames, all of the scene, or frames:A:B:STEP; the current one by default
---cameras PATH          cameras.json, transforms.json or a COLMAP model; without, those of the scene
---save                  with --object: delete the splats there and save
--o OUT                  a file, in the format of its suffix, or for any number of inputs a folder,
-                        which is any other name; made if it is not there
+                        at every STEP-th frame from A to B; frames alone is the panel's range
+render --source WHICH   frames (all of the scene) or frames:A:B:STEP (default: the current frame)
+--cameras PATH          cameras.json, transforms.json or a COLMAP model (default: those of the open
+                        scene)
+--save                  with --object: delete its splats and save the .blend
+-o OUT                  a file, in the format of its suffix; or a folder, by any other name, which
+                        is made if missing
 lod -o OUT              a folder, for INPUT.lod1.ply and so on; FOLDER/NAME.spz for NAME.lod1.spz;
                         or FOLDER/lod-meta.json, a streamed SOG, which viewers load by chunks
 --ratio B               share of the splats to remove, 0 <= B < 1 (default 0.5)
---keep N                how many splats stay
---max-mb M              size of the file, in 1e6 bytes
---psnr DB               remove as much as leaves the views' pictures this close to the unpruned
-                        ones: 40 is hard to tell apart, 30 is seen
---levels S,S,...        share of the splats that stays in each, the finest first (default
+--keep N                number of splats to keep
+--max-mb M              size of the file to write, in 1e6 bytes
+--psnr DB               remove as many as possible while the views' pictures stay this close to the
+                        unpruned ones: 40 is hard to tell apart, 30 is visible
+--levels S,S,...        share of the splats in each level, the finest first (default
                         {",".join(f"{share:g}" for share in SHARES)})
-lod --psnr DB,DB,...    or how close each stays to the original in these views, in dB
---method METHOD         from instant to best: {", ".join(METHODS)}. The first two
-                        delete, closed-form as if nothing was hidden; merge (the default) merges
-                        what goes into what stays, or deletes where that is as good; refit then fits
-                        what stays to what all splats look like, some dB better, in more time
---rounds N              with --method refit: fit up to N times (default 2 to 4, by what they bring)
+lod --psnr DB,DB,...    instead of --levels: how close each stays to the original in the views, in
+                        dB
+--method METHOD         from fastest to best: {", ".join(METHODS)}. The first two
+                        delete splats, closed-form as if none was hidden; merge (the default) merges
+                        removed splats into kept ones, unless deleting is as good; refit then fits
+                        the kept ones to the pictures of all splats, which takes longer and gains
+                        some dB
+--rounds N              with --method refit: number of rounds at most (default: 2 to 4, by what they
+                        gain)
 --views N               use at most N views, spread out evenly; 0 uses all (default {Merge.views})
---clean                 first remove what floats, as clean does; the budget counts the rest
+--clean                 first remove floaters, as clean does; the budget applies to the rest
 --reasons R,R,...       which to remove, of {", ".join(REASONS)}
                         (default {",".join(Cleaning.reasons)})
---remove-inside VOLUME  splats in it go first, and count as removed: box:x0,y0,z0,x1,y1,z1 or
-                        sphere:x,y,z,radius in the coordinates of the cameras, or in Blender an
-                        object, a closed mesh or an empty shown as cube or sphere; may be repeated
---keep-inside VOLUME    all splats go that are in no volume of this kind; see --remove-inside
---protect VOLUME        splats in it stay unchanged, whatever else is said; see --remove-inside;
-                        also a vertex group or boolean attribute of --object
---pictures DIR          draw up to 3 of the views before and after, and what differs, as
-                        NAME-CAMERA-before.png and so on; made if it is not there
+--remove-inside VOLUME  splats in it are removed first, as part of the budget:
+                        box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius in the coordinates of the
+                        cameras, or in Blender an object, a closed mesh or an empty shown as cube or
+                        sphere; may be repeated
+--keep-inside VOLUME    splats in no volume of this kind are removed; see --remove-inside
+--protect VOLUME        splats in it stay unchanged, whatever else removes them; see
+                        --remove-inside; also a vertex group or boolean attribute of --object
+--pictures DIR          draw up to 3 of the views before and after, and their difference, as
+                        NAME-CAMERA-before.png and so on; the folder is made if missing
 --together              the inputs are tiles of one scene: one budget over all, never all in memory;
                         for plain PLY; INPUT and OUT may be URLs (needs the extra distributed)
---workers N|ADDRESS     with --together: on N processes of a Dask cluster, started here, or on the
-                        workers of the scheduler at an address (needs the extra distributed)
+--workers N|ADDRESS     with --together: run on N new processes of a Dask cluster, or on the workers
+                        of the scheduler at an address (needs the extra distributed)
 --degree D              leave out harmonics above this degree, 0 to 4
---model MODEL           how the splats are drawn, where a file does not say or is wrong: default,
+--model MODEL           how the splats are drawn, if the file does not say or is wrong: default,
                         antialiased (Mip-Splatting, gsplat, Brush's mip) or 2dgs (discs)
---dry-run               decide and report, write no splats; --pictures are drawn
+--dry-run               decide and report, but write no splats; --pictures are drawn
 --report FILE.json      write a report as JSON
 --overwrite             replace files that exist
 --quiet                 print errors only
 """
-"""Each option, after the subcommand where its text differs there."""
+"""Help of each option; after a subcommand where it differs there."""
 
 _REST = "--report --overwrite --quiet"
 _VIEWS = f"--cameras --source --views --remove-inside --keep-inside --model {_REST}"
@@ -96,12 +101,12 @@ inputs* --object -o --method {_VIEWS}
   refine score in.ply --cameras cameras.json -o scored.ply
   {BLENDER} score --object Splats -o scored.ply
 
-clean: remove what the cameras see to float in the air; without -o, only say what would go
+clean: remove floaters, which the cameras see in empty air; without -o only report them
 inputs+ -o --reasons --protect {_VIEWS}
   refine clean *.ply --cameras cameras.json -o cleaned
   refine clean in.ply --cameras cameras.json --reasons front,isolated -o out.ply
 
-lod: write levels of detail, each with what it costs
+lod: write levels of detail, and report the quality of each
 inputs+ -o --levels --psnr --method --rounds --protect {_VIEWS}
   refine lod in.ply --cameras cameras.json -o levels
   refine lod in.ply --cameras cameras.json -o web/lod-meta.json
@@ -112,7 +117,7 @@ inputs+ output --degree --model {_REST}
   refine convert in.ply out.spz
   refine convert room.ply statue.spz both.sog --degree 1
 
-info: say what is in files of splats
+info: describe files of splats
 inputs+ {_REST}
   refine info *.ply --report report.json
 
@@ -120,16 +125,16 @@ render: render the open scene with splats, by its output settings
 --source --quiet
   {BLENDER} render --source frames:1:250:10
 """
-"""For each subcommand its purpose, inputs, options, and examples."""
+"""Purpose, inputs, options and examples of each subcommand."""
 
 ROLES: dict[str, Role] = {"protect": "protect", "remove_inside": "remove", "keep_inside": "keep"}
-"""Options -> role of their volumes."""
+"""Option -> role of its volumes."""
 
-LAST_FRAME = 1_048_574  # Blender's last frame; negative, its first
+LAST_FRAME = 1_048_574  # Largest frame number of Blender; the smallest is its negative
 
 
 def settings(kind: type, options: argparse.Namespace, **default: Any) -> Any:
-    """Settings of a kind: each field from the option of its name, else from `default`."""
+    """A `kind` with the options of its fields' names; with `default` if none is given."""
     values = {field.name: getattr(options, field.name, None) for field in fields(kind)}
     return kind(**({n: value for n, value in values.items() if value is not None} or default))
 
@@ -149,23 +154,23 @@ def complete(options: argparse.Namespace) -> None:
 
 
 def _name(text: str) -> str:
-    """A name, not empty: an unset variable of a script is a mistake, not a default."""
+    """The text; refused if empty, as from an unset variable of a script."""
     if not text:
         raise RefineError("expected a name, got none")
     return text
 
 
-def _given(text: str) -> Path | Url:
+def _input(text: str) -> Path | Url:
     if "\0" in text:
-        raise RefineError("a path holds no zero byte")
+        raise RefineError("expected a path without a zero byte")
     return Url(text) if is_url(text) else Path(_name(text))
 
 
-def _made(text: str) -> Path | Url:
+def _output(text: str) -> Path | Url:
     """An output path, ``~`` expanded."""
     if text == "-":
-        raise RefineError("nothing is written to standard output: name a file (./- is one, too)")
-    place = _given(text)
+        raise RefineError("nothing is written to standard output: name a file (one named - is ./-)")
+    place = _input(text)
     return place if isinstance(place, Url) else expanded(place)
 
 
@@ -185,12 +190,12 @@ def _numbers(text: str) -> tuple[float, ...]:
 
 
 def _volume(text: str) -> tuple[str, Volume | None]:
-    """The text, and its volume if it holds numbers, not a name."""
+    """The text, and its volume; None if the text is the name of an object."""
     return _name(text), parse(text)
 
 
 def _source(text: str) -> tuple[str, str | range]:
-    """The kind of source as the panel names it, with its collection or frames."""
+    """The source by its name in the panel, and its collection or frames."""
     kind, colon, rest = text.partition(":")
     if kind == "frames" and colon:
         return "FRAMES", _frames(rest)
@@ -200,7 +205,7 @@ def _source(text: str) -> tuple[str, str | range]:
 
 
 def _frames(text: str) -> range:
-    """The frames between colons, both ends included."""
+    """Frames of ``A:B:STEP``, with A and B."""
     words = text.split(":")
     with contextlib.suppress(ValueError):
         first, last, step = map(int, words if words[2:] else [*words, "1"])
@@ -212,17 +217,17 @@ def _frames(text: str) -> range:
     )
 
 
-def _told(take: Callable[[str], Any]) -> Callable[[str], Any]:
-    """The same for argparse, which shows messages of its own error type only."""
+def _for_argparse(parse: Callable[[str], Any]) -> Callable[[str], Any]:
+    """The same, but raising the only error whose message argparse shows."""
 
-    @functools.wraps(take)
-    def told(text: str) -> Any:
+    @functools.wraps(parse)
+    def wrapped(text: str) -> Any:
         try:
-            return take(text)
+            return parse(text)
         except RefineError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
 
-    return told
+    return wrapped
 
 
 _TYPES: dict[str, Callable[[str], Any]] = {
@@ -230,26 +235,26 @@ _TYPES: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(("B", "M", "DB"), float),
     **dict.fromkeys(("S,S,...", "DB,DB,..."), _numbers),
     "R,R,...": lambda text: tuple(word.strip() for word in text.split(",")),
-    **dict.fromkeys(("INPUT", "PATH"), _given),
-    **dict.fromkeys(("OUT", "FILE", "DIR", "FILE.json"), _made),
+    **dict.fromkeys(("INPUT", "PATH"), _input),
+    **dict.fromkeys(("OUT", "FILE", "DIR", "FILE.json"), _output),
     **{"NAME": _name, "N|ADDRESS": _workers, "WHICH": _source, "VOLUME": _volume},
 }
-"""Type of an option by its placeholder in the help; else any text."""
+"""Placeholder in the help -> parser of the value; others take any text."""
 
-_NAMES = {"-o": "output", "--levels": "shares"}  # Field names of options, where they differ
+_NAMES = {"-o": "output", "--levels": "shares"}  # Options whose attribute has another name
 
 _CHOICES = {"METHOD": tuple(METHODS), "MODEL": MODELS, "D": tuple(range(5))}
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose complaints are safe to print, whatever the arguments hold."""
+    """A parser whose errors show control characters of the arguments escaped."""
 
     def error(self, message: str) -> NoReturn:
         super().error(printable(message))
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Parser of all subcommands; options that one lacks are None."""
+    """Parser of all subcommands; options that a subcommand lacks are None."""
     parser = _Parser(
         prog="refine",
         description="Prune 3D Gaussian splats by how much the cameras would miss them.",
@@ -264,8 +269,8 @@ def make_parser() -> argparse.ArgumentParser:
         (own, option): (metavar, " ".join(text.split()))
         for own, option, metavar, text in re.findall(row, _TABLE, re.MULTILINE)
     }
-    none = {option.strip("-").replace("-", "_"): None for _, option in rows}
-    parser.set_defaults(**none | {"inputs": ()})
+    absent = {option.strip("-").replace("-", "_"): None for _, option in rows}
+    parser.set_defaults(**absent | {"inputs": ()})
     for block in _COMMANDS.strip().split("\n\n"):
         head, takes, *examples = block.split("\n")
         name, purpose = head.split(": ")
@@ -287,7 +292,7 @@ def make_parser() -> argparse.ArgumentParser:
                 option,
                 help=text,
                 metavar=metavar,
-                type=_told(_TYPES.get(metavar, str)),
+                type=_for_argparse(_TYPES.get(metavar, str)),
                 choices=_CHOICES.get(metavar),
                 nargs=word[-1] if word != option else None,
                 action="append" if metavar == "VOLUME" else "store",

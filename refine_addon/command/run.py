@@ -1,5 +1,5 @@
-"""The part common to all subcommands: go from input to input, print and record each result.
-Output cannot harm a terminal; the report says what was done, as JSON, for programs."""
+"""What all subcommands share: a loop over the inputs that prints and records each result.
+Control characters are printed escaped; the report is JSON, for programs."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _CLEAR = "\r\x1b[K"
 
 
 def described(error: Exception) -> str:
-    """An error's message; for those of the system with the file."""
+    """Message of an error, with the file if the system raised it."""
     file = getattr(error, "filename", None)
     return f"{file}: {error.strerror}" if file else reason_of(error)
 
 
 def complain(text: str) -> None:
-    """Print an error in place of the progress."""
+    """Print an error in place of the progress line."""
     start = _CLEAR if _is_terminal(sys.stderr) else ""
     _write("stderr", f"{start}refine: error: {printable(text)}\n")
 
@@ -57,13 +57,13 @@ class Terminal:
             self.failed |= _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
 
     def draw(self, text: str) -> None:
-        """Show a line until the next replaces it; on terminals only."""
+        """Show a line that the next one replaces; on terminals only."""
         if self._draws:
             _write("stderr", f"{_CLEAR}{printable(text)}")
 
 
 class Run:
-    """One call of the command: options, terminal, and the report's entries, one an input."""
+    """One call of the command: its options, its terminal, and a report entry for each input."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
@@ -78,7 +78,7 @@ class Run:
         self._cameras: dict[str, Any] = {}
 
     def views(self) -> ViewSet:
-        """The deciding views; notes their source for the report."""
+        """Views of the deciding cameras, read once; their source goes into the report."""
         path = self.options.cameras
         if self._views is None and path is not None:
             self._views, self._cameras = read_cameras(path), {"source": "file", "file": str(path)}
@@ -89,7 +89,7 @@ class Run:
         return self._views
 
     def progress(self, name: str) -> Progress:
-        """Progress callback that draws the share done of the current file, and the time left."""
+        """Progress callback that draws the share done of an input, and the time left."""
         done, sizes = len(self.entries), self._sizes
         before, total, several = sum(sizes[:done]), sum(sizes), " in all" if sizes[1:] else ""
 
@@ -100,14 +100,14 @@ class Run:
 
         return draw
 
-    def say(self, label: str, line: str, done: dict[str, Any], *more: str) -> dict[str, Any]:
-        """Print what was done, what decided, then more and the notes; the report.
-        What decided: the scene's cameras (the user named a file's), protected and removed splats,
-        and the number of scored splats that no view holds."""
-        splats, words, output = done["splats"], self._cameras.get("words"), done["files"]["output"]
-        lines = [f"cameras: {words}" if words else "", _demands(done)]
+    def say(self, label: str, line: str, report: dict[str, Any], *more: str) -> dict[str, Any]:
+        """Print the summary `line` of an input, then cameras of the scene, protected and removed
+        splats, splats in no view, `more`, and the report's notes; the report."""
+        splats, output = report["splats"], report["files"]["output"]
+        cameras = self._cameras.get("words")  # none of --cameras, which the user typed
+        lines = [f"cameras: {cameras}" if cameras else "", _demands(report)]
         if unseen := splats.get("unseen"):
-            cleaned = done["cleaned"].values() if "budget" in done and "cleaned" in done else ()
+            cleaned = report["cleaned"].values() if {"budget", "cleaned"} <= report.keys() else ()
             scored = splats["before"] - splats["removed_by_user"]
             scored -= sum(count for count in cleaned if isinstance(count, int))
             lines.append(f"{unseen:,} of {scored:,} splats lie in no view")
@@ -115,23 +115,22 @@ class Run:
                 lines.append(f"{gone / unseen:.0%} of these go: add views if others can see them")
         self.terminal.draw("")
         first = f"{self._named(label)}: {line}{f' -> {output}' if output else ''}"
-        rest = filter(None, [*lines, *more, *(f"note: {note}" for note in done["notes"])])
+        rest = filter(None, [*lines, *more, *(f"note: {note}" for note in report["notes"])])
         self.terminal.say(first, *(f"  {text}" for text in rest))
-        return done
+        return report
 
     def each(self, work: Callable[..., dict[str, Any]]) -> None:
-        """Do the work of the object or of each input, with its output if one is wanted."""
+        """Do the work of the object or of each input, with its output path or None."""
         options, output = self.options, self.options.output
         inside = output is not None and options.command != "lod" and not names_file(output)
         if options.inputs and options.command != "info":
             self.views()  # without cameras no input can be done
-        makes = inside and not options.dry_run
-        with new_folder(output) if makes else contextlib.nullcontext():
+        with new_folder(output) if inside and not options.dry_run else contextlib.nullcontext():
             for source in options.inputs or [options.object]:
                 self.attempt(work, source, output / source.name if inside else output)
 
     def attempt(self, work: Callable[..., dict[str, Any]], source: Any, *output: Any) -> None:
-        """Do one input's work; record its error, so that the others go on."""
+        """Do one input's work and record its result or error; the others go on."""
         label = str(source)
         if not self.entries:
             self._left = TimeLeft()
@@ -140,7 +139,7 @@ class Run:
             self.entries.append(entry | ({"cameras": self._cameras} if self._cameras else {}))
         except (RefineError, OSError, MemoryError) as error:
             message = described(error)
-            # What is wrong with the splats is said without the file.
+            # Errors about the splats do not name the file.
             files = (Path(label), self.options.output)
             if not any(file and printable(file.name) in message for file in files):
                 message = f"{label}: {message}"
@@ -152,9 +151,9 @@ class Run:
         options, seconds = self.options, time.perf_counter() - self._started
         done = [entry for entry in self.entries if entry["status"] == "done"]
         if options.report is not None:
-            made = [entry for entry in done if options.save or entry.get("files", {}).get("output")]
-            splats = bool(made) and not options.dry_run
-            _write_report(options.report, self.entries, seconds, options.overwrite, splats)
+            wrote = any(options.save or entry.get("files", {}).get("output") for entry in done)
+            wrote = wrote and not options.dry_run
+            _write_report(options.report, self.entries, seconds, options.overwrite, wrote)
         return len(done) < len(self.entries) or self.terminal.failed
 
     def _named(self, name: str) -> str:
@@ -162,22 +161,22 @@ class Run:
         return name if count == 1 else f"file {len(self.entries) + 1} of {count}, {name}"
 
 
-def _demands(done):
-    """The report's demands in one line, "" without."""
+def _demands(report):
+    """Protected and removed splats in one line, "" if there are none."""
     counts = {"protected": "protected", "removed_by_user": "removed by you"}
-    splats = done["splats"]
+    splats = report["splats"]
     parts = [f"{splats[key]:,} {what}" for key, what in counts.items() if splats.get(key)]
     volumes = "; ".join(
         f"{volume['role']} {volume['name'].removeprefix('object ')}: {volume['splats']:,}"
-        for volume in done.get("volumes", ())
+        for volume in report.get("volumes", ())
     )
     return " ".join([", ".join(parts), f"({volumes})" if volumes else ""]).strip()
 
 
-def _write_report(path, results, seconds, overwrite, splats):
-    """Write the report of all results; an error says whether `splats` were written."""
+def _write_report(path, results, seconds, overwrite, wrote):
+    """Write the report of all results; the error, if any, says whether splats were written."""
     content = {
-        "refine": VERSION,  # first: by this a report is known, see `checks`
+        "refine": VERSION,  # first: `checks` recognizes a report by it
         "python": sys.version.split()[0],
         "numpy": np.__version__,
         "seconds": seconds,
@@ -187,11 +186,11 @@ def _write_report(path, results, seconds, overwrite, splats):
         with whole_file(path, overwrite=overwrite) as stream:
             stream.write(json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
     except RefineError as error:
-        # What `whole_file` says of "nothing" holds for its own file alone.
+        # `whole_file` says that nothing was written, which is true of its own file alone.
         cause = error.__cause__
         why = reason_of(cause if isinstance(cause, OSError) else error).removeprefix(f"{path}: ")
-        done = "; the splats were" if splats else ""
-        raise RefineError(f"{path}: the report was not written ({why}){done}") from error
+        splats = "; the splats were" if wrote else ""
+        raise RefineError(f"{path}: the report was not written ({why}){splats}") from error
 
 
 def _is_terminal(stream: TextIO | None) -> bool:

@@ -1,5 +1,4 @@
-"""From the arguments to the exit code.
-The subcommands: work and messages for a splat file, an object, tiles, several files."""
+"""From the arguments to the exit code; the work and messages of each subcommand."""
 
 from __future__ import annotations
 
@@ -32,31 +31,31 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
     """Parse, check and run; exit code as of `refine_addon.command.main`."""
     parser = make_parser()
     try:
-        given = parser.parse_args(list(arguments))
-        given.scene, given.blend = scene, ""
+        options = parser.parse_args(list(arguments))
+        options.scene, options.blend = scene, ""
         if scene:
             from .scene import opened
 
-            given.blend = opened()
+            options.blend = opened()
         try:
-            complete(given)
-            check(given)
+            complete(options)
+            check(options)
         except RefineError as error:
             parser.error(str(error))
-        if given.report is not None:
-            check_report(given.report, overwrite=given.overwrite)
-        work = Run(given)
+        if options.report is not None:
+            check_report(options.report, overwrite=options.overwrite)
+        work = Run(options)
         _run(work)
         return int(work.finish())
-    except SystemExit as leaving:  # argparse leaves the process; Blender wants a number
-        return int(flush() or leaving.code or 0)
+    except SystemExit as end:  # of argparse; Blender needs a number
+        return int(flush() or end.code or 0)
     except (RefineError, OSError, MemoryError) as error:
         complain(described(error))
     return 1
 
 
 def _run(run: Run) -> None:
-    """Run the options' subcommand, input by input; the run records errors."""
+    """Run the subcommand input by input; errors of inputs are recorded."""
     options = run.options
     work = {"prune": _prune, "score": _score, "clean": _clean, "lod": _lod, "info": _info}
     if options.command == "render":
@@ -94,8 +93,8 @@ def _prune(run: Run, source: Path | str, output: Path | None) -> dict[str, Any]:
         from ..objects.splat_group import prune_object
 
         return _say_pruned(run, name, prune_object(source, views, save=options.save, **how))
-    done = core.prune_file(source, views=views, cleaning=options.cleaning, **how)
-    return _say_pruned(run, str(source), done.report)
+    report = core.prune_file(source, views=views, cleaning=options.cleaning, **how).report
+    return _say_pruned(run, str(source), report)
 
 
 def _prune_together(run: Run, label: str) -> dict[str, Any]:
@@ -103,7 +102,7 @@ def _prune_together(run: Run, label: str) -> dict[str, Any]:
     workers = contextlib.nullcontext() if options.workers is None else cluster(options.workers)
     try:
         with workers as others:
-            done = core.prune_tiles(
+            report = core.prune_tiles(
                 options.inputs, options.output, run.views(), options.budget, options.how,
                 overwrite=options.overwrite, dry_run=options.dry_run, model=options.model,
                 progress=progress, workers=others,
@@ -116,34 +115,34 @@ def _prune_together(run: Run, label: str) -> dict[str, Any]:
         f"{located(tile['input']).name}: {tile['kept']:,} of {tile['before']:,} splats "
         f"({(tile['before'] - tile['kept']) / max(tile['before'], 1):.1%} removed), "
         f"{_sizes(tile['input_bytes'], tile['output_bytes'])}"
-        for tile in done["tiles"]
+        for tile in report["tiles"]
     ]
-    return _say_pruned(run, label, done, *tiles)
+    return _say_pruned(run, label, report, *tiles)
 
 
-def _say_pruned(run: Run, label: str, done: dict[str, Any], *more: str) -> dict[str, Any]:
-    splats = done["splats"]
+def _say_pruned(run: Run, label: str, report: dict[str, Any], *more: str) -> dict[str, Any]:
+    splats = report["splats"]
     line = (
         f"{'would keep' if run.options.dry_run else 'kept'} {splats['kept']:,} of "
         f"{splats['before']:,} splats ({splats['removed'] / splats['before']:.1%} removed)"
-        f"{_files(done)}, {_by(done)}, {done['timings']['total_s']:.2f} s"
+        f"{_files(report)}, {_by(report)}, {report['timings']['total_s']:.2f} s"
     )
-    lines = [f"cleaned: {done['cleaned']['words']}"] if "cleaned" in done else []
-    if quality := _quality(done):
+    lines = [f"cleaned: {report['cleaned']['words']}"] if "cleaned" in report else []
+    if quality := _quality(report):
         lines.append(f"quality: {quality}")
-    if "pictures" in done:
-        lines.append(f"pictures: {measured_in_words(done['pictures'])} -> {run.options.pictures}")
-    return run.say(label, line, done, *lines, *more)
+    if "pictures" in report:
+        lines.append(f"pictures: {measured_in_words(report['pictures'])} -> {run.options.pictures}")
+    return run.say(label, line, report, *lines, *more)
 
 
-def _quality(done: dict[str, Any]) -> str:
-    """The estimated quality in words, "" without."""
-    psnr, method = done["estimated_psnr"], done["method"]
+def _quality(report: dict[str, Any]) -> str:
+    """The estimated quality in words, "" without an estimate."""
+    psnr, method = report["estimated_psnr"], report["method"]
     if psnr is None:
         return ""
-    words = in_views(psnr, done["estimated_psnr_between"])
-    if done.get("written_psnr") is not None:
-        words += f", {in_words(done['written_psnr'])} as written"
+    words = in_views(psnr, report["estimated_psnr_between"])
+    if report.get("written_psnr") is not None:
+        words += f", {in_words(report['written_psnr'])} as written"
     if psnr <= UNSEEN and method["note"]:
         words += f"; {method['note']}"
     elif psnr <= UNSEEN and (others := _by_method(method, method["done"])):
@@ -153,13 +152,13 @@ def _quality(done: dict[str, Any]) -> str:
 
 def _clean(run: Run, source: Path, output: Path | None) -> dict[str, Any]:
     how = _how(run, source.name)
-    done = core.clean_file(source, output, run.views(), run.options.cleaning, **how).report
-    splats = done["splats"]
-    line = f"{done['cleaned']['words']}; {splats['kept']:,} of {splats['before']:,} splats stay"
-    line += f"{_written(splats)}, {_by(done)}"
+    report = core.clean_file(source, output, run.views(), run.options.cleaning, **how).report
+    splats = report["splats"]
+    line = f"{report['cleaned']['words']}; {splats['kept']:,} of {splats['before']:,} splats stay"
+    line += f"{_written(splats)}, {_by(report)}"
     if output is None:
         line += "; nothing is written without -o"
-    return run.say(str(source), line, done)
+    return run.say(str(source), line, report)
 
 
 def _score(run: Run, source: Path | str, output: Path) -> dict[str, Any]:
@@ -167,47 +166,47 @@ def _score(run: Run, source: Path | str, output: Path) -> dict[str, Any]:
     if run.options.object:
         from ..objects.splat_group import score_object
 
-        done = score_object(source, views, method, output=output, **_how(run, source))
+        report = score_object(source, views, method, output=output, **_how(run, source))
     else:
-        done = core.score_file(source, output, views, method, **_how(run, source.name)).report
-    prices = [f"{price['removed']:.0%} removed: {_by_method(price)}" for price in done["prices"]]
-    line = f"scored {done['splats']['before']:,} splats by {done['views']['used']} views"
-    return run.say(str(source), line, done, *prices)
+        report = core.score_file(source, output, views, method, **_how(run, source.name)).report
+    prices = [f"{price['removed']:.0%} removed: {_by_method(price)}" for price in report["prices"]]
+    line = f"scored {report['splats']['before']:,} splats by {report['views']['used']} views"
+    return run.say(str(source), line, report, *prices)
 
 
 def _lod(run: Run, source: Path, output: Path) -> dict[str, Any]:
     options, how = run.options, _how(run, source.name)
-    done = core.lod_file(source, output, run.views(), options.levels, options.how, **how)
-    count, number = done["splats"]["before"], len(done["levels"])
+    report = core.lod_file(source, output, run.views(), options.levels, options.how, **how)
+    count, number = report["splats"]["before"], len(report["levels"])
     levels = [
         f"{entry['file']}: {entry['splats']:,} splats, {size_in_words(entry['bytes'])}"
         + (f", {in_words(entry['psnr'])}" if entry["psnr"] is not None else "")
-        for entry in done["levels"]
+        for entry in report["levels"]
     ]
-    line = f"{number} level{'s' if number > 1 else ''} of {count:,} splats, {_by(done)}"
-    line += f", {done['timings']['total_s']:.2f} s"
-    return run.say(str(source), line, done, *levels)
+    line = f"{number} level{'s' if number > 1 else ''} of {count:,} splats, {_by(report)}"
+    line += f", {report['timings']['total_s']:.2f} s"
+    return run.say(str(source), line, report, *levels)
 
 
 def _convert(run: Run, _first: str) -> dict[str, Any]:
     options = run.options
-    done = core.convert_files(
+    report = core.convert_files(
         options.inputs, options.output, degree=options.degree, model=options.model,
         overwrite=options.overwrite,
     ).report  # fmt: skip
-    line = f"{done['splats']['before']:,} splats{_files(done)}"
-    return run.say(" + ".join(map(str, options.inputs)), line, done)
+    line = f"{report['splats']['before']:,} splats{_files(report)}"
+    return run.say(" + ".join(map(str, options.inputs)), line, report)
 
 
 def _info(run: Run, source: Path, _output: None) -> dict[str, Any]:
-    facts = describe(core.read_splats(source))
-    lines = [f"  {name.replace('_', ' '):18} {value}" for name, value in facts.items()]
+    entry = describe(core.read_splats(source))
+    lines = [f"  {name.replace('_', ' '):18} {value}" for name, value in entry.items()]
     run.terminal.say(str(source), *lines)
-    return {"input": str(source), **facts}
+    return {"input": str(source), **entry}
 
 
 def describe(file: core.SplatFile) -> dict[str, Any]:
-    """Entry of ``info`` on a file: counts, degree, extent, rows that are not finite."""
+    """Report entry of ``info``: counts, degree, format, extent, rows that are not finite."""
     splats, names = file.splats(), file.rows.dtype.names or ()
     pieces = (file.rows[start : start + (1 << 16)] for start in range(0, len(file), 1 << 16))
     finite = (np.logical_and.reduce([np.isfinite(piece[n]) for n in names]) for piece in pieces)
@@ -229,28 +228,28 @@ def describe(file: core.SplatFile) -> dict[str, Any]:
     }
 
 
-def _by(done: dict[str, Any]) -> str:
-    return f"by {done['views']['used']} of {done['views']['given']} views"
+def _by(report: dict[str, Any]) -> str:
+    return f"by {report['views']['used']} of {report['views']['given']} views"
 
 
 def _written(splats: Mapping[str, Any]) -> str:
-    """The splats in a file, if its format left some out; else ""."""
+    """Number of splats written, if the format left some out; else ""."""
     return f", {splats['written']:,} written" if splats["left_out"] and splats["written"] else ""
 
 
-def _files(done: dict[str, Any]) -> str:
-    """The same, and the sizes before and after."""
-    files = done["files"]
-    return f"{_written(done['splats'])}, {_sizes(files['input_bytes'], files['output_bytes'])}"
+def _files(report: dict[str, Any]) -> str:
+    """Number of splats written, if some were left out, and file sizes before and after."""
+    files = report["files"]
+    return f"{_written(report['splats'])}, {_sizes(files['input_bytes'], files['output_bytes'])}"
 
 
 def _sizes(before: int, after: int | None) -> str:
-    """File sizes before and after; None if only writing tells."""
+    """File sizes before and after; `after` is None where only writing would show it."""
     return f"of {size_in_words(before)}" if after is None else sizes_in_words(before, "->", after)
 
 
 def _by_method(predicted: Mapping[str, Any], without: str = "") -> str:
-    """Predicted quality and time of the methods but `without`, from a report's numbers.
+    """Predicted quality and time of all methods except `without`, from a report's numbers.
 
     >>> psnr = {"delete": 38.0, "merge": 46.0, "refit": None}
     >>> _by_method({"psnr": psnr, "seconds": {"delete": 1.2, "merge": 2.1, "refit": 8.0}})
@@ -271,7 +270,7 @@ def _by_method(predicted: Mapping[str, Any], without: str = "") -> str:
 
 
 def _of_object(options: argparse.Namespace) -> Any:
-    """The demands on the splats of --object, from the options and the scene."""
+    """The demands on the splats of --object: those of the options and of the scene."""
     import bpy
 
     from ..objects import demands, splat_group
@@ -283,7 +282,7 @@ def _of_object(options: argparse.Namespace) -> Any:
         if role == "protect" and volume is None and text in marks:
             names.append(text)
         else:
-            also = f", nor has '{obj.name}' a group or an attribute" if role == "protect" else ""
+            also = f", nor a group or attribute of '{obj.name}'" if role == "protect" else ""
             zones.append(_zone(role, text, volume, also))
     scene = demands.Demands.of_scene(bpy.context.scene)
     return scene + demands.Demands(tuple(names), tuple(zones))
@@ -307,6 +306,6 @@ def _zone(role: Role, text: str, volume: Volume | None, also: str = "") -> Zone:
         fit = [o.name for o in bpy.context.scene.objects if demands.can_be_volume(o)]
         there = ", ".join(fit[:8]) or "none"
         raise RefineError(
-            f"no object '{text}' in the open .blend{also} (objects that are volumes: {there})"
+            f"no object '{text}' in the open .blend{also} (objects that can be volumes: {there})"
         )
     return demands.zone(role, obj)

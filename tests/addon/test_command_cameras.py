@@ -114,7 +114,7 @@ def test_cameras_of_a_file_go_before_those_of_the_panel(addon, tmp_path, capsys)
     assert facts == {"source": "file", "file": str(CAMERAS)}
     words = [*PRUNE, "--dry-run", "--source", "active", "--cameras", "c.json"]
     assert addon.command.main(words, scene=True) == 2
-    assert "expected --cameras or --source, and not both" in capsys.readouterr().err
+    assert "expected --cameras or --source, not both" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("animated")

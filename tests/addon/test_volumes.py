@@ -436,8 +436,8 @@ def test_the_command_takes_names_and_boxes(addon, quarter, quarter_file, room_ca
     for option in ("--protect", "--keep-inside"):
         assert command(addon, [*PRUNE, option, "Cbue", "--dry-run", *CLOSED]) == 1
     first, second = capsys.readouterr().err.splitlines()
-    assert "no object 'Cbue' in the open .blend, nor has 'room' a group or an attribute" in first
-    assert second.endswith("in the open .blend (objects that are volumes: Cube)")
+    assert "no object 'Cbue' in the open .blend, nor a group or attribute of 'room'" in first
+    assert second.endswith("in the open .blend (objects that can be volumes: Cube)")
 
 
 def test_a_damaged_note_counts_as_none(addon, quarter):

@@ -76,7 +76,7 @@ def test_a_report_replaces_a_report_and_nothing_else(folder, capsys):
     for content in (b"{}", b'{"frames": []}', b"ply\n", b"\0\1", (folder / "in.ply").read_bytes()):
         report.write_bytes(content)
         assert main(words) == 2
-        assert "report.json exists and is no report: write to another" in capsys.readouterr().err
+        assert "report.json: exists and is no report; choose another" in capsys.readouterr().err
         assert report.read_bytes() == content
 
 

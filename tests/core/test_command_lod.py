@@ -68,7 +68,7 @@ def test_lod_writes_levels_and_says_what_each_costs(files, capsys):
         (["-o", "levels.ply.gz"], "is not written, expected one of .ply"),
         ([], "expected -o OUT"),
         (["-o", "out"], "no cameras"),
-        (["-o", "web/lod-meta.json", "--report", "web/lod-meta.json"], "a file of its own"),
+        (["-o", "web/lod-meta.json", "--report", "web/lod-meta.json"], "is an input or output"),
     ],
 )
 def test_wrong_usage_ends_before_any_work(files, monkeypatch, capsys, options, word):

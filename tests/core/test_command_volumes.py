@@ -69,7 +69,7 @@ def test_clean_and_score_leave_out_what_must_go(scene, capsys):
 @pytest.mark.parametrize(
     ("options", "code", "expected"),
     [
-        (["--remove-inside", "Cube"], 2, "--remove-inside Cube: objects have names in Blender"),
+        (["--remove-inside", "Cube"], 2, "--remove-inside Cube: objects can be named in Blender"),
         (["--protect", ""], 2, "expected a name, got none"),
         (["--protect", "box:1,2"], 2, "expected box:x0,y0,z0,x1,y1,z1 in numbers, got 'box:1,2'"),
         (["--keep-inside", "sphere:0,0,0,-1"], 2, "sphere has radius -1, expected more than 0"),
