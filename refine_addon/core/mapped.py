@@ -92,14 +92,13 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
     files: dict[str, BinaryIO] = {}
     kinds: dict[str, tuple[Any, int, tuple[int, ...]]] = {}  # type, rows, further axes
     try:
-        with contextlib.ExitStack() as held:
+        with writing(folder), contextlib.ExitStack() as held:  # closing writes what is buffered
             for piece in pieces:
                 for name, values in piece.items():
-                    with writing(folder):
-                        if name not in files:
-                            unfinished.mkdir(parents=True, exist_ok=True)
-                            files[name] = held.enter_context((unfinished / name).open("wb"))
-                        files[name].write(np.ascontiguousarray(values).data)
+                    if name not in files:
+                        unfinished.mkdir(parents=True, exist_ok=True)
+                        files[name] = held.enter_context((unfinished / name).open("wb"))
+                    files[name].write(np.ascontiguousarray(values).data)
                     dtype, rows, further = kinds.get(name, (values.dtype, 0, values.shape[1:]))
                     kinds[name] = dtype, rows + len(values), further
         with writing(folder):
