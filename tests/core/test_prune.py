@@ -141,21 +141,6 @@ def test_kept_splats_of_doubles_are_doubles(small, views, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [ClosedForm(), Occlusion(12), Merge(12)])
-def test_scores_that_are_there_already_decide_as_new_ones_would(splats, views, method):
-    """The panel scores once and applies later: the same splats, and the same report."""
-    budget = Budget(threshold=0.5)
-    at_once = prune(splats, views, budget, method)
-    scores = score(splats, views, method)
-    scene = (splats, views) if method.changes else (None, None)
-    later = prune(*scene, budget, method, scores=scores)
-    np.testing.assert_array_equal(at_once.keep, later.keep)
-    for report in (at_once.report, later.report):
-        del report["timings"], report["method"]["seconds"]
-    assert at_once.report == later.report
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("budget", [Budget(ratio=0.04), Budget(psnr=80.0)])
 def test_known_scores_decide_where_merging_deletes(splats, views, budget):
     """Apply keeps what the panel marked by these scores, of fewer views."""

@@ -245,14 +245,6 @@ def test_cameras_of_another_up_axis_are_told_with_the_turn_that_helps(rotation, 
     assert best > 1.4 * max(fineness.values())
 
 
-@pytest.mark.parametrize(("turn", "sentences"), [(0, 0), (1, 1), (-1, 1)])
-def test_what_is_known_of_the_views_is_not_measured(turn, sentences):
-    views = replace(within(), turn=turn)
-    found = alignment(cloud(), views, views)
-    assert (found.turn, found.known, found.fineness) == (turn, True, ())
-    assert len(found.notes()) == sentences
-
-
 def test_views_that_see_all_or_look_one_way_are_not_judged():
     """Turned, they would look at something else, or at all of it from another side."""
     aside = ViewSet(tuple(look_along_z((x, 0.0, -5.0)) for x in range(3)))
