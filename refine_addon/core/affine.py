@@ -73,23 +73,11 @@ def moved(means: NDArray[Any], matrix: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True) -> Splats:
-    """Splats transformed by an invertible affine matrix.
+    """Splats transformed by an invertible affine matrix; RefineError by `check_affine`.
 
-    Parameters
-    ----------
-    splats : Splats, N of them
-    matrix : (4, 4), from their frame to the new one
-    rotate_sh : bool
-        Without it, harmonics stay those of the old frame, of which the closed form uses only the
-        constant, and the matrix may be non-uniform.
-
-    Returns
-    -------
-    Splats : float64; rounded values might lead to another kept set than in the old frame
-
-    Raises
-    ------
-    RefineError : see `check_affine`
+    They are float64, as rounded values might lead to another kept set. Without `rotate_sh`
+    harmonics stay those of the old frame, and the matrix may be non-uniform: the closed form, which
+    uses only their constant, needs no more.
     """
     matrix = np.asarray(matrix, np.float64)
     check_affine(matrix, with_sh=rotate_sh)
@@ -205,20 +193,12 @@ class Move(NamedTuple):
 
 
 def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
-    """Affine maps that explain how points moved, by RANSAC (Fischler and Bolles 1981).
+    """Affine maps that explain how points, (N, 3), moved, by RANSAC (Fischler and Bolles 1981).
 
-    A map is fitted to all points, and to random draws of a few; the one that most points agree with
-    is kept, and the search goes on with the others. The draws are the same at each call.
-
-    Parameters
-    ----------
-    before, after : (N, 3) floating, the points in one frame
-
-    Returns
-    -------
-    list of Move
-        First the points that did not move, then at most 32 maps. Points that were moved one by one
-        or into a plane, and those that are not finite, are in none.
+    A map is fitted to all points, and to random draws of a few, the same at each call; the one that
+    most points agree with is kept, and the search goes on with the others. First come the points
+    that did not move, then at most 32 maps. Points that were moved one by one or into a plane, and
+    those that are not finite, are in none.
     """
     before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
     finite = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)

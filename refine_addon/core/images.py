@@ -56,11 +56,9 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Channels of an image by name, (H, W) float32, the top row first.
+    """Channels of an image by name, (H, W), the top row first.
 
-    Raises
-    ------
-    RefineError : if the file cannot be read, has several parts or is compressed
+    RefineError if the file cannot be read, has several parts or is compressed.
     """
     try:
         return _channels(path.read_bytes())

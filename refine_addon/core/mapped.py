@@ -73,20 +73,7 @@ class Mapped:
 def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, Any]:
     """Write arrays to a folder, which is replaced whole or not at all.
 
-    Parameters
-    ----------
-    folder : Path, within that of a job
-    pieces : iterable of mappings
-        Consecutive rows of each array by name; all with the names, types and other axes of the
-        first.
-
-    Returns
-    -------
-    dict of str to Mapped
-
-    Raises
-    ------
-    Interrupted : if the disk is full or fails
+    Pieces hold consecutive rows of arrays by name. Interrupted: the disk is full or fails.
     """
     unfinished = folder.with_name(f"{folder.name}-{secrets.token_hex(4)}.tmp")
     files: dict[str, BinaryIO] = {}

@@ -58,18 +58,10 @@ def read_scene(
     model: Model | None = None,
     form: Format | None = None,
 ) -> Scene:
-    """Read a file of splats into memory; its frame is that of the views.
+    """Read a file of splats, of any format, into memory; its frame is that of views and zones.
 
-    Parameters
-    ----------
-    path : path-like, of any format
-    zones : sequence of Zone, in that frame
-    model : Model, optional; how splats are drawn, if the file does not say or is wrong
-    form : Format, optional; of the output, for sizes; None is plain PLY
-
-    Raises
-    ------
-    RefineError : see `read_splats` and `forced`
+    `model` is how splats are drawn if the file does not say or is wrong, `form` the output's
+    format, for sizes, None for plain PLY. Errors are those of `read_splats` and `forced`.
     """
     file = read_splats(path, model)
     splats = file.splats()
@@ -95,25 +87,11 @@ def run(
 ) -> Result:
     """Read, decide, write and compare; the report of the result is complete afterwards.
 
-    If this fails nothing is written, but for the last round of a refit that is cancelled, and for
-    a file whose comparison fails.
-
-    Parameters
-    ----------
-    read : callable, ``read(form)``, the scene; `form` is the output's format, None for plain PLY
-    decide : callable, ``decide(scene, clock, progress)``, the result
-    output : Path, optional; its suffix names the format, without it nothing is written
-    source : Path, optional; the file that is read meanwhile
-    overwrite : bool, whether files may be replaced
-    dry_run : bool, whether to decide as for the output and write no splats
-    views : ViewSet, optional; in them a lossy file and pictures are compared with all splats
-    pictures : PictureFiles, optional; where pictures before and after go
-    save : callable, optional; ``save(result, written)`` is called once the file is written
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    RefineError, Cancelled
+    If this fails nothing is written, but for the last round of a refit that is cancelled, and for a
+    file whose comparison fails. `read` gets the output's format, None for plain PLY. The suffix of
+    `output` names it; without `output`, or in a dry run, no splats are written. `source` is the
+    file that is read meanwhile. In `views` a lossy file and `pictures` are compared with all
+    splats. `save` is called once the file is written.
     """
     clock, written = Clock(), None if dry_run else output
     with contextlib.nullcontext() if pictures is None or views is None else pictures.opened(views):

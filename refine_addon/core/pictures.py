@@ -92,25 +92,10 @@ def draw(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.float64]:
-    """Draw splats, and layers among them, in a view.
+    """Draw splats, and layers of the image's size among them, (4, H, W) of 0..1.
 
-    Parameters
-    ----------
-    splats : Splats, in the frame of the view
-    view : View
-    layers : Layers, optional, of the size of the view's image
-    scene : Scene, optional; the frame to compute in, by default that of splats and view
-    progress, threads : see `prune`
-
-    Returns
-    -------
-    (4, H, W) float64, 0..1
-        Red, green and blue, display-referred and premultiplied, and alpha, to which the layers'
-        background does not add.
-
-    Raises
-    ------
-    RefineError, Cancelled
+    Red, green and blue are display-referred and premultiplied; the layers' background does not add
+    to alpha. `scene` is the frame to compute in, by default that of splats and view.
     """
     gaussians, scene, _ = projection.prepare(
         splats, ViewSet((view,)), scene, progress=part(progress, 0.0, 0.1), threads=threads

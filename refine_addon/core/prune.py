@@ -568,20 +568,11 @@ def merge_down(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Merged:
-    """Merge splats until `count` are left, by all `views`.
+    """Merge splats until `count` are left, by all `views`; errors as by `score`.
 
-    Parameters
-    ----------
-    splats, views, progress, threads : see `score`
-    scored : (Scores, Measured), optional; results of `occlusion.score_once` for these splats
-    began : int, optional
-        Number of splats before earlier merges, by default now. The number deleted before merging,
-        and the merge penalty, depend on the share removed since then.
-    protected : (N,) bool, optional; neither removed nor changed
-
-    Raises
-    ------
-    RefineError, Cancelled : see `score`
+    `scored` comes from `occlusion.score_once`. `began` is the number of splats before earlier
+    merges: the number deleted before merging, and the merge penalty, depend on the share removed
+    since then. `protected` splats are neither removed nor changed.
     """
     total = len(splats)
     if scored is None:

@@ -114,15 +114,9 @@ def of_prune(
 ) -> dict[str, Any]:
     """Report of a prune as plain JSON values; it shares the clock's times, later laps too.
 
-    Parameters
-    ----------
-    scores, budget, method, sizes : as in `prune.prune`
-    keep : (N,) bool, kept splats
-    psnr, between : float, optional; estimates in the views that decided and in views in between, dB
-    measured : dict, estimates on rays by method, dB
-    timed : bool, whether `clock` timed the scoring, from which other methods' times are predicted
-    outcome : prune.Outcome, optional; of merging, if its splats are kept
-    tried : prune.Outcome, optional; of merging, if deletion was as good
+    PSNR is in dB: `psnr` of the views that decided, `between` of views in between, `measured` on
+    rays by method. Other methods' times are predicted if the clock `timed` the scoring. `outcome`
+    is that of merging if its splats are kept, else `tried` if deletion was as good.
     """
     count, curve = len(keep), scores.quality
     report: dict[str, Any] = {**scored(scores)}

@@ -329,19 +329,10 @@ def pinhole(
     size: tuple[int, int],
     means: NDArray[Any],
 ) -> View:
-    """View of a camera given by OpenGL's matrices.
+    """View of a camera by OpenGL's matrices, y up, z back; RefineError as of `View`.
 
-    Parameters
-    ----------
-    matrix : (4, 4), world to camera, y up, z back
-    projection_matrix : (4, 4); of one without perspective, the view stands `FAR` extents of the
-        splats away, so that rays are nearly parallel
-    size : (int, int), width and height of the image, pixels
-    means : (N, 3), centres of the splats, world units
-
-    Raises
-    ------
-    RefineError : see `View`
+    Without perspective the view stands `FAR` extents of the splats, by their `means`, away, so that
+    rays are nearly parallel.
     """
     flip = np.diag([1.0, -1.0, -1.0])
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)  # float32
@@ -363,16 +354,10 @@ def view_through(
     size: tuple[int, int],
     parallel: tuple[float, float] = (0.0, 1.0),
 ) -> View:
-    """View of a camera with one of OpenGL's projection matrices.
+    """View of a camera with one of OpenGL's projection matrices and a pose in the axes of `View`.
 
-    Parameters
-    ----------
-    projection_matrix : (4, 4)
-    pose : rotation, (3, 3), world to camera in the axes of `View`, and centre, (3,), world units
-    size : (int, int), width and height of the image, pixels
-    parallel : (float, float)
-        Without perspective: the depth at which pixels have their exact size, and the distance of
-        the view from there, world units.
+    Without perspective `parallel` is the depth at which pixels have their exact size, and the
+    distance of the view from there, world units.
     """
     p, (width, height), (rotation, center) = projection_matrix, size, pose
     fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0

@@ -72,11 +72,8 @@ class CameraPlace(Place):
     def view(self, name: str, pose: Pose, lens: Lens) -> View:
         """View of a camera; characters of `name` that cannot be printed become "?".
 
-        Parameters
-        ----------
-        name : str
-        pose : rotation, (3, 3), world to camera in the axes of `View`, and centre, (3,)
-        lens : two focal lengths, the principal point, and width and height, pixels
+        The pose is the rotation, world to camera in the axes of `View`, and the centre; the lens
+        two focal lengths, the principal point, and width and height, pixels.
         """
         (rotation, center), ((fx, fy), (cx, cy), (width, height)) = pose, lens
         if np.abs(center).max() > LARGEST_NUMBER:

@@ -271,16 +271,10 @@ def _outside(gaussians, scene, shown, unused):
 def judge(
     gaussians: Gaussians, suspects: Suspects, threads: int | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
-    """Decide which suspects float (docs/method.md, section 8).
+    """Suspects that float, others that would if they were less faint, and `Cleaned.sure`, (M,).
 
-    One floats if little light stops near it, views see past it, and the evidence suffices, more of
-    it if kept splats touch it. With nothing behind, as in a sky, it stays.
-
-    Returns
-    -------
-    (M,) bool : suspects that float
-    (M,) bool : others, which would float if they were less faint
-    (M,) float64 : `Cleaned.sure`
+    One floats if little light stops near it, views see past it, and the evidence suffices, more if
+    kept splats touch it (docs/method.md, section 8). With nothing behind, as in a sky, it stays.
     """
     evidence, giant, large = suspects.evidence, suspects.giant, suspects.large
     seen, past = evidence.views, evidence.past

@@ -129,13 +129,8 @@ def hits_of_view(
 ) -> Hits | None:
     """Hits of one view; None if its rays hit nothing.
 
-    Parameters
-    ----------
-    gaussians : Gaussians, M in the frame of `scene`
-    footprints : Footprints of these in the view
-    numbered : (View, int), and the number that sets its pixels (`cast.pixels`)
-    absent : (M,) bool, Gaussians that are hit and stop no light
-    targets : (M,) bool, optional, which rays are aimed at if small
+    The view's number sets its pixels (`cast.pixels`). Gaussians that are `absent` are hit and stop
+    no light; rays are aimed at `targets` that are small.
     """
     view, number = numbered
     count = min(RAYS, MAX_HITS / max(depth_complexity(footprints, view), 1.0))
@@ -221,14 +216,7 @@ def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
 def evidence_of(
     light: Light, suspects: NDArray[np.bool_], colors: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """`Evidence` of one view on each of `Light.hit`, (5, u).
-
-    Parameters
-    ----------
-    light : Light, with all suspects absent
-    suspects : (M,) bool
-    colors : (M, 3) float32, of the Gaussians
-    """
+    """`Evidence` of one view on each of `Light.hit`, (5, u), by light with all suspects absent."""
     rows = np.flatnonzero(suspects[light.hit].take(light.owner))
     before = _running(light.weight)
     first, last, end = light.around(rows)

@@ -101,22 +101,10 @@ def measured_field(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> MeasuredField:
-    """Some splats as merging needs them.
+    """Some drawable splats as merging needs them; `sums` are contribution and error, (2, N), px^2.
 
     A view counts for a splat by 1 / distance^2, of at least `NEAR_RELATIVE` scene sizes, and by
     `BESIDE` of that if it does not hold the centre.
-
-    Parameters
-    ----------
-    splats : Splats, N in the frame and unit of the views
-    rows : (M,) int, drawable ones among them
-    sums : (2, N) float64, contribution and error, px^2 (`visibility.measuring.Measured`)
-    scene : Scene of splats and views
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    Cancelled
     """
     count = len(rows)
     shapes = (3,), (6,), (), (), (), (3,), (3,), (3,), ()
@@ -204,14 +192,7 @@ def across(normal: Array) -> tuple[Array, Array]:
 
 
 def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
-    """Covariances in planes, ``(u, v)' C (u, v) + blur I``.
-
-    Parameters
-    ----------
-    covariances : (M, 6), C, as of `Field`
-    plane : u and v, (3, M) each, orthogonal unit vectors
-    blur : (M,), variance of the low-pass, world units squared
-    """
+    """Covariances in planes, ``(u, v)' C (u, v) + blur I``; u and v are orthogonal, (3, M) each."""
     u, v = plane
     xx, xy, xz, yy, yz, zz = covariances.T
     cu, cv = (

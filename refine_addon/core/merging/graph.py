@@ -260,21 +260,9 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Near neighbours of each point, most of them the nearest.
+    """Near neighbours of N points, (N, min(count, N - 1)), most of them the nearest, nearest first.
 
-    Parameters
-    ----------
-    points : (N, 3) float64, scene sizes
-    count : int, neighbours of each, at most 16
-    progress, threads : see `prune`
-
-    Returns
-    -------
-    (N, min(count, N - 1)) int32 : nearest first; of equally near ones the lower row
-
-    Raises
-    ------
-    Cancelled
+    Points are in scene sizes, `count` is at most 16. Of equally near points the lower row is first.
     """
     total = len(points)
     count = min(count, total - 1)

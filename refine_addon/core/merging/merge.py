@@ -94,22 +94,10 @@ def merge(
 ) -> Merged:
     """Reduce splats to a number at the least cost to the pictures (docs/method.md, section 7).
 
-    Parameters
-    ----------
-    splats : Splats, N in the frame and unit of the views
-    sums : (2, N) float64, contribution and error, px^2 (`visibility.measuring.Measured`)
-    measure : Measure, called before each stage but the first
-    keep_count : int; more are kept if more are protected
-    began : int, optional
-        Of how many splats `merge_penalty` takes the share removed: by default those not `deleted`,
-        more where splats were merged before.
-    deleted : (N,) bool, optional; they go first, then undrawable ones
-    protected : (N,) bool, optional; neither removed nor changed
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    Cancelled
+    `sums` are contribution and error, (2, N), px^2; `measure` gives those of later stages.
+    `deleted` splats go first, then undrawable ones. `protected` ones are neither removed nor
+    changed, even if more than `keep_count` are left. `merge_penalty` takes the share removed of
+    `began`: by default those not `deleted`, more where splats were merged before.
     """
     total, left = len(splats), splats
     # Of each splat left: which of the N it is, and for how many of them it stands, 0 if deleted.

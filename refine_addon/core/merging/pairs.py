@@ -49,12 +49,9 @@ class Pairs(NamedTuple):
 
 
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
-    """Costs and results of merging M pairs of splats, all of contribution above 0.
+    """Costs and results of merging pairs of splats, all of contribution above 0.
 
-    Parameters
-    ----------
-    first, second : (M,) int, rows of `splats`
-    tilt : float, by how many standard deviations the view is turned from its mean direction
+    The view is turned from its mean direction by `tilt` standard deviations.
     """
     return _price(_gather(splats, first, second, np.float64), tilt)
 
@@ -62,12 +59,7 @@ def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pair
 def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Real:
     """Costs of merges, (M,) float32: means over two viewing directions, to either side.
 
-    Computed in float64 for discs, whose thickness is 0, in float32 for others.
-
-    Parameters
-    ----------
-    first, second : (M,) int, rows of `splats`, all of contribution above 0
-    limit : (M,) float64 or float; a cost from there on is infinite
+    Computed in float64 for discs, whose thickness is 0. A cost from `limit` on is infinite.
     """
     # What leaves the range of float32 costs infinity, or NaN: it is not merged.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
@@ -259,15 +251,10 @@ def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
 
 
 def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
-    """Merged splats, (M,), with mean and covariance of the mixture of each pair.
+    """Merged splats, (M,), with mean and covariance of the mixture of each pair of `price`.
 
     ``mu = w mu_i + w' mu_j``, ``C = w C_i + w' C_j + w w' d d'``, w + w' = 1, d = mu_j - mu_i
     (docs/method.md, section 7); discs are made flat (`flat_as_viewed`).
-
-    Parameters
-    ----------
-    first, second : (M,) int, rows of `splats`
-    pairs : Pairs, of `price`
     """
     one, two = splats.take(first), splats.take(second)
     position, color = pairs.position[:, None], pairs.color[:, None]
@@ -342,15 +329,10 @@ def _mixture(one: Real, two: Real, step: Real, share: Real) -> Array:
 
 
 def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Array:
-    """Covariances, (M, 6), of discs that look like given ones from where they are viewed.
+    """Covariances, (M, 6), of discs that look like given ones from where they are viewed (`Field`).
 
     The normal n has ``C n = l M n``, l least, M the mean of ``v v'`` over viewing directions v;
     what is left is ``C - l M n (M n)'``. For M = I that is `flat`.
-
-    Parameters
-    ----------
-    covariances : (M, 6) float64, xx, xy, xz, yy, yz, zz
-    direction, deviation : (M, 3) float64, of viewing directions, see `Field`
     """
     beside = deviation - np.einsum("ij,ij->i", deviation, direction)[:, None] * direction
     size = np.maximum(np.sqrt(np.einsum("ij,ij->i", beside, beside)), ASIDE)

@@ -123,16 +123,7 @@ def alignment(
 ) -> Alignment:
     """Find whether views are to be turned, and which are far away (docs/method.md, section 10).
 
-    Parameters
-    ----------
-    splats : Splats, in the frame of the views
-    views : ViewSet; where its import says how it is turned, nothing is measured
-    used : ViewSet, optional, of which some are turned to measure; by default none is
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    Cancelled
+    Some of `used` are turned to measure, none where the import says how its views are turned.
     """
     with np.errstate(invalid="ignore"):  # signalling NaN
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)

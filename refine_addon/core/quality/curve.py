@@ -217,12 +217,9 @@ def merged_from(
 ) -> NDArray[np.float64]:
     """Predicted PSNR of merging at the first L of `SHARES`, (L,) dB (docs/method.md, section 5).
 
-    Parameters
-    ----------
-    psnr : (L,) float64, by deletion, dB
-    gains : (m,) float64, dB at the first m of `MERGED_SHARES`, where nearest kept hits stand in
-        (`Rays.colors_by_nearest_kept`): no bound, but they vary between scenes as merging's do
-    count : int, splats before any is removed
+    `psnr`, (L,), is that by deletion. `gains`, dB at the first of `MERGED_SHARES`, are of rays
+    where nearest kept hits stand in (`Rays.colors_by_nearest_kept`): no bound, but they vary
+    between scenes as merging's do. `count` is the number of splats before any is removed.
     """
     constant, factor, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
     halvings = max(math.log2(FULL_GAIN / max(count, 1)), 0.0)

@@ -25,15 +25,10 @@ MIN_RAYS_WITH_HITS = 256
 
 
 def psnr_of(colors: NDArray[Any], truth: NDArray[Any], view: View) -> float:
-    """PSNR of a view, dB, at most `PSNR_CAP` (docs/method.md, section 5).
+    """PSNR of a view, dB, at most `PSNR_CAP`, by (3, P) colours (docs/method.md, section 5).
 
     The logarithm of a mean is too low by half its squared relative error, which is corrected; the
     variance is that between neighbouring rays, so that parts of the picture may differ.
-
-    Parameters
-    ----------
-    colors, truth : (3, P) floating, 0..1, of the view's rays with other splats and with all
-    view : View, for the number of its pixels
     """
     errors = np.mean((colors - truth) ** 2, axis=0, dtype=np.float64)
     mean, count = float(np.mean(errors)), len(errors)
@@ -68,18 +63,9 @@ def quality_curve(
 ) -> Quality | None:
     """Estimated PSNR at each of `curve.SHARES`; None if too little is seen.
 
-    Parameters
-    ----------
-    sample : RaySample, of N splats
-    values : (N,) float32, scores: the lowest are removed first, of equal ones the first in the file
-    protected : (N,) bool, optional, removed after all others
-    settled : int, optional, splats in final order, see `Scores`: the curve ends there
-    between : RaySample, optional, of views in between
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    Cancelled
+    Splats of the lowest `values` are removed first, of equal ones the first in the file,
+    `protected` ones last. The curve ends after `settled` splats, which are in final order
+    (`Scores`). `between` has the rays of views in between.
     """
     last = len(values) if settled is None else settled
     if settled is not None and protected is not None:
@@ -137,19 +123,7 @@ def psnr_against(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> float | None:
-    """Estimated PSNR of other splats against those of a sample, dB; None if too little is seen.
-
-    Parameters
-    ----------
-    sample : RaySample, of which about `VALIDATION_VIEWS` views are compared
-    splats : Splats, in the same frame
-    views : ViewSet of the sample
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    Cancelled
-    """
+    """Estimated PSNR of other splats against those of a sample, dB; None if too little is seen."""
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )

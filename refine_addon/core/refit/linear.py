@@ -290,13 +290,9 @@ def linear_view(
 ) -> tuple[LinearView, Shapes]:
     """The colours of a view's rays, linear in the splats that they hit, and these splats' shapes.
 
-    Parameters
-    ----------
-    visible : Rays, at most 2^16, and (h,) float32, the transmittance in front of each hit
-    footprints : Footprints that were hit
-    truth : (3, P) float32, colours of the unpruned splats on the rays
-    colors : (3, u) float32, in which the view sees the splats that are hit
-    shapes : Shapes of the M splats that can change, the first of all that can be hit
+    The rays, at most 2^16, come with the transmittance in front of each hit; `truth`, (3, P), are
+    their colours with the unpruned splats, `colors`, (3, u), those of the splats that are hit. The
+    splats of `shapes`, which can change, are the first of all that can be hit.
     """
     rays, transmittance = visible
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit

@@ -125,21 +125,9 @@ def refit_rounds(
 ) -> Iterator[Refitted]:
     """Yield kept splats as they are, and after each round that gains on validation rays.
 
-    Memory: about 900 bytes a kept splat; a temporary file takes 14 bytes for each hit of a round,
-    see `round_rays.limits`.
-
-    Parameters
-    ----------
-    splats : Splats, N kept ones
-    original : Splats, the unpruned ones; both in the frame and unit of the views
-    rounds : int, optional, the most; by default rounds also end after `ENOUGH_RAYS`
-    protected : (N,) bool, optional; these do not change
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    RefineError : if `rounds` is out of range
-    Cancelled
+    `rounds` are the most (RefineError if out of range); by default they also end after
+    `ENOUGH_RAYS`. `protected` splats do not change. Memory: about 900 bytes a kept splat; a
+    temporary file takes 14 bytes for each hit of a round, see `round_rays.limits`.
     """
     check_rounds(rounds)
     if in_regions(original, len(original)) and in_regions(original, 2 * len(splats)):

@@ -42,13 +42,9 @@ _NO_WEIGHT = 10.0**-5.5  # stands for 0 in a mean of logarithms
 def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> NDArray[np.float64]:
     """Worth of each splat to views not given, (n,), of mean 1 if `seen` is 0 (docs/method.md, 6).
 
-    If none shows it, the next does with probability ``1 / (1 + seen)``, by the rule of succession.
-
-    Parameters
-    ----------
-    prior : (n,) float64, closed form without frustum test and neighbourhoods
-    seen : (n,) int32, views that hold the centre
-    power : float, 1 + p for scores ``error contribution^p``
+    If none of `seen` views that hold the centre shows it, the next does with probability
+    ``1 / (1 + seen)``, by the rule of succession. `prior` is the closed form without frustum test
+    and neighbourhoods, `power` is 1 + p for scores ``error contribution^p``.
     """
     return np.asarray(_unit(prior**power) / (1.0 + seen))
 
@@ -61,10 +57,7 @@ def _with_floor(scores, floors, weight):
 def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
     """Best weight of the floor for each of `SHARES`; all 1 if no view left out has an error.
 
-    Parameters
-    ----------
-    folds : iterable of (scores, floors, errors), (n,), (n,) and (views, n): scores and floors by
-        the views that stay, errors of the splats in each view left out
+    A fold is scores and floors by the views that stay, (n,), and errors by each other, (views, n).
     """
     losses = []
     for scores, floors, errors in folds:
@@ -108,12 +101,7 @@ def order(
 ) -> NDArray[np.int64]:
     """All n rows in the order of removal, exact up to the last of `stops`.
 
-    Parameters
-    ----------
-    scores, floors : (n,) float64
-    ties : (n,) float32, of equal scores the lower goes first
-    floor_weights : one for each of `SHARES`
-    stops : ascending, for each weight, the number removed when the next weight takes over
+    The lower of `ties` goes first. At each stop, ascending, the next of `floor_weights` takes over.
     """
     left, going = np.arange(len(scores)), [np.arange(0)]
     for weight, count in zip(floor_weights, np.diff(stops, prepend=0), strict=True):

@@ -107,16 +107,7 @@ def measure_part(
 ) -> tuple[Measured, float]:
     """What one part of the views sees of all N splats, and its share of the weights of all views.
 
-    Parameters
-    ----------
-    splats : Splats, in the frame of the views
-    turn : int, number of the part, modulo `parts`
-    parts : int, into at most how many parts, each spread over all views, the views are divided
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    Cancelled
+    Of at most `parts` parts, each spread over all views, it is number `turn`, modulo `parts`.
     """
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.05), threads=threads

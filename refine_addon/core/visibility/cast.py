@@ -61,20 +61,11 @@ _STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
 class RaySample:
-    """Scoring or validation rays of all views into one scene.
+    """Scoring or validation rays of all views into one scene, of M Gaussians made of splats.
 
-    Parameters
-    ----------
-    views : sequence of (View, weight), see `ViewSet.by_distance`
-    gaussians : Gaussians, M that were made of `splats`
-    few_views : bool, cast only about `VALIDATION_VIEWS`: enough to compare, not for a curve
-    scoring : bool, whether they are scoring rays
-
-    Attributes
-    ----------
-    splat_rows : (M,) int64, the splat of each Gaussian
-    share : float, number of rays over the usual number
-    rays : list of Rays, None of views that are not cast
+    Views have the weights of `ViewSet.by_distance`. With `few_views` about `VALIDATION_VIEWS` are
+    cast, enough to compare, not for a curve; `rays` holds None for the others. `splat_rows`, (M,),
+    are the splats of the Gaussians, `share` is the number of rays over the usual number.
     """
 
     def __init__(
@@ -151,13 +142,7 @@ def cast_view(
     scoring: bool = False,
     share: float = 1.0,
 ) -> Rays:
-    """Rays of view `number` of the `views` of a sample, which share its rays equally.
-
-    Parameters
-    ----------
-    views, scoring, share : as of `RaySample`
-    footprints : Footprints of that view
-    """
+    """Rays of view `number` of the `views` of a sample, which share its rays equally."""
     view = views[number][0]
     rays_of_all, hits_of_all = VALIDATION_RAYS, MAX_VALIDATION_HITS
     if scoring:
@@ -213,15 +198,10 @@ def depth_complexity(footprints: Footprints, view: View) -> float:
 def aimed(
     view: View, columns: NDArray[np.int64], rows: NDArray[np.int64], targets: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """Column and row of the pixel of each of P rays, (2, P), aimed at targets.
+    """Column and row of the pixel of each of P rays, (2, P), aimed at targets, (2, t) px.
 
-    Columns and rows divide the image into cells of one ray each. It goes through the first target
-    in its cell, or where column and row cross.
-
-    Parameters
-    ----------
-    columns, rows : (C,), (R,) int64, ascending; P = C R
-    targets : (2, t) float32, px
+    Ascending columns and rows divide the image into cells of one ray each. It goes through the
+    first target in its cell, or where column and row cross.
     """
     row, column = np.divmod(np.arange(len(columns) * len(rows)), len(columns))
     aims = np.stack([columns[column], rows[row]])
@@ -245,10 +225,7 @@ def cast(
 ) -> Rays:
     """Rays with all their hits of alpha `ALPHA_CUT` or more, front to back.
 
-    Parameters
-    ----------
-    columns, rows : (C,), (R,) int64, ascending, of the pixels
-    aims : (2, P) int64, optional, column and row of each ray instead (`aimed`)
+    They go where ascending columns and rows cross, or through the pixels `aims`, (2, P) (`aimed`).
     """
     pieces = hits(footprints, columns, rows, _PAIRS, aims=aims)
     return _front_to_back(footprints, columns, rows, aims, pieces)
@@ -304,16 +281,8 @@ def hits(
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
     """Yield hits of some footprints at a time: ascending rows of these, rays, alphas, (h,) each.
 
-    Parameters
-    ----------
-    columns, rows : (C,), (R,) int64, ascending: the rays, see `Rays`
-    limit : int, about how many pairs of footprint and pixel in its bounding box are held at once
-    wanted : callable, optional, of footprints and rays, (p,) each: which pairs to test, (p,) bool
-    aims : (2, P) int64, optional, see `Rays`
-
-    Raises
-    ------
-    Cancelled
+    Columns, rows and aims are those of `Rays`. About `limit` pairs of footprint and pixel in its
+    bounding box are held at once; `wanted` says which pairs to test, by footprints and rays, (p,).
     """
     squared_radius = _squared_radius(footprints.alphas)  # (n,)
     # Of each footprint: the first column and row in its bounding box, and how many lie in it.

@@ -52,13 +52,7 @@ def clip_planes(view: View, near: float) -> tuple[float, float]:
 
 
 def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> NDArray[np.bool_]:
-    """Which of n points lie in a view's frustum, (n,).
-
-    Parameters
-    ----------
-    local : (3, n) floating, camera coordinates: x right, y down, z forward
-    planes : near and far, in the unit of the points
-    """
+    """Which points, (3, n) in camera coordinates, lie in a view's frustum between near and far."""
     x, y, z = local
     inside: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
     for coordinate, side in zip((x, y), image_sides(view), strict=True):
@@ -67,17 +61,11 @@ def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> ND
 
 
 class Frustums:
-    """The frustums of V views, for points relative to an origin, to keep digits far from zero.
+    """The frustums of V views, for points relative to `origin`, to keep digits far from zero.
 
-    Parameters
-    ----------
-    origin : (3,) float64, world units
-    near : float, > 0, for views that have no near plane of their own, world units
-
-    Attributes
-    ----------
-    centers : (V, 3) float64, of the views, relative to the origin
-    beyond_per_unit : (V, 1) float64, growth of `project`'s `beyond` per unit away from a side
+    `near`, > 0, is for views that have no near plane of their own. `centers`, (V, 3), are relative
+    to the origin; `beyond_per_unit`, (V, 1), is the growth of `project`'s `beyond` per world unit
+    away from a side.
     """
 
     def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:
@@ -97,13 +85,9 @@ class Frustums:
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which views may see part of each box, and which surely see all of it, (V, k) bool each.
 
-        Points of a box that a view does not touch lie beyond a plane, or their ``beyond``
-        (`project`) is at least `reach` times `beyond_per_unit`.
-
-        Parameters
-        ----------
-        low, high : (3, k) float64, corners of k boxes
-        reach : (k,) float64, world units, from how far outside an image their points count
+        Boxes have corners `low` and `high`, (3, k). Points of one that a view does not touch lie
+        beyond a plane, or their ``beyond`` (`project`) is at least `reach`, world units, times
+        `beyond_per_unit`.
         """
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         x, y, z = self._rows
@@ -126,20 +110,11 @@ class Frustums:
     def project(
         self, points: NDArray[np.float64], views: NDArray[np.int64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Where points lie in some views. Depths and `beyond` last until this thread's next call.
+        """Depths of points (x, y, z, 1) in b views; ``beyond`` and ``between`` in `count` of them.
 
-        Parameters
-        ----------
-        points : (4, n) float64: x, y, z, 1
-        views : (b,) int64, numbers of views
-        count : int, c, of how many of these more than the depth is wanted
-
-        Returns
-        -------
-        depth : (b, n)
-        beyond : (c, n), ``max(|x'|, |y'|) - depth``, x' and y' in half images at depth 1: at most 0
-            in the image
-        between : (c, n) bool, whether the points lie between near and far plane
+        ``beyond``, (count, n), is ``max(|x'|, |y'|) - depth``, x' and y' in half images at depth 1:
+        at most 0 in the image. ``between``, (count, n), says which lie between near and far plane.
+        Depths and ``beyond`` last until this thread's next call.
         """
         end = len(views) + 2 * count
         stack = np.zeros((-(-end // _STACK), _STACK, 4))

@@ -121,26 +121,12 @@ def measure(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Measured, list[Measured], list[NDArray[np.float64]]]:
-    """Measure Gaussians in views, and cast rays while their footprints are there.
+    """Measure Gaussians in groups of views, and cast rays while their footprints are there.
 
-    Parameters
-    ----------
-    gaussians, scene : as of `projection.prepare`
-    views : sequence of (View, weight), see `ViewSet.by_distance`
-    groups : numbers of the views to use, in groups (`view_groups`)
-    sample : (m,) int64, rows of Gaussians
-    ray_samples : sequence of RaySample, which get the rays of these views that they lack
-    progress, threads : see `prune`
-
-    Returns
-    -------
-    Measured : (M,), over all groups
-    list of Measured : (m,), of the sample, over each group
-    list of (views, m) float64 : errors of the sample in each view of each group
-
-    Raises
-    ------
-    Cancelled
+    Views have the weights of `ViewSet.by_distance`; groups hold their numbers (`view_groups`),
+    `sample` m rows of Gaussians. `ray_samples` get the rays of these views that they lack. Returned
+    are the sums of all Gaussians over all groups, those of the sample over each group, and for each
+    group the errors of the sample in each view, (views, m).
     """
     rows, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
     lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]

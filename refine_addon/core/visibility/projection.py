@@ -139,23 +139,9 @@ def prepare(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Gaussians, Scene, NDArray[np.bool_]]:
-    """Activate splats once for all views.
+    """Gaussians, in the frame of a scene, of drawable splats more opaque than `ALPHA_CUT`.
 
-    Parameters
-    ----------
-    splats : Splats, N in the frame and unit of the views
-    scene : Scene, optional, the frame of the Gaussians; by default that of splats and views
-    progress, threads : see `prune`
-
-    Returns
-    -------
-    Gaussians : splats that can be drawn and are more opaque than `ALPHA_CUT`
-    Scene
-    (N,) bool : which splats can be drawn
-
-    Raises
-    ------
-    Cancelled
+    Also the scene, by default that of splats and views, and which splats are drawable, (N,).
     """
     good, opaque = np.empty((2, len(splats)), np.bool_)
 
@@ -255,12 +241,7 @@ def project(
     The covariance is ``C + 0.3 I``, ``C = J W S W' J'`` (Zwicker et al., "EWA splatting", 2002, Eq.
     31), J the Jacobian at the mean; antialiased opacity is ``o sqrt(det C / det(C + 0.3 I))``.
     Splats with centres nearer than the near plane or beyond the far one have no footprint. Equal
-    depths keep their order.
-
-    Parameters
-    ----------
-    gaussians : Gaussians, M in the frame of `scene`
-    view, window : View; a window has the view's pose and lens, and may be smaller
+    depths keep their order. A window has the view's pose and lens.
     """
     planes, discs = clip_planes(scene, view), gaussians.normals is not None
     turned = (view.rotation @ scene.axes.T).astype(np.float32)
@@ -359,13 +340,9 @@ def _touches(local, largest, views, planes, low_pass):
 def boxes_touch(
     boxes: NDArray[np.float32], scene: Scene, view: View, window: View | None = None
 ) -> NDArray[np.bool_]:
-    """Which of B boxes may hold a Gaussian that reaches into a window of a view, (B,).
+    """Which of B boxes may hold a Gaussian that reaches into a view or its part `window`, (B,).
 
-    Parameters
-    ----------
-    boxes : (B, 7) float32, least means, greatest means and longest standard deviation, in the
-        scene's frame and sizes
-    window : View, optional, part of the image; by default all of it
+    A box is least and greatest mean and longest standard deviation, (7,), in the scene's frame.
     """
     if not _computable(scene, view):
         return np.zeros(len(boxes), np.bool_)

@@ -204,12 +204,8 @@ def contrasts(
 ) -> Iterator[NDArray[np.float32]]:
     """Yield B - c, colour behind less own colour, (m,), for each channel.
 
-    Parameters
-    ----------
-    weight : (m,) float32, T alpha of hits or points, front to back in columns
-    left : (m,) float32, > 0, transmittance behind each
-    colors : (3, m) float32
-    counts : (C,) int64, >= 1, how many each column has
+    Hits or points lie front to back in columns of `counts`, >= 1 each. `weight` is their T alpha,
+    `left`, > 0, the transmittance behind each.
     """
     red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
     blue = behind((weight * colors[2]).astype(np.float64), counts)

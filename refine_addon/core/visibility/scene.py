@@ -71,13 +71,7 @@ def size_of(median: float) -> float:
 def scene_of(
     means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet, *, threads: int | None = 1
 ) -> Scene:
-    """Frame of splats and views.
-
-    Parameters
-    ----------
-    means : (N, 3) floating, world units
-    drawable : (N,) bool; the others do not count
-    """
+    """Frame of views and of those splats that are drawable."""
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
 
