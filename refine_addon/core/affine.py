@@ -18,9 +18,9 @@ QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}  # turns about x by number of quarters
 
-_UNIFORM = 1e-4  # relative difference between the scales of a matrix that still counts as uniform
+_UNIFORM = 1e-4  # largest relative difference of the scales of a matrix that counts as uniform
 
-_FLAT = 1e-9  # least over largest scale of a matrix that cannot be inverted in practice
+_FLAT = 1e-9  # smallest over largest scale up to which a matrix counts as flat
 
 _SMALLEST, _LARGEST = 1e-30, 1e30
 """Scales of a matrix that is applied: its determinant fits float64, usual splats float32."""
@@ -31,7 +31,7 @@ _MOST = 32  # maps that are looked for
 
 _NOISE = 4e-6  # rounding of moved points, relative to a coordinate's terms: 32 units of float32
 
-_PLANAR = 1e-5  # thickness over extent of points that count as lying in a plane
+_PLANAR = 1e-5  # thickness over extent up to which points count as lying in a plane
 
 _SAMPLE, _FITTED = 2048, 16384
 """Points, evenly spread, by which candidates are compared, and to which the best is fitted."""

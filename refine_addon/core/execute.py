@@ -318,7 +318,7 @@ def _side_by_side(work, items, threads, tell, stop=lambda: None):
                     tell(done)
                 while left and len(futures) < _AHEAD * threads:
                     futures.append(pool.submit(checked, left.popleft()))
-                future = futures.popleft()  # and forget the result once it is used
+                future = futures.popleft()  # deleted below, to free its result
                 while not future.done() and not wait([future], _INTERVAL).done:
                     tell(done)
                 yield future.result()
@@ -435,7 +435,7 @@ class _Process:
         if sys.platform == "win32":
             flags = subprocess.CREATE_NO_WINDOW | subprocess.CREATE_NEW_PROCESS_GROUP
             away = {"creationflags": flags}
-        # Imports ignore what is no string. `Path.resolve` raises on loops of links, this does not.
+        # Imports ignore what is no string. `abspath`, unlike `Path.resolve`, takes loops of links.
         path = [os.path.abspath(each) for each in sys.path if isinstance(each, str)]
         unwritten = ["-B"] * sys.dont_write_bytecode
         # Each uses one core.
@@ -501,7 +501,7 @@ def _unpacked(pickled, path, places):
 def serve() -> None:
     """Answer requests of another process, until it ends or sends none for `IDLE` seconds."""
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever is printed is no answer
+    os.dup2(2, 1)  # so that nothing printed gets among the answers
     work: Any = None
     while True:
         watch = threading.Timer(IDLE, os._exit, (0,))
@@ -517,7 +517,7 @@ def serve() -> None:
             if kind == "call":
                 result = True, run_all(work, [message], threads=1)[0]
             else:
-                work = None  # first, so that the arrays of both never are there at once
+                work = None  # first, so that only the arrays of one task are in memory
                 return_freed()
                 work = _unpacked(*message) if message else None
                 result = True, None

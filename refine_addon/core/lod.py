@@ -114,7 +114,7 @@ class Levels:
         """Budgets of the levels for so many splats; each keeps at least one."""
         if self.psnr:
             return [Budget(psnr=psnr) for psnr in self.psnr]
-        # The decimals as written, as `Budget.removals`; as many as with `ratio` of 1 - share.
+        # Decimals as written, like in `Budget.removals`: a share keeps what a ratio leaves.
         kept = (math.ceil(Fraction(repr(float(share))) * count) for share in self.shares)
         return [Budget(keep=max(number, 1)) for number in kept]
 

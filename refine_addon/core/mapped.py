@@ -209,7 +209,7 @@ def divided(
     Boxes are halved across the axis along which `means`, (n, 3), vary most; with `askew`, the axes
     are turned, so that other splats lie at the borders. Non-finite means count as the origin.
     """
-    with np.errstate(over="ignore"):  # doubles that are no floats
+    with np.errstate(over="ignore"):  # doubles beyond float32
         place = np.asarray(means, np.float32)
     place = np.where(np.isfinite(place).all(axis=1, keepdims=True), place, np.float32(0.0))
     place = place @ (_ASKEW if askew else np.eye(3, dtype=np.float32))

@@ -47,7 +47,7 @@ NEIGHBOURS = 8  # nearest splats by which a selection grows and shrinks
 class Surface(NamedTuple):
     """The surface under a pixel."""
 
-    place: NDArray[np.float64]  # (3,), in the splats' frame: before it is half of the pixel
+    place: NDArray[np.float64]  # (3,), in the splats' frame, with half of the pixel before it
     color: NDArray[np.float64]  # (3,), of constant harmonics, display-referred
     scale: float  # pixels of a length of 1 there
 

@@ -39,7 +39,7 @@ from .volumes import Forced, must_go
 
 TRIES = 3  # how often splats are merged at most to reach a PSNR
 
-CLOSE = 0.7  # how close to a PSNR a result's estimate must be, dB, or splats are merged again
+CLOSE = 0.7  # largest distance of an estimate from the PSNR of the budget, dB, else merge again
 
 FIRST = 0.1
 """Share of splats deleted before any merge: deleting the lowest scores costs less than merging."""
@@ -262,7 +262,7 @@ class Outcome:
 class _Prune:
     """One prune; fields as the arguments of `prune`."""
 
-    splats: Any  # Splats, or None where scores are known
+    splats: Any  # Splats, or None where scores are given
     views: Any  # ViewSet, or None
     budget: Budget
     method: Method
@@ -392,7 +392,7 @@ class _Prune:
                 settled=self._settled(), progress=progress, threads=self.threads,
             )  # fmt: skip
         elif self.budget.psnr is not None and self.protected is not None:
-            # Others may have been protected when these were scored.
+            # Other splats may have been protected when these scores were made.
             scores = with_quality(scores, protected=self.protected, threads=self.threads)
         self.clock.lap("score_s")
         return scores
@@ -404,7 +404,7 @@ class _Prune:
         total = len(self.splats)
         spared = 0 if self.protected is None else int(np.count_nonzero(self.protected))
         gone = needed(self.budget.removals(total, *self.sizes), total)
-        # Those that are protected stay, wherever in the order they are.
+        # Protected splats are passed over, wherever in the order they are.
         return None if gone is None or gone + spared >= total else gone + spared
 
     def _select(self, scores: Scores) -> tuple[NDArray[np.bool_], float | None]:
@@ -429,7 +429,7 @@ class _Prune:
         return missed or np.count_nonzero(keep) <= len(outcome.merged.splats)
 
     def _expected_seconds(self, left: int) -> tuple[float, float, float]:
-        """Of merging to so many splats, of the estimate then, and of refitting, if asked."""
+        """Expected seconds of merging to `left` splats, of the estimate then, and of refitting."""
         count, views = len(self.splats), len(self.used)
         counts = stage_counts(max(math.ceil((1.0 - FIRST) * count), left), left)
         refit = 0.0
@@ -520,19 +520,19 @@ class _Prune:
             ):  # fmt: skip
                 done = reached
         except (Cancelled, KeyboardInterrupt) as stop:
-            stopped = stop.with_traceback(None)  # without what was worked on
+            stopped = stop.with_traceback(None)  # which holds the arrays of the round
             if done is None or not done.rounds:
                 stop.add_note("refitting was stopped before its first round was done")
                 return replace(outcome, stopped=stopped)
             stop.add_note(f"refitting was stopped after round {done.rounds}")
-        assert done is not None  # what is to be refitted is yielded first
+        assert done is not None  # the merged splats are yielded first
         return replace(
             outcome, done="refit", psnr=outcome.psnr | {"refit": done.psnr}, refitted=done,
             seconds=time.perf_counter() - start, stopped=stopped,
         )  # fmt: skip
 
     def _between(self, scores: Scores, outcome: Outcome) -> float | None:
-        """Estimate in views in between, dB; None where nothing tells it."""
+        """Estimated PSNR in views in between, dB; None without rays in them."""
         rays = scores.between if self.origin is None else self.origin.between
         if rays is None or outcome.stopped is not None:
             return None

@@ -22,7 +22,7 @@ NOT_PREDICTED = (
 )
 """Why there is no estimate: notes of the report."""
 
-MANY_UNSEEN = 0.05  # share of unseen splats from which on the report says how many of them go
+MANY_UNSEEN = 0.05  # share of unseen splats from which the command says how many were removed
 
 LITTLE_SEEN = 0.19
 """Share of splats in at most one view from which on other views may lose more than predicted. In

@@ -83,8 +83,8 @@ class Scores:
         unscored = ~self.scored if rest is None else rest & ~self.scored
         if unscored.any():
             raise RefineError(
-                f"{np.count_nonzero(unscored)} splats had to go when the others were scored, and "
-                "need not go now; score again"
+                f"{np.count_nonzero(unscored)} splats were removed when the others were scored, "
+                "and are not now; score again"
             )
 
 

@@ -23,7 +23,7 @@ Model = Literal["default", "antialiased", "2dgs"]
 covariance in the image (Yu et al. 2024, "Mip-Splatting"). ``2dgs``: a flat disc without third
 scale, hit where the ray meets its plane (Huang et al. 2024)."""
 
-MODELS: tuple[Model, ...] = get_args(Model)  # files that do not say have the first
+MODELS: tuple[Model, ...] = get_args(Model)  # the first is that of files that do not say
 
 LOW_PASS = 0.3  # variance added to a footprint along both axes so that it covers a pixel, px^2
 
@@ -206,7 +206,7 @@ def single_unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float32]:
 
     Those of length 1 within float32's rounding, and non-finite ones, stay to the bit.
     """
-    with np.errstate(over="ignore", under="ignore"):  # doubles that are no floats
+    with np.errstate(over="ignore", under="ignore"):  # doubles beyond float32
         q = np.array(quaternions, np.float32)
     finite = np.isfinite(q).all(axis=1)
     wide = np.where(finite[:, None], q, 1.0).astype(np.float64)

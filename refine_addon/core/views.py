@@ -361,8 +361,7 @@ def view_through(
     """
     p, (width, height), (rotation, center) = projection_matrix, size, pose
     fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0
-    # What shifts the image stands in the third column of a matrix with perspective, else in the
-    # fourth.
+    # The image is shifted by the third column of a matrix with perspective, else by the fourth.
     cx = (1.0 - p[0, 2] + p[0, 3]) * width / 2.0
     cy = (1.0 + p[1, 2] - p[1, 3]) * height / 2.0
     if p[3, 3] == 0.0:

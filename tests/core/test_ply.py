@@ -225,7 +225,7 @@ REFUSED = [
     (more(VERTEX[:-1]), "header line 18: 'vertex' is declared twice, expected once"),
     (MESH, "a mesh, not splats: vertex lacks f_dc_0"),
     (declared(VERTEX, b"element point 3\n"), "expected an element 'vertex', got point"),
-    (PACKED, "a compressed splat PLY, which 'refine convert IN OUT.ply' makes a plain one of"),
+    (PACKED, "a compressed splat PLY: 'refine convert IN OUT.ply' makes a plain one of it"),
     (declared(b"property float rot_3\n", b""), "incomplete splats: vertex lacks rot_3 (it has x"),
     (more(b"property float f_rest_0"), "found 1 f_rest properties, expected f_rest_0 onward, 0,"),
     (plain_header(0, [*NAMES, *GAP]), "found 9 f_rest properties, expected f_rest_0 onward"),

@@ -123,7 +123,7 @@ def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(splats, 
 def test_what_had_to_go_when_scored_and_need_not_now_has_no_score(scores):
     """It might be worth most: nothing tells. If more must go, scores tell of the others."""
     fewer, more = REMOVED & (EVERY > 100), REMOVED | (EVERY < 50)
-    with pytest.raises(RefineError, match=r"splats had to go when the others were scored"):
+    with pytest.raises(RefineError, match=r"splats were removed when the others were scored"):
         prune(None, None, Budget(ratio=0.6), Occlusion(), scores=scores, removed=fewer)
     found = prune(None, None, Budget(keep=100), Occlusion(), scores=scores, removed=more)
     assert not found.keep[more].any()
@@ -143,7 +143,7 @@ def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats,
     best = np.argmax(score(splats, views, settings).values) == EVERY
     scores = score(splats, views, settings, removed=best)
     for removed in (EVERY == 5, None):
-        with pytest.raises(RefineError, match=r"^1 splats had to go when the others were scored"):
+        with pytest.raises(RefineError, match=r"^1 splats were removed when the others were"):
             prune(None, None, Budget(ratio=0.5), settings, scores=scores, removed=removed)
     again = prune(None, None, Budget(ratio=0.5), settings, scores=scores, removed=best)
     assert not again.keep[best].any()

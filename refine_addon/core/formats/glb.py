@@ -118,7 +118,7 @@ def _read(path, data):
             place.fail("belongs to two nodes, expected a tree")
         visited.add(index)
         if not node.keys().isdisjoint(_MOVES):
-            moves.append((node, place, frame))  # the number of the frame that it stands in
+            moves.append((node, place, frame))  # the frame is that of its parent
             frame = len(moves)
         if "children" in node:
             left += [(child, place, frame) for child in _listed(node, "children", place)[::-1]]
@@ -307,7 +307,7 @@ def _rotations(splats):
 def _write(stream, splats):
     """Write splats as a file with one node; `RefineError` above 4 GiB, the format's limit."""
     attributes = _attributes(splats.sh_degree)
-    with np.errstate(under="ignore", over="ignore"):  # doubles that are no floats
+    with np.errstate(under="ignore", over="ignore"):  # doubles beyond float32
         means = np.asarray(splats.means, np.float32) * np.array([-1.0, -1.0, 1.0], np.float32)
         ends = [(end.astype(np.float64) + 0.0).tolist() for end in (means.min(0), means.max(0))]
         text, body = _json(attributes, len(splats), *ends)

@@ -184,7 +184,7 @@ class SplatFile:
         count = len(self) if keep is None else int(np.count_nonzero(keep))
         header, names = with_count(self.header, count), self.rows.dtype.names or ()
         if isinstance(columns, ChangedColumns):
-            return header, self.rows.dtype, count  # they have the stored types: not made here
+            return header, self.rows.dtype, count  # in stored types, and not computed for this
         declared, place = [], Place(self.path)
         for name, values in columns.items():
             stored = self.rows.dtype[name] if name in names else None
@@ -277,7 +277,7 @@ def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
     rest = [name for name in kinds if name.startswith("f_rest_")]
     problem = ""
     if "packed_position" in kinds:
-        problem = "a compressed splat PLY, which 'refine convert IN OUT.ply' makes a plain one of"
+        problem = "a compressed splat PLY: 'refine convert IN OUT.ply' makes a plain one of it"
     elif missing and missing != [THIRD_SCALE]:
         mesh = any(name in INDEXING for name in names)
         guess = f"a {'mesh' if mesh else 'point cloud'}, not splats"

@@ -105,7 +105,7 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
     def __getitem__(self, name: str) -> NDArray[Any]:
         values = self._values[name]
         column: NDArray[Any] = self._stored[name].copy()
-        with np.errstate(over="ignore", under="ignore"):  # a double may be no float
+        with np.errstate(over="ignore", under="ignore"):  # doubles beyond float32
             column[self._rows] = values
         return column
 

@@ -1,4 +1,4 @@
-"""All splat formats. An input is told by its content, an output by its suffix."""
+"""All splat formats: that of an input by its content, that of an output by its suffix."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .format import Format
 from .ply import SplatFile, file_bytes, read_plain
 from .ply_columns import Changes, Keep, other_properties, splats_from_columns
 
-# Last ``.splat``, since only the name tells it.
+# ``.splat`` comes last, since only its name tells it from others.
 FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, by_name.SPLAT)
 """Formats that are written, but for plain PLY."""
 
@@ -40,7 +40,7 @@ _HEAD = 1 << 16  # first bytes, which tell the format; the header of a compresse
 
 
 def read_splats(path: Path | str, model: Model | None = None, level: int = 0) -> SplatFile:
-    """Open a file of splats of any format, which its content tells.
+    """Open a file of splats of any format, recognised by its content.
 
     A plain PLY is mapped. Other formats become the plain PLY of the same splats, in memory.
 

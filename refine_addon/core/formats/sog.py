@@ -69,7 +69,7 @@ class Bundle:
             place.at("version").expected(str(VERSION), self.meta["version"])
         self.version = VERSION if "version" in self.meta else 1
         self.size = sum(files.values())
-        self.model = meta.get("model", MODELS[0])  # as splat-transform says how they are drawn
+        self.model = meta.get("model", MODELS[0])  # as splat-transform writes it
         if self.model not in MODELS:
             place.at("model").expected(f"one of {', '.join(MODELS)}", self.model)
         self._codec = codec_for(place.path)
