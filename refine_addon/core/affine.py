@@ -76,8 +76,8 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     """Splats transformed by an invertible affine matrix; RefineError by `check_affine`.
 
     They are float64, as rounded values might lead to another kept set. Without `rotate_sh`
-    harmonics stay those of the old frame, and the matrix may be non-uniform: the closed form, which
-    uses only their constant, needs no more.
+    harmonics stay those of the old frame, and the matrix may be non-uniform; the closed form needs
+    no more.
     """
     matrix = np.asarray(matrix, np.float64)
     check_affine(matrix, with_sh=rotate_sh)
@@ -107,10 +107,7 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
 
 
 def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
-    """Like `transformed`, also by non-uniform matrices.
-
-    Their harmonics are fitted, see `spherical_harmonics.stretched`.
-    """
+    """Like `transformed`, also by non-uniform matrices: harmonics are fitted, see `stretched`."""
     uniform = is_uniform(matrix)
     result = transformed(splats, matrix, rotate_sh=uniform)
     if uniform or not splats.sh_degree:
@@ -142,10 +139,9 @@ def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternions w x y z of rotation matrices, (..., 3, 3) -> (..., 4).
+    """Unit quaternions w x y z, w >= 0, of rotation matrices, (..., 3, 3) -> (..., 4) float64.
 
-    The eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack 2000), which
-    needs no cases and is as accurate for half a turn as for other angles. Float64, w >= 0.
+    The eigenvector of the largest eigenvalue (Bar-Itzhack 2000): as accurate for half a turn.
     """
     m = np.asarray(rotation, np.float64)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]

@@ -191,10 +191,7 @@ def checked_by(check: Callable[[], None]) -> AbstractContextManager[None]:
 
 
 def on(cluster: Any) -> AbstractContextManager[None]:
-    """Make `run` in this thread send long work to a `Cluster` within the block, unless it is None.
-
-    Work that holds large arrays is not sent.
-    """
+    """Make `run` in this thread send long work without large arrays to a `Cluster`, if any."""
     return _with(cluster=cluster)
 
 

@@ -56,10 +56,7 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Channels of an image by name, (H, W), the top row first.
-
-    RefineError if the file cannot be read, has several parts or is compressed.
-    """
+    """Channels by name, (H, W), top row first; `RefineError` if damaged, compressed or in parts."""
     try:
         return _channels(path.read_bytes())
     except OSError as error:

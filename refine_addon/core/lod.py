@@ -339,8 +339,7 @@ def _streamed(target, views, overwrite):
 def viewing_distance(splats: Splats, views: ViewSet) -> float:
     """Median distance from the views to the splats in them, world units; inf if there are none.
 
-    A streamed SOG's chunks are at most this wide: from such a distance, the far end of a chunk is
-    at most twice as far away as its near end.
+    A streamed SOG's chunks are at most this wide: far ends are at most twice as far as near ones.
     """
     means = splats.means[:: max(len(splats) // _SAMPLE, 1)].astype(np.float64)
     distances = [np.empty(0)]

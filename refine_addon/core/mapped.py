@@ -71,10 +71,7 @@ class Mapped:
 
 
 def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, Any]:
-    """Write arrays to a folder, which is replaced whole or not at all.
-
-    Pieces hold consecutive rows of arrays by name. Interrupted: the disk is full or fails.
-    """
+    """Write arrays by name to a folder, replaced whole or not at all; `Interrupted` on errors."""
     unfinished = folder.with_name(f"{folder.name}-{secrets.token_hex(4)}.tmp")
     files: dict[str, BinaryIO] = {}
     kinds: dict[str, tuple[Any, int, tuple[int, ...]]] = {}  # type, rows, further axes
@@ -158,10 +155,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def on_disk(folder: Path, parts: Iterable[Splats]) -> Splats:
-    """Write splats to files of a new folder in that of a job; `parts` are joined in order.
-
-    They have the same types, degree and model. Returns splats whose arrays are `Mapped`.
-    """
+    """Join splats of the same types, degree and model as `Mapped` arrays in a new folder."""
     model: Any = None
 
     def columns() -> Iterator[dict[str, NDArray[Any]]]:

@@ -88,10 +88,9 @@ def run(
     """Read, decide, write and compare; the report of the result is complete afterwards.
 
     If this fails nothing is written, but for the last round of a refit that is cancelled, and for a
-    file whose comparison fails. `read` gets the output's format, None for plain PLY. The suffix of
-    `output` names it; without `output`, or in a dry run, no splats are written. `source` is the
-    file that is read meanwhile. In `views` a lossy file and `pictures` are compared with all
-    splats. `save` is called once the file is written.
+    file whose comparison fails. `read` gets the output's format, None for plain PLY; without
+    `output`, or in a dry run, no splats are written. `source` is the file that is read meanwhile.
+    In `views` a lossy file and `pictures` are compared with all splats. `save` follows the writing.
     """
     clock, written = Clock(), None if dry_run else output
     with contextlib.nullcontext() if pictures is None or views is None else pictures.opened(views):

@@ -85,10 +85,7 @@ class Sight:
     def of_color(
         self, color: NDArray[np.float64], tolerance: float, *, hidden: bool = False
     ) -> NDArray[np.bool_]:
-        """Splats in the image whose red, green and blue are within a tolerance, (N,) bool.
-
-        `color`, (3,), and `tolerance` are display-referred, 0..1.
-        """
+        """Splats in the image of a red, green and blue, within `tolerance`, all 0..1, (N,) bool."""
         gaussians = self.prepared.gaussians
         place = np.full(len(self.prepared.splats), -1)
         place[gaussians.index] = np.arange(len(gaussians))
@@ -226,10 +223,7 @@ def polygon(corners: Sequence[tuple[float, float]], width: int, height: int) -> 
 def paint(
     area: NDArray[np.bool_], start: tuple[float, float], end: tuple[float, float], radius: float
 ) -> None:
-    """Add to an area, (H, W) bool, in place, the pixels that a round brush covers on its way.
-
-    `start`, `end` (column, row) and `radius` are in pixels.
-    """
+    """Add to an area, (H, W), in place, the pixels that a round brush covers on its way."""
     (left, right), (top, bottom) = (
         (max(math.floor(min(ends) - radius), 0), min(math.ceil(max(ends) + radius) + 1, size))
         for ends, size in zip(zip(start, end, strict=True), area.shape[::-1], strict=True)
@@ -258,10 +252,7 @@ def shrunk(neighbours: NDArray[np.int32], selected: NDArray[np.bool_]) -> NDArra
 
 
 def neighbours_of(means: NDArray[Any], *, progress: Progress = silent) -> NDArray[np.int32]:
-    """Rows of the `NEIGHBOURS` nearest splats of each, (N, K), by their centres, (N, 3).
-
-    Those of a splat whose centre is not finite are meaningless.
-    """
+    """Rows of the `NEIGHBOURS` nearest centres of each, (N, K); meaningless for non-finite ones."""
     places = np.asarray(means, np.float64)
     finite = np.isfinite(places).all(axis=1)
     if not finite.any():

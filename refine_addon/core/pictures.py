@@ -73,10 +73,7 @@ class Layers:
 
 
 def in_order(layers: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]) -> Layers:
-    """Layers (colours, alphas, depths) sorted by depth in each pixel; ties keep their order.
-
-    Each is (3, H, W), (H, W) and (H, W), as in `Layers`.
-    """
+    """Layers of (colours, alphas, depths), sorted by depth in each pixel; ties keep their order."""
     colors, alphas, depths = (np.stack(arrays) for arrays in zip(*layers, strict=True))
     order = np.argsort(depths, axis=0, kind="stable")
     alphas, depths = (np.take_along_axis(of_each, order, 0) for of_each in (alphas, depths))

@@ -128,10 +128,7 @@ def with_quality(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Scores with the curve of the estimated PSNR, if they have validation rays.
-
-    `protected`, (N,) bool, are taken to be kept; see `score` for the rest.
-    """
+    """Scores with the curve of the estimated PSNR, if they have validation rays; see `score`."""
     if scores.ray_sample is None:
         return scores
     curve = quality_curve(
@@ -570,9 +567,8 @@ def merge_down(
 ) -> Merged:
     """Merge splats until `count` are left, by all `views`; errors as by `score`.
 
-    `scored` comes from `occlusion.score_once`. `began` is the number of splats before earlier
-    merges: the number deleted before merging, and the merge penalty, depend on the share removed
-    since then. `protected` splats are neither removed nor changed.
+    `scored` comes from `occlusion.score_once`. `began` is the number before earlier merges:
+    deletion before merging, and the merge penalty, depend on the share removed since then.
     """
     total = len(splats)
     if scored is None:

@@ -116,7 +116,7 @@ def of_prune(
 
     PSNR is in dB: `psnr` of the views that decided, `between` of views in between, `measured` on
     rays by method. Other methods' times are predicted if the clock `timed` the scoring. `outcome`
-    is that of merging if its splats are kept, else `tried` if deletion was as good.
+    is that of merging, or `tried` if deletion was as good.
     """
     count, curve = len(keep), scores.quality
     report: dict[str, Any] = {**scored(scores)}
@@ -224,10 +224,7 @@ def little_seen(seen: NDArray[np.int32]) -> str:
 
 
 def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
-    """Predicted PSNR and seconds of each method at the shares `PRICED`, for the report.
-
-    `took` are the seconds of scoring. Empty for the closed form, and without a curve of the PSNR.
-    """
+    """Predicted PSNR and seconds of each method at the shares `PRICED`; empty without a curve."""
     curve = scores.quality
     if curve is None or scores.method == "closed-form":
         return []
@@ -245,10 +242,7 @@ def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
 
 
 def predicted(scores: Scores, share: float, measured: Mapping[Way, float | None]) -> dict[str, Any]:
-    """PSNR of each method at a share removed, dB, for the report, and why one is missing.
-
-    `measured` are estimates on rays; the curve of the scores predicts the others.
-    """
+    """PSNR of each method at a share removed, dB, measured or predicted, and why one is missing."""
     rays, many = scores.ray_sample, len(scores.values) >= FEWEST
     hits = rays.hits_of_ray() if rays is not None and many else None
     psnr = expected(scores.quality, share, measured, hits)

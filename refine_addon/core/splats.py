@@ -112,10 +112,7 @@ def with_model(splats: Splats, model: Model) -> Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Several sets of splats as one, in order, of the highest degree; missing harmonics are 0.
-
-    `RefineError` if their models differ.
-    """
+    """Splats joined in order, of the highest degree; `RefineError` if their models differ."""
     if len(parts) == 1:
         return parts[0]
     models = dict.fromkeys(part.model for part in parts)
@@ -159,10 +156,7 @@ LOG_ZERO = -104.0
 def opacity_logits(
     opacities: NDArray[Any], margin: float = OPACITY_MARGIN, least: float | None = None
 ) -> NDArray[np.float64]:
-    """Inverse of `opacity`, (...) float64, of values clipped to ``least..1 - margin``; NaN stays.
-
-    `least` is `margin` by default.
-    """
+    """Inverse of `opacity`, (...) float64, values clipped to ``least..1 - margin``; NaN stays."""
     low = margin if least is None else least
     inside = np.clip(np.asarray(opacities, np.float64), low, 1.0 - margin)
     return np.asarray(np.log(inside) - np.log1p(-inside))

@@ -331,8 +331,7 @@ def pinhole(
 ) -> View:
     """View of a camera by OpenGL's matrices, y up, z back; RefineError as of `View`.
 
-    Without perspective the view stands `FAR` extents of the splats, by their `means`, away, so that
-    rays are nearly parallel.
+    Without perspective the view stands `FAR` extents of the splats away: rays are nearly parallel.
     """
     flip = np.diag([1.0, -1.0, -1.0])
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)  # float32

@@ -96,10 +96,7 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
 
 
 def read_colmap(folder: Path, suffix: str) -> ViewSet:
-    """Views of a COLMAP model, sorted by image name, as text and binary may differ in order.
-
-    `RefineError`, with the place in the file, if `cameras` or `images` is missing or wrong.
-    """
+    """Views of a COLMAP model, sorted by image name, as text and binary may differ in order."""
     cameras, images = (CameraPlace(folder / f"{stem}{suffix}") for stem in MODEL_FILES[:2])
     binary = suffix == ".bin"
     lenses: dict[int, tuple[Any, ...]] = {}

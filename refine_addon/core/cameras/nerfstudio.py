@@ -45,11 +45,7 @@ LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
 
 
 def read_transforms(path: Path, data: object) -> ViewSet:
-    """Views of a ``transforms.json``, in its order.
-
-    `data` is its parsed JSON. Missing image sizes are read from the images beside `path`.
-    `RefineError`, with the place in the file, if something is missing or wrong.
-    """
+    """Views of a ``transforms.json``, in its order; missing image sizes are those of the images."""
     place = CameraPlace(path)
     shared = place.members(data, ("frames",))
     frames = place.at("'frames'").items(shared["frames"])

@@ -94,10 +94,7 @@ class Search:
         self.hits: list[Hits | None] = [None] * len(views)
 
     def find(self, slender: NDArray[np.bool_], progress: Progress) -> Suspects:
-        """Look in rounds until few suspects join (docs/method.md, section 8).
-
-        `slender`, (M,) bool, is `is_slender` of all. Raises `RefineError` if no ray hits a splat.
-        """
+        """Look in rounds until few suspects join (docs/method.md, 8); `RefineError` with no hit."""
         light, supported, views, width = self._first_look(part(progress, 0.0, ROUNDS[0][0]))
         support = share(supported, light)
         giant = self.huge & (width >= GIANT)
@@ -225,10 +222,7 @@ def touching(
 
 
 def connected(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Lowest node that is connected to each node of a graph, (count,).
-
-    Edges are between the nodes `one` and `other`, (E,) each.
-    """
+    """Lowest node that is connected to each node of a graph, (count,), by edges, (E,) each."""
     labels = np.arange(count)
     while True:
         low = np.minimum(labels[one], labels[other])

@@ -67,10 +67,7 @@ class Light(NamedTuple):
     window: NDArray[np.float64]  # (h,), difference of keys up to which hits are near
 
     def around(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
-        """First, last and end of the hits near and behind some hits, (r,) each.
-
-        Near ones are those from first to before last, those behind from last to before end.
-        """
+        """First, last and end of the hits, (r,) each: near ones up to last, then those behind."""
         key, window, ray = self.key[rows], self.window[rows], np.floor(self.key[rows])
         end = ray + (1.0 + _FRACTION) / 2.0
         first = np.searchsorted(self.key, np.maximum(key - window, ray))
@@ -197,8 +194,7 @@ def _depths(gaussians, footprints, scene, view, rays, reached):
 def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Light that stops at each of `Light.hit`, and that times its support by others, (2, u).
 
-    0 of those not `wanted`, (M,) bool. Support is as if the splat were gone: what lies behind then
-    gets ``1 / (1 - alpha)`` times the light.
+    Support is as if the splat were gone: what lies behind gets ``1 / (1 - alpha)`` times the light.
     """
     rows = np.flatnonzero(wanted[light.hit].take(light.owner) & (light.weight > 0.0))
     before = _running(light.weight)

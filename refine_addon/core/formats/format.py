@@ -81,8 +81,7 @@ def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Index, (N,), of the largest component of unit quaternions, (N, 4), and the others, (N, 3).
 
-    Of equal components the first is the largest. Signs are flipped where the largest is negative,
-    so that `join_largest` gives the same rotation.
+    Of equal ones the first is the largest; signs are flipped where it is negative (`join_largest`).
     """
     largest = np.abs(q).argmax(axis=1)
     others = np.take_along_axis(q, _OTHERS[largest], axis=1)

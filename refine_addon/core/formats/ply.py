@@ -260,10 +260,7 @@ class Header(NamedTuple):
 
 
 def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
-    """Header of a file of splats from its first bytes, and the index of the element ``vertex``.
-
-    `RefineError` names the problem if these are no splats.
-    """
+    """Header from a file's first bytes, and the index of ``vertex``; `RefineError` without it."""
     header = read_header(path, head)
     names = [element.name for element in header.elements]
     if "vertex" not in names:
@@ -524,12 +521,7 @@ def _lines(raw: bytes) -> list[bytes]:
 def write_rows(
     stream: BinaryIO, rows: NDArray[Any], keep: Keep, columns: Changes, threads: int | None = 1
 ) -> None:
-    """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended.
-
-    rows : (N,) structured
-    keep : (N,) bool, or None for all
-    columns : see `SplatFile.write`
-    """
+    """Write kept rows, a chunk at a time, with `columns` set or appended (`SplatFile.write`)."""
     columns = columns or {}
     plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
     changed = columns if isinstance(columns, ChangedColumns) else None

@@ -64,10 +64,7 @@ def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
 
 
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
-    """Views of splats as properties, (N,) each, by name, in the order of a 3DGS PLY.
-
-    Discs have two scales.
-    """
+    """Views of splats as properties, (N,) each, by name, in the order of a 3DGS PLY."""
     coefficients = splats.sh_rest.shape[1]
     axes = 2 if splats.model == "2dgs" else 3
     planes = [splats.sh_rest[:, k, channel] for channel in range(3) for k in range(coefficients)]
@@ -95,8 +92,7 @@ class Columns(Protocol):
 class ChangedColumns(Mapping[str, "NDArray[Any]"]):
     """Properties with new values in `rows`, (n,) ascending, rounded once to the stored type.
 
-    `stored` are the old values, `splats` the n new ones. A column is copied when it is read; `put`
-    serves to write a binary PLY without such copies.
+    A column is copied when it is read; `put` serves to write a binary PLY without such copies.
     """
 
     def __init__(self, stored: Columns, rows: NDArray[np.int64], splats: Splats) -> None:

@@ -172,10 +172,7 @@ def _tame(colors):
 
 
 def row_sizes(file: SplatFile, form: Format | None, count: int | None = None) -> tuple[float, int]:
-    """Bytes of a splat in a format, and at most of the rest; both 0 if compressed as a whole.
-
-    `count` is the number of splats written, by default all.
-    """
+    """Bytes of a splat in a format, and at most of the rest; both 0 if compressed as a whole."""
     if form is None:
         return file.row_bytes, file.fixed_bytes
     degree, count = min(file.splats().sh_degree, form.degree), len(file) if count is None else count

@@ -46,10 +46,7 @@ _FOLDER = re.compile(rf"(\d+_\d+)/{re.escape(META)}")  # LEVEL_NUMBER, as in spl
 
 
 def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
-    """Read a level of a streamed SOG, 0 is the finest, with the environment.
-
-    `data` are the bytes of the index, (n,). `RefineError` if it or a folder is damaged.
-    """
+    """Read a level of a streamed SOG, 0 is the finest, with the environment, by its index."""
     place = Place(path)
     meta = place.members(place.parsed(data.tobytes()))
     if meta.get("version", VERSION) != VERSION:
@@ -128,11 +125,10 @@ def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[ra
 
 
 def _tree_over(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
-    """Tree over positions, (N, 3), and its number of chunks.
+    """Tree over positions, (N, 3), and its number of chunks: a leaf is a chunk's number.
 
-    A leaf is a chunk's number; a branch is an axis, a value, the subtree below it and that of the
-    rest. Chunks of more than `UNIT` splats, or of more than `LEAST` and wider than `width`, are
-    halved at the median along the longest side.
+    A branch is an axis, a value, the subtree below and that of the rest. Chunks of more than `UNIT`
+    splats, or of `LEAST` and wider than `width`, are halved at the median of the longest side.
     """
     numbers = itertools.count()
 
@@ -156,8 +152,7 @@ def _tree_over(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
 class StreamedSog:
     """A streamed SOG, written level by level into a folder of `folder_for`, then published.
 
-    Chunks are made of the `finest` level's positions, (N, 3); those of many splats are at most
-    `width` wide, in the unit of these.
+    Chunks are those of the `finest` positions, (N, 3), most of them at most `width` wide.
     """
 
     def __init__(self, finest: NDArray[Any], width: float, folder: Path) -> None:
@@ -205,7 +200,6 @@ class StreamedSog:
         """Move the folders beside `path`, under free names, and write the index to `path`.
 
         An index that is replaced stays whole, with its folders, until the new one is in place.
-        `RefineError` if it may not be replaced.
         """
         checkpoint()
         refuse_existing(path, overwrite=overwrite)

@@ -260,10 +260,7 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Near neighbours of N points, (N, min(count, N - 1)), most of them the nearest, nearest first.
-
-    Points are in scene sizes, `count` is at most 16. Of equally near points the lower row is first.
-    """
+    """Neighbours of N points, most of them the nearest, (N, min(count, N - 1)), nearest first."""
     total = len(points)
     count = min(count, total - 1)
     if count <= 0:

@@ -94,10 +94,10 @@ def merge(
 ) -> Merged:
     """Reduce splats to a number at the least cost to the pictures (docs/method.md, section 7).
 
-    `sums` are contribution and error, (2, N), px^2; `measure` gives those of later stages.
-    `deleted` splats go first, then undrawable ones. `protected` ones are neither removed nor
-    changed, even if more than `keep_count` are left. `merge_penalty` takes the share removed of
-    `began`: by default those not `deleted`, more where splats were merged before.
+    `sums` are contribution and error, (2, N), px^2. `deleted` splats go first, then undrawable
+    ones; `protected` ones neither go nor change, even if more than `keep_count` are left.
+    `merge_penalty` takes the share removed of `began`: by default those not `deleted`, more after
+    earlier merges.
     """
     total, left = len(splats), splats
     # Of each splat left: which of the N it is, and for how many of them it stands, 0 if deleted.
@@ -338,10 +338,7 @@ def _merge(folder, item):
 
 
 def _removals(priced, goal):
-    """Number removed of each region, `goal` in all, by one ranking of the operations of all.
-
-    `priced` holds (costs, weights) of each region, weights in splats that an operation removes.
-    """
+    """Number removed of each region, `goal` in all, by one ranking of (costs, weights) of all."""
     ends = np.cumsum([len(costs) for costs, _ in priced])
     costs, weights = (np.concatenate(each) for each in zip(*priced, strict=True))
     # Where more than half go, most splats that merge go, too.

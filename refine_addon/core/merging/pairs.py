@@ -49,18 +49,12 @@ class Pairs(NamedTuple):
 
 
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
-    """Costs and results of merging pairs of splats, all of contribution above 0.
-
-    The view is turned from its mean direction by `tilt` standard deviations.
-    """
+    """Costs and results of merging pairs, viewed `tilt` standard deviations off the mean."""
     return _price(_gather(splats, first, second, np.float64), tilt)
 
 
 def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Real:
-    """Costs of merges, (M,) float32: means over two viewing directions, to either side.
-
-    Computed in float64 for discs, whose thickness is 0. A cost from `limit` on is infinite.
-    """
+    """Costs of merges, (M,) float32: means over two directions; infinite from `limit` on."""
     # What leaves the range of float32 costs infinity, or NaN: it is not merged.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         ends = _gather(splats, first, second, np.float64 if splats.model == "2dgs" else np.float32)
@@ -281,10 +275,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
 
 
 def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[Array, Array, Array]:
-    """Stored values: log scales, (M, 3), quaternions, (M, 4), w x y z, opacity logits, (M,).
-
-    Third log scales of discs are `LOG_ZERO`.
-    """
+    """Stored log scales, of discs with `LOG_ZERO`, quaternions w x y z, and opacity logits."""
     count = len(merged.opacity)
     stored = np.empty((count, 3)), np.empty((count, 4)), np.empty(count)
 

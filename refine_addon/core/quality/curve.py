@@ -181,10 +181,7 @@ def expected(
     measured: Mapping[Way, float | None],
     hits: float | None = None,
 ) -> dict[Way, float | None]:
-    """PSNR of each way to remove a share, dB: as measured, else predicted, else None.
-
-    Where merging was measured, refitting is predicted from it, by a ray's mean `hits`.
-    """
+    """PSNR of each way to remove a share, dB: as measured, else predicted, also from merging's."""
     psnr: dict[Way, float | None] = {}
     for way in WAYS:
         psnr[way] = measured.get(way)
@@ -218,8 +215,7 @@ def merged_from(
     """Predicted PSNR of merging at the first L of `SHARES`, (L,) dB (docs/method.md, section 5).
 
     `psnr`, (L,), is that by deletion. `gains`, dB at the first of `MERGED_SHARES`, are of rays
-    where nearest kept hits stand in (`Rays.colors_by_nearest_kept`): no bound, but they vary
-    between scenes as merging's do. `count` is the number of splats before any is removed.
+    where nearest kept hits stand in: no bound, but they vary between scenes as merging's do.
     """
     constant, factor, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
     halvings = max(math.log2(FULL_GAIN / max(count, 1)), 0.0)

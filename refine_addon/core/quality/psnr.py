@@ -64,8 +64,7 @@ def quality_curve(
     """Estimated PSNR at each of `curve.SHARES`; None if too little is seen.
 
     Splats of the lowest `values` are removed first, of equal ones the first in the file,
-    `protected` ones last. The curve ends after `settled` splats, which are in final order
-    (`Scores`). `between` has the rays of views in between.
+    `protected` ones last. The curve ends after `settled` splats, see `Scores`.
     """
     last = len(values) if settled is None else settled
     if settled is not None and protected is not None:

@@ -290,9 +290,9 @@ def linear_view(
 ) -> tuple[LinearView, Shapes]:
     """The colours of a view's rays, linear in the splats that they hit, and these splats' shapes.
 
-    The rays, at most 2^16, come with the transmittance in front of each hit; `truth`, (3, P), are
-    their colours with the unpruned splats, `colors`, (3, u), those of the splats that are hit. The
-    splats of `shapes`, which can change, are the first of all that can be hit.
+    The rays, at most 2^16, come with the transmittance in front of each hit; `truth` are their
+    colours with the unpruned splats, `colors`, (3, u), those of the splats that are hit. The splats
+    of `shapes`, which can change, are the first of these.
     """
     rays, transmittance = visible
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit

@@ -194,10 +194,7 @@ def refit_on(
 
 
 def _solve(linear, movable, damping, before, *, progress, threads):
-    """Change of the parameters, (22, N), and the next round's `before`.
-
-    `before` holds K and the part of earlier rounds' gradient that counts, (22, N) each.
-    """
+    """Change of the parameters, and the next `before`: K and the gradient kept, (22, N) each."""
     index = linear.shapes.gaussians.index
     moving = movable[:, index]
     steps = [part(progress, k / STEPS, (k + 1) / STEPS) for k in range(STEPS)]

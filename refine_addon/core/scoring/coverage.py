@@ -78,10 +78,7 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
 
 
 def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
-    """Ascending rows of at most `count` splats, chosen by a hash of opacity and colour.
-
-    The choice depends neither on the order of the splats nor on the frame of the scene.
-    """
+    """Ascending rows of at most `count` splats, by a hash that neither order nor frame changes."""
     total = len(gaussians)
     if total <= count:
         return np.arange(total)

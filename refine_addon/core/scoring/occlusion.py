@@ -87,10 +87,7 @@ def score_once(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Scores, Measured]:
-    """Scores of one round, and what was measured of all N splats; else as `score`.
-
-    `few_views` is that of `RaySample`, for validation rays.
-    """
+    """Scores of one round, and what was measured of all N splats; else as `score`."""
     with np.errstate(under="ignore"):  # numbers that underflow to 0 are negligible in all sums
         return _score(splats, views, 1, None, sampling, few_views, progress, threads)
 
@@ -105,10 +102,7 @@ def measure_part(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Measured, float]:
-    """What one part of the views sees of all N splats, and its share of the weights of all views.
-
-    Of at most `parts` parts, each spread over all views, it is number `turn`, modulo `parts`.
-    """
+    """What one of at most `parts` parts of the views sees of N splats, and its share of weights."""
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.05), threads=threads
     )

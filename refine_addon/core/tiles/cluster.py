@@ -108,10 +108,7 @@ class Cluster:
         self._client = client
 
     def check(self, job: Path, tiles: Sequence[Tile]) -> None:
-        """Raise `RefineError` if a worker lacks files or has another version of this program.
-
-        `Interrupted` if all workers are lost.
-        """
+        """Raise `RefineError` if a worker lacks files or the version, `Interrupted` without any."""
         for _ in range(_TRIES):
             try:
                 self._client.wait_for_workers(1, timeout=_CONNECT)

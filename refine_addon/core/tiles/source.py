@@ -58,10 +58,7 @@ class Tile(NamedTuple):
 
 
 def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
-    """Tiles of a scene, by the headers of its files; see `tile_at`.
-
-    `RefineError` also if a file is given twice, models differ, or there are no splats.
-    """
+    """Tiles of a scene (`tile_at`); `RefineError` also for a file twice, other models, no splat."""
     tiles: list[Tile] = []
     given: dict[Hashable, Tile] = {}
     for path in paths:
@@ -82,10 +79,7 @@ def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Ti
 
 
 def tile_at(path: Path | str, model: Model | None = None) -> Tile:
-    """Tile of a plain binary PLY, of which only the header is read.
-
-    `model` says how its splats are drawn if the file does not. `RefineError` if it is no such file.
-    """
+    """Tile of a plain binary PLY by its header, by default drawn by `model`; or `RefineError`."""
     place = storage.located(path)
     size, changed = storage.state(place)
     if place.name in ("", ".", ".."):
@@ -111,10 +105,7 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
 
 
 def rows_of(tile: Tile, start: int, stop: int) -> NDArray[Any]:
-    """Rows of a tile, (stop - start,) structured; `RefineError` if the file has changed.
-
-    They are read, not mapped, since mapped pages would stay in memory.
-    """
+    """Rows of a tile, read, as mapped pages would stay in memory; `RefineError` if it changed."""
     return _read(tile, tile.dtype, stop - start, tile.begin + start * tile.dtype.itemsize)
 
 
@@ -137,10 +128,7 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
 
 
 def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
-    """Copy all splats of some tiles to files of a new folder.
-
-    They get the widest types and the highest degree among the tiles; missing harmonics are 0.
-    """
+    """Copy tiles to files of a new folder, of their widest types and highest degree, else 0."""
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
     kinds = [splats_from_columns(np.empty(0, each)) for each in dtypes] if len(dtypes) > 1 else []
     pieces = [(tile, part.start, part.stop) for tile in tiles for part in chunks(tile.splats, ROWS)]

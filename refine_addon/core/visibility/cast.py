@@ -167,10 +167,7 @@ def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[
 
 
 def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Columns, (C,), and rows, (R,), ascending, of about `count` pixels, evenly spread.
-
-    `number` shifts them, by an R2 sequence: other numbers give other pixels.
-    """
+    """Ascending columns and rows of about `count` even pixels; `number` shifts them (R2)."""
     count = max(count, MIN_RAYS_OF_VIEW)
     columns = max(round(math.sqrt(count * view.width / view.height)), 1)
     columns = min(columns, view.width, max(int(count), 1))
@@ -223,10 +220,7 @@ def cast(
     rows: NDArray[np.int64],
     aims: NDArray[np.int64] | None = None,
 ) -> Rays:
-    """Rays with all their hits of alpha `ALPHA_CUT` or more, front to back.
-
-    They go where ascending columns and rows cross, or through the pixels `aims`, (2, P) (`aimed`).
-    """
+    """Rays through some pixels, see `hits`, with all hits of alpha `ALPHA_CUT` or more, sorted."""
     pieces = hits(footprints, columns, rows, _PAIRS, aims=aims)
     return _front_to_back(footprints, columns, rows, aims, pieces)
 

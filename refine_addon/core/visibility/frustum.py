@@ -63,9 +63,8 @@ def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> ND
 class Frustums:
     """The frustums of V views, for points relative to `origin`, to keep digits far from zero.
 
-    `near`, > 0, is for views that have no near plane of their own. `centers`, (V, 3), are relative
-    to the origin; `beyond_per_unit`, (V, 1), is the growth of `project`'s `beyond` per world unit
-    away from a side.
+    `near`, > 0, is for views that have no near plane of their own. `beyond_per_unit`, (V, 1), is
+    the growth of `project`'s `beyond` per world unit away from a side.
     """
 
     def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:
@@ -85,9 +84,8 @@ class Frustums:
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Which views may see part of each box, and which surely see all of it, (V, k) bool each.
 
-        Boxes have corners `low` and `high`, (3, k). Points of one that a view does not touch lie
-        beyond a plane, or their ``beyond`` (`project`) is at least `reach`, world units, times
-        `beyond_per_unit`.
+        Points of a box that a view does not touch lie beyond a plane, or their ``beyond``
+        (`project`) is at least `reach`, world units, times `beyond_per_unit`.
         """
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         x, y, z = self._rows

@@ -121,12 +121,11 @@ def measure(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Measured, list[Measured], list[NDArray[np.float64]]]:
-    """Measure Gaussians in groups of views, and cast rays while their footprints are there.
+    """Measure Gaussians in groups of views (`view_groups`), and cast rays with their footprints.
 
-    Views have the weights of `ViewSet.by_distance`; groups hold their numbers (`view_groups`),
-    `sample` m rows of Gaussians. `ray_samples` get the rays of these views that they lack. Returned
-    are the sums of all Gaussians over all groups, those of the sample over each group, and for each
-    group the errors of the sample in each view, (views, m).
+    `ray_samples` get the rays of these views that they lack. Returned are the sums of all Gaussians
+    over all groups, those of the rows `sample` over each group, and for each group the errors of
+    the sample in each view, (views, m).
     """
     rows, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
     lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]

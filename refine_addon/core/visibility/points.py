@@ -86,10 +86,7 @@ class Points(NamedTuple):
 
 
 def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Yield slices of groups, and of their members, about `_BLOCK` members at a time.
-
-    `sizes`, (G,), are the numbers of members.
-    """
+    """Yield slices of groups of `sizes` members, and of their members, about `_BLOCK` at a time."""
     ends = np.cumsum(sizes)
     cuts = np.searchsorted(ends, np.arange(_BLOCK, int(sizes.sum()), _BLOCK)) + 1
     start = member = 0
@@ -101,10 +98,7 @@ def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
 
 
 def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
-    """Side of a view's cells, px: `cell`, or more to keep `FOOTPRINTS`, `MAX_CELLS`, `MAX_POINTS`.
-
-    `cell` and `density` are those of `measuring.Sampling`.
-    """
+    """Side of a view's cells, px: `cell`, or more for `FOOTPRINTS`, `MAX_CELLS`, `MAX_POINTS`."""
     needed = max(FEW_CELLS, len(footprints.index) / FOOTPRINTS)
     side = max(cell, math.sqrt(view.width * view.height / min(needed, MAX_CELLS)) * _SLACK)
     while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:

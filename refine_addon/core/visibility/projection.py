@@ -240,8 +240,7 @@ def project(
 
     The covariance is ``C + 0.3 I``, ``C = J W S W' J'`` (Zwicker et al., "EWA splatting", 2002, Eq.
     31), J the Jacobian at the mean; antialiased opacity is ``o sqrt(det C / det(C + 0.3 I))``.
-    Splats with centres nearer than the near plane or beyond the far one have no footprint. Equal
-    depths keep their order. A window has the view's pose and lens.
+    Splats with centres off the near or far plane have no footprint. Equal depths keep their order.
     """
     planes, discs = clip_planes(scene, view), gaussians.normals is not None
     turned = (view.rotation @ scene.axes.T).astype(np.float32)

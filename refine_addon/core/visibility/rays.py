@@ -204,8 +204,7 @@ def contrasts(
 ) -> Iterator[NDArray[np.float32]]:
     """Yield B - c, colour behind less own colour, (m,), for each channel.
 
-    Hits or points lie front to back in columns of `counts`, >= 1 each. `weight` is their T alpha,
-    `left`, > 0, the transmittance behind each.
+    Columns hold `counts`, >= 1, front to back, of T alpha `weight`; `left`, > 0, is T behind each.
     """
     red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
     blue = behind((weight * colors[2]).astype(np.float64), counts)

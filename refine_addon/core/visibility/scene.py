@@ -116,10 +116,7 @@ def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
-    """A hash of each row of columns, (N,) each, as float32: the same wherever the row stands.
-
-    Use values that a motion of the scene does not change, such as opacity and base colour.
-    """
+    """A hash of each row of float32 columns, (N,) each; give it values that no motion changes."""
     key = np.zeros(len(columns[0]), np.uint64)
     for values in columns:
         with np.errstate(over="ignore", under="ignore"):  # of float64
