@@ -75,9 +75,8 @@ def moved(means: NDArray[Any], matrix: NDArray[Any]) -> NDArray[np.float64]:
 def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True) -> Splats:
     """Splats transformed by an invertible affine matrix; RefineError by `check_affine`.
 
-    They are float64, as rounded values might lead to another kept set. Without `rotate_sh`
-    harmonics stay those of the old frame, and the matrix may be non-uniform; the closed form needs
-    no more.
+    They are float64: rounded, other splats might be kept. Without `rotate_sh` harmonics stay those
+    of the old frame, and the matrix may be non-uniform; the closed form needs no more.
     """
     matrix = np.asarray(matrix, np.float64)
     check_affine(matrix, with_sh=rotate_sh)
@@ -193,8 +192,7 @@ def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
 
     A map is fitted to all points, and to random draws of a few, the same at each call; the one that
     most points agree with is kept, and the search goes on with the others. First come the points
-    that did not move, then at most 32 maps. Points that were moved one by one or into a plane, and
-    those that are not finite, are in none.
+    that did not move, then at most 32 maps. Points moved one by one, or into a plane, are in none.
     """
     before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
     finite = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)

@@ -60,8 +60,7 @@ def read_scene(
 ) -> Scene:
     """Read a file of splats, of any format, into memory; its frame is that of views and zones.
 
-    `model` is how splats are drawn if the file does not say or is wrong, `form` the output's
-    format, for sizes, None for plain PLY. Errors are those of `read_splats` and `forced`.
+    `model` is how splats are drawn if the file does not say, `form` the output's format, for sizes.
     """
     file = read_splats(path, model)
     splats = file.splats()

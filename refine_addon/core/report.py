@@ -114,9 +114,9 @@ def of_prune(
 ) -> dict[str, Any]:
     """Report of a prune as plain JSON values; it shares the clock's times, later laps too.
 
-    PSNR is in dB: `psnr` of the views that decided, `between` of views in between, `measured` on
-    rays by method. Other methods' times are predicted if the clock `timed` the scoring. `outcome`
-    is that of merging, or `tried` if deletion was as good.
+    PSNR, dB, is `psnr` in the views that decided, `between` in views in between, `measured` on rays
+    by method. `timed` says whether the clock timed the scoring, from which other methods' times are
+    predicted. `outcome` is that of merging, `tried` if deletion was as good.
     """
     count, curve = len(keep), scores.quality
     report: dict[str, Any] = {**scored(scores)}

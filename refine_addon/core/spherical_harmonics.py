@@ -90,10 +90,7 @@ def colors(
 
 
 def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`colors` in float32, (3, N), in a tenth of the time.
-
-    `directions` are (3, N), `harmonics`, with the constant, (N, 3, (degree + 1)^2).
-    """
+    """`colors` in float32, (3, N), in a tenth of the time; harmonics are (N, 3, (degree + 1)^2)."""
     degree = math.isqrt(harmonics.shape[2]) - 1
     values = np.stack(_values(np.asarray(directions, np.float32), degree), axis=1)  # (N, K)
     result = np.einsum("nk,nck->cn", values, harmonics)
@@ -102,10 +99,7 @@ def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> N
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients, (N, K, 3) float64, whose colour along ``rotation @ d`` is the old one along d.
-
-    `sh_rest` is (N, K, 3); `rotation`, (3, 3), is orthonormal and may be a reflection.
-    """
+    """Coefficients, (N, K, 3), whose colour along ``rotation @ d`` is the old one along d."""
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     rotated = np.empty_like(sh_rest, np.float64)
     # A rotation maps each band to itself. Its matrix is fitted to more directions than it has rows.

@@ -196,10 +196,7 @@ def unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def single_unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float32]:
-    """Quaternions w x y z of length 1, (N, 4) float32, as Blender's; zero becomes the identity.
-
-    Those of length 1 within float32's rounding, and non-finite ones, stay to the bit.
-    """
+    """Unit quaternions, (N, 4) float32, as Blender's: zero is the identity, unit ones keep bits."""
     with np.errstate(over="ignore", under="ignore"):  # doubles beyond float32
         q = np.array(quaternions, np.float32)
     finite = np.isfinite(q).all(axis=1)

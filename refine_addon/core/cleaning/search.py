@@ -222,7 +222,7 @@ def touching(
 
 
 def connected(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Lowest node that is connected to each node of a graph, (count,), by edges, (E,) each."""
+    """Lowest node that is connected to each node of a graph, (count,); edges are (E,) each."""
     labels = np.arange(count)
     while True:
         low = np.minimum(labels[one], labels[other])

@@ -104,10 +104,7 @@ class Hits(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What views see at the places of suspects with all of them absent, (M,) each, else 0.
-
-    Light is summed over rays, as a share of a ray's light.
-    """
+    """Light on rays at the places of suspects, with all of them absent, (M,) each, else 0."""
 
     near: NDArray[np.float64]  # light that stops near, times the suspect's alpha
     behind: NDArray[np.float64]  # light that stops behind, times alpha

@@ -41,10 +41,7 @@ class Format:
 def new_file(
     path: Path, origin: tuple[str, int], count: int, degree: int, model: Model = "default"
 ) -> tuple[SplatFile, Splats]:
-    """New plain PLY of `count` splats in memory, and these splats, whose arrays are to be filled.
-
-    `origin` are format and bytes of the file that is read. The splats have a third scale.
-    """
+    """Plain PLY of `count` splats, and their arrays to fill; `origin`: input's format and bytes."""
     rows, splats = empty_rows(count, degree)
     header = with_model(new_header(rows.dtype, count), model)
     return SplatFile(path, rows, header, origin=Origin(*origin)), splats

@@ -362,10 +362,7 @@ def has_lists(element: Any) -> bool:
 
 
 def row_ranges(header: Header, available: int) -> list[slice]:
-    """Range of bytes of each element's rows in a body, exact up to the first element with lists.
-
-    `RefineError` if `available` bytes cannot hold as many rows, before memory is allocated.
-    """
+    """Byte range of each element's rows, exact up to lists; `RefineError` beyond `available`."""
     ranges, least, text = [], 0, header.order == TEXT
     for element, count in zip(header.elements, header.counts, strict=True):
         kinds = (getattr(prop, "len_dtype", prop.val_dtype) for prop in element.properties)

@@ -278,10 +278,7 @@ def _write(stream, splats):
 
 
 def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
-    """Yield name and bytes of `META`, then of the images, with pixels in the order of the splats.
-
-    `RefineError`, naming `path`, if no codec is there or images would be too large.
-    """
+    """Yield names and bytes of `META` and images, by splat; `RefineError` if too large."""
     count, codec = len(splats), codec_for(path)
     across = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)  # nearly square, divisible by 4
     if across > _MOST_PIXELS:

@@ -252,10 +252,7 @@ class StreamedSog:
 
 @contextlib.contextmanager
 def folder_for(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Make a folder beside `path`, the index to come, which is removed after the block.
-
-    `RefineError` if `path` is a link, or exists and is no index or not to be replaced.
-    """
+    """Yield a new folder beside `path`, removed afterwards; `RefineError` if it is no index."""
     with new_folder(path.parent):
         if path.is_symlink():
             raise RefineError(f"{path}: is a link, expected the index itself, beside its folders")

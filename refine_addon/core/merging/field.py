@@ -139,10 +139,7 @@ def measured_field(
 
 
 def _viewing(means, views, closest):
-    """Mean direction, its deviation, area of a pixel at the splat, number of views with its centre.
-
-    Cameras count as at least `closest` away.
-    """
+    """Mean direction, its deviation, area of a pixel at the splat, number of views that hold it."""
     points = means.T
     rows, columns = np.triu_indices(3)
     # Sums over views: of the weights, of pixels per squared world unit, of views; (M,) each.

@@ -95,9 +95,8 @@ def merge(
     """Reduce splats to a number at the least cost to the pictures (docs/method.md, section 7).
 
     `sums` are contribution and error, (2, N), px^2. `deleted` splats go first, then undrawable
-    ones; `protected` ones neither go nor change, even if more than `keep_count` are left.
-    `merge_penalty` takes the share removed of `began`: by default those not `deleted`, more after
-    earlier merges.
+    ones; `protected` ones stay, even if more than `keep_count` are left. `merge_penalty` takes the
+    share removed of `began`: by default those not `deleted`, more after earlier merges.
     """
     total, left = len(splats), splats
     # Of each splat left: which of the N it is, and for how many of them it stands, 0 if deleted.
@@ -241,10 +240,7 @@ class _Stage:
 
 
 def _blend(splats, members, share, left, into, progress, threads):
-    """Write harmonics of merged splats: means over members, (m,), into rows `into` of `left`.
-
-    Rounded to float32, so that tiles and files give the same.
-    """
+    """Write means of members' harmonics into rows `into` of `left`, float32: tiles equal files."""
     starts, largest = np.flatnonzero(np.diff(into, prepend=-1)), np.finfo(np.float32).max
 
     def fill(harmonic):  # one at a time, to save memory; -1 is the constant one

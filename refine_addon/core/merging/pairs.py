@@ -229,10 +229,7 @@ def _base(ellipse: Footprint, area: Real, blur: Real, model: Model) -> Real:
 
 
 def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
-    """Ellipses that cover as much as discs with their low-pass (`disc_axes`), on the same axes.
-
-    `sharp` is without the low-pass; `blur` is the low-pass variance of other splats.
-    """
+    """Ellipses that cover as much as discs with a low-pass (`disc_axes`), from those without it."""
     xx, xy, yy = sharp
     pixel = blur / LOW_PASS
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)

@@ -121,10 +121,7 @@ def alignment(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Alignment:
-    """Find whether views are to be turned, and which are far away (docs/method.md, section 10).
-
-    Some of `used` are turned to measure, none where the import says how its views are turned.
-    """
+    """Whether views are to be turned, by some of `used`, and which are far (docs/method.md, 10)."""
     with np.errstate(invalid="ignore"):  # signalling NaN
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
     far, in_pictures, count = [], 0, 0

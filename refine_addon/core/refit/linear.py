@@ -292,7 +292,7 @@ def linear_view(
 
     The rays, at most 2^16, come with the transmittance in front of each hit; `truth` are their
     colours with the unpruned splats, `colors`, (3, u), those of the splats that are hit. The splats
-    of `shapes`, which can change, are the first of these.
+    of `shapes`, which can change, are the first of all that can be hit.
     """
     rays, transmittance = visible
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit

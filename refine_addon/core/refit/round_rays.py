@@ -93,10 +93,7 @@ class Window:
         return replace(self, view=replace(self.view, center=center))
 
     def pixels(self, hits: float, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Columns and rows of the rays of a round (0: validation), with about `hits` hits each.
-
-        Rounds continue an estimate's R2 sequence (`cast.pixels`), so their pixels differ.
-        """
+        """Columns and rows of a round's rays (0: validation), `hits` each, as an R2 sequence."""
         count = min(self.rays, self.hits / max(hits, 1.0), cast.MAX_RAYS_OF_VIEW)
         columns, rows = cast.pixels(self.part, self.number + 1 + number, count)
         if not number:

@@ -182,8 +182,7 @@ def score(
 def lambdas(anisotropy: float, luma_variance: float, translucency: float) -> list[float]:
     """Lambda of geometry, colour and opacity, of sum 1 (REFINE, Eq. 17-20; authors' constants).
 
-    They follow from the mean axis ratio, the variance of luma, 0..1, and the mean of 4 alpha
-    (1 - alpha).
+    They follow from mean axis ratio, variance of luma, 0..1, and mean of 4 alpha (1 - alpha).
 
     >>> [round(value, 3) for value in lambdas(10.73, 0.05, 0.5)]
     [0.274, 0.111, 0.615]

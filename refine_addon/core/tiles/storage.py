@@ -112,8 +112,7 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
 def new_folder(folder: Path | Url) -> Iterator[None]:
     """Make a folder if it is missing; remove it after the block if it is empty.
 
-    Behind a URL, an empty file is written, moved and removed to see that this works, since long
-    work follows.
+    Behind a URL an empty file is written, moved and removed, to fail before long work.
     """
     if not isinstance(folder, Url):
         with whole_file.new_folder(folder):

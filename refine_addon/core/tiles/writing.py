@@ -59,10 +59,7 @@ def header_of(tile: Tile, kept: int) -> bytes:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Outputs of a job in an existing `folder`, each with the name of its tile.
-
-    `RefineError` if two are one file, one is a tile, or one exists and is not to be replaced.
-    """
+    """Outputs of a job by tile; `RefineError` if two are one file, a tile, or not replaceable."""
 
     job: Path
     tiles: Sequence[Tile]

@@ -415,11 +415,9 @@ def jacobian(
 def _principal(across, down, z, shape, view):
     """Eigenvalues of C, (2, n), the larger first, and direction of the major axis, (2, n).
 
-    ``C = J S J'``, no low-pass; S is `shape`, (6, n), J has the rows ``fx (1 / z, 0, -x / z^2)``
-    and ``fy (0, 1 / z, -y / z^2)``. With m the half sum, h the half difference and ``r = hypot(h,
-    xy)``, the eigenvalues are m + r and ``det C / (m + r)``, which keeps its digits. The axis is
-    ``(h + r, xy)`` or ``(xy, r - h)``, whichever does not cancel, pointing right; (1, 0) for a
-    circle.
+    ``C = J S J'``, without the low-pass; S is `shape`, (6, n). The smaller is ``det C`` over the
+    larger, which keeps its digits; of two formulas for the axis the one that does not cancel is
+    taken. It points right, and is (1, 0) for a circle.
     """
     fx, fy = view.fx / z, view.fy / z
     xx = fx * fx * (shape[0] + across * (across * shape[5] - 2 * shape[2]))
@@ -446,13 +444,10 @@ def _half_axes(sigmas, direction):
 
 
 def _discs(across, down, z, shape, normals, view, near):
-    """Footprints of discs: their axes, and what rays hit.
+    """Footprints of discs: their axes, and what rays hit (docs/method.md, section 4).
 
-    A ray hits one at ``(u, v)``, in its scales, with alpha ``o exp(-(u^2 + v^2) / 2)``, at least
-    ``o exp(-|d|^2 / (2 DISC_LOW_PASS))``, d px from the centre (Huang et al. 2024, Eq. 8-11). With
-    ``C = J W S W' J'``, n the normal and r the ray to the centre, of depth 1::
-
-        u^2 + v^2 = d' C^-1 d / (1 + g d)^2        g = (n_x / fx, n_y / fy) / (n r)
+    Alpha at (u, v) is ``o exp(-(u^2 + v^2) / 2)``, at least ``o exp(-|d|^2 / (2 DISC_LOW_PASS))``,
+    d px from the centre (Huang et al. 2024, Eq. 8-11).
     """
     variances, direction = _principal(across, down, z, shape, view)
     sigmas = np.sqrt(np.maximum(variances, _THINNEST_DISC**2))

@@ -202,10 +202,7 @@ def contrasts(
     colors: NDArray[np.float32],
     counts: NDArray[np.int64],
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield B - c, colour behind less own colour, (m,), for each channel.
-
-    Columns hold `counts`, >= 1, front to back, of T alpha `weight`; `left`, > 0, is T behind each.
-    """
+    """Yield B - c, colour behind less own colour, (m,), of each channel, in columns of `counts`."""
     red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
     blue = behind((weight * colors[2]).astype(np.float64), counts)
     for own, light in zip(colors, (red_green.real, red_green.imag, blue), strict=True):
