@@ -564,6 +564,17 @@ def test_a_storage_that_fails_leaves_what_is_done(memory, monkeypatch):
     assert memory.made() == memory.once()
 
 
+def test_a_job_behind_a_link_is_refused(tmp_path, tiles):
+    """It would write files in a folder elsewhere, and could not remove them at the end."""
+    with pytest.raises(KeyboardInterrupt):
+        run(tiles, tmp_path / "out", progress=stopping("writing"))
+    (job,) = (tmp_path / "out").glob(".refine-*")
+    job.rename(tmp_path / "far")
+    job.symlink_to(tmp_path / "far")
+    with pytest.raises(RefineError, match="is a link, expected a folder of an earlier run"):
+        run(tiles, tmp_path / "out")
+
+
 def test_another_url_is_another_job(memory):
     """One that was interrupted goes on where it was, whatever is written elsewhere meanwhile."""
     told = []

@@ -171,6 +171,8 @@ def _stored(job: Path, result: Result) -> Kept:
 @contextlib.contextmanager
 def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
     """Make and lock the folder of a job within the block; it stays if the job can go on."""
+    if job.is_symlink():
+        raise RefineError(f"{job}: is a link, expected a folder of an earlier run; remove the link")
     try:
         waiting_in(job).mkdir(parents=True, exist_ok=True)
         lock = (job / "lock").open("wb")
