@@ -25,9 +25,9 @@ _FLAT = 1e-9  # smallest over largest scale up to which a matrix counts as flat
 _SMALLEST, _LARGEST = 1e-30, 1e30
 """Scales of a matrix that is applied: its determinant fits float64, usual splats float32."""
 
-LEAST = 6  # fewest points of a map: any four have one in common
+LEAST = 6  # fewest points of a map: one can be fitted to any four
 
-_MOST = 32  # maps that are looked for
+_MOST = 32  # most maps that are found
 
 _NOISE = 4e-6  # rounding of moved points, relative to a coordinate's terms: 32 units of float32
 
@@ -106,7 +106,10 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
 
 
 def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
-    """Like `transformed`, also by non-uniform matrices: harmonics are fitted, see `stretched`."""
+    """Like `transformed`; if the matrix is not uniform, harmonics are fitted.
+
+    See `spherical_harmonics.stretched`.
+    """
     uniform = is_uniform(matrix)
     result = transformed(splats, matrix, rotate_sh=uniform)
     if uniform or not splats.sh_degree:
@@ -258,7 +261,7 @@ def _fits(matrix, before, after, *, slack=1.0):
 
 
 def _fitted(before, after):
-    """Affine least-squares map, (4, 4); None of points on a line, or moved into a plane."""
+    """Affine least-squares map, (4, 4); None for points on a line, or moved into a plane."""
     shift = np.eye(4)
     shift[:3, 3] = (after - before).mean(axis=0)
     if _fits(shift, before, after).all():

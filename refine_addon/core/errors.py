@@ -1,4 +1,4 @@
-"""The two exceptions that core raises on purpose, and texts for their messages."""
+"""`RefineError`, for bad input, and texts for messages; the other exception is `Cancelled`."""
 
 from __future__ import annotations
 

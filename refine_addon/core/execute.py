@@ -2,8 +2,8 @@
 
 NumPy's loops release Python's global lock. Where loops are short, threads wait for it: two are only
 1.2 times as fast as one, two processes nearly twice. Unlike those of `ProcessPoolExecutor`, the
-processes import nothing of the caller, only this package, under the name that it has here, which
-for an extension Blender chose. They end after `IDLE` seconds. Progress is divided into `stages`,
+processes import nothing of the caller, only this package, under the name that it has here (Blender
+chooses that of an extension). They end after `IDLE` seconds. Progress is divided into `stages`,
 whose lengths `seconds` predicts.
 """
 
@@ -328,7 +328,7 @@ def _side_by_side(work, items, threads, tell, stop=lambda: None):
 
 
 def start(cost: float, threads: int | None = None) -> None:
-    """Start the processes that `run` will use soon for work of this `cost`, as there."""
+    """Start the processes that `run` will use soon for work of the same `cost` and `threads`."""
     number = default_threads() if threads is None else threads
     if _worth(cost, number):
         with suppress(_LostError):
@@ -338,7 +338,7 @@ def start(cost: float, threads: int | None = None) -> None:
 
 
 def _worth(cost, number):
-    """Whether work is worth `number` processes of the Python that runs here, if one does."""
+    """Whether work is worth `number` processes, and the program that runs here is a Python."""
     with _lock:
         least = WORTH_READY if sum(process.ready for process in _idle) >= number else WORTH
     python = Path(sys.executable or "").name.lower().startswith("python")

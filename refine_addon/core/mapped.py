@@ -66,7 +66,7 @@ class Mapped:
         return np.asarray(self[...], dtype)
 
     def take(self, rows: NDArray[np.int64], axis: int = 0) -> NDArray[Any]:
-        """Elements at `rows`, along the first axis, whatever `axis`, which NumPy passes."""
+        """Elements at `rows` along the first axis; `axis`, which NumPy passes, is ignored."""
         return np.asarray(self[rows])
 
 
@@ -233,8 +233,7 @@ def in_one(
 ) -> tuple[Splats, NDArray[np.int64]]:
     """Join regions, whose folder is then deleted; `boxes` are the rows of each.
 
-    Returns the splats in ascending order of their rows, and that order, (N,): for each, its place
-    among the splats of the regions one after another.
+    Returns the splats by ascending row, and the place of each among the concatenated regions, (N,).
     """
     every, order = on_disk(folder / "every", regions), np.argsort(np.concatenate(boxes))
     result = on_disk(folder.with_name(f"{folder.name}-done"), pieces(every, order))

@@ -1,4 +1,4 @@
-"""The dial: four ways to prune, from instant to best. A method is its settings."""
+"""The dial: four ways to prune, from instant to best, each a class of settings."""
 
 from __future__ import annotations
 

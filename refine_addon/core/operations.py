@@ -394,7 +394,7 @@ def convert_files(
 
     Parameters
     ----------
-    sources : sequence of path-like, one at least; the first comes first
+    sources : sequence of path-like, at least one, in the order of their splats in the output
     moves : sequence of Move, one for each file, or none
     degree : int from 0 to 4, optional; harmonics above it are left out
     morton : bool, whether splats are sorted along a Z-shaped (Morton) curve, near ones together

@@ -29,7 +29,7 @@ LIGHT_LEFT = 0.1
 """Transmittance of a ray at a surface. Splats in front of the depth where it is 0.5 make up a third
 of the picture; at 0.1 these are two thirds, and with `THICKNESS` four fifths."""
 
-THICKNESS = 2.0  # how far behind a surface is visible: a splat's deviations along the view's axis
+THICKNESS = 2.0  # a splat's standard deviations behind a surface up to which it is visible
 
 RAYS = 25_000  # about how many rays find surfaces
 
@@ -72,7 +72,7 @@ class Sight:
     visible: NDArray[np.bool_]  # (n,), see the top of this file
 
     def in_area(self, area: NDArray[np.bool_], *, hidden: bool = False) -> NDArray[np.bool_]:
-        """Splats, (N,) bool, with centres in an area, (H, W) bool; with `hidden`, also those."""
+        """Splats, (N,) bool, visible or also `hidden`, with centres in an area, (H, W) bool."""
         return self._of(area[self.pixels[1], self.pixels[0]], hidden)
 
     def in_ball(

@@ -159,7 +159,7 @@ class _Cut:
         return self._left[self._before(footprint, pixel), pixel] > 0.0
 
     def shares(self, footprint, pixel, alpha):
-        """Transmittance of the layers before each hit, (h,); adds hits to those before layers."""
+        """Transmittance of layers before each hit, (h,); adds the hits to what is before layers."""
         before = self._before(footprint, pixel)
         log_passed = np.log1p(-alpha)
         for layer, log_front in enumerate(self._log_front):

@@ -37,7 +37,7 @@ from .visibility.cast import validation_rays
 from .visibility.measuring import Measured
 from .volumes import Forced, must_go
 
-TRIES = 3  # how often splats are merged at most to reach a PSNR
+TRIES = 3  # most times that splats are merged to reach a PSNR
 
 CLOSE = 0.7  # largest distance of an estimate from the PSNR of the budget, dB, else merge again
 
@@ -49,7 +49,7 @@ PARTS = 2
 values meanwhile."""
 
 REFITTING = "refitting"
-"""What progress says during refitting, from which on a cancelled prune has a result, see
+"""What progress says during refitting. A prune that is cancelled then has a result, see
 `Result.stopped`."""
 
 
@@ -470,8 +470,8 @@ class _Prune:
         self, goal: float, scores: Scores, measurement: Measured, progress: Progress
     ) -> Outcome:
         """Merge to as few splats as keep a PSNR, dB."""
-        # Their number comes from the scores' curve, corrected by what the last try reached; between
-        # a try that keeps the PSNR and one that does not, from these two.
+        # The number comes from the scores' curve, corrected by what the last try reached. Once one
+        # try keeps the PSNR and another does not, it is interpolated between the two.
         total, curve = len(self.splats), quality_of(scores)
         way: Way = "refit" if isinstance(self.method, Refit) else "merge"
         lost = None if self.origin is None else self.origin.psnr

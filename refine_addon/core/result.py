@@ -42,7 +42,7 @@ class Result:
     ----------
     keep : (N,) bool, which splats are kept
     report : dict, ready for JSON; see docs/report.md
-    scores : Scores, optional; by them it was decided, those of kept splats may not be settled
+    scores : Scores, optional; those that decided; of kept splats they may not be in final order
     merged : Merged, optional; kept splats with their new values, None if none changed
     stopped : Cancelled or KeyboardInterrupt, optional; it ended refitting after some rounds
     source : SplatFile or Splats, optional; all splats
@@ -79,7 +79,7 @@ class Result:
         return self.source.splats() if isinstance(self.source, SplatFile) else self.source
 
     def for_all(self, rest: NDArray[np.bool_]) -> Result:
-        """Result for all N splats, from this one for those in `rest`, (N,) bool: others go."""
+        """Result for all N splats, from this for those in `rest`, (N,) bool; others are removed."""
         keep = among_all(self.keep, rest)
         total, kept = len(keep), int(np.count_nonzero(keep))
         self.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}

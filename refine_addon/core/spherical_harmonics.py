@@ -126,8 +126,8 @@ def stretched(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coefficients, (N, 3) and (N, K, 3) float64, fitted to a non-uniform map.
 
-    By least squares over directions d, the colour along ``linear @ d`` is the old colour along d,
-    which harmonics of the same degree cannot have exactly. `linear`, (3, 3), is invertible.
+    The colour along ``linear @ d`` approximates the old colour along d, by least squares over
+    directions d: harmonics of the same degree cannot equal it. `linear`, (3, 3), is invertible.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     here = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))

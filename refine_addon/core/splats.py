@@ -138,7 +138,7 @@ def above_constant(degree: int) -> int:
 def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
     """Opacities (...) float64 in 0..1 of any logits, ``1 / (1 + exp(-logit))``; NaN stays."""
     logits = np.asarray(logits, np.float64)
-    # exp(-700) is 1e-304; the limit avoids underflow.
+    # The limit avoids underflow: exp(-700) is 1e-304.
     decay = np.exp(-np.minimum(np.abs(logits), 700.0))
     return np.asarray(np.where(logits >= 0.0, 1.0, decay) / (1.0 + decay))
 
@@ -223,8 +223,8 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
     """Which splats a renderer can draw, (N,) bool.
 
-    These have finite numbers, except that a logit may be infinite and a log scale minus infinite,
-    an opacity and a size along some axis that are not 0 in float32, and no overflow in float32.
+    Its numbers are finite, but a logit may be infinite and a log scale minus infinite. In float32
+    its opacity and its largest scale are not 0, and nothing overflows.
     """
     good = np.empty(len(splats), np.bool_)
 
@@ -264,7 +264,7 @@ _LOG_SMALLEST = float(np.log(np.float64(np.finfo(np.float32).smallest_subnormal)
 
 
 def among_all(values: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
-    """Values of all N splats, from those, (n,), of the ones in `rest`, (N,) bool; others get 0."""
+    """Values, (N,), for all splats from `values`, (n,), of those in `rest`, (N,) bool; else 0."""
     of_all = np.zeros(len(rest), values.dtype)
     of_all[rest] = values
     return of_all

@@ -195,7 +195,7 @@ class ViewSet:
 
         Farthest-point sampling (Gonzalez 1985) of `places`, beginning with the view farthest from
         the middle. The choice does not depend on frame and unit, nor on the order of views whose
-        names differ. A stray view takes one of the places.
+        names differ. A stray view is one of those chosen.
         """
         # Of views equally far away, of which regular rigs have many, the first by name is taken.
         usable = np.array([index for index in self.by_name() if self.views[index].weight > 0])
@@ -212,7 +212,7 @@ class ViewSet:
         return self.take(np.sort(usable[chosen]))
 
     def places(self) -> NDArray[np.float64]:
-        """Centres relative to `middle`, in units of its distance, and directions, (V, 6)."""
+        """Centres relative to `middle`, over their median distance, and directions, (V, 6)."""
         middle, variance = self.middle()
         offset = (self.centers - middle) / (np.sqrt(variance) or 1.0)
         return np.hstack([offset, self.rotations[:, 2]])

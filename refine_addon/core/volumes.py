@@ -242,7 +242,7 @@ class Zone:
     role : "protect", "remove", or "keep", which removes those in no volume of this role
     name : str, of the volume, for messages and the report
     volume : Volume, in the frame of the views
-    idle : bool, whether it may hold no splat, as after they were removed
+    idle : bool, whether it may hold no splat, such as after an earlier prune
     """
 
     role: Role

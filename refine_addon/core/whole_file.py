@@ -115,7 +115,7 @@ def refuse_mapped(path: Path, source: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[None]:
-    """Make a folder and its parents within the block; new ones that are empty then are deleted."""
+    """Make a folder and its parents; after the block, new ones that are empty are deleted."""
     new: list[Path] = []
     try:
         try:

@@ -33,8 +33,8 @@ POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
 IMAGE_FIELDS = ("IMAGE_ID", *POSE, "CAMERA_ID", "NAME")
 
 SHORT_LINE = 400
-"""Bytes; only shorter lines of points are checked, since without points a line is the next image's,
-and that is short."""
+"""Bytes from which on a line is not checked to hold points. If a file lacks these lines, the next
+image stands there, and its line is shorter."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def counted(count: int, thing: str) -> str:
 
 
 def lens_note(counts: Mapping[Model, int], thing: str) -> str:
-    """Note on lenses that are no pinholes, counted by model, or ""; `thing` has one of them."""
+    """Note on lenses that are no pinholes, counted by model, or ""; `thing` names what has one."""
     ways = (
         "distortion of {} ignored (model {})",
         "{} (fisheye, {}) taken as pinhole: wrong away from the centre",

@@ -2,7 +2,7 @@
 
 ``transform_matrix`` is camera to world in OpenGL axes (x right, y up, z back) and used as stored;
 ``applied_*``, ``scale``, ``offset`` and ``aabb*`` are ignored. nerfstudio trains and exports in
-another frame, to which a ``dataparser_transforms.json`` beside the file leads: it is applied.
+another frame: a ``dataparser_transforms.json`` beside the file, which leads there, is applied.
 Principal points are measured from the upper left corner; pixel centres are at k + 0.5.
 """
 
@@ -25,7 +25,7 @@ DATAPARSER_FILE = "dataparser_transforms.json"
 
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # factors on axes: y up to down, z back to forward
 
-LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6  # of a ``transform_matrix``; in between it is taken out
+LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6  # of a ``transform_matrix``; divided out if in between
 
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PANORAMA_KEYS = ("equirectangular", "latlong")  # of instant-ngp

@@ -2,7 +2,7 @@
 
 Suspects have little support (`support.own_support`), or are small clusters, giants or needles
 (`search`). With all of them absent, the views measure how much light stops at the place of each and
-how much goes on to a surface behind. That evidence alone decides (`judge`). docs/method.md, section
+how much goes on to a surface behind. Only this evidence decides (`judge`). docs/method.md, section
 8, has the formulas.
 """
 
@@ -74,13 +74,13 @@ FAINT = 0.15
 """Opacity below which splats are faint."""
 
 HAZE_HELD = 1.35
-"""Factor of `NEEDED`, to the power of the number of faint neighbours in touch, kept or not, of a
-faint splat that is no giant: a cloud was trained as one, and pictures need it as one."""
+"""Factor of `NEEDED` for a faint splat that is no giant, to the power of the number of faint
+neighbours in touch, kept or not: pictures need the splats of a cloud together."""
 
 VISIBLE, GLARING, WIDE = 4 / 255, 40 / 255, 0.05
-"""Changes of a pixel, opacity times contrast: a splat that would float with the first is nearly
-transparent or haze; the second is the most that counts, but for giants whose width, as a share of
-the picture, exceeds the third."""
+"""Changes of a pixel, opacity times contrast. A splat that would float if its change
+were at least the first is nearly transparent or haze. The second is the most that counts, but for
+giants whose width, as a share of the picture, exceeds the third."""
 
 CLUMP_NEEDED = 125.0
 """Factor of `NEEDED` for a clump that is judged as one, whatever it touches."""
@@ -296,22 +296,22 @@ def judge(
     hazy = gaussians.alphas < FAINT
     in_haze = np.count_nonzero(touch & hazy[near], axis=1) * (hazy & ~giant)[rows]
 
-    def unheld(change: NDArray[np.float64], needed: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def floating(change: NDArray[np.float64], needed: NDArray[np.float64]) -> NDArray[np.bool_]:
         goes = may.copy()
-        while True:  # what stays holds its neighbours: fewer go each time
+        while True:  # kept neighbours raise what is needed: fewer go each time
             stay = np.count_nonzero(touch & ~goes[near], axis=1)
             left = change >= needed * HELD ** np.sqrt(stay)
             if np.array_equal(left, goes[rows]):
                 return goes
             goes[rows] = left
 
-    shows = unheld(change, needed * HAZE_HELD**in_haze) | in_clumps
-    faint = unheld(np.maximum(change, VISIBLE), needed) & ~shows
+    shows = floating(change, needed * HAZE_HELD**in_haze) | in_clumps
+    faint = floating(np.maximum(change, VISIBLE), needed) & ~shows
     return shows, faint, (passed + 1.0) / (seen + 2.0)
 
 
 def _clumps(gaussians, suspects, change, rows, near, touch):
-    """Solid suspects that touch and float as one clump, (M,): rays hit each alone in few views.
+    """Solid suspects that touch and float as one clump, (M,): few views have rays on each of them.
 
     Each group of views has to agree; `near` and `touch`, (s, k), are of the suspects `rows`.
     """

@@ -51,7 +51,7 @@ PAST = 0.15
 
 _TURNS = (0.6180339887498949, 0.7548776662466927)  # spread multiples modulo 1 evenly
 _NEAREST = 0.2  # of the depth of its centre: as near as a ray may hit a splat
-_FRACTION = 0.999  # how much of the numbers from one ray to the next the places on a ray take
+_FRACTION = 0.999  # places on ray k have keys from k to k + this
 _TINY = 1e-30  # replaces 0 as a divisor
 
 
@@ -189,7 +189,7 @@ def _depths(gaussians, footprints, scene, view, rays, reached):
 
 
 def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Light that stops at each of `Light.hit`, and that times its support by others, (2, u).
+    """Light that stops at each of `Light.hit`, and this light times support by others, (2, u).
 
     Support is as if the splat were gone: what lies behind gets ``1 / (1 - alpha)`` times the light.
     """

@@ -1,4 +1,4 @@
-"""``.splat`` and ``.ksplat``, formats that only the file's name tells.
+"""``.splat`` and ``.ksplat``, formats that only the file's name identifies.
 
 ``.splat`` (antimatter15) is 32 bytes a splat. ``.ksplat`` (GaussianSplats3D by mkkellogg), levels
 0 to 2, is only read; in levels 1 and 2 a coordinate is 16 bits around the centre of a bucket.
@@ -19,7 +19,7 @@ _SPLAT = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
 )  # color: red, green, blue, opacity; rotation: w x y z
 
-_NO_TURN = 128.0  # code of 0 in its rotation, and the step from 0 to 1
+_NO_TURN = 128.0  # code of 0 in a rotation of ``.splat``; codes from 0 to 1
 
 _HEADER = struct.Struct("<BBxxI4x4xIHxx12xff")
 """``.ksplat``: version (2 numbers), section headers, splats, level, level 2's harmonics' range."""
@@ -28,7 +28,7 @@ _SECTION = struct.Struct("<IIIIfHxxI4xIIH")  # the fields of `_Section` from `sp
 
 _HEADER_BYTES, _SECTION_BYTES = 4096, 1024  # of the two in a file; the rest of each is unused
 
-_LEVELS, _DEGREES = 3, 3
+_LEVELS, _DEGREES = 3, 3  # how many: each begins at 0
 
 _HARMONICS = 1.5  # level 2: harmonics lie between -1.5 and 1.5 unless the header says otherwise
 

@@ -33,7 +33,7 @@ class Format:
     write: Callable[[BinaryIO, Splats], None] | None = None
     degree: int = 0  # highest of the harmonics
     loss: str = ""  # what is lost, as a sentence whose subject is the suffix
-    # From count and degree, bytes of a splat and at most of the rest; None if all is compressed.
+    # (count, degree) -> bytes of a splat, most bytes of the rest; None if compressed as a whole.
     sizes: Callable[[int, int], tuple[float, int]] | None = None
     models: tuple[Model, ...] = MODELS[:1]  # those that a file can name
 
@@ -87,7 +87,7 @@ def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def join_largest(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternions, (N, 4) float64, of what `split_largest` returns."""
+    """Unit quaternions, (N, 4) float64; the inverse of `split_largest`."""
     left = np.maximum(1.0 - np.einsum("ij,ij->i", others, others), 0.0)
     q = np.empty((len(others), 4))
     np.put_along_axis(q, _OTHERS[largest], others, axis=1)

@@ -1,7 +1,7 @@
 """Binary glTF (``.glb``) with KHR_gaussian_splatting: plain accessors, activated values.
 
 Rotations are x y z w. In glTF y points up, in captures down; half a turn about z, which changes
-signs only, leads from one to the other. The transforms of nodes are applied.
+only signs, maps one to the other. The transforms of nodes are applied.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CHUNK = struct.Struct("<I4s")  # bytes, kind
 _MAGIC, _VERSION = b"glTF", 2
 _JSON, _BINARY = b"JSON", b"BIN\0"
 _LONGEST = (1 << 32) - 1
-_DEGREES = 3
+_DEGREE = 3  # highest
 
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}  # glTF's types -> NumPy's
 
@@ -99,7 +99,7 @@ class _Part(NamedTuple):
     splats: int
     degree: int
     logs: bool  # whether scales are held as their logarithms, as in drafts of the extension
-    remarks: tuple[str, ...]  # what is not as the file says, behind "FILE has"
+    remarks: tuple[str, ...]  # ends of sentences that begin with "FILE has"
     values: Callable[[str, slice], NDArray[Any]]  # of an attribute, named without its prefix
 
 
@@ -198,7 +198,7 @@ def _frames(moves):
     frames = np.tile(np.eye(4), (len(moves) + 1, 1, 1))
     frames[1:, :3, :3] = rotation_matrices(turns) * numbers("scale", 1.0, 1.0, 1.0)[:, None]
     frames[1:, :3, 3] = numbers("translation", 0.0, 0.0, 0.0)
-    matrices = numbers("matrix", *np.eye(4).flat).reshape(-1, 4, 4)  # which others lack
+    matrices = numbers("matrix", *np.eye(4).flat).reshape(-1, 4, 4)  # a node with one has no other
     frames[1:] = frames[1:] @ matrices.transpose(0, 2, 1)
     for number, (*_, above) in enumerate(moves, 1):
         frames[number] = frames[above] @ frames[number]
@@ -234,7 +234,7 @@ def _parts(document, mesh, place):
 def _part(document, attributes, place):
     attributes = place.members(attributes)
     degree, count, held = 0, 0, {}
-    while degree < _DEGREES and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
+    while degree < _DEGREE and f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
         degree += 1
     wanted = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1}
     for name, width in (wanted | dict.fromkeys(_harmonics(degree), 3)).items():
@@ -360,5 +360,5 @@ def _sizes(count, degree):
 
 _LOSS = "holds activated values in single precision, with y up"
 FORMAT = Format(
-    NAME, ".glb", lambda _, head: head.startswith(_MAGIC), _read, _write, _DEGREES, _LOSS, _sizes
+    NAME, ".glb", lambda _, head: head.startswith(_MAGIC), _read, _write, _DEGREE, _LOSS, _sizes
 )

@@ -1,6 +1,6 @@
 """Plain 3DGS PLY: read through a memory map, written with the kept rows unchanged.
 
-plyfile parses the header. It gets it without comments, which have any encoding, with plain line
+plyfile parses a copy of the header: without comments, which have any encoding, with plain line
 ends, and with row counts of 0, since it would allocate memory for the rows. ASCII is written as
 binary.
 """
@@ -115,7 +115,7 @@ class SplatFile:
     def drawn_as(self, model: Model | None) -> SplatFile:
         """The file with another model in its header; None keeps that of the file.
 
-        `RefineError` if the model is unknown, or splats without a third scale are not to be "2dgs".
+        `RefineError` if the model is unknown, or not "2dgs" for splats without a third scale.
         """
         if model is None or model == self.model:
             return self

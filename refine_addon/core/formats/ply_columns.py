@@ -112,7 +112,7 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
         return len(self._values)
 
     def put(self, chunk: NDArray[Any], dtype: np.dtype[Any], piece: slice, kept: Keep) -> None:
-        """Set new values in `chunk`, (n,), kept rows of a piece as bytes; `dtype` is a row's."""
+        """Set new values in `chunk`, (n,) void: the kept rows of a piece, each of type `dtype`."""
         low, high = np.searchsorted(self._rows, (piece.start, piece.stop))
         rows, taken = self._rows[low:high] - piece.start, np.arange(low, high)
         if kept is not None:

@@ -36,7 +36,7 @@ NOT_WRITTEN: tuple[str, ...] = (".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", "
 NOT_WRITTEN += tuple(form.suffix for form in READERS if form.write is None)
 """Suffixes of outputs that are refused: a PLY of such a name would mislead."""
 
-_HEAD = 1 << 16  # first bytes, which tell the format; the header of a compressed PLY has fewer
+_HEAD = 1 << 16  # first bytes, which identify the format; the header of a compressed PLY has fewer
 
 
 def read_splats(path: Path | str, model: Model | None = None, level: int = 0) -> SplatFile:
@@ -191,7 +191,7 @@ def written_size(
 
 
 def left_out(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> int:
-    """Number of kept splats that a format leaves out: only plain PLY has those not drawable."""
+    """Number of kept splats that a format leaves out: only plain PLY holds undrawable ones."""
     return 0 if form is None else int(np.count_nonzero(keep & ~drawable(file.splats())))
 
 

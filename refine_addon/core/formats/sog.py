@@ -36,7 +36,7 @@ _PARTS = ("means_l", "means_u", "quats", "scales", "sh0", "shN_labels", "shN_cen
 IMAGES = tuple(f"{part}.webp" for part in _PARTS)
 """Names of the files written; those of harmonics only where there are any."""
 
-_DEGREES = 3
+_DEGREE = 3  # highest
 _ACROSS = 64  # entries of the palette in a row of its image
 _LABEL_BITS = 16  # of the number of an entry of the palette: two channels of an image
 _TABLE = 256  # values of a table, whose places are a byte
@@ -76,7 +76,7 @@ class Bundle:
 
     @property
     def count(self) -> int:
-        """Number of splats, at most that of bytes, or `RefineError`."""
+        """Number of splats; `RefineError` if it exceeds the number of bytes."""
         if self.version == VERSION:
             return self.place.at("count").whole(self.meta.get("count"), 1, self.size)
         section, place = self.section("means")
@@ -90,8 +90,8 @@ class Bundle:
             return 0
         section, place = self.section("shN")
         if self.version == VERSION:
-            return place.at("bands").whole(section.get("bands"), 1, _DEGREES)
-        widths = [_ACROSS * above_constant(degree) for degree in range(1, _DEGREES + 1)]
+            return place.at("bands").whole(section.get("bands"), 1, _DEGREE)
+        widths = [_ACROSS * above_constant(degree) for degree in range(1, _DEGREE + 1)]
         across = self.pixels("shN", 0, 1, widths[-1] << _LABEL_BITS).shape[1]
         if across not in widths:
             place.fail(f"a palette {across} pixels wide, expected {', '.join(map(str, widths))}")
@@ -369,5 +369,5 @@ def _grouped(rows):
 
 
 _LOSS = "holds positions in 16 bits, all else in 8, takes harmonics from a palette, and sorts"
-FORMAT = Format(NAME, ".sog", is_sog, _read_archive, _write, _DEGREES, _LOSS, models=MODELS)
+FORMAT = Format(NAME, ".sog", is_sog, _read_archive, _write, _DEGREE, _LOSS, models=MODELS)
 META_READER = Format(NAME, META, named_json(META), lambda path, _: bundle_beside(path).read())

@@ -33,11 +33,11 @@ _ANTIALIASED = 1  # bit of the flags: trained with antialiasing
 
 _VERSIONS = (2, 3, 4)
 _ONE_TURN, _ZSTD = 2, 4  # versions with rotations as x y z, and with zstd streams
-_DEGREES = 5
+_DEGREES = 5  # how many, from 0
 
-_COLOR_STEP = 0.15  # share of the codes for 1 of f_dc: also for colours a bit outside of 0..1
+_COLOR_STEP = 0.15  # share of the codes for 1 of f_dc; they reach colours somewhat outside 0..1
 _SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
-_BUCKETS = (8, 16)  # / 128: steps to which harmonics of degree 1, and of others, are rounded
+_BUCKETS = (8, 16)  # steps, 1 / 128 each, to which harmonics of degree 1 and above are rounded
 
 _USUAL_FRACTION, _LEAST_STEPS = 12, 18
 """Bits of a position behind the point in most files; least bits of a scene's largest coordinate."""

@@ -29,7 +29,7 @@ the last few splats of a stage would take as many rounds as all before."""
 
 FILLED = 0.25
 """A round that removes less than this share of its quota also merges pairs that are not both
-splats' cheapest operation: of many copies of a splat, one pair a round would merge."""
+splats' cheapest operation: else, of many copies of a splat, one pair would merge in a round."""
 
 DISC_PENALTY = 0.5
 """Factor on the merge cost of discs (2DGS): on `room_small` at 50 %, 1.0 is 1.6 dB worse, 0.25 or

@@ -34,12 +34,12 @@ STAGE = 0.5
 operation is a merge as half a splat, and would run out of splats to remove."""
 
 FINER = 0.8
-"""Stages more than if each left `STAGE`: three instead of two for 70 % of a park gain 1.4 dB, five
-instead of four for 90 % nothing."""
+"""Added to the number of stages that leave `STAGE` each: three instead of two for 70 % of a park
+gain 1.4 dB, five instead of four for 90 % nothing."""
 
 ALONE, ALONE_BY_REGIONS = 0.55, 0.6
-"""Least share that a single stage leaves, at least a half. Below 5/9, so half of all splats go in
-one stage once a tenth is deleted; by regions in two: four regions in one stage lost 0.5 dB."""
+"""Least share that a single stage leaves, at least a half. The first is below 5/9: once a tenth is
+deleted, one stage reaches half of all splats. Regions take two: one of four regions lost 0.5 dB."""
 
 PENALTY = 2.0  # merge penalty if half of the splats are removed
 
@@ -212,9 +212,9 @@ class _Stage:
         keep[undrawable] = False
         graph.reduce(max(len(rows) - (excess - len(undrawable)), 0), part(progress, 0.0, 0.95))
         keep[rows[~graph.alive]] = False
-        # The splat that each went into, or is, and its share of the colour of that one.
+        # Of each splat: the one that it becomes part of, or is, and its share of the colour there.
         owner, share = np.arange(len(rows)), np.ones(len(rows))
-        # From the last round to the first: what one merges into may go into another in a later one.
+        # From the last round to the first: a splat merged into may itself be merged in a later one.
         for into, gone, kept_share in reversed(graph.merges):
             owner[gone] = owner[into]
             share[gone] = share[into] * (1.0 - kept_share)

@@ -25,8 +25,8 @@ Real = NDArray[np.floating[Any]]
 FLATTEST = 1e-14  # least eigenvalue of a covariance over their sum; rounding hides smaller ones
 
 ASIDE = 0.1
-"""Least standard deviation, about radians, of the viewing directions that discs are flattened for:
-other views look from aside. Results hardly depend on it from 0.03 to 0.3."""
+"""Least standard deviation, about radians, of the viewing directions that discs are flattened for,
+since other views look from the side. Results hardly depend on it from 0.03 to 0.3."""
 
 _CHUNK = 1 << 14  # splats at a time: some MB of temporary memory a thread
 _CANCELLED = 1e-6  # a mean of two unit vectors with a smaller squared length counts as 0
@@ -82,13 +82,13 @@ class _Ends(NamedTuple):
     model: Model
     one: _Side
     two: _Side
-    color: Real
-    rest: Real
-    step: Real
-    direction: Real
-    deviation: Real
-    blur: Real
-    apart: Real
+    color: Real  # (M,), share of the first splat in the colour
+    rest: Real  # (M,), that of the second
+    step: Real  # (3, M), from the first mean to the second
+    direction: Real  # (3, M), see `Field`, as are the next two
+    deviation: Real  # (3, M)
+    blur: Real  # (M,)
+    apart: Real  # (M,), squared difference of the colours
 
     def take(self, rows: Index) -> _Ends:
         one, two = (
@@ -150,8 +150,8 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
     mass = one.mass + two.mass - np.minimum(ij, np.minimum(one.mass, two.mass))
     if ends.model == "2dgs":
         whole = _mixture(ends.one.covariances, ends.two.covariances, ends.step, position)
-        viewed = (np.asarray(each.T, np.float64, order="C") for each in ends[6:8])
-        disc = footprint(flat_as_viewed(whole.T, *viewed), plane, np.zeros(len(blur)))
+        mean, deviation = (np.asarray(each.T, np.float64, order="C") for each in ends[6:8])
+        disc = footprint(flat_as_viewed(whole.T, mean, deviation), plane, np.zeros(len(blur)))
         area = base = _area(_disc_as_drawn(disc, blur))
         growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
         mixed = _disc_as_drawn((disc[0] * growth, disc[1] * growth, disc[2] * growth), blur)
@@ -194,7 +194,7 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
 
 
 class _Signal(NamedTuple):
-    """M splats in the plane viewed: f in the equations, but for their places."""
+    """M splats as seen in a plane: f in the equations, without their positions."""
 
     footprint: Footprint
     area: Real

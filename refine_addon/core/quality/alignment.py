@@ -54,7 +54,7 @@ FEW = 8
 """A view with fewer splats of the sample is never called distant."""
 
 SMALL = 0.02
-"""A view is distant if its splats, but a tenth to each side, fill less of its width and height."""
+"""A view is distant if its splats, without a tenth on each side, fill less of width and height."""
 
 
 @dataclass(frozen=True)

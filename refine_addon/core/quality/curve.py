@@ -29,13 +29,13 @@ MERGED_SHARES = (0.3, 0.5, 0.7, 0.9)
 """Shares removed at which kept splats stand in for removed ones; see `merged_from`."""
 
 GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
-"""Gain of merging over deletion there: a constant, dB, and a factor on `merged_from`'s gains."""
+"""Gain of merging over deletion at these: a constant, dB, and a factor on `merged_from`'s gains."""
 
 FULL_GAIN = 40_000
-"""Scenes of at least this many splats gain that much."""
+"""Fewest splats of a scene that gains as much as `GAIN`."""
 
 FEWER = 0.2, 0.4, 0.8, 1.3
-"""Loss of gain there, dB for each halving: there are fewer like neighbours to merge with."""
+"""Loss of this gain for each halving of the splats, dB: fewer have like neighbours to merge."""
 
 FEWEST = 20_000
 """Fewer splats have no prediction: scenes differ by up to 7 dB."""
@@ -63,7 +63,7 @@ ROUNDS = 2.5
 """Time of scoring by occlusion over that of measuring all splats once."""
 
 TIMED = (0.1, 0.3, 0.5, 0.55, 0.7, 0.9)
-"""Shares removed of the next two, which are interpolated."""
+"""Shares removed to which `MERGING` and `REFITTING` belong; in between they are interpolated."""
 
 MERGING = (0.1, 0.5, 0.65, 1.4, 1.8, 2.4)
 """Time of merging over that of measuring once: one thread's processor time of `room_small`."""
@@ -71,7 +71,7 @@ MERGING = (0.1, 0.5, 0.65, 1.4, 1.8, 2.4)
 REFITTING = (20.0, 17.0, 8.5, 10.5, 7.5, 5.0)
 """Time of refitting over that of measuring once."""
 
-_LEAST_SHARE = 1e-6  # the place of "nothing removed" on the curve's axis, where that is infinite
+_LEAST_SHARE = 1e-6  # stands for 0, whose log-odds are infinite
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class Quality:
     between: NDArray[np.float64] | None = None  # (L,), `psnr` of views in between
 
     def at(self, share: float, way: Way = "delete") -> float:
-        """PSNR with a share removed, dB; between shares linear in log-odds, which it nearly is."""
+        """PSNR with a share removed, dB, interpolated linearly in the log-odds of the share."""
         return self._at(self._curve(way), share)
 
     def of_views(self, share: float, way: Way = "delete") -> dict[str, float]:

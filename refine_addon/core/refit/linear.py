@@ -39,7 +39,7 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matri
 LEAST_WEIGHT = ALPHA_CUT
 """Hits of less weight T a are left out: a quarter less work than 1e-3, equal results to 0.01 dB."""
 
-HUBER = 1.0  # root mean squares of a view from which errors count in proportion, see `_trust`
+HUBER = 1.0  # root mean squares of a view above which errors count linearly, see `_trust`
 
 _LEAST_ERROR = 1e-10  # squared; keeps a division finite
 

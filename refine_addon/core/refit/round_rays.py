@@ -263,10 +263,10 @@ def cast_truth(
         each = (share if shown is None else shown) * predicted
         columns, rows = window.pixels(each, number)
         rays, transmittance = cast.cast_visible(footprints, columns, rows)
-        most = share * len(rays.ray)
+        all_hits = share * len(rays.ray)  # faint ones too, in units of `Window.hits`
         weight = transmittance * rays.alpha
         colors = rays.composited(weight, target.colors(rays.hit, window.view))
-    each = max(np.count_nonzero(weight > LEAST_WEIGHT), most) / max(rays.count, 1)
+    each = max(np.count_nonzero(weight > LEAST_WEIGHT), all_hits) / max(rays.count, 1)
     return Truth(columns, rows, colors, each / max(predicted, _NOTHING))
 
 
@@ -331,7 +331,7 @@ def _add(total, hit, values):
 
 
 class Stored:
-    """A list of objects, in a temporary file after the first `HELD` bytes, if it has room."""
+    """A list of objects, in a temporary file after the first `HELD` bytes, if the disk has room."""
 
     def __init__(self) -> None:
         self._held, self._lock = 0, threading.Lock()

@@ -38,7 +38,7 @@ ETA_RELATIVE = 0.005
 """Eta over the squared size of the scene: the paper's 0.05 at a viewing distance of 3 m."""
 
 UNSEEN = 1e-6
-"""H over alpha of a splat in no view, times (squared distance + V + eta): below nearly all seen."""
+"""H over alpha of a splat in no view, times (squared distance + V + eta): less than nearly all."""
 
 REACH = 2.0
 """Standard deviations along its longest axis that a splat reaches into an image from outside."""
@@ -95,7 +95,7 @@ def score(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Score splats, in memory or files, by the closed form; threads do not change a bit.
+    """Score splats, in memory or files, by the closed form; the same to the bit on any threads.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ def _places():
 
 
 class _Views:
-    """The views as the closed form sums over them."""
+    """Sums of the closed form over views."""
 
     def __init__(self, views, origin, near, eta, by_distance, frustum):
         self.origin, self.weights, self.eta = origin, views.weights, eta

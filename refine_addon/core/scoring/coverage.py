@@ -3,7 +3,7 @@
 What no given view shows may be plain to see from others. So each score gets a floor: the closed
 form, which ignores occlusion, less where more views hold the splat, times a weight. Each of
 `SHARES` has its weight, chosen by cross-validation: an eighth of the views is left out, the others
-score with each of `FLOOR_WEIGHTS`, and the weight wins by which the left-out views lose least.
+score with each of `FLOOR_WEIGHTS`. The weight with which the eighth loses least is the best.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SAMPLE = 1 << 16
 """Splats that are enough to choose the floor's weights."""
 
 TIED = 0.002
-"""A weight of a loss this much above the least counts 1 / e in the log-mean, which is stable."""
+"""A weight whose loss is this much above the least counts 1 / e in the mean of logarithms."""
 
 DOUBTS = (0.03, 0.03, 0.0, 0.0, 0.0)
 """What a tenfold weight must gain in a loss (`_losses`), by `SHARES`, since losses are noisy."""
@@ -57,7 +57,7 @@ def _with_floor(scores, floors, weight):
 def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
     """Best weight of the floor for each of `SHARES`; all 1 if no view left out has an error.
 
-    A fold is scores and floors by the views that stay, (n,), and errors by each other, (views, n).
+    A fold is scores and floors, (n,), by the views that stay, and errors in the others, (views, n).
     """
     losses = []
     for scores, floors, errors in folds:
@@ -98,7 +98,8 @@ def order(
 ) -> NDArray[np.int64]:
     """All n rows in the order of removal, exact up to the last of `stops`.
 
-    The lower of `ties` goes first. At each stop, ascending, the next of `floor_weights` takes over.
+    Of equal scores the lower of `ties` goes first. At each stop, ascending, the next of
+    `floor_weights` takes over.
     """
     left, going = np.arange(len(scores)), [np.arange(0)]
     for weight, count in zip(floor_weights, np.diff(stops, prepend=0), strict=True):

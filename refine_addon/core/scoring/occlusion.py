@@ -1,8 +1,8 @@
 """Scores with occlusion: ``error_i contribution_i^(1/4)`` (`measuring`), plus a floor (`coverage`).
 
 A splat's worth rises as those around it go. So splats go in rounds, and each round scores the rest
-again, down to a tenth. All budgets use this one order. Views are measured once; later rounds
-correct that by rays, cast once, of which n_i hit splat i (docs/method.md, section 6)::
+again, down to a tenth. All budgets use one order. Views are measured once; later rounds correct the
+measured errors by rays, cast once, of which n_i hit splat i (docs/method.md, section 6)::
 
     error_i = (n_i  error on the rays now  +  KNOWN  error measured, `_grown`) / (n_i + KNOWN)
 """
@@ -36,12 +36,12 @@ BETWEEN = 12
 """Most views in between that are estimated."""
 
 BETWEEN_RAYS = 0.375
-"""Their rays, as a part of `VALIDATION_RAYS`."""
+"""Rays of views in between over `VALIDATION_RAYS`."""
 
 KNOWN = 10.0
-"""What was measured counts as much as this many rays."""
+"""Weight of a measured error, in rays."""
 
-_LOADING = 0.3  # share of the time of getting ready that getting colours takes, to show progress
+_LOADING = 0.3  # share of the progress of `_RemovalRounds.__init__` that colours take
 _SAMPLING = Sampling()
 
 
@@ -57,7 +57,7 @@ def score(
 ) -> Scores:
     """Score splats, in memory or files, by how much the views change without them, with occlusion.
 
-    A splat's value is the share of splats gone once it is, in (0, 1]; 0 if undrawable. Memory: 300
+    A splat's value is the share of splats removed up to it, in (0, 1]; 0 if undrawable. Memory: 300
     bytes a splat, 100 more for each further thread, and 100 for each point
     (`points.MAX_POINTS`) of a view in each thread.
 
@@ -206,7 +206,7 @@ def _order(index, prior, measured, rays, weights, kept, progress):
         report(of_round, 1.0, "scoring")
         worth = prior[index[left]]  # (n,)
         floors = coverage.floor(worth.astype(np.float64), now.seen, 1.0 + EXPONENT)
-        # How many of what is left have been removed when each of the shares is reached.
+        # How many of those left are removed when each of the shares is reached.
         go, gone = max(len(left) - stay, 0), count - len(left)
         stops = np.clip(np.rint(np.multiply(coverage.SHARES, count)) - gone, 0, go).astype(int)
         stops[-1] = go
@@ -300,5 +300,5 @@ def _kept_after_rounds(count, rounds, settled):
 
 
 def _combined(measured):
-    """``error contribution^p``, (M,): the error is exact for one splat, and neighbours go too."""
+    """``error contribution^p``, (M,): the error alone is that of removing one splat by itself."""
     return measured.error * measured.contribution**EXPONENT

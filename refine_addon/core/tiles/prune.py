@@ -131,7 +131,7 @@ def prune_tiles(
 
 
 def _check(workers: Cluster, job: Path, tiles: Sequence[Tile]) -> None:
-    """Raise `RefineError` if a worker does not see all files; `Interrupted` if much is done."""
+    """Raise `RefineError` if a worker lacks a file; `Interrupted` if the job was begun before."""
     goes_on = noted(job, "begun")[0]
     note(job, "begun", None)
     try:

@@ -22,7 +22,7 @@ from ..mapped import Interrupted
 from ..whole_file import Url, expanded, is_url
 
 _FLEETING = ("url", "access")
-"""In names of entries that change though the file does not: redirect targets, times of access."""
+"""Parts of names of entries that change though the file does not, such as times of access."""
 
 _LOCAL = "file://"
 _NO_SUCH = "there is no such file"

@@ -47,13 +47,13 @@ MIN_RAYS_OF_VIEW = 16
 """Fewest rays of a view that has as many pixels."""
 
 BEHIND = 1e-4
-"""A disc's plane is missed behind the camera, or beyond 1 / this times the centre's depth."""
+"""Rays miss a disc's plane behind the camera, and beyond 1 / this times the centre's depth."""
 
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
 _MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
 
-_CROSSING = 1e-3  # a disc of which this much is left of a plane through the camera crosses it
+_CROSSING = 1e-3  # least s of `_disc_extent`; with less, a disc is partly behind the camera
 _NO_END = 1e9  # px; beyond any image
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
@@ -197,7 +197,7 @@ def aimed(
 ) -> NDArray[np.int64]:
     """Column and row of the pixel of each of P rays, (2, P), aimed at targets, (2, t) px.
 
-    Ascending columns and rows divide the image into cells of one ray each. It goes through the
+    Ascending columns and rows divide the image into cells of one ray each. A ray goes through the
     first target in its cell, or where column and row cross.
     """
     row, column = np.divmod(np.arange(len(columns) * len(rows)), len(columns))

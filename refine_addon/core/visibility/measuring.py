@@ -227,8 +227,8 @@ def _evenness(footprints, area):
 def _transmittance(front, even):
     """Transmittance in front of points, (m,), of mean optical depth `front`, `even` without gaps.
 
-    The rest, gamma distributed with shape k, lets ``E[exp(-tau)] = (1 + mean / k)^-k`` through: by
-    exp(-mean), splats that show through foliage would count as hidden.
+    The rest, gamma distributed with shape k, lets ``E[exp(-tau)] = (1 + mean / k)^-k`` through.
+    With exp(-mean) instead, splats that show through foliage would count as hidden.
     """
     shape = np.float32(GAMMA_SHAPE)
     gaps = np.maximum(front - even, np.float32(0.0))

@@ -1,7 +1,7 @@
 """Points over the footprints of a view, sorted by depth within the square cells of the image.
 
-A lattice of points stands for a splat's normal distribution, with more points the more cells that
-covers. Each point has a share of the splat's mass, the integral of its alpha.
+A lattice of points stands for a splat's normal distribution: the more cells the splat covers, the
+more points. Each has a share of the splat's mass, the integral of its alpha.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Numbers of points of a lattice along an axis."""
 
 FLAT = 16
-"""Points across and down the image of a splat much larger than that."""
+"""Points across and down the image for a splat much larger than the image."""
 
 WIDE_EXTENT = 3.0
 """Standard deviations to which a lattice of many points reaches."""
@@ -38,10 +38,10 @@ MAX_CELLS = 65535
 """Most cells of an image: NumPy sorts numbers of 16 bits by radix, in linear time."""
 
 MAX_POINTS = 1 << 22
-"""Most points of a view, as estimated, about 100 bytes each: cells grow until it holds."""
+"""Most points of a view, as estimated, about 100 bytes each: cells grow until there are fewer."""
 
 LEAST_POINTS = 1.25
-"""But this many for each footprint, if that is more: one has a point, however large the cells."""
+"""Points of a footprint that are always allowed: each has one at least, however large the cells."""
 
 _EXTENT = 2.4  # standard deviations, of lattices of fewer than `_WIDE` points along an axis
 _WIDE = 8

@@ -119,7 +119,7 @@ class Rays:
         """Colour of each ray, (3, P), 0..1, if kept splats, (u,) bool, stand in for removed ones.
 
         A removed splat keeps its alpha and takes the colour of the ray's nearest kept hit, counted
-        in hits: of two, that of the one behind; black where there is none.
+        in hits; of two equally near ones, of the one behind; without any, it is black.
         """
         kept, here = keep.take(self.owner), np.arange(len(self.owner))
         none = len(here)  # farther than any hit

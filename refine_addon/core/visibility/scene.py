@@ -95,7 +95,7 @@ def scene_of(
 
 
 def _moments(means, scene):
-    """Sums of `principal_axes`, (4, 3), weighted 1 / (1 + r^2)^2: far splats hardly matter."""
+    """Sums for `principal_axes`, (4, 3), weighted 1 / (1 + r^2)^2: far splats hardly matter."""
     with np.errstate(under="ignore"):
         positions = scene.positions(means)  # (n, 3)
         nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
