@@ -66,7 +66,7 @@ class Demands:
             raise RefineError(f"object '{checked.obj.name}': {error}") from error
 
     def of_each(self, group: Sequence[SplatObject]) -> list[Forced]:
-        """The same for each object; a name protects in those that have it, one at least."""
+        """The same for each object. A name protects in the objects that have it, at least one."""
         if len(group) == 1:
             return [self.forced(group[0])]
         having = {name: _having(group, name) for name in self.names}
@@ -80,7 +80,7 @@ NONE = Demands()
 
 
 def _having(group: Sequence[SplatObject], name: str) -> list[SplatObject]:
-    """Objects with a protecting vertex group or attribute of that name; one at least."""
+    """Objects with a protecting vertex group or attribute of that name, at least one."""
     having, error = [], None
     for member in group:
         try:
@@ -153,7 +153,8 @@ def _is_shape(obj: bpy.types.Object) -> bool:
 
 def _mark(checked: SplatObject, forced: Forced, reasons: Collection[str]) -> None:
     """Mark protected and removed splats for previews, and record their numbers.
-    `REMOVE` marks removed splats and floaters of these reasons; with scores it is the budget's."""
+    Without scores `REMOVE` marks removed splats and floaters of these reasons; with scores a plan
+    sets it."""
     mesh, removed = checked.mesh, forced.removed
     force = np.zeros(len(checked), np.int32)
     for number, mask in ((2, removed), (1, forced.protected)):

@@ -47,7 +47,7 @@ LEVEL_STATS = "refine_lod"  # Custom property of a level object: its stats, as i
 
 LEVEL_OF = "refine_level_of"  # Custom property of a level object: its original
 
-Members = list["SplatObject"]  # Objects by name; one at least
+Members = list[SplatObject]  # Objects by name, at least one
 
 
 class Outcome(NamedTuple):
@@ -219,7 +219,7 @@ def stored_arguments(
         "scores": mesh_scores.stored_scores(group, demanded.removed),
         "protected": demanded.protected,
         "removed": demanded.removed,
-        # Of rows of several lengths the longest counts: a size is never exceeded.
+        # The longest row counts, so that the file is never larger than the budget.
         "sizes": (max(row for row, _ in sizes), sum(fixed for _, fixed in sizes)),
     }
 
@@ -424,8 +424,8 @@ def prune_object(
     **how: Any,
 ) -> dict[str, Any]:
     """Prune an object of the open scene, export the result, save the .blend (`save`); the report.
-    See `core.operations.prune_file`; `how`: `overwrite`, `progress`. On an error an exported file
-    and the object stay."""
+    See `core.operations.prune_file`; `how`: `overwrite`, `progress`. On an error the object is
+    unchanged; a file that was exported before it stays."""
     checked = mesh_layout.check(find(name))
     save = save and not dry_run
     method = possible([checked], method)

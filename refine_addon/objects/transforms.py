@@ -48,24 +48,24 @@ def read_to_move(
     (N,), and the number mended."""
     matrix = np.eye(4) if matrix is None else matrix
     check_affine(matrix)
-    find = mesh_drift.mending(checked.mesh) if mend else None
-    if find is None and np.array_equal(matrix, np.eye(4)):
+    repair = mesh_drift.mending(checked.mesh) if mend else None
+    if repair is None and np.array_equal(matrix, np.eye(4)):
         return set(), lambda: ({}, 0)
     splats = mesh_attributes.splats_from_object(checked)
     has_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
     names = {*values_by_name(splats), *(_NORMALS if has_normals else ())} - {"opacity"}
     stored = mesh_attributes.stored_columns(checked)
     normals = np.stack([stored[name] for name in _NORMALS], axis=-1) if has_normals else None
-    return names, partial(_moved, splats, normals, matrix, find)
+    return names, partial(_moved, splats, normals, matrix, repair)
 
 
 def _moved(
     splats: Splats,
     normals: NDArray[np.float32] | None,
     matrix: NDArray[np.float64],
-    find: Callable[[], mesh_drift.Mending] | None,
+    repair: Callable[[], mesh_drift.Mending] | None,
 ) -> tuple[dict[str, NDArray[Any]], int]:
-    moves, regrouped = find() if find else ([], np.zeros(len(splats), np.int64))
+    moves, regrouped = repair() if repair else ([], np.zeros(len(splats), np.int64))
     if regrouped.any():
         splats = replace(splats, sh_rest=_regrouped(splats.sh_rest, regrouped))
     mended = regrouped > 0
@@ -73,11 +73,11 @@ def _moved(
     for move in moves:
         mended[move.rows], still[move.rows] = True, False
     stays = np.array_equal(matrix, np.eye(4))
-    everything = [Move(move.rows, matrix @ move.matrix) for move in moves]
-    everything += [] if stays else [Move(np.flatnonzero(still), matrix)]
+    all_moves = [Move(move.rows, matrix @ move.matrix) for move in moves]
+    all_moves += [] if stays else [Move(np.flatnonzero(still), matrix)]
     values = values_by_name(splats)
     columns = {name: np.array(values[name]) for name in values if name != "opacity"}
-    for move in everything:
+    for move in all_moves:
         _move_rows(splats, columns, move)
         if normals is not None:
             normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
@@ -101,7 +101,7 @@ def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> 
 
 
 def _regrouped(rest: NDArray[Any], degrees: NDArray[np.int64]) -> NDArray[Any]:
-    """Harmonics, (N, K, 3), some of them under the names of a lower degree; 0 for none."""
+    """Harmonics, (N, K, 3), put right; `degrees`: as in `mesh.drift.Mending.regrouped`."""
     rest = np.array(rest)
     for degree in np.unique(degrees[degrees > 0]).tolist():
         rows, own = degrees == degree, above_constant(degree)
@@ -165,11 +165,11 @@ def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:
         parts.append((checked, read_to_move(checked, matrix, mend=True)[1]()[0]))
     write_moved(parts)
     for checked in group:  # nothing fails from here on
-        _take_away(checked.obj, location=location)
+        _reset(checked.obj, location=location)
     return notes
 
 
-def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
+def _reset(obj: bpy.types.Object, *, location: bool) -> None:
     """Reset an object's own transform; children stay in place, and scores hold."""
     bpy.context.view_layer.update()
     before = obj.matrix_world.copy()

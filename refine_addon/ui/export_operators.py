@@ -131,10 +131,10 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
 
     def put(self, _context: Context, _group: list[SplatObject], job: Any, file: SplatFile) -> None:
         """Report what was written."""
-        _, target, _, to_mind = job
+        _, target, _, of_object = job
         if (form := format_named(target)) is not None:
             self.report({"INFO"}, "; ".join(notes(file, form, np.ones(len(file), np.bool_))))
-        self.say(to_mind, f"Wrote the splats to {self.filepath}")
+        self.say(of_object, f"Wrote the splats to {self.filepath}")
 
 
 class REFINE_OT_export_levels(Exporting, bpy.types.Operator):

@@ -87,7 +87,7 @@ def picture(quality: Quality, share: float, size: int, ink: Color) -> NDArray[np
     `share`: of splats removed, 0 to 1; `ink`: colour of lines; light ink means a dark ground."""
     canvas = np.zeros((size, size, 4), np.float32)
     rows, columns = np.arange(size)[:, None] + 0.5, np.arange(size) + 0.5
-    shares, low, unit = columns / size, lowest(quality), size / 212
+    shares, low, unit = columns / size, lowest(quality), size / 212  # 212: `look` at scale 1
     colors = _ON_DARK if sum(ink) > 1.5 else _ON_LIGHT
 
     def paint(distance, width, color, strength=1.0):

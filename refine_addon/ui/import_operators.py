@@ -45,7 +45,7 @@ class _Importing(Job, Needing, ImportHelper):
     bl_options = {"REGISTER", "UNDO", "PRESET"}
     needs = (idle, in_object_mode)
 
-    files: CollectionProperty(  # without them Blender cannot ask about files that are dropped
+    files: CollectionProperty(  # `invoke_popup` reads them if files are dropped
         type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
     )
     directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
@@ -180,8 +180,8 @@ def _is_untouched(scene: bpy.types.Scene) -> bool:
     render = scene.render
     size = (render.resolution_x, render.resolution_y, render.resolution_percentage)
     cameras = [obj for obj in scene.objects if obj.type == "CAMERA"]
-    moved = any(obj.animation_data or SOURCE in obj for obj in cameras)
-    return size == _DEFAULT_SIZE and len(cameras) <= 1 and not moved
+    chosen = any(obj.animation_data or SOURCE in obj for obj in cameras)
+    return size == _DEFAULT_SIZE and len(cameras) <= 1 and not chosen
 
 
 _ROWS = 1 << 16  # Rows read between two checks for cancelling

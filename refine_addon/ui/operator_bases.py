@@ -50,14 +50,14 @@ class Worker:
 
     def __init__(self, work: Callable[[Progress], Any]) -> None:
         self.fraction, self.what = 0.0, ""
-        self._cancelled: float | None = None  # when
+        self._cancelled: float | None = None  # time of `cancel`
         self._outcome: Future[Any] = Future()
         self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
         self._thread.start()
 
     def running(self) -> bool:
         """Whether to wait for it: until it ends, or `PATIENCE` after it was cancelled.
-        Cancelled work that goes on, like packing a file, ends at its next check, for nothing."""
+        Work that goes on after that ends at its next check; its result is dropped."""
         late = self.cancelled and time.monotonic() - self._cancelled > PATIENCE
         return not late and self._thread.is_alive()
 
@@ -77,7 +77,7 @@ class Worker:
         self._thread.join(PATIENCE)
 
     def result(self) -> Any:
-        """Hand over the work's result, or raise its error."""
+        """The work's result, handed over once; raises the work's error."""
         if self.cancelled and self._thread.is_alive():
             raise Cancelled
         self._thread.join()
@@ -92,7 +92,7 @@ class Worker:
                 self._check()  # it may have been cancelled since its last check
             self._outcome.set_result(result)
         except BaseException as error:
-            # A traceback would keep the work's arrays alive.
+            # A new `Cancelled`: the traceback of `error` would keep the work's arrays alive.
             self._outcome.set_exception(Cancelled() if self.cancelled else error)
 
     def _check(self) -> None:
@@ -121,7 +121,7 @@ class Target(NamedTuple):
 
 
 class Running:
-    """A running operation. Apart from its operator, which Blender's history would keep with splats.
+    """A running operation. Holds the splats, as Blender's history would keep them in the operator.
     `operator`: its `bl_idname`; `job`: see `Job.gather`; `worker`: a `Worker`, or a render's
     stand-in; `waits`: what the user must do before the result is written, "" if nothing."""
 
@@ -135,7 +135,7 @@ class Running:
     ) -> None:
         self.operator, self.doing = type(operator).bl_idname, operator.doing
         self.job, self.waits = job, ""
-        self._offers, self._targets = operator.offers, [Target.of(each) for each in group]
+        self._partial, self._targets = operator.partial_step, [Target.of(each) for each in group]
         self._left, self._shown = TimeLeft(), ""
         self.worker = worker or Worker(partial(operator.compute, job))
         self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
@@ -178,7 +178,7 @@ class Running:
     @property
     def at_escape(self) -> str:
         """What Esc does now."""
-        keeps = self._offers and self.worker.what == self._offers and not self.waits
+        keeps = self._partial and self.worker.what == self._partial and not self.waits
         return "keeps the result so far" if keeps else "cancels"
 
     @property
@@ -278,7 +278,7 @@ def scored(context: bpy.types.Context) -> str:
 
 
 def tooltips(name: str, items: Sequence[Sequence[Any]]) -> Any:
-    """A `description` for an operator: the tooltip of the enum item that a button has."""
+    """A `description` for an operator: the tooltip of the enum item that its button sets."""
 
     def described(_cls: type, _context: bpy.types.Context, properties: Any) -> str:
         return next(text for value, _, text, *_ in items if value == getattr(properties, name))
@@ -330,10 +330,10 @@ class AtOnce:
 class Job:
     """An operator on a thread, with progress bar and Esc, defined by three functions and `doing`,
     its name while it runs. The window stays usable; the result is refused if objects changed.
-    `offers`: the step whose partial result is kept on cancel (`Result.stopped`)."""
+    `partial_step`: the step whose partial result is kept on cancel (`Result.stopped`)."""
 
-    doing = offers = ""
-    by_hand = False  # A user started it: set by `invoke`, or before a file browser's `execute`
+    doing = partial_step = ""
+    by_hand = False  # Whether a user started it; `invoke` sets it, also before a file browser
     _running: Running | None = None
 
     def gather(self, context: bpy.types.Context) -> tuple[list[SplatObject], Any]:
@@ -379,34 +379,34 @@ class Job:
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Wait for the thread, then put its result."""
-        now = self._running
-        if now is None:
+        running = self._running
+        if running is None:
             return {"CANCELLED"}
         if event.type == "TIMER":
-            return self._looked(context, now)
+            return self._check(context, running)
         if event.type != "ESC" or event.value != "PRESS":
             return {"PASS_THROUGH"}
-        now.worker.cancel()
+        running.worker.cancel()
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
         """End the thread when Blender ends the operator, closing its window or file."""
-        if (now := self._running) is not None:
-            self._over(context, now)
-            now.worker.end()
+        if (running := self._running) is not None:
+            self._over(context, running)
+            running.worker.end()
 
-    def _looked(self, context: bpy.types.Context, now: Running) -> Answer:
-        """Check the thread; errors other than failures are bugs, which Blender prints."""
+    def _check(self, context: bpy.types.Context, running: Running) -> Answer:
+        """Put the result if the thread is done; Blender prints errors that are no `FAILURES`."""
         try:
             main_thread.serve()
-            if not now.done():
-                now.tell(context)
+            if not running.done():
+                running.tell(context)
                 return {"PASS_THROUGH"}
-            result, group = now.worker.result(), now.unchanged()
-            self._over(context, now)
-            self.put(context, group, now.job, result)
+            result, group = running.worker.result(), running.unchanged()
+            self._over(context, running)
+            self.put(context, group, running.job, result)
         except BaseException as error:
-            self._over(context, now)
+            self._over(context, running)
             if isinstance(error, FAILURES):
                 return fail(self, error)
             if not isinstance(error, Cancelled):
@@ -415,10 +415,10 @@ class Job:
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def _over(self, context: bpy.types.Context, now: Running) -> None:
+    def _over(self, context: bpy.types.Context, running: Running) -> None:
         if self._running is not None:
             self._running = None
-            now.over(context)
+            running.over(context)
 
 
 def unregister() -> None:

@@ -122,11 +122,14 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
 
 
 class _Applied(NamedTuple):
+    """The result, and the change of each object."""
+
     result: Result
     changes: list[Change]
 
     @property
     def stopped(self) -> BaseException | None:
+        """See `Result.stopped`, which `Worker` reads."""
         return self.result.stopped
 
 
@@ -137,7 +140,7 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
     bl_label = "Apply"
     bl_options = {"UNDO"}
     doing = "Pruning splats"
-    offers = REFITTING
+    partial_step = REFITTING
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Delete at once; merge and refit on a thread."""
@@ -172,7 +175,7 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
         outcome = splat_group.apply(group, applied.changes)
         plans.refresh(context)
         psnr = result.report["estimated_psnr"]
-        reported = scoring_notes(result.scores)  # after scoring
+        reported = scoring_notes(result.scores)  # *Score* showed them
         for note in result.report["notes"]:
             if note not in reported:
                 self.report({"INFO"}, note)
@@ -253,7 +256,7 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
     def compute(job: Any, progress: Progress) -> tuple[Comparison, float | None]:
         """Both pictures of the kept splats; the estimated PSNR, dB."""
         arguments, splats, view, _ = job
-        pruned = 0.6 if arguments["method"].changes else 0.1  # share of the time until then
+        pruned = 0.6 if arguments["method"].changes else 0.1  # share of the time that pruning takes
         result = prune(**arguments, partial=True, progress=part(progress, 0.0, pruned))
         kept = result.merged.splats if result.merged else splats.take(result.keep)
         (comparison,) = compare(splats, kept, view, progress=part(progress, pruned, 1.0))

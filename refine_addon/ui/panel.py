@@ -69,6 +69,7 @@ class REFINE_OT_view(bpy.types.Operator):
 
 
 def _instances(context: bpy.types.Context) -> str:
+    """A need: the active object instances splats."""
     obj = context.object
     if obj is not None and not mesh_layout.looks_like_splats(obj) and any(placings([obj])):
         return ""
@@ -299,8 +300,8 @@ class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):
 
 
 def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
-    """Draw the running operator's progress, last of all:
-    in a panel, Blender 4.3 replaces a bar by a label drawn later."""
+    """Draw the progress if one of these operators runs. Called last in a panel, since Blender 4.3
+    replaces a bar by a label that is drawn later."""
     now = operator_bases.now()
     if now is not None and now.operator in names:
         layout.progress(factor=now.factor, text=now.share)
@@ -374,6 +375,7 @@ def _record(obj: bpy.types.Object | None) -> dict[str, Any] | None:
 
 
 def _model_is_open(obj: bpy.types.Object) -> bool:
+    """Whether the user can choose the model: the file does not name it, or it was chosen."""
     try:
         layout = mesh_layout.layout_of(obj)
     except RefineError:

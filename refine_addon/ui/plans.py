@@ -39,14 +39,14 @@ REST = 0.2  # Seconds without a change after which a slider rests
 WAYS: dict[str, Way] = {"occlusion": "delete", "merge": "merge", "refit": "refit"}
 """What each method does after scoring with occlusion."""
 
-_last: list[tuple[Any, dict[str, Any]]] = []  # The last plan after its key; or none
+_last: list[tuple[Any, dict[str, Any]]] = []  # The last plan, behind its key; empty without one
 
 _waiting: list[tuple[str, str]] = []
 """Scene and objects, by name, to be marked when the slider rests."""
 
 _values: dict[Hashable, Any] = {}  # What `cached` keeps
 
-_NOISE = 1e-6  # Difference between machines, relative to the largest number in a list
+_NOISE = 1e-6  # Largest difference between machines, relative to the largest number in a list
 
 _FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
 
@@ -76,8 +76,8 @@ def refresh(context: bpy.types.Context) -> None:
 
 
 def mark_again(context: bpy.types.Context) -> None:
-    """Renew soon the marks on protected and removed splats.
-    Of the active or first visible object, and of others selected, marked, searched or scored."""
+    """Renew the marks on protected and removed splats soon: of the active object or the first
+    visible one, and of all that are selected, marked, scored, or searched for floaters."""
     active = getattr(context, "object", None)
     objects = [obj for obj in context.scene.objects if mesh_layout.looks_like_splats(obj)]
     first = [active] if active in objects else [obj for obj in objects if obj.visible_get()][:1]
@@ -137,7 +137,7 @@ def price(plan: dict[str, Any] | None, method: str) -> str:
 
 
 def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
-    """What the cameras of a scoring (`record`) cannot tell of a plan without an error."""
+    """The panel's warnings on a plan without an error; `record`: of its scoring."""
     alignment = Alignment.from_facts(record.get("alignment"))
     curve, share, texts = plan["quality"], plan["share"], [alignment.turned()]
     if record["views_used"] == 1:
@@ -204,15 +204,16 @@ def _rested() -> None:
 
 
 def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> None:
-    """Plan for each object, the first one last, or mark its demands if it has no scores."""
+    """Plan for each object, or mark its demands if it has no scores.
+    One plan does for all objects of a scene. The first object's comes last, and so is kept."""
     done: set[bpy.types.Object] = set()
-    firsts = []
+    leading = []  # an object of each scene
     for obj in objects:
         if obj not in done:
-            firsts.append(obj)
+            leading.append(obj)
             done.update(splat_group.chosen(bpy.context.view_layer, obj) if _can_have(obj) else [])
     bpy.context.view_layer.update()  # or volumes that a script moved are still elsewhere
-    for obj in reversed(dict.fromkeys(firsts)):
+    for obj in reversed(dict.fromkeys(leading)):
         if _can_have(obj):
             try:
                 plan = _plan(scene, obj)
@@ -320,6 +321,7 @@ def _marked(obj: bpy.types.Object, kind: int) -> list[int]:
 
 
 def _cameras(context: bpy.types.Context) -> list[Any]:
+    """Numbers by which a change of the deciding cameras is noticed, JSON."""
     scene, settings = context.scene, context.scene.refine
     if settings.source == "FRAMES":
         frames = settings.to_frames(scene)
@@ -331,7 +333,7 @@ def _cameras(context: bpy.types.Context) -> list[Any]:
         return chosen
     (width, height), aspect = render_size(scene)
     numbers = np.array([_numbers(camera, (width, height, aspect)) for camera in cameras])
-    # The same in any order, and of the same length however many there are: (2, C).
+    # Means and root mean squares, (2, C), which do not depend on the order of cameras.
     means = np.array([numbers.mean(axis=0), np.sqrt((numbers**2).mean(axis=0))])
     axes, place, rest = np.split(means, (9, 12), axis=1)
     return [*chosen, axes.ravel().tolist(), place.ravel().tolist(), *rest.T.tolist()]
@@ -385,8 +387,8 @@ def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
     shapes = volumes | {obj.data for obj in volumes}
     for update in depsgraph.updates if volumes else ():
         original = update.id.original
-        splats = update.is_updated_transform and isinstance(original, bpy.types.Object)
-        if original in shapes or (splats and mesh_layout.looks_like_splats(original)):
+        moved = update.is_updated_transform and isinstance(original, bpy.types.Object)
+        if original in shapes or (moved and mesh_layout.looks_like_splats(original)):
             mark_again(bpy.context)
             return
 

@@ -137,6 +137,8 @@ def decimal(value: float) -> float:
 
 
 class _Preferred:
+    """Settings of the scene that have a default in the preferences."""
+
     method: EnumProperty(
         name="Method",
         description="How splats are pruned, from instant to best",

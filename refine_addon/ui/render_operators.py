@@ -25,9 +25,9 @@ _ENDS = (Cancelled, *FAILURES, RuntimeError)  # Exceptions that end a render and
 
 IMAGE = "Render with Splats"  # Name of the image with the last frame
 
-_ENDS_UNSEEN = bpy.app.version < (5, 0, 0)
-"""Blender frees a running render's GPU data unless a window shows its scene. See its
-`RE_FreeUnusedGPUResources`; one frame in sixty ended Blender 4.3 on X11."""
+_NEEDS_WINDOW = bpy.app.version < (5, 0, 0)
+"""Whether Blender frees the GPU data of a running render whose scene no window shows (its
+`RE_FreeUnusedGPUResources`). One frame in 60 crashed Blender 4.3 on X11."""
 
 _SETTLED = 0.5  # Seconds after a render until windows have drawn; see `_draw_whole`
 
@@ -39,7 +39,8 @@ _LINGERS = 10.0  # Seconds that `NOTICE` stays after the render
 
 _until: list[float] = []  # Time until which `NOTICE` is shown
 
-_watched: list[engine.Shared] = []  # The render that Esc stops; `_watch_anew` makes a new list
+_watched: list[engine.Shared] = []
+"""The render that Esc stops. A watcher keeps the list of its start, and ends once that is empty."""
 
 
 def _watch_anew(shared: engine.Shared) -> None:
@@ -60,8 +61,8 @@ def no_render(_context: bpy.types.Context) -> str:
 class REFINE_OT_watch_render(bpy.types.Operator):
     """Stop a render with splats at Esc, which Blender's render gets as well"""
 
-    # Blender passes an event first to the modal operator that started last. Its render takes Esc
-    # away from all others, even if it has just ended by itself and so is not stopped.
+    # Blender passes an event first to the modal operator that started last. Blender's own render
+    # passes Esc to no other, even if it has just ended by itself and so is not stopped.
     bl_idname = "refine.watch_render"
     bl_label = "Watch a Render"
     bl_options = {"INTERNAL"}
@@ -87,7 +88,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     bl_label = "Render with Splats"
     bl_options = {"REGISTER"}
     needs = (idle, no_render)
-    doing, offers = "Rendering", ""
+    doing, partial_step = "Rendering", ""
 
     animation: BoolProperty(
         name="Animation",
@@ -152,8 +153,8 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         self._next: meshes.Step | None = None
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
-        """Take the last render's result, or start the next one at the next event:
-        a render that begins would drop an Esc that waits behind this event."""
+        """Take the last render's result, or start the next render. One event does one of both: a
+        render that begins would drop an Esc that waits behind the event."""
         try:
             step, self._next = self._next, None
             undone = step is not None and step.scene not in bpy.data.scenes
@@ -185,7 +186,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         display = view.render_display_type
         if self._opened:
             view.render_display_type = "NONE"
-        shows = _ENDS_UNSEEN and step.what == "meshes"
+        shows = _NEEDS_WINDOW and step.what == "meshes"
         if shows:
             context.window.scene = bpy.data.scenes[step.scene]
         try:
@@ -233,7 +234,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         if self._steps is not None:
             self._steps.close()
             self._steps = None
-        if _ENDS_UNSEEN and not bpy.app.background:
+        if _NEEDS_WINDOW and not bpy.app.background:
             bpy.app.timers.register(_draw_whole, first_interval=_SETTLED)
         if self._running is not None:
             self._running.over(context)

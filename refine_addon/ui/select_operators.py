@@ -178,6 +178,7 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
 
 
 def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The chosen splats, (N,); `RefineError` if there are none."""
     if not chosen.any():
         raise RefineError(f"object '{obj.name}': no splat is selected")
     return chosen

@@ -50,7 +50,7 @@ MODES = (
     ("INTERSECT", "Intersect", "Deselect all but these splats (Shift Ctrl)", "SELECT_INTERSECT", 3),
 )
 
-_STEP = 0.03  # Seconds between two looks at the thread that sees the view
+_STEP = 0.03  # Seconds between two looks at the thread that computes what the view shows
 
 LEAST_SIDE = 2  # Pixels: a narrower box or lasso was a click, which selects nothing
 
@@ -143,8 +143,8 @@ class Stroke:
     def _taken(self, seen: Sight) -> NDArray[np.bool_]:
         (x, y), (u, v) = self.path[0], self.path[-1]
         if self.shape == "BRUSH":
-            for place in range(self._painted, len(self.path)):
-                ends = self.path[max(place - 1, 0)], self.path[place]
+            for index in range(self._painted, len(self.path)):
+                ends = self.path[max(index - 1, 0)], self.path[index]
                 picking.paint(self._area, *ends, self._brush)
             self._painted = len(self.path)
             return seen.in_area(self._area, hidden=self._hidden)
@@ -298,7 +298,7 @@ _OBJECT_KEYS = (
     _key("refine.grow_selection", "NUMPAD_MINUS", ("shrink", True), ctrl=True),
     *(_key("refine.delete", key, ("what", "SELECTED")) for key in ("X", "DEL")),
 )
-"""Keys in object mode, besides the mouse. In edit mode Blender's own do."""
+"""Keys of the tools in object mode, besides the mouse; edit mode has Blender's own."""
 
 
 def _draw_settings(

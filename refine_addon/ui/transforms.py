@@ -99,8 +99,8 @@ def of(obj: bpy.types.Object) -> Drift | None:
     return _drifts[key]
 
 
-def _in_view(context: Context) -> list[str]:
-    """A line for each object in a view that needs mending: the panel may be closed."""
+def _warnings(context: Context) -> list[str]:
+    """A sentence for each visible object that needs mending, as the panel may be closed."""
     return [
         f"'{obj.name}' was transformed by Blender's own tools: Mend Splats in the tab REFINE"
         for obj in context.visible_objects
@@ -138,6 +138,7 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
 
 @persistent
 def _changed(*_: object) -> None:
+    """Forget all drift after undo, redo and loading; stamp new splats soon."""
     _drifts.clear()
     if any(_is_new(data) for data in (*bpy.data.meshes, *bpy.data.pointclouds)):
         _stamp_soon()
@@ -169,12 +170,12 @@ def _stamp() -> None:
 
 def register() -> None:
     """Have the 3D views warn of drift."""
-    viewport_draw.warned_by.append(_in_view)
+    viewport_draw.warned_by.append(_warnings)
 
 
 def unregister() -> None:
     """Undo `register`."""
-    viewport_draw.warned_by.remove(_in_view)
+    viewport_draw.warned_by.remove(_warnings)
     if bpy.app.timers.is_registered(_stamp):
         bpy.app.timers.unregister(_stamp)
     _drifts.clear()
