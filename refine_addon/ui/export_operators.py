@@ -105,7 +105,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         before = self.filepath, self.suffix
         name = without_suffix(self.filepath)
         typed = self.filepath[len(name) :].lower()
-        if typed and self.suffix == self.settled:
+        if typed in SUFFIXES and self.suffix == self.settled:
             self.suffix = typed
         self.filepath = name + self.suffix
         self.settled = self.suffix

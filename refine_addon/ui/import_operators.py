@@ -27,7 +27,7 @@ from ..mesh import drift as mesh_drift
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from ..viewport import draw
-from . import properties
+from . import operator_bases, properties
 from .operator_bases import FAILURES, Answer, Job, Needing, described, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
@@ -60,7 +60,7 @@ class _Importing(Job, Needing, ImportHelper):
     def add_cameras(self, context: Context, views: ViewSet) -> bpy.types.Collection:
         """Camera objects in a new collection, which decides from now on."""
         scene, collection = context.scene, bpy.data.collections.new("Cameras")
-        target_collection(context).children.link(collection)
+        operator_bases.target_collection(context).children.link(collection)
         cameras = create_cameras(views, collection, upright=self.upright)
         scene.refine.collection = collection
         scene.refine.source = "COLLECTION"
@@ -149,12 +149,6 @@ def suggest_resolution(operator: Any, context: Context) -> None:
     """Default of ``set_resolution``: true where nobody has chosen size or camera."""
     if not operator.properties.is_property_set("set_resolution"):
         operator.set_resolution = _is_untouched(context.scene)
-
-
-def target_collection(context: Context) -> bpy.types.Collection:
-    """Active collection, or the scene's where that is a library's."""
-    active = context.collection
-    return context.scene.collection if active is None or active.library else active
 
 
 def cameras_beside(folder: Path) -> Path | None:
@@ -303,7 +297,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         obj = bpy.data.objects.new(mesh.name, mesh)
         if self.upright:
             obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
-        target_collection(context).objects.link(obj)
+        operator_bases.target_collection(context).objects.link(obj)
         for note in mesh_attributes.import_notes(file):
             self.report({"WARNING"}, note)
         return obj

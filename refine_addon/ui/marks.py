@@ -19,7 +19,7 @@ from ..mesh import selection
 from ..mesh.layout import SplatObject
 from ..objects import demands, splat_group
 from ..objects.demands import Demands
-from . import plans
+from . import operator_bases, plans
 from .operator_bases import Answer, AtOnce, Job, Needing, OnSplats, idle, on_splats, tooltips
 from .operators import chosen_views
 
@@ -119,7 +119,7 @@ def _new_empty(
         away = np.linalg.norm(means - (low + high) / 2.0, axis=1)
         obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), _LEAST_HALF),) * 3
     obj.show_in_front = True
-    context.collection.objects.link(obj)
+    operator_bases.target_collection(context).objects.link(obj)
     for other in context.selected_objects:
         other.select_set(False)
     obj.select_set(True)

@@ -277,6 +277,12 @@ def scored(context: bpy.types.Context) -> str:
     return "" if mesh_scores.record(context.object.data) else "Score the splats first"
 
 
+def target_collection(context: bpy.types.Context) -> bpy.types.Collection:
+    """Active collection, or the scene's where that is a library's."""
+    active = context.collection
+    return context.scene.collection if active is None or active.library else active
+
+
 def tooltips(name: str, items: Sequence[Sequence[Any]]) -> Any:
     """A `description` for an operator: the tooltip of the enum item that its button sets."""
 

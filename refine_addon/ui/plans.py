@@ -283,9 +283,9 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
 
 
 def stale(context: bpy.types.Context, *objects: bpy.types.Object) -> list[str]:
-    """Changes since any object was scored, in few words; none without an origin."""
+    """Changes since any object was scored, in few words; none without an origin or in edit mode."""
     changes: dict[str, None] = {}
-    for obj in objects:
+    for obj in (each for each in objects if each.mode != "EDIT"):  # there marks cannot be read
         record = mesh_scores.record(obj.data) or {}
         now = origin(context, obj)
         try:

@@ -50,6 +50,16 @@ def test_all_formats_can_be_dropped_and_picked(addon):
     assert {module.REFINE_FH_ply, module.REFINE_FH_cameras} <= set(addon.registration.CLASSES)
 
 
+@pytest.mark.parametrize(
+    ("typed", "name"), [("a", "a.ply"), ("a.SPZ", "a.spz"), ("a.ksplat", "a.ply")]
+)
+def test_a_typed_suffix_chooses_the_format_if_it_is_written(addon, typed, name):
+    """*Format* has no entry for one that is only read."""
+    browser = SimpleNamespace(filepath=typed, suffix=".ply", settled=".ply")
+    addon.ui.export_operators.REFINE_OT_export_ply.check(browser, bpy.context)
+    assert (browser.filepath, browser.suffix) == (name, name[1:])
+
+
 @pytest.mark.usefixtures("addon")
 def test_a_level_of_a_streamed_sog_is_imported():
     """76 of 151 splats and 15 of the environment, in an object of its folder's name."""

@@ -242,6 +242,14 @@ def test_marks_are_added_released_and_cleared(addon, quarter, unchanged, kind):
     assert "refine_force" not in obj.data.attributes
 
 
+def test_in_edit_mode_no_mark_is_said_to_have_changed(addon, quarter, crop):
+    """There marks cannot be read."""
+    bpy.ops.refine.score()
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert stale(addon, quarter) == []
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
 def test_a_volume_that_changed_asks_for_new_scores(addon, quarter, crop):
     """Moved, or a corner of its mesh pulled; what had to go has no score, and none is guessed."""
     settings, objects = bpy.context.scene.refine, bpy.data.objects
@@ -380,6 +388,18 @@ NO_VOLUMES = {
     "camera": "is of type CAMERA, expected a mesh, or an empty",
     "far": "holds the centre of no splat (they lie from",
 }
+
+
+def test_beside_a_linked_collection_a_volume_is_put_into_the_scene(quarter, tmp_path):
+    """The active collection takes no object of this file."""
+    scene, layer, path = bpy.context.scene, bpy.context.view_layer, str(tmp_path / "set.blend")
+    bpy.data.libraries.write(path, {bpy.data.collections.new("set")}, fake_user=True)
+    with bpy.data.libraries.load(path, link=True) as (_, wanted):
+        wanted.collections = ["set"]
+    scene.collection.children.link(wanted.collections[0])
+    layer.active_layer_collection = layer.layer_collection.children[0]
+    bpy.ops.refine.add_volume(shape="BOX", role="KEEP")
+    assert set(scene.collection.objects) == {quarter, scene.refine.volumes[0].object}
 
 
 def test_what_is_no_volume_is_refused_by_name(addon, quarter, room_cameras, capsys, unchanged):
