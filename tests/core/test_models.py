@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from refine_addon.core import (
+    Budget,
+    ClosedForm,
     Levels,
     RefineError,
     View,
     ViewSet,
     convert_files,
     lod_file,
+    prune_tiles,
     read_splats,
     score_file,
 )
@@ -127,6 +130,18 @@ def test_a_model_that_cannot_be_is_refused(tmp_path):
 
 
 VIEW = View(np.eye(3), np.zeros(3), 100.0, 110.0, 60.3, 41.7, 120, 80, near=0.2)
+
+
+def test_tiles_of_discs_may_state_them_in_either_way(tmp_path):
+    """One has no third scale, the other a comment; together they are pruned as one scene."""
+    discs = before_the_camera(20, 0.1, "2dgs")
+    tiles = [tmp_path / "flat.ply", tmp_path / "said.ply"]
+    write(tiles[0], discs)
+    write(tiles[1], replace(discs, model="default"), ["SplatRenderMode: 2dgs"])
+
+    assert b"scale_2" not in tiles[0].read_bytes()
+    stats = prune_tiles(tiles, None, ViewSet((VIEW,)), Budget(ratio=0.5), ClosedForm())
+    assert stats["kept"] == 20
 
 
 def footprints_of(splats):

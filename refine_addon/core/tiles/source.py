@@ -130,11 +130,11 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
 def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
     """Copy tiles to files of a new folder, of their widest types and highest degree, else 0."""
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
-    kinds = [splats_from_columns(np.empty(0, each)) for each in dtypes] if len(dtypes) > 1 else []
+    empty = [with_model(splats_from_columns(np.empty(0, each)), tiles[0].model) for each in dtypes]
+    kinds = empty if len(dtypes) > 1 else []
     pieces = [(tile, part.start, part.stop) for tile in tiles for part in chunks(tile.splats, ROWS)]
 
     def read(piece: tuple[Tile, int, int]) -> Splats:
-        splats = joined([*kinds, splats_from_columns(rows_of(*piece))])
-        return with_model(splats, piece[0].model)
+        return joined([*kinds, with_model(splats_from_columns(rows_of(*piece)), piece[0].model)])
 
     return on_disk(folder, run(read, pieces, progress=progress, what="reading", threads=threads))
