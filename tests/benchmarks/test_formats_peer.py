@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from refine_addon.core.formats import streamed_sog
 from refine_addon.core.formats.registry import format_named
 from refine_addon.core.formats.streamed_sog import StreamedSog, folder_for
 from refine_addon.core.splats import MODELS, base_color, opacity, rotation_matrices
-from tests.fuzz import version_1_of
 from tests.strategies import ply_of, splat_names
 
 pytestmark = [
@@ -44,10 +42,10 @@ EXACT[".splat"] = (*EXACT[".spz"][:4], 0.05, 1e-5)
 """Suffix -> largest differences between what the two read of one file: see `BOUNDS`."""
 
 
-def transformed(source: Path, target: Path, *options: str, before: tuple[str, ...] = ()) -> None:
+def transformed(source: Path, target: Path, *before: str) -> None:
     """Have splat-transform write `source` as `target`."""
     start = [*splat_transform.find(), "-g", "cpu", "-q", "-w", *before]
-    order = [*start, str(source), *options, str(target)]
+    order = [*start, str(source), str(target)]
     subprocess.run(order, check=True, timeout=300, capture_output=True)
 
 
@@ -126,36 +124,6 @@ def test_we_read_what_it_writes(tmp_path, suffix, degree):
     compare(ours, read_splats(source).splats().up_to_degree(ours.sh_degree), bounds)
 
 
-@pytest.mark.parametrize("version", ["3", "4"])
-def test_we_read_both_versions_of_spz_that_it_writes(tmp_path, version):
-    """By gzip and by zstd: the same splats."""
-    source, made = room(tmp_path, 2), tmp_path / "a.spz"
-    if version == "4":
-        pytest.importorskip("zstandard")
-    transformed(source, made, "--spz-version", version)
-
-    file = read_splats(made)
-
-    assert file.format == f"SPZ version {version}"
-    compare(file.splats(), read_splats(source).splats(), BOUNDS[".spz"])
-
-
-def test_of_a_sog_in_a_folder_and_of_version_1_both_read_the_same(tmp_path):
-    """Version 1 is one of version 2 with ends in place of tables: no tool at hand writes it."""
-    source, back = room(tmp_path, 1), tmp_path / "back.ply"
-    transformed(source, tmp_path / "sog/meta.json")
-    write_splats(tmp_path / "a.sog", read_splats(source))
-    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
-        files = version_1_of({name: archive.read(name) for name in archive.namelist()})
-    for name, data in files.items():
-        (tmp_path / name).write_bytes(data)
-
-    for made in (tmp_path / "sog/meta.json", tmp_path / "meta.json"):
-        transformed(made, back)
-        compare(read_splats(made).splats(), read_splats(back).splats(), EXACT[".sog"])
-    assert read_splats(tmp_path / "meta.json").format == "SOG version 1"
-
-
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_of_a_streamed_sog_of_ours_it_reads_every_level(tmp_path, level, monkeypatch):
     """Its splats are the source's and those that we read, in chunks of 100 or less."""
@@ -168,7 +136,7 @@ def test_of_a_streamed_sog_of_ours_it_reads_every_level(tmp_path, level, monkeyp
         for each in levels:
             scene.add(each)
         scene.publish(path, overwrite=False)
-    transformed(path, back, before=("-L", str(level)))
+    transformed(path, back, "-L", str(level))
 
     theirs, count = read_splats(back).splats(), len(levels[level])
 

@@ -3,47 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("numba")
-special = pytest.importorskip("scipy.special")
 
 import numba
 from numpy.typing import NDArray
 
 from benchmarks.renderer import rasterizer
-from benchmarks.renderer.rasterizer import Camera, Gaussians
-from refine_addon.core.splats import Splats, rotation_matrices
+from refine_addon.core.spherical_harmonics import colors
+from refine_addon.core.splats import Splats, opacity, opacity_logits, rotation_matrices
 from refine_addon.core.views import View
-
-BACKGROUND = (0.2, 0.5, 0.9)
-DC = math.sqrt(4.0 * math.pi)
-"""Coefficient of the constant harmonic that adds 1 to a colour."""
-
-
-class Plain(NamedTuple):
-    """The arrays `rasterizer.gaussians` takes, in its order."""
-
-    means: NDArray[np.float64]
-    scales: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
-    opacities: NDArray[np.float64]
-    harmonics: NDArray[np.float32]
-
-    def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Plain:
-        return Plain(*(values[index] for values in self))
-
-    def prepared(self) -> Gaussians:
-        return rasterizer.gaussians(*self)
-
+from tests.benchmarks.scenes import BACKGROUND, round_scene
 
 # ----- the plain renderer: the whole model of rasterizer.py's docstring, nothing clever
 
 
-def dense_geometry(scene: Plain, camera: Camera) -> list[tuple[float, ...]]:
+def dense_geometry(scene: Splats, camera: View) -> list[tuple[float, ...]]:
     """For each splat its index, depth, u, v and inverse 2D covariance, front to back."""
     drawn = []
     for i in range(len(scene.means)):
@@ -58,7 +37,7 @@ def dense_geometry(scene: Plain, camera: Camera) -> list[tuple[float, ...]]:
         jacobian = np.array(
             [[camera.fx / z, 0, -camera.fx * tx / z**2], [0, camera.fy / z, -camera.fy * ty / z**2]]
         )
-        axes = rotation_matrices(scene.quaternions[i]) @ np.diag(scene.scales[i])
+        axes = rotation_matrices(scene.quaternions[i]) @ np.diag(np.exp(scene.log_scales[i]))
         projected = jacobian @ camera.rotation @ axes
         inverse = np.linalg.inv(projected @ projected.T + 0.3 * np.eye(2))
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -66,50 +45,31 @@ def dense_geometry(scene: Plain, camera: Camera) -> list[tuple[float, ...]]:
     return sorted(drawn, key=lambda item: item[:2])
 
 
-def real_harmonic(band: int, order: int, direction: NDArray[np.float64]) -> float:
-    """Real spherical harmonic from scipy's associated Legendre functions (Condon-Shortley)."""
-    x, y, z = direction
-    m = abs(order)
-    norm = (2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m)
-    legendre = math.sqrt(norm) * float(special.lpmv(m, band, z))
-    if order == 0:
-        return legendre
-    phi = math.atan2(y, x)
-    return math.sqrt(2) * legendre * (math.cos(m * phi) if order > 0 else math.sin(m * phi))
-
-
-def dense_color(scene: Plain, camera: Camera, i: int) -> NDArray[np.float64]:
-    """Colour of splat `i` as seen from the camera."""
-    direction = scene.means[i] - camera.center
-    direction = direction / np.linalg.norm(direction)
-    degree = round(scene.harmonics.shape[1] ** 0.5) - 1
-    orders = [(band, order) for band in range(degree + 1) for order in range(-band, band + 1)]
-    basis = np.array([real_harmonic(band, order, direction) for band, order in orders])
-    return np.maximum(0.0, basis @ scene.harmonics[i].astype(np.float64) + 0.5)
-
-
 def dense_render(
-    scene: Plain, camera: Camera
+    scene: Splats, camera: View
 ) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
     """Image (H, W, 3) and the statistics that need one pass."""
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     image = np.zeros((camera.height, camera.width, 3))
     through = np.ones((camera.height, camera.width))
     finished = np.zeros((camera.height, camera.width), bool)
-    count = len(scene.means)
+    toward = scene.means - camera.center
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    shown = np.maximum(0.0, colors(toward, scene.sh_dc, scene.sh_rest))
+    opacities, count = opacity(scene.opacity_logits), len(scene)
     stats = {n: np.zeros(count) for n in ("weight_sum", "weight_max", "opacity_sum", "hits")}
     for _, i, u, v, inverse in dense_geometry(scene, camera):
         offset = np.stack([columns - u, rows - v], axis=-1)
         square = np.einsum("hwi,ij,hwj->hw", offset, inverse, offset)
-        alpha = np.minimum(0.99, scene.opacities[i] * np.exp(-0.5 * square))
+        alpha = np.minimum(0.99, opacities[i] * np.exp(-0.5 * square))
         covered = (alpha >= 1 / 255) & ~finished
         finished |= covered & (through * (1 - alpha) < 1e-4)
         hit = covered & ~finished
         weight = np.where(hit, alpha * through, 0.0)
-        image += weight[..., None] * dense_color(scene, camera, i)
+        image += weight[..., None] * shown[i]
         stats["weight_sum"][i] = weight.sum()
         stats["weight_max"][i] = weight.max()
-        stats["opacity_sum"][i] = scene.opacities[i] * through[hit].sum()
+        stats["opacity_sum"][i] = opacities[i] * through[hit].sum()
         stats["hits"][i] = hit.sum()
         through = np.where(hit, through * (1 - alpha), through)
     return image + through[..., None] * np.array(BACKGROUND), stats
@@ -118,42 +78,41 @@ def dense_render(
 # ----- scenes
 
 
-def random_camera(rng: np.random.Generator, width: int = 37, height: int = 29) -> Camera:
+def random_camera(rng: np.random.Generator, width: int = 37, height: int = 29) -> View:
     """Any place and direction; unequal focal lengths, principal point off the middle."""
-    return Camera(
+    return View(
         rotation_matrices(rng.normal(size=4)), rng.normal(size=3), 31.0, 27.0,
         width * 0.45, height * 0.6, width, height,
     )  # fmt: skip
 
 
 def random_scene(
-    rng: np.random.Generator, camera: Camera, count: int = 60, degree: int = 3, opaque: float = 0.5
-) -> Plain:
+    rng: np.random.Generator, camera: View, count: int = 60, degree: int = 3, opaque: float = 0.5
+) -> Splats:
     """Splats around the view's axis, some beside and behind; every shape from ball to needle."""
     local = rng.normal(size=(count, 3)) * [1.5, 1.5, 2.0] + [0, 0, 3.0]
-    return Plain(
+    opacities = np.where(
+        rng.random(count) < opaque, rng.uniform(0.9, 1.0, count), rng.random(count)
+    )
+    harmonics = rng.normal(0, 0.4, size=(count, (degree + 1) ** 2, 3)).astype(np.float32)
+    return Splats(
         local @ camera.rotation + camera.center,
-        np.exp(rng.normal(-1.5, 1.0, size=(count, 3))),
+        rng.normal(-1.5, 1.0, size=(count, 3)),
         rng.normal(size=(count, 4)),
-        np.where(rng.random(count) < opaque, rng.uniform(0.9, 1.0, count), rng.random(count)),
-        rng.normal(0, 0.4, size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
+        opacity_logits(opacities),
+        harmonics[:, 0],
+        harmonics[:, 1:],
     )
 
 
-CAMERA = Camera(np.eye(3), np.zeros(3), 20.0, 20.0, 16.5, 16.5, 32, 32)
+CAMERA = View(np.eye(3), np.zeros(3), 20.0, 20.0, 16.5, 16.5, 32, 32)
 """At the origin, axes of the world, principal point at the centre of pixel (16, 16)."""
 
 
-def single(scale: float, opacity: float, z: float = 2.0) -> Plain:
-    """One ball on the axis, of colour (1, 0.5, 0)."""
-    dc = DC * (np.array([1.0, 0.5, 0.0]) - 0.5)
-    return Plain(
-        np.array([[0.0, 0.0, z]]),
-        np.full((1, 3), scale),
-        np.array([[1.0, 0.0, 0.0, 0.0]]),
-        np.array([opacity]),
-        dc.astype(np.float32)[None, None],
-    )
+def single(scale: float, alpha: float, z: float = 2.0, color=(1.0, 0.5, 0.0)) -> Splats:
+    """One ball on the axis; the constant harmonic is 1 / sqrt(4 pi)."""
+    dc = np.float32(math.sqrt(4.0 * math.pi) * (np.array([color]) - 0.5))
+    return replace(round_scene([[0.0, 0.0, z]], [opacity_logits(alpha)], scale), sh_dc=dc)
 
 
 # ----- tests
@@ -167,11 +126,11 @@ def test_a_single_splat_shows_as_its_projected_gaussian() -> None:
     0.0013 is below 1/255: nothing. The reference clamps alpha to 0.99, and colours at 0: SH + 0.5
     of -0.5 shows as 0, of 1.5 as 1.5.
     """
-    image = rasterizer.render(single(0.1, 0.6).prepared(), CAMERA)
-    over = rasterizer.render(single(0.1, 0.6).prepared(), CAMERA, background=(0.1, 0.2, 0.3))
-    opaque = rasterizer.render(single(0.1, 1.0).prepared(), CAMERA, background=(0, 0, 1.0))
-    harmonics = (DC * np.array([[[-1.0, 1.0, 0.0]]])).astype(np.float32)
-    cut = rasterizer.render(single(0.1, 0.5)._replace(harmonics=harmonics).prepared(), CAMERA)
+    ball = single(0.1, 0.6)
+    image = rasterizer.render(ball, CAMERA)
+    over = rasterizer.render(ball, CAMERA, background=(0.1, 0.2, 0.3))
+    opaque = rasterizer.render(single(0.1, 1.0), CAMERA, background=(0, 0, 1.0))
+    cut = rasterizer.render(single(0.1, 0.5, color=(-0.5, 1.5, 0.5)), CAMERA)
 
     np.testing.assert_allclose(over[16, 16], [0.64, 0.38, 0.12], rtol=1e-7)
     np.testing.assert_allclose(image[16, 18, 0], 0.6 * math.exp(-4 / 2.6), rtol=1e-6)
@@ -192,10 +151,8 @@ def test_pictures_and_statistics_are_those_of_a_dense_compositor(seed: int, opaq
     camera = random_camera(rng)
     scene = random_scene(rng, camera, count=150, degree=seed, opaque=opaque)
 
-    image = rasterizer.render(scene.prepared(), camera, background=BACKGROUND)
-    again, stats = rasterizer.render_with_statistics(
-        scene.prepared(), camera, background=BACKGROUND
-    )
+    image = rasterizer.render(scene, camera, background=BACKGROUND)
+    again, stats = rasterizer.render_with_statistics(scene, camera, background=BACKGROUND)
 
     expected_image, expected = dense_render(scene, camera)
     np.testing.assert_allclose(image, expected_image, rtol=0, atol=1e-10)
@@ -216,19 +173,10 @@ def test_the_removal_error_is_that_of_rendering_again_without_each_splat(opaque:
         without, _ = dense_render(scene.take(np.arange(len(scene.means)) != i), camera)
         expected.append(np.sum((without - everything) ** 2))
 
-    _, stats = rasterizer.render_with_statistics(scene.prepared(), camera, background=BACKGROUND)
+    _, stats = rasterizer.render_with_statistics(scene, camera, background=BACKGROUND)
 
     assert np.count_nonzero(expected) > 20
     np.testing.assert_allclose(stats.removal_error, expected, rtol=1e-9, atol=1e-18)
-
-
-def test_the_first_band_has_the_signs_of_the_reference_files() -> None:
-    """-0.4886 y, 0.4886 z, -0.4886 x: 0.4886 = sqrt(3 / 4 pi); others are in the pictures above."""
-    out = np.empty(25)
-
-    rasterizer.sh_basis(0.48, 0.6, 0.64, out)
-
-    np.testing.assert_allclose(out[1:4], 0.4886025119 * np.array([-0.6, 0.64, -0.48]))
 
 
 def test_a_splat_behind_or_beside_the_camera_adds_nothing() -> None:
@@ -237,25 +185,23 @@ def test_a_splat_behind_or_beside_the_camera_adds_nothing() -> None:
     The near plane is a parameter: at depth 0.2 nothing is drawn by default; with near = 0.1 it is.
     """
     beside = [(50.0, 0, 2.0), (-50.0, 0, 2.0), (0, 50.0, 2.0), (0, -50.0, 2.0)]
-    scenes = [single(0.1, 0.9)._replace(means=np.array([mean]))
-              for mean in [(0, 0, -2.0), (0, 0, 0.2), *beside]]  # fmt: skip
+    places = [(0, 0, -2.0), (0, 0, 0.2), *beside]
+    scenes = [replace(single(0.1, 0.9), means=np.array([place])) for place in places]
     for scene in [*scenes, scenes[0].take(np.zeros(0, np.int64))]:
-        image, stats = rasterizer.render_with_statistics(
-            scene.prepared(), CAMERA, background=BACKGROUND
-        )
+        image, stats = rasterizer.render_with_statistics(scene, CAMERA, background=BACKGROUND)
         np.testing.assert_array_equal(image, np.broadcast_to(BACKGROUND, image.shape))
         assert stats.hits.sum() == stats.removal_error.sum() == stats.weight_sum.sum() == 0
         assert len(stats.hits) == len(scene.means)
 
-    assert rasterizer.render(single(0.01, 0.9, z=0.2).prepared(), CAMERA, near=0.1).max() > 0.5
+    assert rasterizer.render(single(0.01, 0.9, z=0.2), CAMERA, near=0.1).max() > 0.5
 
 
 def test_the_number_of_threads_changes_no_bit_and_views_add_up() -> None:
     """Every tile sums for itself, and the tiles are merged in order; maxima over views are kept."""
     rng = np.random.default_rng(5)
     camera = random_camera(rng, 100, 70)
-    second = camera._replace(center=camera.center + 0.3)
-    scene = random_scene(rng, camera, count=300).prepared()
+    second = replace(camera, center=camera.center + 0.3)
+    scene = random_scene(rng, camera, count=300)
     before = numba.get_num_threads()
     results = []
     try:
@@ -277,26 +223,18 @@ def test_the_number_of_threads_changes_no_bit_and_views_add_up() -> None:
         np.testing.assert_array_equal(getattr(both, name), add(values, getattr(other, name)))
 
 
-def test_stored_splats_are_activated_and_broken_ones_left_out() -> None:
-    """Log scale, logit opacity, the constant harmonic first; a NaN anywhere is never drawn."""
+def test_splats_that_are_not_finite_are_left_out() -> None:
+    """A NaN or infinity anywhere is never drawn, nor a size beyond float64."""
     rng = np.random.default_rng(2)
     camera = random_camera(rng)
-    plain = random_scene(rng, camera, count=40)
-    splats = Splats(
-        plain.means,
-        np.log(plain.scales),
-        plain.quaternions,
-        np.log(plain.opacities / (1 - plain.opacities)),
-        plain.harmonics[:, 0],
-        plain.harmonics[:, 1:],
-    )
-    view = View(*camera)
+    splats = random_scene(rng, camera, count=40)
+    others = splats.take(np.delete(np.arange(40), [3, 7, 9, 11]))
     splats.means[3, 1] = np.nan
     splats.sh_rest[7, 2, 0] = np.inf
     splats.log_scales[9, 0] = 1e3
     splats.quaternions[11, 0] = np.nan
 
-    image = rasterizer.render(splats, view, background=BACKGROUND)
+    image = rasterizer.render(splats, camera, background=BACKGROUND)
 
-    expected, _ = dense_render(plain.take(np.delete(np.arange(40), [3, 7, 9, 11])), camera)
+    expected, _ = dense_render(others, camera)
     np.testing.assert_allclose(image, expected, rtol=0, atol=1e-10)
