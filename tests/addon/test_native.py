@@ -10,7 +10,7 @@ import pytest
 from tests.e2e.inside.clouds import FOUR, as_blender_imports, point_cloud, store
 from tests.strategies import ply_of
 
-from .conftest import export, keep_mask
+from .conftest import export, keep_mask, read
 
 COUNT = 9_939
 
@@ -54,10 +54,6 @@ def exported(addon, tmp_path):
         return addon.core.read_ply(path)
 
     return exported
-
-
-def read(addon, obj, name):
-    return addon.mesh.attributes.read_attribute(obj.data, name)
 
 
 def contents(addon, obj):
