@@ -141,7 +141,7 @@ def test_tiles_of_discs_may_state_them_in_either_way(tmp_path):
 
     assert b"scale_2" not in tiles[0].read_bytes()
     stats = prune_tiles(tiles, None, ViewSet((VIEW,)), Budget(ratio=0.5), ClosedForm())
-    assert stats["kept"] == 20
+    assert stats["splats"]["kept"] == 20
 
 
 def footprints_of(splats):
