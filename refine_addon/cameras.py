@@ -31,7 +31,7 @@ UPRIGHT[:3, :3] = QUARTER
 SENSOR = 36.0
 """Sensor width given to imported cameras, millimetres."""
 
-FLIP = np.array([1.0, -1.0, -1.0])
+FLIP = np.array([1.0, -1.0, -1.0])  # Axes of Blender's camera to those of a view, and back
 
 _RESIDUE = 3e-7  # Largest error of float32 in the zeros and ones of a quarter turn
 
@@ -149,8 +149,8 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
 
 
 def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -> int | None:
-    """Quarter turns about x (0, 1, -1) that turn an imported camera as its file has it; None if
-    none does. `axes`: (3, 3) rotation to the world of an object with splats as in their file."""
+    """Quarter turns about x (0, 1, -1) after which an imported camera looks as in its file; None if
+    after none. `axes`: (3, 3) rotation to the world of an object with splats as in their file."""
     source = _source(obj)
     if not source:
         return None

@@ -28,7 +28,7 @@ _calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQ
 
 def call(function: Callable[[], Any]) -> Any:
     """Result of a function called on the main thread: at once if this is it, else by `serve`.
-    Raises the function's error, or `Cancelled`, after which it may run or not."""
+    Raises the function's error, or `Cancelled`; the function may have been called even then."""
     if threading.current_thread() is threading.main_thread():
         return function()
     answer: Future[Any] = Future()

@@ -37,9 +37,9 @@ _SAMPLE = 1 << 15  # Splats looked at for the panel's text, spread evenly
 
 
 class Drift(NamedTuple):
-    """Sentences on drift (`told`), and whether Mend Splats repairs it."""
+    """Sentences on drift, and whether Mend Splats repairs it."""
 
-    told: list[str]
+    sentences: list[str]
     mendable: bool
 
 
@@ -101,8 +101,7 @@ def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
 
 
 def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Callable[[], Mending] | None:
-    """Read the notes now; return a thread-safe callable that computes the repair, None if nothing
-    changed."""
+    """Read the notes; a thread-safe callable that computes the repair, None if nothing changed."""
     if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
         return None
     return lambda: Mending(notes.moves()[0], notes.regrouped())

@@ -162,7 +162,7 @@ def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
 
 
 def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Splats marked by hand with `PROTECT` or `MUST_GO`, (N,); None if none is."""
+    """Splats marked by hand with `PROTECT` or `MUST_GO`, (N,); None without the attribute."""
     marked = has(obj.data, name, "BOOLEAN")
     return mesh_attributes.read_attribute(obj.data, name) if marked else None
 

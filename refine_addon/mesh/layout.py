@@ -221,8 +221,8 @@ def lost_base(obj: bpy.types.Object) -> bool:
     if obj.type != "POINTCLOUD":
         return False
     attributes = obj.data.attributes
-    rest = SCALE in attributes and ROTATION in attributes and "f_dc_0" not in attributes
-    return rest and BASE not in attributes
+    others = SCALE in attributes and ROTATION in attributes and "f_dc_0" not in attributes
+    return others and BASE not in attributes
 
 
 def check(obj: bpy.types.Object) -> SplatObject:

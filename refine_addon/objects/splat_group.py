@@ -181,7 +181,7 @@ def drift_notes(checked: SplatObject) -> list[str]:
     if drift is None:
         return []
     remedy = "; Mend Splats in the panel puts that right" if drift.mendable else ""
-    return [f"object '{checked.obj.name}': {told}{remedy}" for told in drift.told]
+    return [f"object '{checked.obj.name}': {sentence}{remedy}" for sentence in drift.sentences]
 
 
 def store(

@@ -25,8 +25,8 @@ def available() -> bool:
 
 
 def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], NDArray[np.float64]]:
-    """Return a function that draws like `core.pictures.draw`, to be called on the main thread.
-    Sorting and packing happen at once, on any thread. Perspective and constant colours only."""
+    """A function that draws like `core.pictures.draw`, to be called on the main thread.
+    Splats are sorted and packed now, on any thread. Perspective and constant colours only."""
     matrix = np.empty((3, 4))  # world to camera: x right, y up, z back
     matrix[:, :3] = np.array([1.0, -1.0, -1.0])[:, None] * view.rotation
     matrix[:, 3] = -matrix[:, :3] @ view.center
@@ -44,12 +44,12 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
     rows, depths = in_front(packed.means, eye, near)
     rows = rows[depths < view.far]
     order = rows[farthest_first(depths[depths < view.far], perspective=True)]
-    limits = []  # window depths of the layers, which part the splats, the lowest row first
+    limits = []  # window depths of the layers between which splats are drawn, lowest row first
     for depth in () if layers is None else layers.depths:
         away = np.maximum(depth[::-1], near)
         ndc = (projection[2, 2] * -away + projection[2, 3]) / away
         limits.append((0.5 * ndc + 0.5).astype(np.float32))
-    everything = np.ones((1, 1), np.float32)
+    farthest = np.ones((1, 1), np.float32)
     textures = {
         "order": (as_texture(order), 1, "R32F"),
         "means": (as_texture(means), 4, "RGBA32F"),
@@ -58,8 +58,8 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
         "colors": (as_texture(colors(packed)), 4, "RGBA16F"),
         "selection": (as_texture(np.zeros(len(packed), np.float32)), 1, "R32F"),
         "matrices": (matrix.astype(np.float32).reshape(1, 12), 4, "RGBA32F"),
-        "depths": (everything, 1, "R32F"),
-        "near_depths": (everything, 1, "R32F"),
+        "depths": (farthest, 1, "R32F"),
+        "near_depths": (farthest, 1, "R32F"),
     }
 
     def paint() -> NDArray[np.float64]:

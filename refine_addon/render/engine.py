@@ -237,6 +237,7 @@ def steps(
 
 
 def _whole(scene: bpy.types.Scene, what: str) -> str:
+    """Name of a new copy of the scene that the engine renders."""
     copy = meshes.copied(scene, what)
     copy.render.engine = REFINE_engine.bl_idname
     copy.render.use_overwrite, copy.render.use_placeholder = True, False  # see `_is_there`

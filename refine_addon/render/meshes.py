@@ -220,16 +220,16 @@ def _nodes(tree):
 
 
 def _is_clear(node: bpy.types.Node, glass: bool) -> bool:
-    def between(name: str, opaque: float) -> bool:
+    def differs(name: str, opaque: float) -> bool:
         socket = node.inputs.get(name)
         return socket is not None and (socket.is_linked or socket.default_value != opaque)
 
     if node.type in {"BSDF_TRANSPARENT", "HOLDOUT"}:
         return True
     if node.type == "BSDF_PRINCIPLED":
-        return between("Alpha", 1.0) or (glass and between("Transmission Weight", 0.0))
+        return differs("Alpha", 1.0) or (glass and differs("Transmission Weight", 0.0))
     if node.type == "EEVEE_SPECULAR":
-        return between("Transparency", 0.0)
+        return differs("Transparency", 0.0)
     return glass and node.type in {"BSDF_GLASS", "BSDF_REFRACTION"}
 
 

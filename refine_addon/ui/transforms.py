@@ -111,7 +111,7 @@ def _warnings(context: Context) -> list[str]:
 def draw(layout: bpy.types.UILayout, context: Context, objects: Sequence[bpy.types.Object]) -> None:
     """Draw the objects' drift, and the buttons that move splats."""
     drifts = [drift for drift in map(of, objects) if drift]
-    for sentence in dict.fromkeys(s for drift in drifts for s in drift.told):
+    for sentence in dict.fromkeys(s for drift in drifts for s in drift.sentences):
         wrapped.label(layout, context, sentence, icon="ERROR")
     if any(drift.mendable for drift in drifts):
         layout.operator("refine.mend", icon="MODIFIER")

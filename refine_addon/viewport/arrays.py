@@ -30,8 +30,8 @@ MOST = 1 << 24  # Splats drawn at most: their order is stored as float32, exact 
 STAYS, GOES = 1, 2  # Protected, and removed by the user, as in `mesh.edit.FORCE`
 
 MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (0.45, 0.0, 1.0)}
-"""Green and violet tints. They show on white and black, and differ from the heat map, from the tint
-of the budget, and from `SELECTED`."""
+"""Turquoise and violet tints. They show on white and black, and differ from the heat map, from the
+tint of the budget, and from `SELECTED`."""
 
 SELECTED, SELECTED_SHARE = (1.0, 0.1, 0.75), 0.6  # Tint of selected splats, and its share
 

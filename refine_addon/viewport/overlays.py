@@ -31,7 +31,7 @@ WORDS = {"HEAT": ("goes first", "goes last"), "STAYS": ("What stays",), "GOES": 
 
 MARKED = {STAYS: "Protected", GOES: "Must go"}  # Text beside tints of protected and removed splats
 
-_REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}  # Marks and modes that show no splat with them
+_REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}  # Mark and a mode in which no splat has it
 
 _WIDE, _HIGH, _EDGE, _FONT = 220, 10, 16, 12  # pixels at scale 1
 _GAP = 6  # between the bar and the words above it
@@ -69,6 +69,7 @@ def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
 
 
 def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
+    """Draw an object's see-through faces over the splats."""
     shading = context.space_data.shading
     materials = [slot.material for slot in obj.material_slots] or [None]
     colors = np.array([_color(obj, material, shading) for material in materials], np.float32)

@@ -146,6 +146,7 @@ class View:
         return now - self._changed < REST
 
     def _take(self) -> None:
+        """Take order and colours from the thread if it is done."""
         if self._job is None or not self._job[2].done():
             return
         order_key, colors_key, future = self._job
@@ -174,6 +175,7 @@ class View:
         self._job = (key, colors_key, work)
 
     def _sort(self, key, shown, camera, mode, most):
+        """Sort the `most` most important splats, unless that is done."""
         if self._order is None or self._order.key != key:
             order = _order(_parts(shown, camera), camera.near, mode, most)
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
@@ -290,6 +292,7 @@ def _depths(size: tuple[int, int]) -> NDArray[np.float32] | None:
 
 
 def _put(picture: gpu.types.GPUTexture) -> None:
+    """Draw a picture of splats into the view."""
     program, quad = shader.picture()
     gpu.state.blend_set("ALPHA_PREMULT")
     gpu.state.depth_test_set("NONE")

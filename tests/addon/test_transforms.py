@@ -52,7 +52,7 @@ def assert_alike(got, expected):
 def told_of(addon, obj):
     """Return what the panel says that others did to an object's splats."""
     drift = addon.ui.transforms.of(obj)
-    return drift.told if drift else []
+    return drift.sentences if drift else []
 
 
 def set_places(obj, places):

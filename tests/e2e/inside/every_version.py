@@ -95,7 +95,7 @@ def mended(step, form, cloud):
     extension.select(*objects)
     bpy.ops.object.join() if step == "join" else bpy.ops.object.transform_apply()
     left = [obj for obj in bpy.context.scene.objects if obj.type == form]
-    said = [drift.of(obj).told for obj in left if drift.of(obj)]
+    said = [drift.of(obj).sentences for obj in left if drift.of(obj)]
     extension.select(*left)
     bpy.ops.refine.mend()
     still = [obj.name for obj in left if drift.of(obj)]

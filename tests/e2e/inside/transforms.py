@@ -138,7 +138,7 @@ def splats(but=None):
 def said():
     """Return what the panel says of the splats."""
     drift = extension.module("ui.transforms").of(splats())
-    return drift.told if drift else []
+    return drift.sentences if drift else []
 
 
 def look(hand, name):
