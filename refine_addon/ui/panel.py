@@ -71,9 +71,9 @@ class REFINE_OT_view(bpy.types.Operator):
 def _instances(context: bpy.types.Context) -> str:
     """A need: the active object instances splats."""
     obj = context.object
-    if obj is not None and not mesh_layout.looks_like_splats(obj) and any(placings([obj])):
-        return ""
-    return "Select an empty that instances a collection with splats"
+    if obj is None or mesh_layout.looks_like_splats(obj) or not any(placings([obj])):
+        return "Select an empty that instances a collection with splats"
+    return "Make the empty local first: a library has it" if obj.library else ""
 
 
 class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):

@@ -93,3 +93,16 @@ def test_a_linked_collection_is_made_real(quarter, tmp_path):
     real = bpy.context.object
     assert [real.library, real.data.library] == [None, None]
     assert len(real.data.vertices) == 9_939
+
+
+def test_a_linked_empty_is_not_made_real(quarter, tmp_path):
+    """Its copies would lie in no collection of this file."""
+    empty, path = instanced(quarter), str(tmp_path / "set.blend")
+    bpy.data.libraries.write(path, {empty}, fake_user=True)
+    with bpy.data.libraries.load(path, link=True) as (_, wanted):
+        wanted.objects = [empty.name]
+    linked = wanted.objects[0]
+    bpy.context.scene.collection.objects.link(linked)
+    bpy.context.view_layer.objects.active = linked
+    bpy.context.view_layer.update()
+    assert not bpy.ops.refine.make_real.poll()
