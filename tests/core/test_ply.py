@@ -15,7 +15,7 @@ from refine_addon.core import RefineError, read_ply
 from refine_addon.core.formats import registry
 from refine_addon.core.formats.ply_columns import splats_from_columns, values_by_name
 from refine_addon.core.splats import ARRAYS
-from tests.hostile import refused, seconds
+from tests.hostile import refused
 from tests.strategies import TYPES, masks, plain_header, plain_ply, ply_files, ply_of, splat_names
 
 BINARY = ("binary_little_endian", "binary_big_endian")
@@ -296,16 +296,6 @@ def test_a_header_line_of_a_hundred_megabytes_costs_one(tmp_path):
         stream.write(b"ply\nformat ascii 1.0\ncomment ")
         stream.truncate(100_000_000)
     refused(path, "no 'end_header' line in the first 1048576 bytes", read=read_ply, memory=4e6)
-
-
-def test_a_header_of_empty_lines_is_refused_in_time_that_grows_with_its_length(tmp_path):
-    """For eight times the length about eight times the time; it was the square, 64 times."""
-
-    def took(size):
-        (tmp_path / "a.ply").write_bytes(b"ply" + b"\n" * size)
-        return seconds(lambda: refused(tmp_path / "a.ply", "header without end"))
-
-    assert took(32_000) < 24 * max(took(4_000), 1e-3)
 
 
 def test_what_is_no_file_is_refused(tmp_path):
