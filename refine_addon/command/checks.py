@@ -32,6 +32,7 @@ def check(options: argparse.Namespace) -> None:
     if options.command not in ("lod", "convert"):
         _refuse_doubles(inputs, outputs, read=() if together else inputs)
     if options.pictures:
+        _refuse_one_of("--pictures", options.pictures, [*inputs, *outputs])
         names = [without_suffix(path.name) for path in inputs]
         _refuse_doubles(inputs, [options.pictures / f"{n}-CAMERA-after.png" for n in names])
     if options.report:
@@ -114,11 +115,8 @@ def _refuse_report(options: argparse.Namespace, outputs: Sequence[Path | Url]) -
     """Refuse a report that would replace an input or output, even with --overwrite."""
     report, pictures = options.report, options.pictures
     others = [*options.inputs, *outputs, options.output, options.cameras, options.blend, pictures]
+    _refuse_one_of("--report", report, others)
     path = os.path.realpath(report)
-    for other in filter(None, others):
-        # These two never raise, as pathlib's do for some names.
-        if os.path.realpath(os.path.expanduser(other)) == path:
-            raise RefineError(f"--report {report}: {other} is an input or output already")
     if pictures and path.endswith(".png") and os.path.dirname(path) == os.path.realpath(pictures):
         raise RefineError(f"--report {report}: may be one of the pictures; choose another name")
     if options.overwrite and os.path.isfile(report):
@@ -126,6 +124,14 @@ def _refuse_report(options: argparse.Namespace, outputs: Sequence[Path | Url]) -
             words = stream.read(64).split()
             if words and not b"".join(words).startswith(b'{"refine":'):
                 raise RefineError(f"{report}: exists and is no report; choose another name")
+
+
+def _refuse_one_of(option, path, others):
+    """Refuse the path of an option that is one of the others, which may be None."""
+    for other in filter(None, others):
+        # These two never raise, as pathlib's do for some names.
+        if os.path.realpath(os.path.expanduser(other)) == os.path.realpath(path):
+            raise RefineError(f"{option} {path}: {other} is an input or output already")
 
 
 def _refuse_doubles(inputs, outputs, read=()):

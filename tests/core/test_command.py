@@ -331,6 +331,7 @@ USAGE = {
     "report over other splats": [*PRUNE, "--dry-run", "--report", "b.ply", "--overwrite"],
     "report over other cameras": [*PRUNE, "--dry-run", "--report", "t.json", "--overwrite"],
     "report that is the folder of the pictures": [*MADE, "--report", "p", "--pictures", "p"],
+    "pictures in the place of the output": [*MADE, "--pictures", "./out.ply"],
     "report among the pictures": [*MADE, "--pictures", ".", "--report", "in-000-after.png"],
     "output that is not named as splats": ["prune", "in.dat", *PRUNE[2:], "-o", "m", "--overwrite"],
     "an option in part": [*MADE, "--rat", ".5"],
