@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError
-from .execute import Progress, seconds, silent, stages
+from .execute import Progress, report, seconds, silent, stages
 from .formats import registry, sog
 from .formats.registry import format_named, held_splats, left_out, notes, scene_name, write_splats
 from .formats.streamed_sog import INDEX, StreamedSog, folder_for
@@ -395,7 +395,7 @@ def lod_file(
         scene = read_scene(source, zones, model)
         clock.lap("read_s")
         demands, entries, notes, remarks = scene.demands, list[dict[str, Any]](), list[str](), {}
-        report: dict[str, Any] = {"settings": method.facts(), "volumes": list(demands.facts)}
+        summary: dict[str, Any] = {"settings": method.facts(), "volumes": list(demands.facts)}
         count = len(scene.splats)
         making, writing = stages(progress, seconds("merge", count), seconds("write", count))
         for level in lod(
@@ -405,19 +405,19 @@ def lod_file(
             if level.number == 1:
                 seen = scored(level.scores)
                 seen["splats"] |= {"before": count, **demands.counts()}
-                report |= {"source": {"file": file.name, "bytes": scene.bytes}, **seen}
-                report["nested"] = not method.changes
+                summary |= {"source": {"file": file.name, "bytes": scene.bytes}, **seen}
+                summary["nested"] = not method.changes
                 notes += scoring_notes(level.scores)
             name, size, missing, more = add(scene, level)
             notes += [note for note in more if note not in notes]
             entry = level.facts() | {"left_out": missing, "file": name, "bytes": size}
             entries.append(entry | {"splats": entry["splats"] - missing})
             remarks[level.goal] = level.remark
-        writing(0.5, "writing")
+        report(writing, 0.5, "writing")
         notes += levels.notes(remarks) + finish()
         clock.lap("levels_s")
     clock.stop()
-    return report | {
+    return summary | {
         "levels": entries,
         "files": {"input": scene.name, "output": str(path)},
         "timings": clock.timings,

@@ -265,3 +265,13 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, wall_file
         with pytest.raises(type(error)):
             lod_file(wall_file, tmp_path / "out", cameras(2), TWO, QUICK)
         assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_levels_that_were_written_go_where_writing_is_cancelled(tmp_path, wall_file):
+    def stop(_, what):
+        return what != "writing"
+
+    with pytest.raises(Cancelled):
+        lod_file(wall_file, tmp_path / "out", cameras(2), TWO, QUICK, progress=stop)
+    assert list(tmp_path.iterdir()) == []
