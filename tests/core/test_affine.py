@@ -52,29 +52,24 @@ def test_the_basis_holds_the_real_harmonics_with_the_signs_of_the_reference():
     """From Legendre's polynomials, at (1, 2, 2) / 3 and (-6, 2, 3) / 7, degrees 0 to 4.
 
     Y = sqrt((2l + 1) / 4 pi (l - m)! / (l + m)!) (-sin)^m P_l^(m)(cos), times sqrt(2) cos or sin
-    of m phi for m > 0. Degree 1 in 3DGS code is -0.4886 y, 0.4886 z, -0.4886 x.
-    """
-    for point in np.array([[1, 2, 2], [-6, 2, 3]]) / [[3], [7]]:
-        x, y, z = point
+    of m phi for m > 0. Degree 1 in 3DGS code is -0.4886 y, 0.4886 z, -0.4886 x."""
+    for x, y, z in np.array([[1, 2, 2], [-6, 2, 3]]) / [[3], [7]]:
         expected = []
         for order in range(5):
             for m in range(-order, order + 1):
                 size, legendre = abs(m), np.polynomial.legendre.Legendre.basis(order)
                 ratio = math.factorial(order - size) / math.factorial(order + size)
                 value = math.sqrt((2 * order + 1) / (4 * math.pi) * ratio) * (-1) ** size
-                value *= (legendre.deriv(size) if size else legendre)(z)
+                value *= legendre.deriv(size)(z) * (math.sqrt(2) if m else 1.0)
                 turn = complex(x, y) ** size
-                expected.append(value * (math.sqrt(2) * (turn.imag if m < 0 else turn.real)
-                                         if m else 1.0))  # fmt: skip
+                expected.append(value * (turn.imag if m < 0 else turn.real))
 
-        np.testing.assert_allclose(basis(point, 4), expected, rtol=1e-12)
-        np.testing.assert_allclose(basis(point, 1)[1:], 0.4886025 * np.array([-y, z, -x]), 1e-6)
+        np.testing.assert_allclose(basis(np.array([x, y, z]), 4), expected, rtol=1e-12)
+        np.testing.assert_allclose(expected[1:4], 0.4886025 * np.array([-y, z, -x]), rtol=1e-6)
 
 
 def test_a_colour_is_a_half_where_all_coefficients_are_zero():
-    zero = np.zeros((3, 3)), np.zeros((3, 15, 3))
-
-    np.testing.assert_array_equal(colors(directions(3), *zero), 0.5)
+    np.testing.assert_array_equal(colors(directions(3), np.zeros((3, 3)), np.zeros((3, 0, 3))), 0.5)
 
 
 def test_colours_do_not_depend_on_how_harmonics_lie_in_memory():
