@@ -130,6 +130,12 @@ def joined(parts: Sequence[Splats]) -> Splats:
     return replace(parts[0], **columns)
 
 
+def assign(target: Splats, source: Splats) -> None:
+    """Set the arrays of `target`, new ones that are being filled, to those of `source`."""
+    for name in ARRAYS:
+        getattr(target, name)[:] = getattr(source, name)
+
+
 def above_constant(degree: int) -> int:
     """Number of harmonics of a channel above the constant one."""
     return (degree + 1) ** 2 - 1

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..affine import transformed
 from ..errors import RefineError
 from ..place import Place, described, is_whole
-from ..splats import ARRAYS, opacity, rotation_matrices, scales, single_logits, unit_quaternions
+from ..splats import assign, opacity, rotation_matrices, scales, single_logits, unit_quaternions
 from .format import Format, color_codes, new_file, pieces, refuse_short
 
 NAME = "GLB"
@@ -151,8 +151,7 @@ def _read(path, data):
                     moved = _half_turned(target) if unmoved else transformed(target, turned)
                 except RefineError as error:
                     place.fail(str(error))
-                for name in ARRAYS:
-                    getattr(target, name)[:] = getattr(moved, name)
+                assign(target, moved)
             start += part.splats
     required = _listed(document.content, "extensionsRequired", document.place)
     unread = [described(name) for name in required if name not in _READ]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..errors import RefineError, reason_of
 from ..execute import checkpoint
 from ..place import Place, described
-from ..splats import ARRAYS, Splats, rotation_matrices, scales
+from ..splats import Splats, assign, rotation_matrices, scales
 from ..whole_file import mode_of, new_folder, refuse_existing, whole_file
 from .format import Format, nearby_order, new_file, pieces
 from .ply import SplatFile
@@ -73,8 +73,7 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
         stored = bundle.read().splats()
         for rows in spans:
             target = splats.take(slice(start, start + len(rows))).up_to_degree(stored.sh_degree)
-            for name in ARRAYS:
-                getattr(target, name)[:] = getattr(stored, name)[rows.start : rows.stop]
+            assign(target, stored.take(slice(rows.start, rows.stop)))
             start += len(rows)
     return file
 
