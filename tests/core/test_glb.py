@@ -12,13 +12,13 @@ import pytest
 from refine_addon.core import read_splats
 from refine_addon.core.formats import registry
 from refine_addon.core.spherical_harmonics import colors
-from refine_addon.core.splats import opacity, rotation_matrices
+from refine_addon.core.splats import ARRAYS, SH_C0, drawable, opacity, rotation_matrices
 from tests.hostile import refused, seconds, with_value
 
 SPLATTING = "KHR_gaussian_splatting"
 OPACITY, ROTATION, SCALE = (f"{SPLATTING}:{name}" for name in ("OPACITY", "ROTATION", "SCALE"))
-DTYPES = {5126: "<f4", 5122: "<i2", 5121: "u1"}
-FLOAT, SHORT, BYTE = DTYPES
+DTYPES = {5126: "<f4", 5122: "<i2", 5121: "u1", 5120: "i1", 5123: "<u2"}
+FLOAT, SHORT, BYTE, SIGNED_BYTE, UNSIGNED_SHORT = DTYPES
 
 VALUES = {
     "POSITION": [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]],
@@ -90,12 +90,12 @@ def test_values_are_activated_and_y_points_up(read):
     """Half a turn about z: x and y change sign, and so do harmonics of odd order.
 
     The rotation is multiplied by that turn, (0, 0, 0, 1), from the left: 1 becomes (0, 0, 0, 1).
-    A scale of 2 is log 2, one of 0 minus infinity; an opacity of 1 is kept 2^-26 away from it.
+    A scale of 2 is log 2, one of 0 -104; an opacity of 1 is kept 2^-26 away from it.
     """
     splats = read(*document())
     assert splats.means.tolist() == [[-1.0, -2.0, 3.0], [-4.0, -5.0, 6.0]]
     np.testing.assert_allclose(splats.log_scales[0], np.log([1.0, 2.0, 4.0]), rtol=1e-6)
-    assert splats.log_scales[1, 1] == -np.inf
+    assert splats.log_scales[1, 1] == -104.0
     np.testing.assert_allclose(splats.opacity_logits, [0.0, np.log(2.0**26)], atol=1e-6)
     assert splats.quaternions.tolist() == [[0.0, 0.0, 0.0, 1.0], [-0.5, 0.5, 0.5, -0.5]]
     np.testing.assert_allclose(splats.sh_dc, VALUES[f"{SPLATTING}:SH_DEGREE_0_COEF_0"], rtol=1e-6)
@@ -170,18 +170,118 @@ def test_normalized_integers_and_values_that_stand_apart_are_read(read):
     assert splats.means.tolist()[1] == [-4.0, -5.0, 6.0]
 
 
+INTEGERS = [
+    (ROTATION, SIGNED_BYTE, 127, [[127, 0, 0, -127], [0, 64, -128, 0]]),
+    (ROTATION, SHORT, 32767, [[32767, 0, 0, 9], [0, 64, -32768, 0]]),
+    (SCALE, BYTE, 1, [[1, 2, 255], [0, 3, 4]]),
+    (SCALE, BYTE, 255, [[1, 2, 255], [0, 3, 4]]),
+    (SCALE, UNSIGNED_SHORT, 1, [[1, 2, 65535], [0, 3, 4]]),
+    (SCALE, UNSIGNED_SHORT, 65535, [[1, 2, 65535], [0, 3, 4]]),
+    (SCALE, SIGNED_BYTE, 1, [[1, -2, 3], [0, 4, 5]]),  # signed ones: drafts alone, logarithms
+    (SCALE, SIGNED_BYTE, 127, [[127, -128, 0], [0, 4, 5]]),
+    (SCALE, SHORT, 1, [[1, -2, 3], [0, 4, 5]]),
+    (SCALE, SHORT, 32767, [[1, -2, 3], [0, 4, 5]]),
+    (OPACITY, BYTE, 255, [[0], [255]]),
+    (OPACITY, UNSIGNED_SHORT, 65535, [[1], [32768]]),
+]
+"""Attribute, type, the number that stands for 1 and values, for every type that is allowed."""
+
+
+@pytest.mark.parametrize("case", range(len(INTEGERS)))
+def test_integers_of_every_type_are_read_as_the_floats_they_stand_for(read, case):
+    """The least of signed ones is -1, as the one above it: -128 as -127."""
+    name, kind, unit, stored = INTEGERS[case]
+    content, binary = document(VALUES | {name: stored}, **{name.split(":")[1]: kind})
+    content["accessors"][list(VALUES).index(name)]["normalized"] = unit != 1
+    splats = read(content, binary)
+    meant = np.array(stored) / unit
+    expected = read(*document(VALUES | {name: np.maximum(meant, -1.0) if unit != 1 else meant}))
+    for array in ARRAYS:
+        np.testing.assert_allclose(getattr(splats, array), getattr(expected, array), 1e-6, 1e-6)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_harmonics_of_every_degree_are_turned_as_the_splats(read, degree):
+    """The colour along a direction turned half about z is that of the file along it."""
+    shape = ((degree + 1) ** 2, 2, 3)
+    stored = np.random.default_rng(degree).normal(size=shape).astype(np.float32)
+    names = [f"SH_DEGREE_{band}_COEF_{n}" for band in range(4) for n in range(2 * band + 1)]
+    plain = {name: VALUES[name] for name in ("POSITION", ROTATION, SCALE, OPACITY)}
+    pairs = zip(names, stored, strict=False)
+    splats = read(*document(plain | {f"{SPLATTING}:{name}": rows for name, rows in pairs}))
+    along = np.array([[0.6, 0.48, 0.64], [0.0, -0.6, 0.8]])
+    np.testing.assert_allclose(
+        colors(along * [-1.0, -1.0, 1.0], splats.sh_dc, splats.sh_rest),
+        colors(along, stored[0], stored[1:].transpose(1, 0, 2)),
+        atol=1e-6,
+    )
+
+
+def srgb(linear):
+    """Return the curve of IEC 61966-2-1."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def test_linear_colours_become_those_of_srgb(tmp_path):
+    """Base colours by the curve, other harmonics by its slope, here from a difference.
+
+    0.2140411 is 0.5 in sRGB, 0.001 is on the line; a colour beyond 1 goes on along the curve.
+    """
+    linear = np.array([[0.2140411, 0.001, 1.5], [0.03, 0.5, 1.0]])
+    values = VALUES | {f"{SPLATTING}:SH_DEGREE_0_COEF_0": (linear - 0.5) / SH_C0}
+    content, binary = document(values)
+    (tmp_path / "srgb.glb").write_bytes(packed(content, binary))
+    content["meshes"][0]["primitives"][0]["extensions"][SPLATTING]["colorSpace"] = (
+        "lin_rec709_display"
+    )
+    (tmp_path / "a.glb").write_bytes(packed(content, binary))
+
+    file = read_splats(tmp_path / "a.glb")
+
+    splats = file.splats()
+    np.testing.assert_allclose(SH_C0 * splats.sh_dc + 0.5, srgb(linear), atol=1e-6)
+    assert abs(splats.sh_dc[0, 0]) < 1e-5
+    slopes = (srgb(linear * 1.0001) - srgb(linear * 0.9999)) / (0.0002 * linear)
+    rest = read_splats(tmp_path / "srgb.glb").splats().sh_rest
+    np.testing.assert_allclose(splats.sh_rest, rest * slopes[:, None], rtol=1e-5)
+    assert file.remarks == (
+        'a.glb has colorSpace "lin_rec709_display", converted to sRGB: '
+        "harmonics and blends are approximate",
+    )
+
+
 def test_what_is_not_as_the_file_says_is_noted(tmp_path):
-    """Colours for a linear display, another projection, and what a reader must know of."""
+    """Colours of an unknown space, another projection, and what a reader must know of."""
     content, binary = document()
     kind = content["meshes"][0]["primitives"][0]["extensions"][SPLATTING]
-    kind |= {"colorSpace": "lin_rec709_display", "projection": "orthographic"}
+    kind |= {"colorSpace": "custom_display", "projection": "orthographic"}
     content["extensionsRequired"] = [SPLATTING, "KHR_mesh_quantization", "X_packed"]
     (tmp_path / "a.glb").write_bytes(packed(content, binary))
     assert read_splats(tmp_path / "a.glb").remarks == (
         'a.glb has a required extension that is not read, "X_packed"',
-        'a.glb has colorSpace "lin_rec709_display", read as "srgb_rec709_display"',
+        'a.glb has colorSpace "custom_display", read as "srgb_rec709_display"',
         'a.glb has projection "orthographic", read as "perspective"',
     )
+
+
+def test_scales_of_one_primitive_are_all_logarithms_or_none(tmp_path):
+    """One negative scale makes logarithms of those of its primitive alone; NaN makes none."""
+    content, binary = document(VALUES | {SCALE: [[-3.0, -2.0, 0.5], [0.0, 1.0, 2.0]]})
+    other, more = document(VALUES | {SCALE: [[1.0, 1.0, np.nan], [0.0, 1.0, 1.0]]})
+    views, size = len(content["bufferViews"]), len(binary)
+    for view in other["bufferViews"]:
+        content["bufferViews"].append(view | {"byteOffset": view["byteOffset"] + size})
+    for accessor in other["accessors"]:
+        content["accessors"].append(accessor | {"bufferView": accessor["bufferView"] + views})
+    part = copy.deepcopy(content["meshes"][0]["primitives"][0])
+    part["attributes"] = {name: index + views for name, index in part["attributes"].items()}
+    content["meshes"][0]["primitives"].append(part)
+    (tmp_path / "a.glb").write_bytes(packed(content, binary + more))
+    file = read_splats(tmp_path / "a.glb")
+    expected = [[-3.0, -2.0, 0.5], [0.0, 1.0, 2.0], [0.0, 0.0, np.nan], [-104.0, 0.0, 0.0]]
+    np.testing.assert_array_equal(file.splats().log_scales, expected)
+    assert file.remarks == ("a.glb has negative scales: its scales are read as logarithms",)
+    assert drawable(file.splats()).tolist() == [True, True, False, True]
 
 
 def test_values_that_no_splat_holds_are_taken_for_what_they_mean(tmp_path, read):

@@ -68,6 +68,18 @@ def set_colors(splats: Splats, shares: NDArray[Any]) -> None:
     splats.opacity_logits[:] = opacity_logits(shares[:, 3])
 
 
+def encode_colors(splats: Splats) -> None:
+    """Convert linear colours of splats to sRGB (IEC 61966-2-1).
+
+    The constant one exactly; to first order the other harmonics, by the curve's slope there.
+    """
+    linear = SH_C0 * np.asarray(splats.sh_dc, np.float64) + 0.5
+    dark, bright = linear <= 0.0031308, np.maximum(linear, 0.0031308)
+    curve = bright ** (1 / 2.4)
+    splats.sh_dc[:] = (np.where(dark, 12.92 * linear, 1.055 * curve - 0.055) - 0.5) / SH_C0
+    splats.sh_rest[:] *= np.where(dark, 12.92, 1.055 / 2.4 * curve / bright)[:, None]
+
+
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
     """Raise `RefineError` if `what` needs more bytes than the `available` ones of the file."""
     if needed > available:

@@ -19,7 +19,7 @@ from ..affine import transformed
 from ..errors import RefineError
 from ..place import Place, described, is_whole
 from ..splats import assign, opacity, rotation_matrices, scales, single_logits, unit_quaternions
-from .format import Format, color_codes, new_file, pieces, refuse_short
+from .format import Format, color_codes, encode_colors, new_file, pieces, refuse_short
 
 NAME = "GLB"
 EXTENSION = "KHR_gaussian_splatting"
@@ -44,6 +44,9 @@ _READ = (EXTENSION, "KHR_mesh_quantization")  # extensions that a file may requi
 
 _DRAWN = {"colorSpace": "srgb_rec709_display", "projection": "perspective"}
 """How splats are drawn, whatever the extension says."""
+
+_LINEAR = "lin_rec709_display"  # colour space that is converted
+_CONVERTED = f'colorSpace "{_LINEAR}", converted to sRGB: harmonics and blends are approximate'
 
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # from the frame of captures to glTF's, and back
 
@@ -100,6 +103,7 @@ class _Part(NamedTuple):
     degree: int
     logs: bool  # whether scales are held as their logarithms, as in drafts of the extension
     remarks: tuple[str, ...]  # ends of sentences that begin with "FILE has"
+    linear: bool  # whether its colours are linear
     values: Callable[[str, slice], NDArray[Any]]  # of an attribute, named without its prefix
 
 
@@ -220,13 +224,15 @@ def _parts(document, mesh, place):
             where.fail(f"splats by {described(next(iter(more)))}, expected plain accessors")
         if primitive.get("mode", 4) != _POINTS:
             where.at("mode").expected(str(_POINTS), primitive.get("mode", 4))
+        linear = extension.get("colorSpace") == _LINEAR
         remarks = tuple(
             f"{key} {described(extension[key])}, read as {described(drawn)}"
             for key, drawn in _DRAWN.items()
-            if extension.get(key, drawn) != drawn
+            if extension.get(key, drawn) not in (drawn, _LINEAR)
         )
+        remarks += (_CONVERTED,) * linear
         part = _part(document, primitive.get("attributes"), where.at("attributes"))
-        parts.append(part._replace(remarks=remarks + part.remarks))
+        parts.append(part._replace(remarks=remarks + part.remarks, linear=linear))
     return parts
 
 
@@ -251,20 +257,24 @@ def _part(document, attributes, place):
 
     logs = any((values("SCALE", piece) < 0.0).any() for piece in pieces(count))
     remarks = ("negative scales: its scales are read as logarithms",) if logs else ()
-    return _Part(count, degree, logs, remarks, values)
+    return _Part(count, degree, logs, remarks, False, values)
 
 
 def _fill(target, part, piece):
     """Set splats to a piece of a primitive; harmonics that it lacks are 0."""
     target.means[:] = part.values("POSITION", piece)
     sizes = part.values("SCALE", piece)
-    target.log_scales[:] = sizes if part.logs else np.log(sizes, dtype=np.float32)
+    # The logarithm of 0 is -104, as of Blender's splats.
+    logs = sizes if part.logs else np.log(sizes, dtype=np.float32)
+    target.log_scales[:] = np.maximum(logs, -104.0)
     target.quaternions[:] = np.roll(part.values("ROTATION", piece), 1, axis=1)
     target.opacity_logits[:] = single_logits(part.values("OPACITY", piece)[:, 0])
     constant, *others = _harmonics(part.degree)
     target.sh_dc[:], target.sh_rest[:] = part.values(constant, piece), 0.0
     for index, name in enumerate(others):
         target.sh_rest[:, index] = part.values(name, piece)
+    if part.linear:
+        encode_colors(target)
 
 
 def _half_turned(splats):
