@@ -138,7 +138,7 @@ def foreign_kind(path: Path | Url, head: bytes) -> str:
     if suffix in (".splat", ".ksplat"):  # only the name tells: they have no signature
         return f"a {suffix} file: {read}"
     if suffix == ".gltf" and head.lstrip().startswith(b"{"):
-        return "a glTF file, whose splats lie in another: save it as one file, .glb"
+        return f"a glTF file: {read}"
     if is_spz(head):
         return f"an SPZ file: {read}"
     if is_sog(path, head):

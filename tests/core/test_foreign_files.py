@@ -62,7 +62,7 @@ def test_a_known_format_is_named_and_so_is_what_to_do(tmp_path, case):
 
 
 def test_a_gltf_is_named(tmp_path):
-    words = ": a glTF file, whose splats lie in another: save it as one file, .glb"
+    words = ": a glTF file: 'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
     refused(tmp_path / "in.gltf", words, b' {"asset": {}}', read=read_ply)
 
 

@@ -1,7 +1,8 @@
-"""Binary glTF by hand: nodes, integers, and files that are not what they say."""
+"""glTF by hand: nodes, integers, bytes beside it, and files that are not what they say."""
 
 from __future__ import annotations
 
+import base64
 import copy
 import json
 import struct
@@ -9,7 +10,7 @@ import struct
 import numpy as np
 import pytest
 
-from refine_addon.core import read_splats
+from refine_addon.core import RefineError, read_splats, write_splats
 from refine_addon.core.formats import registry
 from refine_addon.core.spherical_harmonics import colors
 from refine_addon.core.splats import ARRAYS, SH_C0, drawable, opacity, rotation_matrices
@@ -339,6 +340,7 @@ def inside(scale):
 
 
 PLACE = "meshes[0] primitives[0]"
+ACCESSOR = {"bufferView": 0, "componentType": FLOAT, "type": "VEC3", "count": 0}
 
 FAULTS = [
     ("scenes", [], "scene: 0 is none of 0 scenes"),
@@ -366,8 +368,10 @@ FAULTS = [
     ("accessors", 0, "count", 10**12, "accessors[0]: 1000000000000 values of 12 "),
     ("accessors", 0, "count", -1, "accessors[0] count: expected a whole number"),
     ("accessors", 2, "count", 1, f"{PLACE} attributes {SCALE}: 1 values, expected 2 as for"),
-    ("buffers", 0, "uri", "a.bin", "bufferViews[0]: in another file or compress"),
-    ("bufferViews", 0, "byteOffset", 10**6, "accessors[0]: 2 values of 12 bytes fro"),
+    ("accessors", 0, ACCESSOR | {"byteOffset": 10**6}, "accessors[0]: 0 values of 12 b"),
+    ("bufferViews", 0, "buffer", 1, "bufferViews[0]: 1 is none of 1 buffers"),
+    ("bufferViews", 0, "byteOffset", 10**6, "bufferViews[0]: 24 bytes from byte 1000000 of "),
+    ("bufferViews", 0, "extensions", {"X_packed": {}}, "bufferViews[0]: compressed, expected p"),
     ("bufferViews", 0, "byteStride", 4, "accessors[0]: 2 values of 12 bytes f"),
 ]
 
@@ -404,3 +408,65 @@ def test_a_few_bytes_do_not_become_many_splats(tmp_path):
 )
 def test_a_file_that_is_no_glb_is_refused(tmp_path, data, expected):
     refused(tmp_path / "a.glb", expected, data)
+
+
+def test_a_gltf_is_read_with_its_bytes_beside_it_and_in_itself(tmp_path):
+    """A GLB's splats. A file named twice counts once among the bytes of the input."""
+    content, binary = document()
+    (tmp_path / "a.glb").write_bytes(packed(content, binary))
+    (tmp_path / "a b").mkdir()
+    (tmp_path / "a b/c.bin").write_bytes(binary)
+    inside = base64.b64encode(binary).decode()
+    uris = ["a%20b/c.bin", f"data:application/octet-stream;base64,{inside}", "./%61 b//c.bin"]
+    content["buffers"] = [{"uri": uri, "byteLength": len(binary)} for uri in uris]
+    for number, view in enumerate(content["bufferViews"]):
+        view["buffer"] = number % 3
+    text = json.dumps(content).encode()
+    (tmp_path / "a.gltf").write_bytes(text)
+
+    file = read_splats(tmp_path / "a.gltf")
+
+    assert file.rows.tobytes() == read_splats(tmp_path / "a.glb").rows.tobytes()
+    assert file.format == f"glTF with {SPLATTING}"
+    assert file.origin.size == len(text) + len(binary)
+    with pytest.raises(RefineError, match=r"\.gltf is not written"):
+        write_splats(tmp_path / "b.gltf", file)
+
+
+OUTSIDE = "expected a file in this folder or one below"
+
+
+@pytest.mark.parametrize(
+    ("uri", "expected"),
+    [
+        ("../a.bin", OUTSIDE),
+        ("%2e%2e%2fa.bin", OUTSIDE),
+        ("b/%2E./../a.bin", OUTSIDE),
+        ("/etc/passwd", OUTSIDE),
+        ("C:/a.bin", OUTSIDE),
+        ("..\\a.bin", OUTSIDE),
+        ("file:///etc/passwd", OUTSIDE),
+        ("http://127.0.0.1/a.bin", OUTSIDE),
+        ("data:text/plain,AAAA", OUTSIDE),
+        ("a%00.bin", OUTSIDE),
+        ("none.bin", '"none.bin" is not there'),
+        (".", OUTSIDE),
+        ("\ud800", "is not there"),
+        ("a" * 100_000, "is not there"),
+        (5, "buffers[0]: expected a string, got 5"),
+        ("data:;base64,AAA", "buffers[0]: invalid base64: "),
+        ("data:;base64,A*AA", "buffers[0]: invalid base64: "),
+        ("data:;base64,", "bufferViews[0]: 24 bytes from byte 0 of 0 do not fit"),
+        ("data:;base64,AAAA", "bufferViews[0]: 24 bytes from byte 0 of 3 do not fit"),
+        ("short.bin", "bufferViews[0]: 24 bytes from byte 0 of 10 do not fit"),
+        ("", "bufferViews[0]: 24 bytes from byte 0 of 0 do not fit"),
+    ],
+    ids=range(21),
+)
+def test_a_gltf_reads_nothing_outside_its_folder(tmp_path, uri, expected):
+    """Addresses are refused without a look at them, after their % codes are undone."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "a.bin").write_bytes(BINARY)
+    (tmp_path / "in/short.bin").write_bytes(bytes(10))
+    data = json.dumps(with_value(CONTENT, "buffers", 0, "uri", uri)).encode()
+    refused(tmp_path / "in/a.gltf", expected, data)

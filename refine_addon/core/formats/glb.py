@@ -1,4 +1,4 @@
-"""Binary glTF (``.glb``) with KHR_gaussian_splatting: plain accessors, activated values.
+"""glTF (``.glb``, and only read ``.gltf``) with KHR_gaussian_splatting: activated values.
 
 Rotations are x y z w. In glTF y points up, in captures down; half a turn about z, which changes
 only signs, maps one to the other. The transforms of nodes are applied.
@@ -6,11 +6,13 @@ only signs, maps one to the other. The transforms of nodes are applied.
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,8 @@ from ..errors import RefineError
 from ..place import Place, described, is_whole
 from ..splats import assign, opacity, rotation_matrices, scales, single_logits, unit_quaternions
 from .format import Format, color_codes, encode_colors, new_file, pieces, refuse_short
+from .ply import file_bytes
+from .sog import beside, named_json
 
 NAME = "GLB"
 EXTENSION = "KHR_gaussian_splatting"
@@ -54,7 +58,8 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # from the frame of captures to gl
 class _Document(NamedTuple):
     place: Place
     content: dict[str, Any]
-    binary: NDArray[np.uint8]
+    buffers: list[NDArray[np.uint8]]
+    size: int  # bytes of the file and of those beside it
 
     def item(self, group: str, index: Any, place: Place) -> tuple[dict[str, Any], Place]:
         """Item of a list such as ``nodes``, and its place; `place` is where the index stands."""
@@ -65,12 +70,21 @@ class _Document(NamedTuple):
         where = self.place.at(f"{group}[{index}]")
         return where.members(items[index]), where
 
+    def view(self, index: Any, place: Place) -> tuple[NDArray[np.uint8], int]:
+        """Bytes of a view of a buffer, (n,), and its stride, 0 if it has none."""
+        held, place = self.item("bufferViews", index, place)
+        self.item("buffers", held.get("buffer"), place)
+        content = self.buffers[held["buffer"]]
+        keys = {"byteOffset": 0, "byteLength": None, "byteStride": 0}
+        start, length, stride = (place.at(key).whole(held.get(key, keys[key])) for key in keys)
+        if "extensions" in held:
+            place.fail("compressed, expected plain bytes")
+        if start + length > len(content):
+            place.fail(f"{length} bytes from byte {start} of {len(content)} do not fit")
+        return content[start : start + length], stride
+
     def values(self, index: Any, place: Place, width: int) -> tuple[NDArray[Any], float]:
         """Stored values of an accessor, (n, width), and the number that stands for 1."""
-
-        def whole(key: str, default: int | None = None) -> int:
-            return where.at(key).whole(view.get(key, default))
-
         held, place = self.item("accessors", index, place)
         kind, shape = held.get("componentType"), held.get("type")
         if not is_whole(kind) or kind not in _KINDS or shape != _SHAPES[width]:
@@ -78,21 +92,16 @@ class _Document(NamedTuple):
             place.fail(f"{got}, expected {_SHAPES[width]} of {', '.join(map(str, _KINDS))}")
         if "sparse" in held or "bufferView" not in held:
             place.fail("sparse or without values, which splats are not read from")
-        dtype, view, where = np.dtype(_KINDS[kind]), held, place
-        count, offset = whole("count"), whole("byteOffset", 0)
-        view, where = self.item("bufferViews", held["bufferView"], place)
-        buffer, _ = self.item("buffers", view.get("buffer"), where)
-        if view["buffer"] != 0 or "uri" in buffer or "extensions" in view:
-            where.fail("in another file or compressed, expected the binary chunk")
-        start, length = whole("byteOffset", 0), whole("byteLength")
+        dtype = np.dtype(_KINDS[kind])
+        count = place.at("count").whole(held.get("count"))
+        offset = place.at("byteOffset").whole(held.get("byteOffset", 0))
+        content, stride = self.view(held["bufferView"], place)
         size = dtype.itemsize * width
-        stride = whole("byteStride", 0) or size
-        end = offset + stride * (count - 1) + size if count else 0
-        if stride < size or end > length or start + length > len(self.binary):
-            around = f"of a view of {length} bytes at byte {start} of {len(self.binary)}"
-            got = f"{count} values of {size} bytes from byte {offset}"
-            place.fail(f"{got} {around}, expected that they fit")
-        layout = self.binary.data, start + offset, (stride, dtype.itemsize)
+        stride = stride or size
+        end = offset + (stride * (count - 1) + size if count else 0)
+        if stride < size or end > len(content):
+            place.fail(f"{count} values of {size} bytes from {offset} of {len(content)} do not fit")
+        layout = content.data, offset, (stride, dtype.itemsize)
         values: NDArray[Any] = np.ndarray((count, width), dtype, *layout)
         shares = dtype.kind != "f" and held.get("normalized", False)
         return values, float(np.iinfo(dtype).max) if shares else 1.0
@@ -101,10 +110,9 @@ class _Document(NamedTuple):
 class _Part(NamedTuple):
     splats: int
     degree: int
-    logs: bool  # whether scales are held as their logarithms, as in drafts of the extension
-    remarks: tuple[str, ...]  # ends of sentences that begin with "FILE has"
-    linear: bool  # whether its colours are linear
-    values: Callable[[str, slice], NDArray[Any]]  # of an attribute, named without its prefix
+    fill: Callable[[Any, slice], None]  # sets splats of its degree to a piece of it
+    remarks: tuple[str, ...] = ()  # ends of sentences that begin with "FILE has"
+    linear: bool = False  # whether its colours are linear
 
 
 def _read(path, data):
@@ -135,20 +143,24 @@ def _read(path, data):
         parts = [part for part in meshes[node["mesh"]] if part.splats]
         shown += [(part, frame, place) for part in parts]
         count += sum(part.splats for part in parts)
-        if count > len(data):  # nodes may share a mesh: few bytes, many splats
-            wanted = f"expected at most {len(data)}, the bytes of the file"
+        if count > document.size:  # nodes may share a mesh: few bytes, many splats
+            wanted = f"expected at most {document.size}, the bytes of its files"
             document.place.fail(f"its nodes show {count} splats or more, {wanted}")
     if not every:
         document.place.fail(f"no splats: no node of its scene shows a primitive with {EXTENSION}")
-    origin, degree = (f"{NAME} with {EXTENSION}", len(data)), max(part.degree for part in every)
+    name = NAME if data[: len(_MAGIC)].tobytes() == _MAGIC else READER.name
+    origin, degree = (f"{name} with {EXTENSION}", document.size), max(part.degree for part in every)
     file, splats = new_file(path, origin, count, degree)
+    splats.sh_rest[:] = 0.0
     start = 0
     with np.errstate(all="ignore"):  # files may hold any numbers
         frames = _frames(moves)
         for part, frame, place in shown:
             for piece in pieces(part.splats):
                 target = splats.take(slice(start + piece.start, start + piece.stop))
-                _fill(target, part, piece)
+                part.fill(target.up_to_degree(part.degree), piece)
+                if part.linear:
+                    encode_colors(target)
                 try:
                     unmoved = np.array_equal(frames[frame], np.eye(4))
                     turned = _HALF_TURN @ frames[frame]
@@ -166,6 +178,30 @@ def _read(path, data):
 
 
 def _opened(path, data):
+    chunks = _chunks(path, data) if data[: len(_MAGIC)].tobytes() == _MAGIC else {_JSON: data}
+    place, text = Place(path), Place(path, "JSON")
+    content = text.members(text.parsed(chunks.get(_JSON, data[:0]).tobytes()))
+    buffers, files = [], dict[Any, NDArray[np.uint8]]()
+    for number, item in enumerate(_listed(content, "buffers", place)):
+        where = place.at(f"buffers[{number}]")
+        uri = unquote(where.text(where.members(item).get("uri", "")))
+        kind, _, coded = uri.partition(",")
+        if not uri:
+            held = chunks.get(_BINARY, data[:0])[: None if number == 0 else 0]
+        elif kind.startswith("data:") and kind.endswith(";base64"):
+            try:
+                held = np.frombuffer(base64.b64decode(coded, validate=True), np.uint8)
+            except ValueError as error:
+                where.fail(f"invalid base64: {error}")
+        else:
+            file = beside(where, uri).resolve()
+            files[file] = held = files[file] if file in files else file_bytes(file)
+        buffers.append(held)
+    return _Document(place, content, buffers, len(data) + sum(map(len, files.values())))
+
+
+def _chunks(path, data):
+    """Chunks of a GLB by kind, the first of each."""
     refuse_short(path, _HEADER.size + _CHUNK.size, len(data), "the first bytes of a GLB file")
     _, version, length = _HEADER.unpack(data[: _HEADER.size].tobytes())
     if version != _VERSION:
@@ -178,9 +214,7 @@ def _opened(path, data):
         refuse_short(path, at + size, length, f"a chunk at byte {at} and what is before it")
         chunks.setdefault(kind, data[at : at + size])
         at += size
-    text = Place(path, "JSON")
-    content = text.members(text.parsed(chunks.get(_JSON, data[:0]).tobytes()))
-    return _Document(Place(path), content, chunks.get(_BINARY, data[:0]))
+    return chunks
 
 
 def _listed(holder, key, place):
@@ -255,26 +289,22 @@ def _part(document, attributes, place):
         stored, unit = held[name]
         return stored[piece] if unit == 1.0 else np.maximum(stored[piece] / unit, -1.0)
 
-    logs = any((values("SCALE", piece) < 0.0).any() for piece in pieces(count))
-    remarks = ("negative scales: its scales are read as logarithms",) if logs else ()
-    return _Part(count, degree, logs, remarks, False, values)
+    log = any((values("SCALE", piece) < 0.0).any() for piece in pieces(count))
+    remarks = ("negative scales: its scales are read as logarithms",) if log else ()
 
+    def fill(target, piece):
+        target.means[:] = values("POSITION", piece)
+        sizes = values("SCALE", piece)
+        # The logarithm of 0 is -104, as of Blender's splats.
+        target.log_scales[:] = np.maximum(sizes if log else np.log(sizes, dtype=np.float32), -104.0)
+        target.quaternions[:] = np.roll(values("ROTATION", piece), 1, axis=1)
+        target.opacity_logits[:] = single_logits(values("OPACITY", piece)[:, 0])
+        constant, *others = _harmonics(degree)
+        target.sh_dc[:] = values(constant, piece)
+        for index, name in enumerate(others):
+            target.sh_rest[:, index] = values(name, piece)
 
-def _fill(target, part, piece):
-    """Set splats to a piece of a primitive; harmonics that it lacks are 0."""
-    target.means[:] = part.values("POSITION", piece)
-    sizes = part.values("SCALE", piece)
-    # The logarithm of 0 is -104, as of Blender's splats.
-    logs = sizes if part.logs else np.log(sizes, dtype=np.float32)
-    target.log_scales[:] = np.maximum(logs, -104.0)
-    target.quaternions[:] = np.roll(part.values("ROTATION", piece), 1, axis=1)
-    target.opacity_logits[:] = single_logits(part.values("OPACITY", piece)[:, 0])
-    constant, *others = _harmonics(part.degree)
-    target.sh_dc[:], target.sh_rest[:] = part.values(constant, piece), 0.0
-    for index, name in enumerate(others):
-        target.sh_rest[:, index] = part.values(name, piece)
-    if part.linear:
-        encode_colors(target)
+    return _Part(count, degree, fill, remarks)
 
 
 def _half_turned(splats):
@@ -371,3 +401,4 @@ _LOSS = "holds activated values in single precision, with y up"
 FORMAT = Format(
     NAME, ".glb", lambda _, head: head.startswith(_MAGIC), _read, _write, _DEGREE, _LOSS, _sizes
 )
+READER = Format("glTF", ".gltf", named_json(".gltf"), _read)

@@ -23,7 +23,7 @@ FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, by_name.SP
 """Formats that are written, but for plain PLY."""
 
 # Streamed SOG comes before SOG: ``lod-meta.json`` ends in ``meta.json``.
-READERS = (*FORMATS, by_name.KSPLAT, streamed_sog.READER, sog.META_READER)
+READERS = (*FORMATS, by_name.KSPLAT, glb.READER, streamed_sog.READER, sog.META_READER)
 """Formats that are read, but for plain PLY, in the order in which an input is tried."""
 
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))  # of outputs
@@ -32,7 +32,7 @@ READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))  # of inputs
 
 INDEX_NAMES = (streamed_sog.INDEX, sog.META)  # files that stand for their folder
 
-NOT_WRITTEN: tuple[str, ...] = (".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
+NOT_WRITTEN: tuple[str, ...] = (".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
 NOT_WRITTEN += tuple(form.suffix for form in READERS if form.write is None)
 """Suffixes of outputs that are refused: a PLY of such a name would mislead."""
 
