@@ -340,6 +340,7 @@ def inside(scale):
 
 
 PLACE = "meshes[0] primitives[0]"
+SPZ = f"{SPLATTING}_compression_spz_2"
 ACCESSOR = {"bufferView": 0, "componentType": FLOAT, "type": "VEC3", "count": 0}
 
 FAULTS = [
@@ -359,6 +360,10 @@ FAULTS = [
     (*PART, "mode", 4, f"{PLACE} mode: expected 0, got 4"),
     (*KIND, "kernel", "cube", f'{PLACE}: splats of kernel "cube", expected "ellipse"'),
     (*KIND, "extensions", {"X_spz": {}}, f'{PLACE}: splats by "X_spz", expected plain accessors'),
+    (*KIND, "extensions", {"": {}, SPZ: {}}, f'{PLACE}: splats by "", expected plain accessors'),
+    (*KIND, "extensions", {SPZ: {"bufferView": 9}}, f"{PLACE} {SPZ}: 9 is none of 8 bufferViews"),
+    (*KIND, "extensions", {SPZ: {"bufferView": 0}}, "a.glb: "),
+    (*KIND, "extensions", [1], f"{PLACE}: expected an object, got a list of 1"),
     (*NAMED, {"POSITION": 0}, f"{PLACE} attributes: no {ROTATION}"),
     (*NAMED, LESS, f"{PLACE} attributes: no {SPLATTING}:SH_DEGREE_1_COEF_2"),
     (*NAMED, [], f"{PLACE} attributes: expected an object, got a list of 0"),
@@ -470,3 +475,54 @@ def test_a_gltf_reads_nothing_outside_its_folder(tmp_path, uri, expected):
     (tmp_path / "in/short.bin").write_bytes(bytes(10))
     data = json.dumps(with_value(CONTENT, "buffers", 0, "uri", uri)).encode()
     refused(tmp_path / "in/a.gltf", expected, data)
+
+
+@pytest.mark.parametrize("model", ["default", "antialiased"])
+def test_an_spz_within_is_read_and_faces_as_the_extension_says(tmp_path, model):
+    """SPZ's axes are right, up and back, those of its decoder here left, up and front.
+
+    That turned half about z, (x, y, z) becomes (x, -y, -z); so do directions.
+    """
+    (tmp_path / "a.glb").write_bytes(packed(*document()))
+    write_splats(tmp_path / "a.spz", read_splats(tmp_path / "a.glb", model))
+    stored = read_splats(tmp_path / "a.spz").splats()
+    content, binary = document()
+    primitive = content["meshes"][0]["primitives"][0]
+    primitive["extensions"][SPLATTING]["extensions"] = {SPZ: {"bufferView": 0}}
+    content["extensionsRequired"] = [SPLATTING, SPZ]
+    data = (tmp_path / "a.spz").read_bytes()
+    content["bufferViews"][0] |= {"byteOffset": len(binary), "byteLength": len(data)}
+    for accessor in content["accessors"]:
+        del accessor["bufferView"]
+    (tmp_path / "b.glb").write_bytes(packed(content, binary + data))
+
+    file = read_splats(tmp_path / "b.glb")
+
+    splats, turn = file.splats(), np.diag([1.0, -1.0, -1.0])
+    assert (file.model, file.remarks) == (model, ())
+    np.testing.assert_allclose(splats.means, stored.means @ turn, atol=1e-6)
+    np.testing.assert_allclose(splats.log_scales, stored.log_scales, atol=1e-6)
+    np.testing.assert_array_equal(splats.opacity_logits, stored.opacity_logits)
+    turned = np.abs(turn @ rotation_matrices(stored.quaternions))
+    np.testing.assert_allclose(np.abs(rotation_matrices(splats.quaternions)), turned, atol=1e-6)
+    along = np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])
+    np.testing.assert_allclose(
+        colors(along @ turn, splats.sh_dc, splats.sh_rest),
+        colors(along, stored.sh_dc, stored.sh_rest),
+        atol=1e-6,
+    )
+
+
+def test_models_that_differ_are_refused(tmp_path):
+    """An antialiased SPZ beside plain accessors: a file of splats has one model."""
+    content, binary = document()
+    (tmp_path / "a.glb").write_bytes(packed(content, binary))
+    write_splats(tmp_path / "a.spz", read_splats(tmp_path / "a.glb", "antialiased"))
+    data = (tmp_path / "a.spz").read_bytes()
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
+    content["bufferViews"].append(view)
+    primitives = content["meshes"][0]["primitives"]
+    primitives.append(copy.deepcopy(primitives[0]))
+    primitives[1]["extensions"][SPLATTING]["extensions"] = {SPZ: {"bufferView": 8}}
+    data = packed(content, binary + data)
+    refused(tmp_path / "b.glb", "some splats are default, others not, expected one", data)

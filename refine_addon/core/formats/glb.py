@@ -1,4 +1,4 @@
-"""glTF (``.glb``, and only read ``.gltf``) with KHR_gaussian_splatting: activated values.
+"""glTF (``.glb``, and only read ``.gltf``) with KHR_gaussian_splatting: activated values, or SPZ.
 
 Rotations are x y z w. In glTF y points up, in captures down; half a turn about z, which changes
 only signs, maps one to the other. The transforms of nodes are applied.
@@ -21,12 +21,14 @@ from ..affine import transformed
 from ..errors import RefineError
 from ..place import Place, described, is_whole
 from ..splats import assign, opacity, rotation_matrices, scales, single_logits, unit_quaternions
+from . import spz
 from .format import Format, color_codes, encode_colors, new_file, pieces, refuse_short
 from .ply import file_bytes
 from .sog import beside, named_json
 
 NAME = "GLB"
 EXTENSION = "KHR_gaussian_splatting"
+_SPZ = f"{EXTENSION}_compression_spz_2"  # a draft
 
 _HEADER = struct.Struct("<4sII")  # magic, version, bytes of all
 _CHUNK = struct.Struct("<I4s")  # bytes, kind
@@ -44,7 +46,7 @@ _POINTS, _VERTICES = 0, 34962
 
 _MOVES = ("matrix", "translation", "rotation", "scale")  # keys of a node that move what it holds
 
-_READ = (EXTENSION, "KHR_mesh_quantization")  # extensions that a file may require
+_READ = (EXTENSION, _SPZ, "KHR_mesh_quantization")  # extensions that a file may require
 
 _DRAWN = {"colorSpace": "srgb_rec709_display", "projection": "perspective"}
 """How splats are drawn, whatever the extension says."""
@@ -53,6 +55,7 @@ _LINEAR = "lin_rec709_display"  # colour space that is converted
 _CONVERTED = f'colorSpace "{_LINEAR}", converted to sRGB: harmonics and blends are approximate'
 
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # from the frame of captures to glTF's, and back
+_SPZ_TURN = np.diag([-1.0, 1.0, -1.0, 1.0])  # from SPZ's (right, up, back) to left, up, front
 
 
 class _Document(NamedTuple):
@@ -113,6 +116,8 @@ class _Part(NamedTuple):
     fill: Callable[[Any, slice], None]  # sets splats of its degree to a piece of it
     remarks: tuple[str, ...] = ()  # ends of sentences that begin with "FILE has"
     linear: bool = False  # whether its colours are linear
+    model: Any = "default"
+    turn: Any = np.eye(4)  # to the frame of its node
 
 
 def _read(path, data):
@@ -150,7 +155,10 @@ def _read(path, data):
         document.place.fail(f"no splats: no node of its scene shows a primitive with {EXTENSION}")
     name = NAME if data[: len(_MAGIC)].tobytes() == _MAGIC else READER.name
     origin, degree = (f"{name} with {EXTENSION}", document.size), max(part.degree for part in every)
-    file, splats = new_file(path, origin, count, degree)
+    model = every[0].model
+    if any(part.model != model for part in every):
+        document.place.fail(f"some splats are {model}, others not, expected one model")
+    file, splats = new_file(path, origin, count, degree, model)
     splats.sh_rest[:] = 0.0
     start = 0
     with np.errstate(all="ignore"):  # files may hold any numbers
@@ -162,9 +170,9 @@ def _read(path, data):
                 if part.linear:
                     encode_colors(target)
                 try:
-                    unmoved = np.array_equal(frames[frame], np.eye(4))
-                    turned = _HALF_TURN @ frames[frame]
-                    moved = _half_turned(target) if unmoved else transformed(target, turned)
+                    turn = _HALF_TURN @ frames[frame] @ part.turn
+                    unmoved = np.array_equal(turn, _HALF_TURN)
+                    moved = _half_turned(target) if unmoved else transformed(target, turn)
                 except RefineError as error:
                     place.fail(str(error))
                 assign(target, moved)
@@ -251,11 +259,12 @@ def _parts(document, mesh, place):
         if not isinstance(extensions, dict) or EXTENSION not in extensions:
             continue
         extension = extensions[EXTENSION] if isinstance(extensions[EXTENSION], dict) else {}
-        kernel, more = extension.get("kernel", "ellipse"), extension.get("extensions")
+        kernel, more = extension.get("kernel", "ellipse"), extension.get("extensions") or {}
         if kernel != "ellipse":
             where.fail(f'splats of kernel {described(kernel)}, expected "ellipse"')
-        if isinstance(more, dict) and more:
-            where.fail(f"splats by {described(next(iter(more)))}, expected plain accessors")
+        unread = [name for name in where.members(more) if name != _SPZ]
+        if unread:
+            where.fail(f"splats by {described(unread[0])}, expected plain accessors or {_SPZ}")
         if primitive.get("mode", 4) != _POINTS:
             where.at("mode").expected(str(_POINTS), primitive.get("mode", 4))
         linear = extension.get("colorSpace") == _LINEAR
@@ -265,9 +274,24 @@ def _parts(document, mesh, place):
             if extension.get(key, drawn) not in (drawn, _LINEAR)
         )
         remarks += (_CONVERTED,) * linear
-        part = _part(document, primitive.get("attributes"), where.at("attributes"))
+        if more:
+            part = _packed_part(document, more[_SPZ], where.at(_SPZ))
+        else:
+            part = _part(document, primitive.get("attributes"), where.at("attributes"))
         parts.append(part._replace(remarks=remarks + part.remarks, linear=linear))
     return parts
+
+
+def _packed_part(document, held, place):
+    """Part of the splats in an SPZ file within."""
+    content, _ = document.view(place.members(held).get("bufferView"), place)
+    file = spz.FORMAT.read(place.path, content)
+    stored = file.splats()
+
+    def fill(target, piece):
+        assign(target, stored.take(piece))
+
+    return _Part(len(stored), stored.sh_degree, fill, model=file.model, turn=_SPZ_TURN)
 
 
 def _part(document, attributes, place):
