@@ -1,4 +1,4 @@
-"""PNG, OpenEXR and WebP images, and the size of a PNG or JPEG, read from its header.
+"""PNG, OpenEXR and WebP images, the size of a PNG or JPEG by its header, and the curve of sRGB.
 
 PNG has 8 bits a channel (ISO/IEC 15948). OpenEXR is read as Blender writes it for us: one part,
 without compression ("OpenEXR File Layout"). Core has no codec of its own for lossless WebP: `use`
@@ -39,6 +39,18 @@ _LAST = 0xDA, 0xD9  # start of scan and end of image
 _STANDALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers that no segment follows
 _FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """JPEG start-of-frame markers: a segment with precision (1 byte), height, width (2 each)."""
+
+
+def srgb_of(linear: NDArray[Any]) -> NDArray[np.float64]:
+    """Values (...) float64 in sRGB of linear ones (IEC 61966-2-1); also beyond 0..1."""
+    curved = 1.055 * np.maximum(linear, 0.0031308) ** (1.0 / 2.4) - 0.055
+    return np.asarray(np.where(linear > 0.0031308, curved, 12.92 * linear))
+
+
+def linear_of(srgb: NDArray[Any]) -> NDArray[np.float64]:
+    """Inverse of `srgb_of`."""
+    curved = ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4
+    return np.asarray(np.where(srgb > 0.04045, curved, srgb / 12.92))
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:

@@ -11,10 +11,12 @@ from __future__ import annotations
 import contextlib
 import errno
 import math
+import mmap
 import os
 import pickle
 import secrets
 import shutil
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -239,3 +241,18 @@ def in_one(
     result = on_disk(folder.with_name(f"{folder.name}-done"), pieces(every, order))
     shutil.rmtree(folder, ignore_errors=True)
     return result, order
+
+
+def file_bytes(path: Path) -> NDArray[np.uint8]:
+    """Bytes of a file, memory-mapped, (n,); `RefineError` if it is no file or cannot be read."""
+    try:
+        state = path.stat()
+        if not stat.S_ISREG(state.st_mode):  # opening a pipe would wait for a writer
+            kind = "folder" if path.is_dir() else "device"
+            raise RefineError(f"{path}: is a {kind}, expected a PLY file")
+        with path.open("rb") as stream:
+            if not state.st_size:
+                return np.empty(0, np.uint8)
+            return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
+    except (OSError, ValueError) as error:
+        raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error

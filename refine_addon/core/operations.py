@@ -18,7 +18,7 @@ from .cleaning.clean import clean as clean_splats
 from .errors import RefineError
 from .execute import Cancelled, Progress, part, report, seconds, silent, stages
 from .formats import registry
-from .formats.format import Format, nearby_order
+from .formats.format import Format
 from .formats.ply import SplatFile
 from .formats.ply_columns import other_properties
 from .formats.registry import format_named, read_splats, refuse_unknown_size, write_splats
@@ -32,6 +32,7 @@ from .result import Result, file_of
 from .selection import Budget
 from .splats import Model, Splats, joined
 from .views import ViewSet
+from .visibility.scene import nearby_order
 from .volumes import Forced, Zone, forced
 from .whole_file import expanded, refuse_existing, refuse_mapped
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import stat
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn, Self, TypeGuard
 
 from .errors import RefineError
-from .whole_file import Url
+from .whole_file import Url, mode_of
 
 LARGEST_NUMBER = 1e18  # largest number taken, such as a coordinate: its square fits float32
 
@@ -97,6 +98,20 @@ class Place:
             self.fail(f"missing {missing[0]!r}, expected the keys {', '.join(required)}")
         return value
 
+    def beside(self, name: str) -> Path:
+        """Path of a file that this one names; `RefineError` unless in its folder or one below."""
+        steps = PurePosixPath(name).parts
+        if not steps or name.startswith("/") or ".." in steps or not set("\\:\0").isdisjoint(name):
+            self.fail(f"{described(name)}, expected a file in this folder or one below")
+        path = self.path.parent.joinpath(*steps)
+        try:
+            mode = mode_of(path)
+        except (OSError, ValueError):  # a name too long, a folder that may not be entered
+            mode = 0
+        if not stat.S_ISREG(mode):
+            self.fail(f"{described(name)} is not there")
+        return path
+
     def parsed(self, text: bytes | str) -> Any:
         """Value of a JSON text; `RefineError` with line and column if it is none."""
         try:
@@ -149,6 +164,11 @@ def foreign_kind(path: Path | Url, head: bytes) -> str:
     if suffix == ".spz" and head and not head.startswith(b"ply"):
         return f"a damaged SPZ file: begins with {head[:4]!r}, expected {SPZ!r} or {GZIP!r}"
     return ""
+
+
+def named_json(end: str) -> Callable[[Path, bytes], bool]:
+    """Whether a file, by path and first bytes, is JSON of a name with this `end`, as a function."""
+    return lambda path, head: path.name.lower().endswith(end) and head.lstrip().startswith(b"{")
 
 
 def is_spz(head: bytes) -> bool:

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .execute import chunks
+from .images import srgb_of
+from .splats import SH_C0
 
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 
@@ -98,9 +100,17 @@ def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> N
     return np.asarray(result, np.float32)
 
 
-def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients, (N, K, 3), whose colour along ``rotation @ d`` is the old one along d."""
+def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]:
+    """Coefficients, (N, K, 3), whose colour along ``rotation @ d`` is the old one along d.
+
+    They are float64, unless only signs change.
+    """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
+    signs = np.diag(rotation)
+    if np.array_equal(rotation, np.diag(signs)):  # half turns and mirrors: exact
+        point = np.array([0.6, 0.48, 0.64])  # no harmonic is 0 there
+        flips = np.rint(basis(signs * point, degree) / basis(point, degree))
+        return np.asarray(sh_rest * flips[1:, None].astype(np.float32))
     rotated = np.empty_like(sh_rest, np.float64)
     # A rotation maps each band to itself. Its matrix is fitted to more directions than it has rows.
     points = np.random.default_rng(0).normal(size=(64, 3))
@@ -112,6 +122,19 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.f
         stored = slice(columns.start - 1, columns.stop - 1)
         _map(matrix, sh_rest[:, stored], rotated[:, stored])
     return rotated
+
+
+def encoded(
+    sh_dc: NDArray[Any], sh_rest: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coefficients, (N, 3) and (N, K, 3) float64, in sRGB of those of linear colours.
+
+    The constant is exact. The others are multiplied by the curve's slope there: to first order.
+    """
+    linear = 0.5 + SH_C0 * np.asarray(sh_dc, np.float64)
+    bright = np.maximum(linear, 0.0031308)
+    slope = np.where(linear > 0.0031308, 1.055 / 2.4 * bright ** (1.0 / 2.4 - 1.0), 12.92)
+    return (srgb_of(linear) - 0.5) / SH_C0, sh_rest * slope[:, None]
 
 
 def _map(matrix, coefficients, result):

@@ -22,6 +22,7 @@ from ..cameras import active_camera, pose
 from ..core.affine import is_flat, transformed
 from ..core.errors import RefineError
 from ..core.execute import Cancelled, checked_by, checkpoint, report
+from ..core.images import linear_of
 from ..core.pictures import Layers, draw, seen_from
 from ..core.splats import Splats, drawable, joined
 from ..core.views import View, ViewSet, view_through
@@ -166,12 +167,10 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
 
 def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
     """A display-referred picture, (4, H, W), as linear pixels, (H * W, 4), lowest row first.
-    By the sRGB curve (IEC 61966-2-1), which the view transform of the copied scene inverts."""
+    The view transform of the copied scene encodes them again."""
     colors, alphas = picture[:3], picture[3]
     straight = (colors / np.maximum(alphas, 1e-6)).clip(0.0, 1.0)
-    curved = ((straight + 0.055) / 1.055) ** 2.4
-    linear = alphas * np.where(straight > 0.04045, curved, straight / 12.92)
-    pixels = np.concatenate([linear, picture[3:]]).astype(np.float32)
+    pixels = np.concatenate([alphas * linear_of(straight), picture[3:]]).astype(np.float32)
     return np.moveaxis(pixels, 0, -1)[::-1].reshape(-1, 4)
 
 

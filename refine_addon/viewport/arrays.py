@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.formats.format import pieces
+from ..core.images import srgb_of
 from ..core.spherical_harmonics import colors as colors_along
 from ..core.splats import (
     ALPHA_CUT,
@@ -139,8 +140,7 @@ def ramp() -> NDArray[np.float64]:
     chroma = 0.11 + 0.07 * np.sin(np.pi * t)
     lab = np.stack([lightness, chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1)
     linear = np.clip((lab @ _OKLAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T, 0.0, 1.0)
-    # The curve of sRGB (IEC 61966-2-1).
-    return np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
+    return srgb_of(linear)
 
 
 def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDArray[np.float32]:

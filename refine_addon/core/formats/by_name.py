@@ -27,11 +27,8 @@ _HEADER = struct.Struct("<BBxxI4x4xIHxx12xff")
 _SECTION = struct.Struct("<IIIIfHxxI4xIIH")  # the fields of `_Section` from `splats` on
 
 _HEADER_BYTES, _SECTION_BYTES = 4096, 1024  # of the two in a file; the rest of each is unused
-
 _LEVELS, _DEGREES = 3, 3  # how many: each begins at 0
-
 _HARMONICS = 1.5  # level 2: harmonics lie between -1.5 and 1.5 unless the header says otherwise
-
 _MIDDLE = 32767  # levels 1 and 2: code of a bucket's middle unless the section says otherwise
 
 
@@ -109,7 +106,6 @@ def _read_ksplat(path, data):
         Place(path).fail(f"{announced} splats by byte 16, {count} by the sections")
     degree = max((section.degree for section in sections if section.splats), default=0)
     file, splats = new_file(path, (f".ksplat level {level}", len(data)), count, degree)
-    splats.sh_rest[:] = 0.0
     limits = np.float32(least or -_HARMONICS), np.float32(largest or _HARMONICS)
     start = 0
     # Files may hold any bits, such as negative scales, and ranges that are NaN.

@@ -10,14 +10,13 @@ import numpy as np
 
 from ..place import Place
 from ..splats import MODELS, SH_C0, above_constant, opacity, unit_quaternions
+from ..visibility.scene import nearby_order
 from . import ply
-from .format import Format, join_largest, nearby_order, new_file, pieces, set_colors, split_largest
+from .format import Format, join_largest, new_file, pieces, set_colors, split_largest
 from .ply_columns import REST_COUNTS
 
 NAME = "compressed PLY"
-
 SPLATS = 256  # of a chunk
-
 _NAMES = [(end, axis) for end in ("min", "max") for axis in "xyz"]
 _POSITION = tuple(f"{end}_{axis}" for end, axis in _NAMES)
 _SCALE = tuple(f"{end}_scale_{axis}" for end, axis in _NAMES)
@@ -25,16 +24,13 @@ _COLOR = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"
 """Properties of a chunk: in each group the three lower ends of ranges, then the upper ones."""
 
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-
 _PLACES = ((21, 0x7FF), (11, 0x3FF), (0, 0x7FF))  # of x, y, z: shift, largest code
-
 _CHANNELS = ((24, 0xFF), (16, 0xFF), (8, 0xFF), (0, 0xFF))  # likewise red, green, blue, opacity
 
 _TURNS = ((20, 0x3FF), (10, 0x3FF), (0, 0x3FF))
 """Likewise of a rotation; the two bits above are the number of the largest component."""
 
 SCALE_LIMIT = 20.0  # log scales are clipped to ±20
-
 REST_RANGE = 8.0  # harmonics are written between -4 and 4, in 256 steps
 
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from ..errors import RefineError
 from ..execute import chunks
 from ..splats import MODELS, SH_C0, Model, Splats, base_color, opacity, opacity_logits
-from ..visibility.scene import spatial_order
 from .ply import Origin, SplatFile, new_header, with_model
 from .ply_columns import empty_rows
 
@@ -57,27 +56,16 @@ def codes(shares: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * 255), np.uint8)
 
 
-def color_codes(splats: Splats) -> NDArray[np.uint8]:
-    """Colours and opacities in 8 bits each, (N, 4) uint8."""
-    return codes(np.column_stack([base_color(splats.sh_dc), opacity(splats.opacity_logits)]))
+def color_codes(splats: Splats, curve: Callable[..., Any] = np.asarray) -> NDArray[np.uint8]:
+    """Colours, each through a `curve`, and opacities in 8 bits each, (N, 4) uint8."""
+    colors = curve(base_color(splats.sh_dc))
+    return codes(np.column_stack([colors, opacity(splats.opacity_logits)]))
 
 
 def set_colors(splats: Splats, shares: NDArray[Any]) -> None:
     """Set the constant harmonics and logits of splats from colours and opacities, (N, 4), 0..1."""
     splats.sh_dc[:] = (shares[:, :3] - 0.5) / SH_C0
     splats.opacity_logits[:] = opacity_logits(shares[:, 3])
-
-
-def encode_colors(splats: Splats) -> None:
-    """Convert linear colours of splats to sRGB (IEC 61966-2-1).
-
-    The constant one exactly; to first order the other harmonics, by the curve's slope there.
-    """
-    linear = SH_C0 * np.asarray(splats.sh_dc, np.float64) + 0.5
-    dark, bright = linear <= 0.0031308, np.maximum(linear, 0.0031308)
-    curve = bright ** (1 / 2.4)
-    splats.sh_dc[:] = (np.where(dark, 12.92 * linear, 1.055 * curve - 0.055) - 0.5) / SH_C0
-    splats.sh_rest[:] *= np.where(dark, 12.92, 1.055 / 2.4 * curve / bright)[:, None]
 
 
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
@@ -108,17 +96,3 @@ def join_largest(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDAr
 
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # left-out component -> the others
-
-
-def nearby_order(means: NDArray[Any]) -> NDArray[np.int64]:
-    """Order, (N,), of finite positions, (N, 3), along a Z-shaped (Morton) curve."""
-    sample = np.asarray(means[:: max(len(means) // _SAMPLE, 1)], np.float64)
-    middle = np.median(sample, axis=0)
-    size = float(np.median(np.abs(sample - middle))) or 1.0
-    with np.errstate(over="ignore", under="ignore"):
-        place = (np.asarray(means, np.float64) - middle) / size
-        return spatial_order(np.clip(place, -_FARTHEST, _FARTHEST))
-
-
-_SAMPLE = 10_000  # least positions for the medians of middle and size; more change them little
-_FARTHEST = 1e100  # in sizes; positions are clipped to it, so that their squares are finite

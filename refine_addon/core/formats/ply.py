@@ -8,9 +8,7 @@ binary.
 from __future__ import annotations
 
 import io
-import mmap
 import re
-import stat
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -22,8 +20,9 @@ import plyfile
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
-from ..errors import RefineError, reason_of
+from ..errors import RefineError
 from ..execute import chunks, run
+from ..mapped import file_bytes
 from ..place import Place, foreign_kind, refuse_pointer
 from ..splats import MODELS, Model, Splats
 from ..splats import with_model as drawn_as
@@ -32,14 +31,11 @@ from . import ply_columns
 from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, Changes, Keep
 
 HEADER_LIMIT = 1 << 20  # longest header that is read, bytes
-
 TEXT = "="  # stands for ASCII among byte orders: once parsed, numbers have the machine's
-
 PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort"}
 PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # NumPy's names -> PLY's
 
 INDEXING = ("edge", "face", "tristrips")  # elements that by convention hold indices of vertices
-
 _NAMES_SHOWN = 12
 
 _MODES: dict[Model, bytes] = {"default": b"default", "antialiased": b"mip", "2dgs": b"2dgs"}
@@ -219,21 +215,6 @@ def read_ply(path: Path | str) -> SplatFile:
     """
     path = expanded(path)
     return read_plain(path, file_bytes(path))
-
-
-def file_bytes(path: Path) -> NDArray[np.uint8]:
-    """Bytes of a file, memory-mapped, (n,); `RefineError` if it is no file or cannot be read."""
-    try:
-        state = path.stat()
-        if not stat.S_ISREG(state.st_mode):  # opening a pipe would wait for a writer
-            kind = "folder" if path.is_dir() else "device"
-            raise RefineError(f"{path}: is a {kind}, expected a PLY file")
-        with path.open("rb") as stream:
-            if not state.st_size:
-                return np.empty(0, np.uint8)
-            return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
-    except (OSError, ValueError) as error:
-        raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error
 
 
 def read_plain(path: Path, data: NDArray[np.uint8]) -> SplatFile:

@@ -15,7 +15,6 @@ REQUIRED = tuple(_NAMES.split())
 """Properties that every splat has."""
 
 THIRD_SCALE = "scale_2"  # the only one that discs (2DGS) may lack
-
 REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}  # number of ``f_rest_*`` -> degree
 
 
@@ -52,10 +51,10 @@ def other_properties(names: Iterable[str]) -> list[str]:
 
 
 def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
-    """Rows, (count,), of a 3DGS PLY in float32, not filled yet, and their splats as views."""
+    """Rows, (count,), of a 3DGS PLY in float32, all 0, and their splats as views."""
     rest = 3 * above_constant(degree)
     names = [*REQUIRED[:6], *(f"f_rest_{index}" for index in range(rest)), *REQUIRED[6:]]
-    table = np.empty((count, len(names)), "<f4")
+    table = np.zeros((count, len(names)), "<f4")
     ends = np.cumsum([3, 3, rest, 1, 3])
     means, sh_dc, sh_rest, logits, scales, quaternions = np.split(table, ends, axis=1)
     planes = sh_rest.reshape(count, 3, rest // 3)

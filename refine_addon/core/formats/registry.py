@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
+from ..mapped import file_bytes
 from ..place import LARGEST_NUMBER, Place, refuse_pointer
 from ..splats import Model, Splats, drawable, with_model
 from ..whole_file import Url, expanded, whole_file
 from . import by_name, compressed_ply, glb, sog, spz, streamed_sog
 from .format import Format
-from .ply import SplatFile, file_bytes, read_plain
+from .ply import SplatFile, read_plain
 from .ply_columns import Changes, Keep, other_properties, splats_from_columns
 
 # ``.splat`` comes last, since only its name tells it from others.
@@ -27,9 +28,7 @@ READERS = (*FORMATS, by_name.KSPLAT, glb.READER, streamed_sog.READER, sog.META_R
 """Formats that are read, but for plain PLY, in the order in which an input is tried."""
 
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))  # of outputs
-
 READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))  # of inputs
-
 INDEX_NAMES = (streamed_sog.INDEX, sog.META)  # files that stand for their folder
 
 NOT_WRITTEN: tuple[str, ...] = (".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")

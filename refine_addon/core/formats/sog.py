@@ -11,11 +11,10 @@ from __future__ import annotations
 import io
 import json
 import math
-import stat
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,10 +22,10 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..images import codec_for
-from ..place import Place, described, is_sog
+from ..place import Place, is_sog, named_json
 from ..splats import MODELS, Splats, above_constant, opacity, opacity_logits, unit_quaternions
-from ..whole_file import mode_of
-from .format import Format, codes, join_largest, nearby_order, new_file, pieces, split_largest
+from ..visibility.scene import nearby_order
+from .format import Format, codes, join_largest, new_file, pieces, split_largest
 from .ply import SplatFile
 
 NAME, VERSION = "SOG", 2
@@ -243,29 +242,9 @@ def bundle_beside(path: Path) -> Bundle:
     meta = place.members(place.parsed(held(path, _META_LIMIT)))
     named = [part.get("files") for part in meta.values() if isinstance(part, dict)]
     every = [name for group in named if isinstance(group, list) for name in group]
-    paths = {path, *(beside(place, name) for name in every if isinstance(name, str))}
+    paths = {path, *(place.beside(name) for name in every if isinstance(name, str))}
     files = {there.resolve(): there.stat().st_size for there in paths}
-    return Bundle(place, meta, lambda name, limit: held(beside(place, name), limit), files)
-
-
-def beside(place: Place, name: str) -> Path:
-    """Path of a file named in a JSON file; `RefineError` unless in its folder or one below."""
-    steps = PurePosixPath(name).parts
-    if not steps or name.startswith("/") or ".." in steps or not set("\\:\0").isdisjoint(name):
-        place.fail(f"{described(name)}, expected a file in this folder or one below")
-    path = place.path.parent.joinpath(*steps)
-    try:
-        mode = mode_of(path)
-    except (OSError, ValueError):  # a name too long, a folder that may not be entered
-        mode = 0
-    if not stat.S_ISREG(mode):
-        place.fail(f"{described(name)} is not there")
-    return path
-
-
-def named_json(end: str) -> Callable[[Path, bytes], bool]:
-    """`Format.matches` for JSON files by the `end` of their names; nothing else tells them."""
-    return lambda path, head: path.name.lower().endswith(end) and head.lstrip().startswith(b"{")
+    return Bundle(place, meta, lambda name, limit: held(place.beside(name), limit), files)
 
 
 def _write(stream, splats):

@@ -30,11 +30,9 @@ _TABLE_AT = struct.Struct("<I12x")  # behind the header in version 4: byte of th
 _STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, packed and unpacked
 
 _ANTIALIASED = 1  # bit of the flags: trained with antialiasing
-
 _VERSIONS = (2, 3, 4)
 _ONE_TURN, _ZSTD = 2, 4  # versions with rotations as x y z, and with zstd streams
 _DEGREES = 5  # how many, from 0
-
 _COLOR_STEP = 0.15  # share of the codes for 1 of f_dc; they reach colours somewhat outside 0..1
 _SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
 _BUCKETS = (8, 16)  # steps, 1 / 128 each, to which harmonics of degree 1 and above are rounded
@@ -48,7 +46,6 @@ _INFLATION = 1032
 """Most bytes unpacked from a byte: gzip's limit, which zstd exceeds only for equal splats."""
 
 _PIECE = 1 << 20  # bytes that a zstd stream is unpacked to at a time
-
 _STEP = 1 << 12  # bytes of gzip unpacked at a time, into at most 4 MB
 
 

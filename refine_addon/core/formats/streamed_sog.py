@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..execute import checkpoint
-from ..place import Place, described
+from ..place import Place, described, named_json
 from ..splats import Splats, assign, rotation_matrices, scales
+from ..visibility.scene import nearby_order
 from ..whole_file import mode_of, new_folder, refuse_existing, whole_file
-from .format import Format, nearby_order, new_file, pieces
+from .format import Format, new_file, pieces
 from .ply import SplatFile
-from .sog import GENERATOR, IMAGES, META, Bundle, beside, bundle_beside, contents, named_json
+from .sog import GENERATOR, IMAGES, META, Bundle, bundle_beside, contents
 
 NAME, VERSION = "streamed SOG", 1
 INDEX = "lod-meta.json"
@@ -41,7 +42,6 @@ LEAST = 1 << 13
 """Smaller chunks are not split for width, as in splat-transform: viewers take as long for each."""
 
 _MOST_LEVELS = 1 << 10
-
 _FOLDER = re.compile(rf"(\d+_\d+)/{re.escape(META)}")  # LEVEL_NUMBER, as in splat-transform
 
 
@@ -67,7 +67,6 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
         place.fail(f"{count} splats, expected at most {size}, the bytes of all files together")
     degree = max(bundle.degree for bundle, _ in units)
     file, splats = new_file(path, (f"{NAME}, level {level}", size), count, degree, model)
-    splats.sh_rest[:] = 0.0
     start = 0
     for bundle, spans in units:
         stored = bundle.read().splats()
@@ -85,7 +84,7 @@ def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[tuple[Bun
     opened: set[Path] = set()
 
     def bundle(where: Place, name: Any) -> Bundle:
-        path = beside(where, where.text(name)).resolve()
+        path = where.beside(where.text(name)).resolve()
         if path in opened:
             where.fail(f"{described(name)} is named twice")
         opened.add(path)

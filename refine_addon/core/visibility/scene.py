@@ -21,6 +21,9 @@ MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: its multiples spread numbers that differ little."""
 
 _CHUNK = 1 << 16  # rows that are computed together, which limits temporary memory
+_SAMPLE = 10_000  # least positions for the medians in `nearby_order`; more change them little
+_FARTHEST = 1e100  # in sizes; positions are clipped to it there, so that their squares are finite
+
 _BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
 _SPREAD_BITS = (
     (32, 0x1F00000000FFFF),
@@ -163,3 +166,13 @@ def spatial_order(
         rows = order[tied]
         order[tied] = rows[np.lexsort((ties(rows), code[rows]))]
     return order
+
+
+def nearby_order(means: NDArray[Any]) -> NDArray[np.int64]:
+    """Order, (N,), of finite positions, (N, 3), along a Z-shaped (Morton) curve."""
+    sample = np.asarray(means[:: max(len(means) // _SAMPLE, 1)], np.float64)
+    middle = np.median(sample, axis=0)
+    size = float(np.median(np.abs(sample - middle))) or 1.0
+    with np.errstate(over="ignore", under="ignore"):
+        place = (np.asarray(means, np.float64) - middle) / size
+        return spatial_order(np.clip(place, -_FARTHEST, _FARTHEST))
