@@ -10,6 +10,7 @@ of seconds among it, is a crash: the input is kept and the exit code is 1.
 from __future__ import annotations
 
 import argparse
+import base64
 import gzip
 import io
 import json
@@ -110,6 +111,17 @@ def sog_seeds() -> list[Files]:
     return seeds
 
 
+def gltf_seeds() -> list[Files]:
+    """GLB files as JSON, so that values are broken; their bytes are in base64."""
+    seeds = []
+    for data in (seed["in.glb"] for seed in format_seeds(FORMATS[SUFFIXES.index(".glb") - 1])):
+        end = 20 + int.from_bytes(data[12:16], "little")
+        content = json.loads(data[20:end])
+        content["buffers"][0]["uri"] = f"data:;base64,{base64.b64encode(data[end + 8 :]).decode()}"
+        seeds.append({"in.gltf": json.dumps(content).encode()})
+    return seeds
+
+
 def version_1_of(files: Files) -> Files:
     """The files of a SOG with what version 1 says in place of version 2."""
     held = json.loads(files["meta.json"])
@@ -138,7 +150,7 @@ def broken(files: Files, others: list[Files], chance: random.Random) -> Files:
     name = chance.choice(sorted(files))
     data = files[name]
     for _ in range(chance.choice((1, 1, 1, 2, 3, 5))):
-        if name.endswith(".json") and chance.random() < 0.6:
+        if name.endswith((".json", ".gltf")) and chance.random() < 0.6:
             data = _other_value(data, chance)
         else:
             other = chance.choice(others).get(name, data)
@@ -254,6 +266,7 @@ use_sog = partial(use_splats, name="meta.json", suffix=".sog")
 TARGETS: dict[str, tuple[Callable[[], list[Files]], Callable[[Path], Any]]] = {
     "ply": (lambda: [{"in.ply": ply_case(*kind).data} for kind in PLY_KINDS], use_ply),
     **{f.name: (partial(format_seeds, f), use_splats) for f in FORMATS if f.name != "SOG"},
+    "glTF": (gltf_seeds, partial(use_splats, suffix=".glb")),
     "SOG": (sog_seeds, use_sog),
     "SOG 1": (lambda: [version_1_of(seed) for seed in sog_seeds()], use_sog),
     ".ksplat": (ksplat_seeds, use_ksplat),

@@ -116,10 +116,8 @@ BOUNDS = {key: dict(zip(NAMES, bounds, strict=True)) for key, bounds in BOUNDS.i
 @pytest.mark.parametrize("suffix", SUFFIX)
 def test_what_comes_back_lies_within_the_bounds(tmp_path, suffix, degree):
     """Written, read as what it is, compared splat by splat with activated values.
-
     A file of any format is read under any name: only .splat has no signature but its name. Written
-    as a plain PLY it has the same numbers to the bit.
-    """
+    as a plain PLY it has the same numbers to the bit."""
     path = written(tmp_path, suffix, scene(degree))
     size = path.stat().st_size
     other = path.rename(tmp_path / ("in.bin" if suffix != ".splat" else "IN.SPLAT"))
@@ -139,10 +137,8 @@ def test_what_comes_back_lies_within_the_bounds(tmp_path, suffix, degree):
 @pytest.mark.parametrize("suffix", SUFFIX)
 def test_what_a_format_cannot_hold_is_left_out_with_a_note(tmp_path, suffix):
     """Of 40 splats, one has no number as mean and one opacity 0: 38 are written.
-
     No format but PLY and SPZ holds degree 4, none a property that is no splat's; to write one is
-    refused.
-    """
+    refused."""
     columns = {**scene(4, 40), "mine": np.zeros(40, np.float32)}
     columns["y"][3], columns["opacity"][5] = np.nan, -np.inf
     columns["scale_1"][7] = -np.inf  # flat, which can be drawn
@@ -163,9 +159,7 @@ def test_what_a_format_cannot_hold_is_left_out_with_a_note(tmp_path, suffix):
 @pytest.mark.parametrize("suffix", SUFFIX)
 def test_one_colour_beyond_all_others_is_no_file_that_is_refused(tmp_path, suffix, cameras):
     """1e20 is more than a number in JSON may be here, and so is 1e30 of a harmonic.
-
-    A .sog was written, could not be read again, and stayed where it was with exit code 1.
-    """
+    A .sog was written, could not be read again, and stayed where it was with exit code 1."""
     columns = scene(1)
     columns["f_dc_1"][7], columns["f_rest_4"][9] = 1e20, -1e30
     (tmp_path / "in.ply").write_bytes(ply_of(columns))
@@ -225,9 +219,7 @@ def test_a_size_is_kept_to_or_refused_where_only_writing_tells_it(tmp_path, suff
 @pytest.mark.skipif(os.name != "posix", reason="needs permissions")
 def test_a_file_that_may_not_be_read_is_replaced(cameras):
     """The new one may not be read either: what it rounds is not told, where the run had failed.
-
-    Pictures are those of what was written before it was rounded.
-    """
+    Pictures are those of what was written before it was rounded."""
     with own_folder() as folder:
         (folder / "in.ply").write_bytes(ply_of(scene()))
         output, pictures = folder / "out.splat", PictureFiles(folder, "a")
@@ -262,20 +254,18 @@ def test_the_command_converts_by_the_suffix(tmp_path, capsys):
     assert f"in.ply: 600 splats, 34.0 -> 19.2 kB -> {there}\n  note: .splat holds c" in said.out
     assert "exists already" in said.err
     assert read_ply(back).rows.tobytes() == read_splats(there).rows.tobytes()
-    for name in ("a.ksplat", "meta.json", "lod-meta.json"):
+    for name in ("a.ksplat", "a.gltf", "meta.json", "lod-meta.json"):
         assert main(["convert", source, str(tmp_path / name)]) == 2
     assert main(["score", source, "-o", there]) == 2
     said = capsys.readouterr().err
-    for problem in (".ksplat is not written", ".json is not written", "only a .ply holds scores"):
-        assert problem in said
+    assert all(f"{end} is not written" in said for end in (".ksplat", ".gltf", ".json"))
+    assert "only a .ply holds scores" in said
     assert f"holds levels, which lod makes; expected one of {', '.join(SUFFIXES)}" in said
 
 
 def test_a_splat_file_written_by_hand(tmp_path):
     """Mean and scale as floats; red 255 is 1, which is f_dc = .5 / .282095; 128 is no turn.
-
-    The rotation (128, 192, 128, 128) is (0, .5, 0, 0): half a turn about x once it has length 1.
-    """
+    The rotation (128, 192, 128, 128) is (0, .5, 0, 0): half a turn about x once it has length 1."""
     row = struct.pack("<6f", 1.0, -2.0, 3.0, 0.5, 1.0, 2.0)
     (tmp_path / "a.splat").write_bytes(row + bytes([255, 0, 51, 204, 128, 192, 128, 128]))
     splats = read_splats(tmp_path / "a.splat").splats()

@@ -10,16 +10,19 @@ import struct
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, read_splats, write_splats
+from refine_addon.core import read_splats, write_splats
+from refine_addon.core.affine import transformed
+from refine_addon.core.formats import format as form
 from refine_addon.core.formats import registry
 from refine_addon.core.spherical_harmonics import colors
-from refine_addon.core.splats import ARRAYS, SH_C0, drawable, opacity, rotation_matrices
+from refine_addon.core.splats import ARRAYS, SH_C0, drawable, joined, opacity, rotation_matrices
 from tests.hostile import refused, seconds, with_value
 
 SPLATTING = "KHR_gaussian_splatting"
 OPACITY, ROTATION, SCALE = (f"{SPLATTING}:{name}" for name in ("OPACITY", "ROTATION", "SCALE"))
 DTYPES = {5126: "<f4", 5122: "<i2", 5121: "u1", 5120: "i1", 5123: "<u2"}
-FLOAT, SHORT, BYTE, SIGNED_BYTE, UNSIGNED_SHORT = DTYPES
+FLOAT, *INTEGERS = DTYPES
+SHORT, BYTE, BYTES, UNSIGNED_SHORT = INTEGERS
 
 VALUES = {
     "POSITION": [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]],
@@ -72,27 +75,31 @@ def packed(content, binary=b""):
 
 
 @pytest.fixture
-def read(tmp_path):
-    """Return a function that reads a file of this JSON and binary chunk."""
+def opened(tmp_path):
+    """Return a function that opens a file of this JSON and binary chunk."""
 
-    def read_back(content, binary, nodes=()):
+    def read_back(content, binary, nodes=(), model=None):
         """`nodes`, if given, are the file's, each below the one before."""
         if nodes:
             chain = [{"children": [k + 1], **node} for k, node in enumerate(nodes[:-1])]
             content = {**content, "nodes": [*chain, {"mesh": 0, **nodes[-1]}]}
         (tmp_path / "a.glb").write_bytes(packed(content, binary))
         with np.errstate(all="raise"):
-            return read_splats(tmp_path / "a.glb").splats()
+            return read_splats(tmp_path / "a.glb", model)
 
     return read_back
 
 
-def test_values_are_activated_and_y_points_up(read):
-    """Half a turn about z: x and y change sign, and so do harmonics of odd order.
+@pytest.fixture
+def read(opened):
+    """Return a function that reads the splats of such a file."""
+    return lambda *parts: opened(*parts).splats()
 
+
+def test_values_are_activated_and_y_points_up(read):
+    """Half a turn about z: x and y change sign.
     The rotation is multiplied by that turn, (0, 0, 0, 1), from the left: 1 becomes (0, 0, 0, 1).
-    A scale of 2 is log 2, one of 0 -104; an opacity of 1 is kept 2^-26 away from it.
-    """
+    A scale of 2 is log 2, one of 0 -104; an opacity of 1 is kept 2^-26 away from it."""
     splats = read(*document())
     assert splats.means.tolist() == [[-1.0, -2.0, 3.0], [-4.0, -5.0, 6.0]]
     np.testing.assert_allclose(splats.log_scales[0], np.log([1.0, 2.0, 4.0]), rtol=1e-6)
@@ -100,46 +107,32 @@ def test_values_are_activated_and_y_points_up(read):
     np.testing.assert_allclose(splats.opacity_logits, [0.0, np.log(2.0**26)], atol=1e-6)
     assert splats.quaternions.tolist() == [[0.0, 0.0, 0.0, 1.0], [-0.5, 0.5, 0.5, -0.5]]
     np.testing.assert_allclose(splats.sh_dc, VALUES[f"{SPLATTING}:SH_DEGREE_0_COEF_0"], rtol=1e-6)
-    stored = np.array([VALUES[f"{SPLATTING}:SH_DEGREE_1_COEF_{n}"] for n in range(3)])
-    expected = stored.transpose(1, 0, 2) * np.array([-1.0, 1.0, -1.0])[:, None]
-    np.testing.assert_allclose(splats.sh_rest, expected, atol=1e-7)
+
+
+def alike(one, other):
+    """Compare splats; a rotation and its negative are one."""
+    for name in {*ARRAYS} - {"quaternions"}:
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), 1e-6, 2e-6)
+    turns = (rotation_matrices(splats.quaternions) for splats in (one, other))
+    np.testing.assert_allclose(*turns, atol=1e-6)
 
 
 def test_what_nodes_do_is_applied(read):
     """A node turned a quarter about x, of twice the size and moved by (1, 0, 0), in a moved one.
-
     (x, y, z) becomes 2 (x, -z, y) + (1, 0, 0) + (0, 0, 1), and that is turned half about z.
-    The colour along the direction that the turns make of d is that of the untouched file along d.
-    A matrix stands column by column: one that moves by (7, 8, 9) has these last.
-    """
+    A matrix stands column by column: one that moves by (7, 8, 9) has these last."""
     moved = {"matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 7, 8, 9, 1]}
     assert read(*document(), [moved]).means.tolist() == [[-8.0, -10.0, 12.0], [-11.0, -13.0, 15.0]]
-    plain = read(*document())
-    half = float(np.sqrt(0.5))
+    half, flip = float(np.sqrt(0.5)), np.diag([-1.0, -1, 1, 1])
     child = {"rotation": [half, 0, 0, half], "scale": [2, 2, 2], "translation": [1, 0, 0]}
-
-    splats = read(*document(), [{"translation": [0, 0, 1]}, child])
-
-    np.testing.assert_allclose(splats.means[0], [-3.0, 6.0, 5.0], atol=1e-5)
-    np.testing.assert_allclose(splats.log_scales[0], plain.log_scales[0] + np.log(2.0), atol=1e-6)
-    quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    flip = np.diag([-1.0, -1, 1])
-    turn = flip @ quarter @ flip
-    turned = np.abs(turn @ rotation_matrices(plain.quaternions))
-    np.testing.assert_allclose(np.abs(rotation_matrices(splats.quaternions)), turned, atol=1e-6)
-    along = np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])
-    np.testing.assert_allclose(
-        colors(along @ turn.T, splats.sh_dc, splats.sh_rest),
-        colors(along, plain.sh_dc, plain.sh_rest),
-        atol=1e-6,
-    )
+    frame = np.array([[2, 0, 0, 1], [0, 0, -2, 0], [0, 2, 0, 1], [0, 0, 0, 1.0]])
+    expected = transformed(read(*document()), flip @ frame @ flip)
+    alike(read(*document(), [{"translation": [0, 0, 1]}, child]), expected)
 
 
 def test_every_node_shows_its_primitives_where_it_stands(read):
     """Three nodes: one mesh moved by 5 and by 7 along x, which changes sign, around another.
-
-    The one of less degree has zeros; all are there in the order of the scene's nodes.
-    """
+    The one of less degree has zeros; all are there in the order of the scene's nodes."""
     content, binary = document()
     short = copy.deepcopy(content["meshes"][0]["primitives"][0])
     for n in range(3):
@@ -154,51 +147,31 @@ def test_every_node_shows_its_primitives_where_it_stands(read):
     assert [part.any() for part in np.split(splats.sh_rest, 3)] == [True, False, True]
 
 
-def test_normalized_integers_and_values_that_stand_apart_are_read(read):
-    """Opacity 51 of 255 is .2; a rotation of 32767 is 1, and -32768 is -1 too.
-
-    Positions have 8 bytes behind each, by a stride of 20.
-    """
-    turns = [[0, 0, 0, 32767], [-32768, 0, 0, 0]]
-    values = {**VALUES, OPACITY: [[51], [255]], ROTATION: turns}
-    content, binary = document(values, OPACITY=BYTE, ROTATION=SHORT)
+def test_values_that_stand_apart_are_read(read):
+    """Positions have 8 bytes behind each, by a stride of 20."""
+    content, binary = document()
     view = {"buffer": 0, "byteOffset": len(binary), "byteLength": 40, "byteStride": 20}
     content["bufferViews"][0] = view
     rows = np.pad(np.array(VALUES["POSITION"], "<f4"), ((0, 0), (0, 2)))
     splats = read(content, binary + rows.tobytes())
-    np.testing.assert_allclose(splats.opacity_logits[0], np.log(0.25), rtol=1e-6)
-    assert splats.quaternions.tolist() == [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -1.0, 0.0]]
-    assert splats.means.tolist()[1] == [-4.0, -5.0, 6.0]
+    assert splats.means.tolist() == [[-1.0, -2.0, 3.0], [-4.0, -5.0, 6.0]]
 
 
-INTEGERS = [
-    (ROTATION, SIGNED_BYTE, 127, [[127, 0, 0, -127], [0, 64, -128, 0]]),
-    (ROTATION, SHORT, 32767, [[32767, 0, 0, 9], [0, 64, -32768, 0]]),
-    (SCALE, BYTE, 1, [[1, 2, 255], [0, 3, 4]]),
-    (SCALE, BYTE, 255, [[1, 2, 255], [0, 3, 4]]),
-    (SCALE, UNSIGNED_SHORT, 1, [[1, 2, 65535], [0, 3, 4]]),
-    (SCALE, UNSIGNED_SHORT, 65535, [[1, 2, 65535], [0, 3, 4]]),
-    (SCALE, SIGNED_BYTE, 1, [[1, -2, 3], [0, 4, 5]]),  # signed ones: drafts alone, logarithms
-    (SCALE, SIGNED_BYTE, 127, [[127, -128, 0], [0, 4, 5]]),
-    (SCALE, SHORT, 1, [[1, -2, 3], [0, 4, 5]]),
-    (SCALE, SHORT, 32767, [[1, -2, 3], [0, 4, 5]]),
-    (OPACITY, BYTE, 255, [[0], [255]]),
-    (OPACITY, UNSIGNED_SHORT, 65535, [[1], [32768]]),
-]
-"""Attribute, type, the number that stands for 1 and values, for every type that is allowed."""
+ALLOWED = {ROTATION: [BYTES, SHORT], SCALE: [*INTEGERS], OPACITY: [BYTE, UNSIGNED_SHORT]}
 
 
-@pytest.mark.parametrize("case", range(len(INTEGERS)))
-def test_integers_of_every_type_are_read_as_the_floats_they_stand_for(read, case):
-    """The least of signed ones is -1, as the one above it: -128 as -127."""
-    name, kind, unit, stored = INTEGERS[case]
-    content, binary = document(VALUES | {name: stored}, **{name.split(":")[1]: kind})
-    content["accessors"][list(VALUES).index(name)]["normalized"] = unit != 1
-    splats = read(content, binary)
-    meant = np.array(stored) / unit
-    expected = read(*document(VALUES | {name: np.maximum(meant, -1.0) if unit != 1 else meant}))
-    for array in ARRAYS:
-        np.testing.assert_allclose(getattr(splats, array), getattr(expected, array), 1e-6, 1e-6)
+@pytest.mark.parametrize("name", ALLOWED)
+@pytest.mark.parametrize("shares", [True, False])
+def test_integers_of_every_type_are_read_as_the_floats_they_stand_for(read, name, shares):
+    """The least of signed ones is -1, as the one above it: -128 as -127. Signed scales are those of
+    drafts. Only scales may stand for themselves."""
+    for kind in ALLOWED[name] if shares or name == SCALE else ():
+        ends = np.iinfo(DTYPES[kind])
+        stored = np.resize([ends.max, 3, ends.min, 0, ends.max // 2], (2, len(VALUES[name][0])))
+        content, binary = document(VALUES | {name: stored}, **{name.split(":")[1]: kind})
+        content["accessors"][list(VALUES).index(name)]["normalized"] = shares
+        meant = np.maximum(stored / ends.max, -1.0) if shares else stored
+        alike(read(content, binary), read(*document(VALUES | {name: meant})))
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -223,84 +196,67 @@ def srgb(linear):
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def test_linear_colours_become_those_of_srgb(tmp_path):
+def test_linear_colours_become_those_of_srgb(opened):
     """Base colours by the curve, other harmonics by its slope, here from a difference.
-
-    0.2140411 is 0.5 in sRGB, 0.001 is on the line; a colour beyond 1 goes on along the curve.
-    """
+    0.2140411 is 0.5 in sRGB, 0.001 is on the line; a colour beyond 1 goes on along the curve."""
     linear = np.array([[0.2140411, 0.001, 1.5], [0.03, 0.5, 1.0]])
-    values = VALUES | {f"{SPLATTING}:SH_DEGREE_0_COEF_0": (linear - 0.5) / SH_C0}
-    content, binary = document(values)
-    (tmp_path / "srgb.glb").write_bytes(packed(content, binary))
-    content["meshes"][0]["primitives"][0]["extensions"][SPLATTING]["colorSpace"] = (
-        "lin_rec709_display"
-    )
-    (tmp_path / "a.glb").write_bytes(packed(content, binary))
-
-    file = read_splats(tmp_path / "a.glb")
-
-    splats = file.splats()
-    np.testing.assert_allclose(SH_C0 * splats.sh_dc + 0.5, srgb(linear), atol=1e-6)
-    assert abs(splats.sh_dc[0, 0]) < 1e-5
+    content, binary = document(VALUES | {f"{SPLATTING}:SH_DEGREE_0_COEF_0": (linear - 0.5) / SH_C0})
+    rest = opened(content, binary).splats().sh_rest
+    file = opened(with_value(content, *KIND, "colorSpace", "lin_rec709_display"), binary)
+    np.testing.assert_allclose(SH_C0 * file.splats().sh_dc + 0.5, srgb(linear), atol=1e-6)
+    assert abs(file.splats().sh_dc[0, 0]) < 1e-5
     slopes = (srgb(linear * 1.0001) - srgb(linear * 0.9999)) / (0.0002 * linear)
-    rest = read_splats(tmp_path / "srgb.glb").splats().sh_rest
-    np.testing.assert_allclose(splats.sh_rest, rest * slopes[:, None], rtol=1e-5)
-    assert file.remarks == (
-        'a.glb has colorSpace "lin_rec709_display", converted to sRGB: '
-        "harmonics and blends are approximate",
-    )
+    np.testing.assert_allclose(file.splats().sh_rest, rest * slopes[:, None], rtol=1e-5)
+    note = 'a.glb has colorSpace "lin_rec709_display", converted to sRGB: '
+    assert file.remarks == (f"{note}harmonics and blends are approximate",)
 
 
-def test_what_is_not_as_the_file_says_is_noted(tmp_path):
+def test_colours_for_programs_without_the_extension_are_linear(tmp_path, opened, monkeypatch):
+    """COLOR_0 is so by glTF: 8 bits, of which half a step is at most 12.92 / 510 of sRGB."""
+    monkeypatch.setattr(form, "CHUNK", 1)  # each splat by itself
+    write_splats(tmp_path / "b.glb", opened(*document()))
+    data = (tmp_path / "b.glb").read_bytes()
+    start = len(data) - 2 * (60 + 36) + 24  # behind two positions
+    codes = np.frombuffer(data[start : start + 8], np.uint8).reshape(2, 4)
+    shown = 0.5 + SH_C0 * np.array(VALUES[f"{SPLATTING}:SH_DEGREE_0_COEF_0"])
+    np.testing.assert_allclose(srgb(codes[:, :3] / 255), shown, atol=0.003)
+    assert codes[:, 3].tolist() == [128, 255]
+
+
+def test_what_is_not_as_the_file_says_is_noted(opened):
     """Colours of an unknown space, another projection, and what a reader must know of."""
     content, binary = document()
     kind = content["meshes"][0]["primitives"][0]["extensions"][SPLATTING]
-    kind |= {"colorSpace": "custom_display", "projection": "orthographic"}
-    content["extensionsRequired"] = [SPLATTING, "KHR_mesh_quantization", "X_packed"]
-    (tmp_path / "a.glb").write_bytes(packed(content, binary))
-    assert read_splats(tmp_path / "a.glb").remarks == (
+    kind |= {"colorSpace": 7, "projection": "orthographic"}
+    content["extensionsRequired"] = [SPLATTING, "KHR_materials_unlit", "X_packed"]
+    assert opened(content, binary).remarks == (
         'a.glb has a required extension that is not read, "X_packed"',
-        'a.glb has colorSpace "custom_display", read as "srgb_rec709_display"',
+        'a.glb has colorSpace 7, read as "srgb_rec709_display"',
         'a.glb has projection "orthographic", read as "perspective"',
     )
 
 
-def test_scales_of_one_primitive_are_all_logarithms_or_none(tmp_path):
+def test_scales_of_one_primitive_are_all_logarithms_or_none(opened):
     """One negative scale makes logarithms of those of its primitive alone; NaN makes none."""
-    content, binary = document(VALUES | {SCALE: [[-3.0, -2.0, 0.5], [0.0, 1.0, 2.0]]})
-    other, more = document(VALUES | {SCALE: [[1.0, 1.0, np.nan], [0.0, 1.0, 1.0]]})
-    views, size = len(content["bufferViews"]), len(binary)
-    for view in other["bufferViews"]:
-        content["bufferViews"].append(view | {"byteOffset": view["byteOffset"] + size})
-    for accessor in other["accessors"]:
-        content["accessors"].append(accessor | {"bufferView": accessor["bufferView"] + views})
-    part = copy.deepcopy(content["meshes"][0]["primitives"][0])
-    part["attributes"] = {name: index + views for name, index in part["attributes"].items()}
-    content["meshes"][0]["primitives"].append(part)
-    (tmp_path / "a.glb").write_bytes(packed(content, binary + more))
-    file = read_splats(tmp_path / "a.glb")
+    values = VALUES | {SCALE: [[-3.0, -2.0, 0.5], [0.0, 1.0, 2.0]]}
+    content, binary = document(values | {"OTHER": [[1.0, 1.0, np.nan], [0.0, 1.0, 1.0]]})
+    primitives = content["meshes"][0]["primitives"]
+    primitives.append(copy.deepcopy(primitives[0]))
+    primitives[1]["attributes"][SCALE] = len(VALUES)
+    file = opened(content, binary)
     expected = [[-3.0, -2.0, 0.5], [0.0, 1.0, 2.0], [0.0, 0.0, np.nan], [-104.0, 0.0, 0.0]]
     np.testing.assert_array_equal(file.splats().log_scales, expected)
-    assert file.remarks == ("a.glb has negative scales: its scales are read as logarithms",)
+    note = "a.glb has negative scales: its scales are read as logarithms"
+    assert registry.notes(file, None, np.ones(4, np.bool_)) == [note]
     assert drawable(file.splats()).tolist() == [True, True, False, True]
 
 
-def test_values_that_no_splat_holds_are_taken_for_what_they_mean(tmp_path, read):
-    """Drafts of the extension have logarithms of scales; they became NaN, and nothing was said.
-
-    The logit of an opacity of 0 is -104, as that of Blender's splats: float32 has nothing that
-    small. 1e10 times 1e30 is beyond float32, which cannot be drawn.
-    """
-    scales = [[-3.0, -2.0, 0.5], [-1.0] * 3]
-    values = {**VALUES, SCALE: scales, OPACITY: [[0.0], [-0.1]]}
-    (tmp_path / "a.glb").write_bytes(packed(*document(values)))
-    file = read_splats(tmp_path / "a.glb")
-    assert file.splats().log_scales.tolist() == scales
-    note = "a.glb has negative scales: its scales are read as logarithms"
-    assert registry.notes(file, None, np.ones(2, np.bool_)) == [note]
-    logits = file.splats().opacity_logits
-    assert opacity(logits).astype(np.float32).tolist() == [0.0, 0.0]
-    np.testing.assert_allclose(logits, -104.0, rtol=1e-6)
+def test_values_that_no_splat_holds_are_taken_for_what_they_mean(read):
+    """The logit of an opacity of 0 is -104, as that of Blender's splats: float32 has nothing that
+    small. 1e10 times 1e30 is beyond float32, which cannot be drawn."""
+    splats = read(*document(VALUES | {OPACITY: [[0.0], [-0.1]]}))
+    np.testing.assert_allclose(splats.opacity_logits, -104.0, rtol=1e-6)
+    assert opacity(splats.opacity_logits).astype(np.float32).tolist() == [0.0, 0.0]
     far = document({**VALUES, "POSITION": [[1e10, 0.0, 0.0]] * 2})
     assert read(*far, [{"scale": [1e15] * 3}] * 2).means[:, 0].tolist() == [-np.inf, -np.inf]
 
@@ -308,10 +264,8 @@ def test_values_that_no_splat_holds_are_taken_for_what_they_mean(tmp_path, read)
 @pytest.mark.slow
 def test_time_grows_with_the_file_and_not_with_nodes_times_accessors(read):
     """1,000 nodes with one mesh of 20 primitives of 8 attributes: 160 are read, not 160,000.
-
     Of 20,001 nodes one moves anything: matrices of the others took 80 µs each. Either took seconds,
-    as 10,000 that move something without splats did: each was turned by itself.
-    """
+    as 10,000 that move something without splats did: each was turned by itself."""
     content, binary = document()
     crowd = copy.deepcopy(content)
     for accessor in crowd["accessors"]:
@@ -332,16 +286,12 @@ NAMED = (*PART, "attributes")
 NODE = ("nodes", 0)
 LESS = {name: index for index, name in enumerate(list(VALUES)[:-1])}
 KIND = (*PART, "extensions", SPLATTING)
-
-
-def inside(scale):
-    """Return two nodes of a scale, one in the other: NumPy warned, or knew no powers, of both."""
-    return [{"children": [1], "scale": [scale] * 3}, {"mesh": 0, "scale": [scale] * 3}]
-
-
 PLACE = "meshes[0] primitives[0]"
 SPZ = f"{SPLATTING}_compression_spz_2"
 ACCESSOR = {"bufferView": 0, "componentType": FLOAT, "type": "VEC3", "count": 0}
+SCALES = [{"scale": [scale] * 3} for scale in (1e18, 1e-30)]
+INSIDE = [[{"children": [1], **scale}, {"mesh": 0, **scale}] for scale in SCALES]
+URI, OUTSIDE = ("buffers", 0, "uri"), "expected a file in this folder or one below"
 
 FAULTS = [
     ("scenes", [], "scene: 0 is none of 0 scenes"),
@@ -354,8 +304,8 @@ FAULTS = [
     (*NODE, "scale", [10**400] * 3, "nodes[0] scale [0]: expected a f"),
     (*NODE, "scale", [1, 1, 0], "nodes[0]: the transform is flat"),
     (*NODE, "scale", [1, 2, 1], "nodes[0]: the transform scales"),
-    ("nodes", inside(1e18), "nodes[1]: the transform sc"),
-    ("nodes", inside(1e-30), "nodes[1]: the transform sc"),
+    ("nodes", INSIDE[0], "nodes[1]: the transform sc"),  # NumPy warned, or knew no powers, of both
+    ("nodes", INSIDE[1], "nodes[1]: the transform sc"),
     (*NODE, "translation", [float("inf"), 0, 0], "nodes[0] translation [0]: expected a finite"),
     (*PART, "mode", 4, f"{PLACE} mode: expected 0, got 4"),
     (*KIND, "kernel", "cube", f'{PLACE}: splats of kernel "cube", expected "ellipse"'),
@@ -369,7 +319,7 @@ FAULTS = [
     (*NAMED, [], f"{PLACE} attributes: expected an object, got a list of 0"),
     ("accessors", 0, "type", "VEC4", 'accessors[0]: "VEC4" of 5126, exp'),
     ("accessors", 0, "componentType", 5125, 'accessors[0]: "VEC3" of 5125, '),
-    ("accessors", 0, "sparse", {}, "accessors[0]: sparse or without values"),
+    ("accessors", 0, "sparse", {}, "accessors[0]: sparse or without values in a bufferView"),
     ("accessors", 0, "count", 10**12, "accessors[0]: 1000000000000 values of 12 "),
     ("accessors", 0, "count", -1, "accessors[0] count: expected a whole number"),
     ("accessors", 2, "count", 1, f"{PLACE} attributes {SCALE}: 1 values, expected 2 as for"),
@@ -378,7 +328,14 @@ FAULTS = [
     ("bufferViews", 0, "byteOffset", 10**6, "bufferViews[0]: 24 bytes from byte 1000000 of "),
     ("bufferViews", 0, "extensions", {"X_packed": {}}, "bufferViews[0]: compressed, expected p"),
     ("bufferViews", 0, "byteStride", 4, "accessors[0]: 2 values of 12 bytes f"),
+    *((*URI, f"{up}/a.bin", OUTSIDE) for up in ("%2e%2e", "http://[::1]", "", "%00", "data:")),
+    *((*URI, name, "is not there") for name in ("none.bin", "\ud800", "a" * 100_000)),
+    (*URI, 5, "buffers[0]: expected a string, got 5"),
+    *((*URI, f"data:;base64,{text}", "buffers[0]: invalid base64: ") for text in ("AAA", "AA*AA")),
+    (*URI, "data:;base64,AAAA", "bufferViews[0]: 24 bytes from byte 0 of 3 do not fit"),
 ]
+"""Where to put which value, and what is said. Of addresses that lead out of the folder, after their
+% codes are undone, no file is so much as looked for."""
 
 
 @pytest.mark.parametrize("case", range(len(FAULTS)))
@@ -397,22 +354,17 @@ def test_a_few_bytes_do_not_become_many_splats(tmp_path):
     assert "00 splats or more, expected at most 16" in message
 
 
-@pytest.mark.parametrize(
-    ("data", "expected"),
-    [
-        (struct.pack("<4sII", b"glTF", 1, 99) + bytes(87), "glTF version 1, expected 2"),
-        (struct.pack("<4sII", b"glTF", 2, 2**32 - 1) + bytes(87), "truncated: all chunks need 429"),
+def test_a_file_that_is_no_glb_is_refused(tmp_path):
+    head, chunk = struct.Struct("<4sII").pack, struct.Struct("<4sIII4s").pack
+    for data, expected in (
+        (head(b"glTF", 1, 99) + bytes(87), "glTF version 1, expected 2"),
+        (head(b"glTF", 2, 2**32 - 1) + bytes(87), "truncated: all chunks need 4294967295"),
         (packed(b"[]"), "JSON: expected an object, got a list of 0"),
         (packed(b"{"), "JSON line 1 column 5: invalid JSON: Expecting prop"),
-        (packed(b"[" * 100_000), "JSON: invalid JSON: nested too deeply"),
-        (packed(b"\xff\xff"), "JSON: invalid JSON: 'utf-8'"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 24, 99, b"JSON") + bytes(4), "truncated: a chunk at "),
-        (struct.pack("<4sIII4s", b"glTF", 2, 20, 0, b"BIN\0"), "JSON line 1 column 1: invalid"),
-    ],
-    ids=range(8),
-)
-def test_a_file_that_is_no_glb_is_refused(tmp_path, data, expected):
-    refused(tmp_path / "a.glb", expected, data)
+        (chunk(b"glTF", 2, 24, 99, b"JSON") + bytes(4), "truncated: a chunk at byte 20 and "),
+        (chunk(b"glTF", 2, 20, 0, b"BIN\0"), "JSON line 1 column 1: invalid"),
+    ):
+        refused(tmp_path / "a.glb", expected, data)
 
 
 def test_a_gltf_is_read_with_its_bytes_beside_it_and_in_itself(tmp_path):
@@ -434,95 +386,46 @@ def test_a_gltf_is_read_with_its_bytes_beside_it_and_in_itself(tmp_path):
     assert file.rows.tobytes() == read_splats(tmp_path / "a.glb").rows.tobytes()
     assert file.format == f"glTF with {SPLATTING}"
     assert file.origin.size == len(text) + len(binary)
-    with pytest.raises(RefineError, match=r"\.gltf is not written"):
-        write_splats(tmp_path / "b.gltf", file)
 
 
-OUTSIDE = "expected a file in this folder or one below"
+@pytest.fixture
+def with_spz(tmp_path, opened):
+    """Return a function: the stored splats, and a file that has them in views of an SPZ within."""
 
+    def made(model, *views, behind=b""):
+        """`views` are those of the primitives; 8 is one that shares its bytes with 0."""
+        write_splats(tmp_path / "a.spz", opened(*document(), (), model), overwrite=True)
+        data = (tmp_path / "a.spz").read_bytes() + behind
+        content, binary = document()
+        content["bufferViews"].append(content["bufferViews"][0])
+        for view in content["bufferViews"][::8]:
+            view |= {"byteOffset": len(binary), "byteLength": len(data)}
+        primitives = content["meshes"][0]["primitives"]
+        for view in views:
+            packing = {SPZ: {"bufferView": view}}
+            primitives.append(with_value(primitives[0], *KIND[4:], "extensions", packing))
+        del primitives[0]
+        content["extensionsRequired"] = [SPLATTING, SPZ]
+        return read_splats(tmp_path / "a.spz").splats(), (content, binary + data)
 
-@pytest.mark.parametrize(
-    ("uri", "expected"),
-    [
-        ("../a.bin", OUTSIDE),
-        ("%2e%2e%2fa.bin", OUTSIDE),
-        ("b/%2E./../a.bin", OUTSIDE),
-        ("/etc/passwd", OUTSIDE),
-        ("C:/a.bin", OUTSIDE),
-        ("..\\a.bin", OUTSIDE),
-        ("file:///etc/passwd", OUTSIDE),
-        ("http://127.0.0.1/a.bin", OUTSIDE),
-        ("data:text/plain,AAAA", OUTSIDE),
-        ("a%00.bin", OUTSIDE),
-        ("none.bin", '"none.bin" is not there'),
-        (".", OUTSIDE),
-        ("\ud800", "is not there"),
-        ("a" * 100_000, "is not there"),
-        (5, "buffers[0]: expected a string, got 5"),
-        ("data:;base64,AAA", "buffers[0]: invalid base64: "),
-        ("data:;base64,A*AA", "buffers[0]: invalid base64: "),
-        ("data:;base64,", "bufferViews[0]: 24 bytes from byte 0 of 0 do not fit"),
-        ("data:;base64,AAAA", "bufferViews[0]: 24 bytes from byte 0 of 3 do not fit"),
-        ("short.bin", "bufferViews[0]: 24 bytes from byte 0 of 10 do not fit"),
-        ("", "bufferViews[0]: 24 bytes from byte 0 of 0 do not fit"),
-    ],
-    ids=range(21),
-)
-def test_a_gltf_reads_nothing_outside_its_folder(tmp_path, uri, expected):
-    """Addresses are refused without a look at them, after their % codes are undone."""
-    (tmp_path / "in").mkdir()
-    (tmp_path / "a.bin").write_bytes(BINARY)
-    (tmp_path / "in/short.bin").write_bytes(bytes(10))
-    data = json.dumps(with_value(CONTENT, "buffers", 0, "uri", uri)).encode()
-    refused(tmp_path / "in/a.gltf", expected, data)
+    return made
 
 
 @pytest.mark.parametrize("model", ["default", "antialiased"])
-def test_an_spz_within_is_read_and_faces_as_the_extension_says(tmp_path, model):
+def test_an_spz_within_is_read_and_faces_as_the_extension_says(opened, with_spz, model):
     """SPZ's axes are right, up and back, those of its decoder here left, up and front.
-
-    That turned half about z, (x, y, z) becomes (x, -y, -z); so do directions.
-    """
-    (tmp_path / "a.glb").write_bytes(packed(*document()))
-    write_splats(tmp_path / "a.spz", read_splats(tmp_path / "a.glb", model))
-    stored = read_splats(tmp_path / "a.spz").splats()
-    content, binary = document()
-    primitive = content["meshes"][0]["primitives"][0]
-    primitive["extensions"][SPLATTING]["extensions"] = {SPZ: {"bufferView": 0}}
-    content["extensionsRequired"] = [SPLATTING, SPZ]
-    data = (tmp_path / "a.spz").read_bytes()
-    content["bufferViews"][0] |= {"byteOffset": len(binary), "byteLength": len(data)}
-    for accessor in content["accessors"]:
-        del accessor["bufferView"]
-    (tmp_path / "b.glb").write_bytes(packed(content, binary + data))
-
-    file = read_splats(tmp_path / "b.glb")
-
-    splats, turn = file.splats(), np.diag([1.0, -1.0, -1.0])
+    That turned half about z, (x, y, z) becomes (x, -y, -z)."""
+    stored, parts = with_spz(model, 0, 0)
+    file = opened(*parts)
+    expected = transformed(stored, np.diag([1.0, -1.0, -1.0, 1.0]))
     assert (file.model, file.remarks) == (model, ())
-    np.testing.assert_allclose(splats.means, stored.means @ turn, atol=1e-6)
-    np.testing.assert_allclose(splats.log_scales, stored.log_scales, atol=1e-6)
-    np.testing.assert_array_equal(splats.opacity_logits, stored.opacity_logits)
-    turned = np.abs(turn @ rotation_matrices(stored.quaternions))
-    np.testing.assert_allclose(np.abs(rotation_matrices(splats.quaternions)), turned, atol=1e-6)
-    along = np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])
-    np.testing.assert_allclose(
-        colors(along @ turn, splats.sh_dc, splats.sh_rest),
-        colors(along, stored.sh_dc, stored.sh_rest),
-        atol=1e-6,
-    )
+    alike(file.splats(), joined([expected] * 2))
 
 
-def test_models_that_differ_are_refused(tmp_path):
-    """An antialiased SPZ beside plain accessors: a file of splats has one model."""
-    content, binary = document()
-    (tmp_path / "a.glb").write_bytes(packed(content, binary))
-    write_splats(tmp_path / "a.spz", read_splats(tmp_path / "a.glb", "antialiased"))
-    data = (tmp_path / "a.spz").read_bytes()
-    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
-    content["bufferViews"].append(view)
-    primitives = content["meshes"][0]["primitives"]
-    primitives.append(copy.deepcopy(primitives[0]))
-    primitives[1]["extensions"][SPLATTING]["extensions"] = {SPZ: {"bufferView": 8}}
-    data = packed(content, binary + data)
-    refused(tmp_path / "b.glb", "some splats are default, others not, expected one", data)
+def test_spz_files_that_share_their_bytes_or_differ_in_model_are_refused(tmp_path, with_spz):
+    """Each view of a file of 1 MB may be unpacked to 1 GB; a file of splats has one model."""
+    path, (content, binary) = tmp_path / "b.glb", with_spz("default", 0, 8, behind=bytes(10**5))[1]
+    refused(path, f"{SPZ}: 200", packed(content, binary))
+    content, binary = with_spz("antialiased", 0)[1]
+    content["meshes"][0]["primitives"] += document()[0]["meshes"][0]["primitives"]
+    refused(path, "some splats are antialiased, others not, expected one", packed(content, binary))

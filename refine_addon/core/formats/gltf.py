@@ -186,7 +186,7 @@ def _opened(path, data):
         uri = unquote(where.text(where.members(item).get("uri", "")))
         kind, _, coded = uri.partition(",")
         if not uri:
-            held = chunks.get(BINARY, data[:0])[: None if number == 0 else 0]
+            held = chunks.get(BINARY, data[:0])
         elif kind.startswith("data:") and kind.endswith(";base64"):
             try:
                 held = np.frombuffer(base64.b64decode(coded, validate=True), np.uint8)
