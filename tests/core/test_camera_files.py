@@ -69,8 +69,7 @@ def test_every_format_gives_the_same_view(tmp_path, kind):
 
     Inria stores x, y, z as columns; OpenGL x, -y, -z. COLMAP stores R with rows x, y, z: its
     trace is 0, so qw = 1/2, qx = (R21 - R12) / 2 = 1/2, qy = (R02 - R20) / 2 = 1/2,
-    qz = (R10 - R01) / 2 = -1/2, and t = -R (1, 2, 3) = (-2, 3, 1).
-    """
+    qz = (R10 - R01) / 2 = -1/2, and t = -R (1, 2, 3) = (-2, 3, 1)."""
     write(tmp_path / "cameras.json", [INRIA])
     write(tmp_path / "transforms.json", TRANSFORMS)
     write_colmap(tmp_path / "colmap")
@@ -84,9 +83,7 @@ def test_every_format_gives_the_same_view(tmp_path, kind):
 
 def test_inria_cameras_keep_their_order_and_may_share_a_name(tmp_path, monkeypatch):
     """One without a name is called by its index; half a surrogate pair could not be printed.
-
-    A byte order mark and a tilde are understood.
-    """
+    A byte order mark and a tilde are understood."""
     named = [{**INRIA, "img_name": name} for name in ("b", "a", "b", "\ud800ä")]
     unnamed = {key: value for key, value in INRIA.items() if key != "img_name"}
     views = read(tmp_path, [*named, {**unnamed, "cx": 30.5, "cy": 20}])
@@ -100,9 +97,7 @@ def test_inria_cameras_keep_their_order_and_may_share_a_name(tmp_path, monkeypat
 
 def test_a_rounded_rotation_is_made_exact(tmp_path):
     """Rows of 4 decimals are off by up to 5e-5; the view's rotation is orthonormal again.
-
-    1e-200 squared would underflow: such entries are read as 0, and the result is exact.
-    """
+    1e-200 squared would underflow: such entries are read as 0, and the result is exact."""
     c, s = round(math.cos(0.3), 4), round(math.sin(0.3), 4)
     rounded = {**INRIA, "rotation": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}
     tiny = {**INRIA, "rotation": [[1, 1e-200, 0], [-1e-200, 1, 0], [0, 5e-324, 1]]}
@@ -139,9 +134,7 @@ def test_what_a_frame_says_comes_before_what_all_share(tmp_path):
 
 def test_focal_lengths_come_from_lengths_or_angles(tmp_path):
     """A field of view of 90 degrees spans a side s at the focal length s / 2: 32 or 24 pixels.
-
-    What instant-ngp does inside itself moves no camera; a missing principal point is the middle.
-    """
+    What instant-ngp does inside itself moves no camera; a missing principal point is the middle."""
     inside = {"scale": 0.33, "offset": [0.5, 0.5, 0.5], "aabb_scale": 16, "aabb": [[0] * 3] * 2}
     quarter = math.pi / 2
     for keys, expected in (
@@ -158,13 +151,11 @@ def test_focal_lengths_come_from_lengths_or_angles(tmp_path):
 
 def test_dataparser_transforms_beside_it_lead_to_the_splats_of_ns_export(tmp_path):
     """Nerfstudio turned the poses by D: (x, y, z) -> (y, -x, z) + (1, 1, 1), and then halved them.
-
     Before, ns-process-data had applied A: (x, y, z) -> (x, z, -y) + (5, 0, 0). The file stores
     D after A: (x, y, z) -> (z, -x, -y) + D(5, 0, 0) = (z, -x, -y) + (1, -4, 1), and 0.5; with a
     scale of 4 that was applied before, 2.
     The camera at (1, 2, 3) goes to (2, -1, 3) + 1 = (3, 0, 4), halved (1.5, 0, 2); the point at
-    (-1, 2.5, 2.75) to (3.5, 2, 3.75) / 2, and it still lands at pixel (57, 39).
-    """
+    (-1, 2.5, 2.75) to (3.5, 2, 3.75) / 2, and it still lands at pixel (57, 39)."""
     applied = [[1, 0, 0, 5], [0, 0, 1, 0], [0, -1, 0, 0]]
     views = read(tmp_path, {**TRANSFORMS, "applied_transform": applied, "applied_scale": 2})
     assert views.note == "splats of ns-export need dataparser_transforms.json beside it"
@@ -180,9 +171,7 @@ def test_dataparser_transforms_beside_it_lead_to_the_splats_of_ns_export(tmp_pat
 
 def test_older_colmap_projects_of_nerfstudio_have_a_transform_of_their_own(tmp_path):
     """Where none is named but colmap/sparse/0 is there, A is (x, y, z) -> (y, x, -z).
-
-    With A itself stored, nerfstudio's own part is nothing and the camera stays. Errors name it.
-    """
+    With A itself stored, nerfstudio's own part is nothing and the camera stays. Errors name it."""
     (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
     stored = {"transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "scale": 1}
     write(tmp_path / BESIDE, stored)
@@ -206,9 +195,7 @@ MIRRORED = [[-row[0], *row[1:]] for row in MATRIX[:3]] + MATRIX[3:]
 
 def test_poses_and_lenses_that_are_no_pinholes_are_noted(tmp_path):
     """A scaled camera sees the same picture: u = fx (s x) / (s z) + cx. Its centre stays.
-
-    With x negated, the point's x is -0.5 and u = 32 - 25 = 7. A matrix of three rows will do.
-    """
+    With x negated, the point's x is -0.5 and u = 32 - 25 = 7. A matrix of three rows will do."""
     for keys, note in (
         ({"transform_matrix": MATRIX[:3]}, ""),
         ({"transform_matrix": SCALED}, "uniform scale taken out of 1 frame"),
@@ -331,9 +318,7 @@ def test_an_image_that_does_not_tell_its_size_is_no_crash(tmp_path):
 
 def test_a_folder_prefers_some_names_and_notes_the_rest(tmp_path):
     """First cameras.json, then transforms.json, the train split, and COLMAP in ``sparse/0``.
-
-    A file that is named itself is read whatever lies beside it.
-    """
+    A file that is named itself is read whatever lies beside it."""
     write_colmap(tmp_path / "sparse" / "0")
     others = "COLMAP model in sparse/0"
     train = {**TRANSFORMS, "frames": [{**FRAME, "file_path": "train"}]}

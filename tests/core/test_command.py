@@ -119,10 +119,8 @@ def test_scores_are_written_bit_for_bit_and_twice_alike(folder):
 
 def test_info_says_what_is_in_a_file(folder, capsys):
     """Two splats of degree 1, x from -1 to 2, one with a signalling NaN in a property of its own.
-
     14 + 9 properties and the extra one, of 4 bytes each: 96 bytes a splat. A row of text is as
-    long as the average; nothing to measure is no error; nothing warns.
-    """
+    long as the average; nothing to measure is no error; nothing warns."""
     properties = [*splat_names(1), "extra"]
     values = np.zeros((2, len(properties)), "<f4")
     values[:, 0] = -1.0, 2.0
@@ -159,15 +157,6 @@ def test_info_says_what_is_in_a_file(folder, capsys):
         assert re.search(line, said, re.MULTILINE)
     assert text["bytes_per_splat"] == (len(text_header) + 61) / 2
     assert (none["splats"], none["extent_low"], none["extent_high"]) == (0, None, None)
-
-
-def test_the_input_can_be_its_own_output_if_asked_to(folder):
-    before = contents(folder)
-
-    assert command.main([*PRUNE, "-o", "in.ply"]) == 1
-    assert contents(folder) == before
-    assert command.main([*PRUNE, "-o", "in.ply", "--overwrite", "--keep", "5"]) == 0
-    assert len(read_ply("in.ply")) == 5
 
 
 def test_one_bad_file_does_not_stop_the_others(folder, capsys):

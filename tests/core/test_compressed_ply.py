@@ -42,10 +42,8 @@ def ply(*body, chunks=1, count=1, rest=0, color=True, swap=("", "")):
 @pytest.mark.parametrize("color", [True, False])
 def test_values_by_hand(tmp_path, color):
     """Steps of x are 1, of y 1, of z 1: 0 + 1, 10 + 23, -1 + 2047. The rotation leaves out x.
-
     Its codes 512, 1023 and 0 of 1023 are .5 / 1023, 1/2 and -1/2 times sqrt(2). Colours are the
-    ends of their ranges; without these they are the codes themselves, 0, 1 and 7/255.
-    """
+    ends of their ranges; without these they are the codes themselves, 0, 1 and 7/255."""
     data = ply(bytes([0, 255, 128, *[127] * 6]), rest=9, color=color)
     (tmp_path / "a.ply").write_bytes(data)
     file = read_splats(tmp_path / "a.ply")

@@ -89,9 +89,7 @@ def merged():
 @pytest.mark.slow
 def test_deleting_keeps_rows_of_the_level_before_as_they_were():
     """Of 576 splats, .5, .3 and .1 are 288, 173 (172.8) and 58 (57.6): rounded up, as with prune.
-
-    One ranking decides, that of a prune by the same method: the kept sets are the same ones.
-    """
+    One ranking decides, that of a prune by the same method: the kept sets are the same ones."""
     splats, views = colourful(), cameras(2)
     levels = list(lod(splats, views, Levels((0.5, 0.3, 0.1)), QUICK))
     assert [len(level.result.splats) for level in levels] == [288, 173, 58]
@@ -109,10 +107,8 @@ def test_deleting_keeps_rows_of_the_level_before_as_they_were():
 @pytest.mark.slow
 def test_each_level_is_merged_from_the_one_before(merges, merged):
     """The first is made from the original, as prune's result is: equal to the bit.
-
     Rows of others are among those before; one that is unchanged there stayed the original's. What
-    was merged before is not thinned by a tenth again. The PSNR is that against the original.
-    """
+    was merged before is not thinned by a tenth again. The PSNR is that against the original."""
     splats, levels = colourful(), merged[0]
     wanted = prune(splats, cameras(), Budget(keep=288), Merge())
     np.testing.assert_array_equal(levels[0].result.keep, wanted.keep)
@@ -154,9 +150,7 @@ def test_protected_splats_are_in_all_levels_unchanged(merges, method):
 @pytest.mark.parametrize("method", [Merge(), Occlusion()])
 def test_levels_by_psnr_lie_near_it(method):
     """Deleting keeps at least it by the curve; merging comes as near as prune does, .7 dB.
-
-    Between the shares of the curve, straight lines are off by some tenths on so small a scene.
-    """
+    Between the shares of the curve, straight lines are off by some tenths on so small a scene."""
     splats, views = read_ply(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
     splats, views = splats.take(slice(0, None, 12)), views.take(range(0, 72, 9))
     levels = list(lod(splats, views, Levels(psnr=(34.0, 28.0)), method))
@@ -167,9 +161,7 @@ def test_levels_by_psnr_lie_near_it(method):
 
 def test_levels_that_cannot_be_are_refused():
     """Shares lie between 0 and 1, PSNR between 0 and 100 dB; both fall.
-
-    .001 of 5 splats are none, but a level without any is no level.
-    """
+    .001 of 5 splats are none, but a level without any is no level."""
     for given, word in (
         ({}, "got none"),
         ({"shares": (0.5,), "psnr": (40.0,)}, "got both"),
@@ -208,9 +200,7 @@ def test_progress_only_rises_and_can_cancel(merged):
 @pytest.mark.slow
 def test_files_of_levels_hold_the_kept_rows_or_what_they_became(tmp_path, wall_file, merged):
     """The bytes are the source's; merged splats are rounded to float32 once.
-
-    In any format; what it loses is noted.
-    """
+    In any format; what it loses is noted."""
     out = tmp_path / "out"
 
     done = lod_file(wall_file, out, cameras(2), TWO, QUICK)
@@ -234,18 +224,6 @@ def test_files_of_levels_hold_the_kept_rows_or_what_they_became(tmp_path, wall_f
     for name in ("means", "opacity_logits"):
         expected = getattr(became, name).astype(np.float32)
         np.testing.assert_array_equal(getattr(written, name), expected)
-
-
-@pytest.mark.slow
-def test_no_file_is_replaced_unless_told(tmp_path, wall_file):
-    """Said before any work, and nothing else is written."""
-    path = tmp_path / "a.lod2.ply"
-    path.write_text("mine")
-    with pytest.raises(RefineError, match="exists already"):
-        lod_file(wall_file, tmp_path, cameras(2), TWO, QUICK)
-    assert list(tmp_path.iterdir()) == [path]
-    lod_file(wall_file, tmp_path, cameras(2), TWO, QUICK, overwrite=True)
-    assert len(read_ply(path)) == 144
 
 
 @pytest.mark.slow

@@ -71,9 +71,7 @@ def test_comments_of_a_ply_say_how_it_is_drawn(tmp_path, comments, model):
 
 def test_splats_without_a_third_scale_are_discs_and_stay_so(tmp_path):
     """They are read as of size 0 along their third axis, and written without it.
-
-    So are discs of several files, whether these have it or not.
-    """
+    So are discs of several files, whether these have it or not."""
     splats = replace(cloud(5), model="2dgs")
     path = write(tmp_path / "in.ply", splats, ["antialiased 1"])
     other = write(tmp_path / "other.ply", cloud(3), ["SplatRenderMode: 2dgs"])

@@ -86,9 +86,7 @@ def test_a_prune_holds_a_few_megabytes_of_a_file(tmp_path):
 @given(case=ply_files(forms=BINARY), data=st.data(), kind=st.sampled_from(["f4", "f8", "u1", "i2"]))
 def test_a_pruned_file_is_the_kept_rows_and_another_count(folder, case, data, kind):
     """All else stays to the byte: byte order, comments, the count's spelling, what trails.
-
-    Opacity becomes 1/3 in its own type; a new property is the last of each row.
-    """
+    Opacity becomes 1/3 in its own type; a new property is the last of each row."""
     keep = data.draw(masks(len(case.rows)))
     file = opened(folder, case.data)
     assert case.data == rewritten(folder, file)
@@ -135,10 +133,8 @@ def test_text_is_written_as_the_binary_file_of_its_splats(folder, case, data):
 
 def test_odd_headers_are_read_and_kept(tmp_path):
     """NumPy hands out no buffer of rows with a colon in a name.
-
     Lines end as the first does; 0x0a may be the first byte of x then. A byte-sized first property
-    does not turn the byte order: 1.0 is 3f 80 00 00. The count is the third word of its line.
-    """
+    does not turn the byte order: 1.0 is 3f 80 00 00. The count is the third word of its line."""
     tag = np.arange(3, dtype=np.float32)
     file = opened(tmp_path, ply_of(dict.fromkeys([*NAMES, "t:ag"], tag), ["made here"]))
     assert b"\ncomment made here\n" in rewritten(tmp_path, file, columns={"more": 2 * tag})

@@ -50,10 +50,8 @@ BOTH = {  # of one splat
 
 def test_values_by_hand(tmp_path):
     """One splat. 16 bits of 255 + 256 * 127 = 32767 of 65535 between 0 and 2, logarithmic.
-
     exp(.99998) - 1 = 1.71825. Components 0 of a rotation are 127.5, so that 128 is .5 / 127.5 /
-    sqrt(2); the alpha 253 leaves out x. Places 2 of tables that count by tenths are .2.
-    """
+    sqrt(2); the alpha 253 leaves out x. Places 2 of tables that count by tenths are .2."""
     tenths = [0.1 * index for index in range(256)]
     meta = {
         "version": 2,
@@ -107,10 +105,8 @@ def unbundled(folder, meta):
 
 def test_version_1_by_hand(tmp_path):
     """Of -9 to -4, place 51 of 255 is -8; of 0 to 51, places 10 and 2 are 2 and .4.
-
     Of logits from -5.1 to 5.1, 51 is -3.06. A palette of 192 pixels is one of degree 1; from -1.5
-    in steps of .01, 150 is 0 and 255 is 1.05.
-    """
+    in steps of .01, 150 is 0 and 255 is 1.05."""
     file = read_splats(unbundled(tmp_path, VERSION_1))
     splats = file.splats()
     assert file.format == "SOG version 1"
@@ -155,7 +151,6 @@ FAULTS = [
     ("version", None, "meta.json version: expected 2, got null"),
     ("count", 10**9, COUNT),
     ("count", 0, COUNT),
-    ("count", 1.5, COUNT),
     ("count", 100, "image 'means_l.webp': "),
     ("means", [], "meta.json means: expected an object, got a list"),
     ("means", "mins", [0, 0], "meta.json means mins: expected a list of 3 numbers"),
@@ -189,9 +184,7 @@ def test_what_is_wrong_is_named_with_its_place(made, tmp_path, case):
 @pytest.mark.slow
 def test_an_archive_that_is_packed_as_no_sog_is_refused(made, tmp_path):
     """Ways to compress that take any memory; a damaged one of LZMA was a traceback.
-
-    100 MB of zeros in 100 KB, as an image. No fault: 64 pixels hold 40 splats.
-    """
+    100 MB of zeros in 100 KB, as an image. No fault: 64 pixels hold 40 splats."""
     files, path = dict(made[0]), tmp_path / "a.sog"
     assert len(read_splats(pack(path, {**files, "quats.webp": picture(8, 8)}))) == 40
     for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):

@@ -118,9 +118,7 @@ def test_a_file_that_lies_is_refused(tmp_path, data, expected):
 
 def test_streams_that_lie_are_refused(tmp_path):
     """Before they are unpacked, or a piece at a time: 10 MB in a few bytes for one of opacity.
-
-    Zstd packs zeros 30,000 times as small: 400,000 splats of 29 bytes are 11.6 MB in 1 kB.
-    """
+    Zstd packs zeros 30,000 times as small: 400,000 splats of 29 bytes are 11.6 MB in 1 kB."""
     parts, path = body(4), tmp_path / "a.spz"
     sizes = [len(part) for part in parts]
     more = version_4([parts[0], b"\0" * 10**7, *parts[2:]], said=sizes)
@@ -151,11 +149,9 @@ def test_what_follows_the_splats_is_read_once(tmp_path):
 )
 def test_the_steps_of_positions_follow_the_scene(tmp_path, scale, fraction):
     """The largest coordinate is below 2^b: 23 - b bits behind the point fit, 18 - b are enough.
-
     Between the two it is 12. .001 is below 2^-9, where 23 is the most; 1 is below 2^1, 40 below
     2^6, 10,000 below 2^14 and 5,000,000 below 2^23. 8,388,607 is the largest whole number of 24
-    bits with a sign.
-    """
+    bits with a sign."""
     (tmp_path / "in.ply").write_bytes(plain_ply(50))
     file = read_splats(tmp_path / "in.ply")
     columns = {axis: (file.rows[axis] / file.rows["z"].max() * scale) for axis in "xyz"}

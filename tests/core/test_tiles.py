@@ -191,9 +191,7 @@ WAYS = [
 @pytest.mark.parametrize(("method", "budget", "model"), WAYS, ids=str)
 def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, method, budget, model):
     """To the byte, in the order of the files; reports agree.
-
-    The four headers take bytes that one does not, so of a size as many rows are compared.
-    """
+    The four headers take bytes that one does not, so of a size as many rows are compared."""
     out, pruned = tmp_path / "out", tmp_path / "pruned.ply"
     told = run(tiles, out, method, budget, model=model)
     if budget.max_mb:
@@ -251,9 +249,7 @@ def test_merging_by_regions_is_as_good_as_merging_one_file(
     tmp_path, merges, monkeypatch, ratio, used, step
 ):
     """Within .3 dB; of 5 %, which are deleted alone, the same rows stay.
-
-    No splat is merged twice or lost, though the stages divide along other planes.
-    """
+    No splat is merged twice or lost, though the stages divide along other planes."""
     monkeypatch.setattr(mapped, "REGION", 10_000 // step)
     out, method, judging = tmp_path / "out", Merge(16), VIEWS.spread(16)
     rows, splats = room().rows[::step], room().splats().take(slice(None, None, step))
@@ -641,9 +637,7 @@ class Server(SimpleHTTPRequestHandler):
 @pytest.mark.filterwarnings("default")
 def test_a_server_sends_ranges(tmp_path, monkeypatch):
     """The same bytes as from the disk; nobody can write there, and a change is noticed.
-
-    Of a large file, one that only sends whole files would have sent only the beginning: refused.
-    """
+    Of a large file, one that only sends whole files would have sent only the beginning: refused."""
     pytest.importorskip("aiohttp", reason="fsspec opens http:// by aiohttp")
     monkeypatch.chdir(tmp_path)
     store = Store(str(tmp_path), fsspec.filesystem("file"))

@@ -19,7 +19,6 @@ from refine_addon.core import RefineError, read_ply
 from refine_addon.core import whole_file as whole_files
 from refine_addon.core.execute import Cancelled, checked_by
 from refine_addon.core.whole_file import refuse_existing, whole_file
-from tests.hostile import files_of_at_most
 from tests.strategies import plain_header, plain_ply, splat_names
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs fork, links and signals")
@@ -69,19 +68,6 @@ def test_a_file_whose_writing_was_cancelled_is_not_put_in_place(tmp_path):
     with pytest.raises(Cancelled), checked_by(check):
         written(tmp_path / "out")
     assert contents(tmp_path) == {}
-
-
-@posix
-def test_a_file_that_may_not_grow_leaves_what_was_there(tmp_path):
-    """A real limit of 5,000 bytes, on a file of 56,000: the system's own error, in our words."""
-    source, output = tmp_path / "in.ply", tmp_path / "out.ply"
-    source.write_bytes(plain_ply(1000))
-    output.write_bytes(b"old")
-    before, file = contents(tmp_path), read_ply(source)
-    with files_of_at_most(5_000), pytest.raises(RefineError) as told:
-        file.write(output, overwrite=True)
-    assert str(told.value) == f"{output}: cannot be written (File too large); nothing was changed"
-    assert before == contents(tmp_path)
 
 
 @posix
