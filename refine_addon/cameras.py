@@ -21,9 +21,7 @@ from .core.views import View, ViewSet
 from .mesh.layout import LAYOUT, is_native
 
 WEIGHT = "refine_weight"  # Custom property of a camera object: the weight of its view, 1 without it
-
 SOURCE = "refine_view"  # Custom property of an imported camera: its view in the file, exact, JSON
-
 UPRIGHT = np.eye(4)
 UPRIGHT[:3, :3] = QUARTER
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
@@ -32,16 +30,11 @@ SENSOR = 36.0
 """Sensor width given to imported cameras, millimetres."""
 
 FLIP = np.array([1.0, -1.0, -1.0])  # Axes of Blender's camera to those of a view, and back
-
 _RESIDUE = 3e-7  # Largest error of float32 in the zeros and ones of a quarter turn
-
 SHEAR = 1e-4  # Largest deviation of a camera's axes from orthonormal
-
 _SIZES = ("fx", "fy", "cx", "cy", "width", "height")
 _FIELDS = (*_SIZES, *["rotation", "center", "near", "far", "matrix", "lens", "clip", "upright"])
-
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.01, 1000.0
-
 _FEW = 16  # Cameras looked at, at most, to know whether all must be turned
 
 

@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 from .core.execute import Cancelled, checkpoint
 
 _STEP = 0.1  # Seconds between two checks of a waiting thread for cancelling
-
 _LOSSLESS = 100  # Quality at which Blender compresses WebP without loss
-
 _calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
 
 

@@ -21,7 +21,6 @@ from ..core.whole_file import Url, expanded, is_url
 from ..version import VERSION
 
 _SOURCES = "visible, active, selected, collection:NAME, frames or frames:A:B:STEP"
-
 _TABLE = f"""
 inputs INPUT            files of splats: {", ".join(READ_SUFFIXES)}
 output FILE             the file to write, in the format of its suffix: {", ".join(SUFFIXES)}
@@ -84,7 +83,6 @@ _REST = "--report --overwrite --quiet"
 _VIEWS = f"--cameras --source --views --remove-inside --keep-inside --model {_REST}"
 _MORE = "--rounds --clean --protect --pictures --together --workers --dry-run"
 BLENDER = "blender -b scene.blend --command refine"
-
 _COMMANDS = f"""
 prune: remove the splats the cameras would miss least
 inputs* --object --save -o --ratio --keep --max-mb --psnr --method {_MORE} {_VIEWS}
@@ -242,7 +240,6 @@ _TYPES: dict[str, Callable[[str], Any]] = {
 """Placeholder in the help -> parser of the value; others take any text."""
 
 _NAMES = {"-o": "output", "--levels": "shares"}  # Options whose attribute has another name
-
 _CHOICES = {"METHOD": tuple(METHODS), "MODEL": MODELS, "D": tuple(range(5))}
 
 

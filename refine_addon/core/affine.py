@@ -17,20 +17,15 @@ QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
 
 QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}  # turns about x by number of quarters
-
 _UNIFORM = 1e-4  # largest relative difference of the scales of a matrix that counts as uniform
-
 _FLAT = 1e-9  # smallest over largest scale up to which a matrix counts as flat
 
 _SMALLEST, _LARGEST = 1e-30, 1e30
 """Scales of a matrix that is applied: its determinant fits float64, usual splats float32."""
 
 LEAST = 6  # fewest points of a map: one can be fitted to any four
-
 _MOST = 32  # most maps that are found
-
 _NOISE = 4e-6  # rounding of moved points, relative to a coordinate's terms: 32 units of float32
-
 _PLANAR = 1e-5  # thickness over extent up to which points count as lying in a plane
 
 _SAMPLE, _FITTED = 2048, 16384

@@ -68,7 +68,6 @@ _ALIGNED = 64  # bytes, of arrays in a file
 _SENT = 1 << 24  # most bytes of work sent to a cluster; arrays in files are sent as names
 _AHEAD = 4  # pieces of work for each thread whose results may wait for those before them
 _PACKAGE, _FOLDER = __name__.rpartition(".core.")[0], Path(__file__).resolve().parents[1]
-
 _BEGIN = """
 import importlib, json, sys, types
 name, folder, sys.path[:] = json.loads(sys.argv[1])

@@ -24,16 +24,12 @@ from .errors import RefineError
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TRUECOLOR = 2
 _UP = 2  # the filter that stores each row's difference to the one above
-
 _EXR = 20000630
 _MULTI_PART = 0x1000  # flag of the version
 _LINE_HEAD = 8  # bytes: number and size of a line
 _TYPES = {1: "<f2", 2: "<f4"}  # of numbers in a channel
-
 _JPEG_START = b"\xff\xd8"
-
 _MOST_SEGMENTS = 4096  # segments and fill bytes of a JPEG skipped at most; cameras write fewer
-
 _FILL = 0xFF
 _LAST = 0xDA, 0xD9  # start of scan and end of image
 _STANDALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers that no segment follows

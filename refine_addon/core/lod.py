@@ -47,9 +47,7 @@ from .whole_file import (
 )
 
 MAX_LEVELS = 16  # the last of so many halvings would hold 0.0015 % of the splats
-
 SHARES = (0.5, 0.25, 0.12, 0.06)  # shares kept, by default
-
 _SAMPLE, _VIEWS = 4096, 8  # splats and views from which `viewing_distance` is estimated
 
 

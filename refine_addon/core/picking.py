@@ -30,11 +30,8 @@ LIGHT_LEFT = 0.1
 of the picture; at 0.1 these are two thirds, and with `THICKNESS` four fifths."""
 
 THICKNESS = 2.0  # a splat's standard deviations behind a surface up to which it is visible
-
 RAYS = 25_000  # about how many rays find surfaces
-
 LEAST_STEP = 4  # pixels between two of these rays, at least
-
 _EMPTY = 0.1  # a ray with less alpha in all hits nothing
 _PAIRS = 1 << 17  # see `hits`
 

@@ -33,9 +33,7 @@ from .visibility.scene import Scene
 from .whole_file import new_folder, refuse_existing, whole_file
 
 LONGEST = 960  # pixels along the longer side of a picture, at most
-
 CAMERAS = 3  # how many views are drawn at most, spread evenly over all
-
 AMPLIFIED = 8  # factor by which differences are shown larger
 
 KINDS = ("before", "after", "difference")
@@ -45,7 +43,6 @@ _IMAGE = re.compile(r"\.(png|jpe?g|webp|tiff?|exr|bmp)$", re.IGNORECASE)
 """The suffix of a photo, after which imported cameras are named."""
 
 _LABEL = 80  # bytes at the end of a camera's name used in file names; systems take 255 in all
-
 _PIXELS = 1 << 15  # drawn at a time, about, which limits temporary memory
 _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
 

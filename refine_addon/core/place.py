@@ -15,17 +15,11 @@ from .errors import RefineError
 from .whole_file import Url, mode_of
 
 LARGEST_NUMBER = 1e18  # largest number taken, such as a coordinate: its square fits float32
-
 LARGEST_COUNT = 1 << 53  # largest whole number that is taken: floats hold every one up to it
-
 NEGLIGIBLE = 1e-30  # smaller numbers are read as 0, so that products of two do not underflow
-
 _SHOWN = 40  # most characters of a value in a message
-
 GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
-
 SPZ = b"NGSP"  # the first bytes of what an SPZ file holds
-
 _ZIP = b"PK\x03\x04"
 
 

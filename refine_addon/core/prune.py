@@ -38,7 +38,6 @@ from .visibility.measuring import Measured
 from .volumes import Forced, must_go
 
 TRIES = 3  # most times that splats are merged to reach a PSNR
-
 CLOSE = 0.7  # largest distance of an estimate from the PSNR of the budget, dB, else merge again
 
 FIRST = 0.1

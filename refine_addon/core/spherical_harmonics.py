@@ -13,7 +13,6 @@ from .images import srgb_of
 from .splats import SH_C0
 
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
-
 _DIRECTIONS = 4096  # over which stretched harmonics are fitted; degree 4 has 25 coefficients
 
 

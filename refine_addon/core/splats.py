@@ -24,7 +24,6 @@ covariance in the image (Yu et al. 2024, "Mip-Splatting"). ``2dgs``: a flat disc
 scale, hit where the ray meets its plane (Huang et al. 2024)."""
 
 MODELS: tuple[Model, ...] = get_args(Model)  # the first is that of files that do not say
-
 LOW_PASS = 0.3  # variance added to a footprint along both axes so that it covers a pixel, px^2
 
 DISC_LOW_PASS = 0.5
@@ -32,7 +31,6 @@ DISC_LOW_PASS = 0.5
 no disc is thinner (Huang et al. 2024, Eq. 11, sigma = sqrt(2) / 2)."""
 
 ALPHA_MAX = 0.99  # largest alpha of one splat at a pixel: none hides everything behind it
-
 ALPHA_CUT = 1.0 / 255.0  # least alpha that is drawn; a splat's footprint ends there
 
 NEAR_RELATIVE = 0.01
@@ -40,7 +38,6 @@ NEAR_RELATIVE = 0.01
 it does not depend on the scene's unit."""
 
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic, 1 / (2 sqrt(pi))
-
 _CHECKED = 1 << 15  # rows checked at a time by `drawable`
 _COPIED = 2048  # rows of a file copied at a time: 0.5 MB at degree 3, in the L2 cache
 

@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 from .errors import RefineError
 
 ORTHONORMAL = 1e-3  # largest error of a rotation's entries: files may have only four decimals
-
 WIDEST = math.radians(90.0)  # views turned farther from each other get no view in between
-
 MOST_BETWEEN = 1000  # most views in between: each is compared with all others, which takes minutes
-
 FAR = 1000.0  # distance, in extents of the splats, of a view that stands in for parallel rays
-
 _CANDIDATES = 64  # nearest views of each that may be its neighbours
 
 

@@ -21,7 +21,6 @@ from .affine import is_flat, moved, scales_of
 from .errors import RefineError
 
 Role = Literal["protect", "remove", "keep"]
-
 _LEAF = 1 << 14  # pairs of point and triangle below which a group is not divided further
 
 

@@ -23,7 +23,6 @@ from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
 
 _GROUP = 16  # Columns transposed together: float32 numbers in a cache line of 64 bytes
-
 _ROWS = 4096  # Rows transposed at a time: 256 kB, which fits a cache
 
 

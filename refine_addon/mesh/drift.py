@@ -32,7 +32,6 @@ _MIX = np.uint32(0x9E3779B1)
 """Odd number near 2^32 over the golden ratio, for multiplicative hashing."""
 
 _FEW, _FEW_SHARE = 100, 0.01  # Splats moved singly without a warning: number, share of all
-
 _SAMPLE = 1 << 15  # Splats looked at for the panel's text, spread evenly
 
 

@@ -16,15 +16,10 @@ from . import attributes as mesh_attributes
 from .layout import has, splat_count
 
 REMOVE = "refine_remove"  # Boolean point attribute: splats that the budget removes
-
 PROTECT = "refine_protect"  # Boolean point attribute, set by hand: splats protected above all else
-
 MUST_GO = "refine_must_go"  # Boolean point attribute, set by hand: splats removed before all others
-
 FORCE = "refine_force"  # Integer point attribute, for display: 1 protected, 2 removed by user
-
 MARKING = ("BOOLEAN", "FLOAT")  # Types of point attributes that can protect splats by name
-
 _GROUP_VALUES = "refine_group_values"
 
 

@@ -23,17 +23,11 @@ from ..core.formats.ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE
 from ..core.splats import MODELS, Model, opacity, scales, single_log_scales, single_logits
 
 BASE, SCALE, ROTATION, HARMONIC = "radiance:base", "scale", "rotation", "radiance:sh_"
-
 NATIVE = "GAUSSIAN_SPLAT"  # Type of point clouds that Blender draws as splats, since 5.3
-
 _NATIVE_NAMES = f"{BASE}, {SCALE}, {ROTATION}"
-
 _FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")  # Types of `BASE`: in 5.3, and in older versions
-
 _MOST = 24  # Harmonics of degree 4, without the constant
-
 LAYOUT = "refine_layout"  # Custom property of the mesh: layout of its file, JSON
-
 MODEL = "refine_model"  # Custom property of the mesh: one of `splats.MODELS`, set by the user
 
 
@@ -90,7 +84,6 @@ NORMAL_PLACES = {
 """Where Blender's own PLY importer puts a file's normals."""
 
 _LONGEST_NAME = 63  # Bytes of Blender's longest attribute name
-
 _MOST_NAMES = 8  # Attribute names in an error message, at most
 
 _TAKEN = {"position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"}

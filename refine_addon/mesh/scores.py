@@ -29,9 +29,7 @@ SCORED = "refine_scored"
 added later, as false is Blender's default."""
 
 RECORD = "refine_scores"  # Custom property of the mesh: record of its scoring, JSON
-
 REASON = "refine_floats"  # Integer point attribute: 0, or 1 + the index of a reason in `REASONS`
-
 FLOATERS = "refine_floaters"  # Custom property of the mesh: floaters by reason, and how sure, JSON
 
 

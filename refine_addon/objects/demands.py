@@ -24,11 +24,8 @@ from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject, recorded, splat_count
 
 RECORD = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
-
 UNFIT = "expected a mesh, or an empty that is shown as a cube or a sphere"
-
 _MOST_MASKS = 16  # Most cached masks; 1 MB each at a million splats
-
 _masks: dict[bytes, NDArray[np.bool_]] = {}  # Points in each volume, by a digest of both
 
 

@@ -44,9 +44,7 @@ from .demands import NONE, Demands
 from .transforms import read_to_move, uneven_notes
 
 LEVEL_STATS = "refine_lod"  # Custom property of a level object: its stats, as in files' reports
-
 LEVEL_OF = "refine_level_of"  # Custom property of a level object: its original
-
 Members = list[SplatObject]  # Objects by name, at least one
 
 

@@ -27,7 +27,6 @@ from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 
 _NORMALS = ("nx", "ny", "nz")
-
 _ROWS = 1 << 14  # Splats moved at a time on one thread
 
 _TRANSFORM = (

@@ -37,17 +37,11 @@ _BY_RAYS = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES"}
 """Types that can be hidden from cameras; EEVEE ignores that for instances."""
 
 _TILE = 128  # Largest side of a tile that Cycles renders on the processor, pixels
-
 _WORLD_SAMPLES = 16  # Samples for a pixel of the world, at most
-
 _FARTHEST = 0.999  # Share of the clip end from which on depths mean nothing (EEVEE of 4.3)
-
 _INFINITE = 1e9  # Depth from which on depths mean nothing: Cycles stores 1e10
-
 _PIXELS = 1 << 18  # Pixels for each call of the view transform
-
 _ROUNDS = 2  # Pixels by which depths spread into edges without one
-
 _MOMENT = 0.01  # Seconds to wait for the thread before Blender may do other things
 
 

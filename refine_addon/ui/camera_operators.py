@@ -64,9 +64,7 @@ def draw(layout: bpy.types.UILayout, record: dict[str, Any], psnr: Mapping[str, 
 
 
 _INNER = (5.0, 95.0)  # Percentiles of positions that a ring frames: far floaters do not count
-
 _ELEVATIONS = (15.0, 40.0)  # Degrees above the horizon of a ring's cameras, in turn
-
 _MARGIN = 1.1  # Distance of a camera over the least that frames all
 
 

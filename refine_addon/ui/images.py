@@ -35,11 +35,8 @@ def put(name: str, pixels: NDArray[Any]) -> bpy.types.Image:
 
 
 Color = tuple[float, float, float]  # sRGB, 0..1
-
 WIDTH = 11  # Edge of the chart in interface units, about the sidebar's default width
-
 NAMES: dict[Way, str] = {"delete": "Occlusion", "merge": "Merge", "refit": "Refit"}
-
 _BORDER, _SWATCH, _STEP = 4, 8, 10  # Pixels of Blender's border, of a patch; dB between two lines
 
 _ON_DARK: dict[Way, Color] = {

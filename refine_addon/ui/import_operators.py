@@ -33,9 +33,7 @@ from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
 _ABOVE = 3  # folders above the splats in which their cameras are looked for
-
 _DEFAULT_SIZE = (1920, 1080, 100)  # of Blender's factory settings, with the percentage
-
 _OF_MODELS = {".bin", ".txt"}  # several files of one folder are a COLMAP model
 
 
@@ -179,7 +177,6 @@ def _is_untouched(scene: bpy.types.Scene) -> bool:
 
 
 _ROWS = 1 << 16  # Rows read between two checks for cancelling
-
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)  # File browser's filter
 
 

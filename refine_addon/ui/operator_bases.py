@@ -22,13 +22,9 @@ from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 
 _STEP = 0.05  # Seconds between two looks at the thread
-
 PATIENCE = 0.7  # Seconds that a cancelled thread has to end before it is left alone
-
 Answer = set[str]  # FINISHED, CANCELLED, RUNNING_MODAL or PASS_THROUGH
-
 Need = Callable[[bpy.types.Context], str]  # Gives what an operator lacks to run, "" if nothing
-
 FAILURES = (RefineError, MemoryError)  # Exceptions reported as errors; all others are bugs
 
 

@@ -33,7 +33,6 @@ from . import images, operator_bases
 from .wrapped import counted
 
 Value = TypeVar("Value")
-
 REST = 0.2  # Seconds without a change after which a slider rests
 
 WAYS: dict[str, Way] = {"occlusion": "delete", "merge": "merge", "refit": "refit"}
@@ -45,9 +44,7 @@ _waiting: list[tuple[str, str]] = []
 """Scene and objects, by name, to be marked when the slider rests."""
 
 _values: dict[Hashable, Any] = {}  # What `cached` keeps
-
 _NOISE = 1e-6  # Largest difference between machines, relative to the largest number in a list
-
 _FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
 
 _WORDS = {

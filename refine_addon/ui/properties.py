@@ -272,7 +272,6 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
 
 
 PACKAGE = __package__.rpartition(".")[0]  # Such as ``bl_ext.user_default.refine_addon``
-
 DEFAULTS = ("method", "views")  # Preferences that are scene settings of the same name
 
 

@@ -22,7 +22,6 @@ from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle, now
 from .wrapped import counted
 
 _ENDS = (Cancelled, *FAILURES, RuntimeError)  # Exceptions that end a render and are no bugs
-
 IMAGE = "Render with Splats"  # Name of the image with the last frame
 
 _NEEDS_WINDOW = bpy.app.version < (5, 0, 0)
@@ -30,13 +29,9 @@ _NEEDS_WINDOW = bpy.app.version < (5, 0, 0)
 `RE_FreeUnusedGPUResources`). One frame in 60 crashed Blender 4.3 on X11."""
 
 _SETTLED = 0.5  # Seconds after a render until windows have drawn; see `_draw_whole`
-
 NOTICE = "Splats are not in this render: use Render > Render with Splats"
-
 IN_BACKGROUND = "refine: splats are not in this render; use --command refine render"
-
 _LINGERS = 10.0  # Seconds that `NOTICE` stays after the render
-
 _until: list[float] = []  # Time until which `NOTICE` is shown
 
 _watched: list[engine.Shared] = []

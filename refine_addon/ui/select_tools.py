@@ -51,9 +51,7 @@ MODES = (
 )
 
 _STEP = 0.03  # Seconds between two looks at the thread that computes what the view shows
-
 LEAST_SIDE = 2  # Pixels: a narrower box or lasso was a click, which selects nothing
-
 _kept: dict[object, Prepared | Sight] = {}  # The last stroke's splats, and what each view shows
 
 

@@ -25,7 +25,6 @@ from .operator_bases import Answer, AtOnce, Job, OnSplats, in_object_mode
 from .wrapped import counted
 
 _SOON = 0.1  # Seconds until new splats are stamped: Blender's operator is over by then
-
 _drifts: dict[int, Drift | None] = {}  # By the data's `session_uid`, until it changes
 
 

@@ -8,9 +8,7 @@ import blf
 import bpy
 
 _TAKEN = 52  # Pixels of a sidebar at scale 1 without text: margins, tabs, scroll bar
-
 _ICON = 30  # Pixels of an icon and its gaps at scale 1
-
 _USUAL = 280  # Pixels of the sidebar if unknown: its default at scale 1
 
 

@@ -25,9 +25,7 @@ from ..core.splats import (
 )
 
 WIDTH = 4096  # Columns of a texture with one value for each splat, row by row
-
 MOST = 1 << 24  # Splats drawn at most: their order is stored as float32, exact up to this
-
 STAYS, GOES = 1, 2  # Protected, and removed by the user, as in `mesh.edit.FORCE`
 
 MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (0.45, 0.0, 1.0)}
@@ -35,11 +33,8 @@ MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (0.45, 0.0, 1.0)}
 tint of the budget, and from `SELECTED`."""
 
 SELECTED, SELECTED_SHARE = (1.0, 0.1, 0.75), 0.6  # Tint of selected splats, and its share
-
 SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}  # Share of `MARKS`, by mode
-
 _LARGEST_KEY = 65535.0
-
 _LARGEST_HALF = 65504.0
 
 _OKLAB_TO_LMS = np.array(

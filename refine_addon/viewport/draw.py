@@ -25,11 +25,8 @@ MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
 """Draw nothing, all splats, colours by rank, the splats that Apply keeps, those it removes."""
 
 SHOWN = "refine_shown"  # Custom property of the scene: the mode when the file was saved
-
 _TICK = 0.03  # Seconds between two looks at the sorting thread
-
 _EDIT_REST = 0.3  # Seconds without a change in edit mode before splats are read again
-
 _VIEWS = 16  # Regions whose pictures stay on the graphics card
 
 

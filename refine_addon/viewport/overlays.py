@@ -26,19 +26,13 @@ _COLORS = {"PROTECT": MARKS[STAYS], "REMOVE": MARKS[GOES], "KEEP": MARKS[STAYS]}
 """Role of a volume -> colour of its edges, by what becomes of the splats inside."""
 
 _FILLED = {"SOLID", "TEXTURED"}  # Display types of objects whose faces are drawn
-
 WORDS = {"HEAT": ("goes first", "goes last"), "STAYS": ("What stays",), "GOES": ("What goes",)}
-
 MARKED = {STAYS: "Protected", GOES: "Must go"}  # Text beside tints of protected and removed splats
-
 _REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}  # Mark and a mode in which no splat has it
-
 _WIDE, _HIGH, _EDGE, _FONT = 220, 10, 16, 12  # pixels at scale 1
 _GAP = 6  # between the bar and the words above it
-
 _WHITE, _BLACK = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
 _WARNING = (1.0, 0.8, 0.2, 1.0)
-
 _TURN = np.linspace(0.0, 2.0 * np.pi, 49)
 
 

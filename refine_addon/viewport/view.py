@@ -30,7 +30,6 @@ from .arrays import (
 from .content import Atlas, Content, Marks, Slot
 
 REST = 0.2  # Seconds without a change after which a view counts as resting
-
 TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55  # Tint of splats that the budget removes, and its share
 
 BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)

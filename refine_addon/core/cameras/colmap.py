@@ -24,11 +24,8 @@ from ..views import ViewSet
 from .place import CameraPlace, is_file, opened
 
 SUFFIXES = (".bin", ".txt")  # binary files are preferred, as in COLMAP itself
-
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")  # without suffix
-
 POINT_BYTES = 24  # an observation in ``images.bin``: x, y (doubles), point id (64 bit)
-
 POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
 IMAGE_FIELDS = ("IMAGE_ID", *POSE, "CAMERA_ID", "NAME")
 

@@ -22,11 +22,8 @@ from .colmap import MODELS_BY_NAME, Model, counted, lens_note
 from .place import CameraPlace, is_file, is_folder, read_json
 
 DATAPARSER_FILE = "dataparser_transforms.json"
-
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # factors on axes: y up to down, z back to forward
-
 LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6  # of a ``transform_matrix``; divided out if in between
-
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PANORAMA_KEYS = ("equirectangular", "latlong")  # of instant-ngp
 

@@ -17,9 +17,7 @@ from ..views import View, is_orthonormal
 from ..whole_file import mode_of
 
 SMALLEST_LENGTH = 1e-6  # focal length, px, or scale
-
 LARGEST_SIDE = 1_000_000  # of an image, px
-
 SNIFFED_BYTES = 4096  # read to find out whether a file can be JSON
 
 

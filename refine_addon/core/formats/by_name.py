@@ -25,7 +25,6 @@ _HEADER = struct.Struct("<BBxxI4x4xIHxx12xff")
 """``.ksplat``: version (2 numbers), section headers, splats, level, level 2's harmonics' range."""
 
 _SECTION = struct.Struct("<IIIIfHxxI4xIIH")  # the fields of `_Section` from `splats` on
-
 _HEADER_BYTES, _SECTION_BYTES = 4096, 1024  # of the two in a file; the rest of each is unused
 _LEVELS, _DEGREES = 3, 3  # how many: each begins at 0
 _HARMONICS = 1.5  # level 2: harmonics lie between -1.5 and 1.5 unless the header says otherwise

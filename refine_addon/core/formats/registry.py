@@ -30,7 +30,6 @@ READERS = (*FORMATS, by_name.KSPLAT, glb.READER, streamed_sog.READER, sog.META_R
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))  # of outputs
 READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))  # of inputs
 INDEX_NAMES = (streamed_sog.INDEX, sog.META)  # files that stand for their folder
-
 NOT_WRITTEN: tuple[str, ...] = (".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
 NOT_WRITTEN += tuple(form.suffix for form in READERS if form.write is None)
 """Suffixes of outputs that are refused: a PLY of such a name would mislead."""

@@ -26,9 +26,7 @@ _HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, splats, degree, fractional bits, flags, streams (0 before version 4)."""
 
 _TABLE_AT = struct.Struct("<I12x")  # behind the header in version 4: byte of the table of streams
-
 _STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, packed and unpacked
-
 _ANTIALIASED = 1  # bit of the flags: trained with antialiasing
 _VERSIONS = (2, 3, 4)
 _ONE_TURN, _ZSTD = 2, 4  # versions with rotations as x y z, and with zstd streams

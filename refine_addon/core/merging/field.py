@@ -21,14 +21,10 @@ Footprint = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 """Covariances in a plane: xx, xy and yy, (M,) each."""
 
 DIRECTION_VIEWS = 32  # most views, spread evenly, that decide the viewing directions
-
 BESIDE = 1e-6  # weight of views without the splat's centre: they count only if no view has it
-
 LARGEST_LENS = 1e18  # largest product of a view's focal lengths, px^2; the smallest is its inverse
-
 _CHUNK = 1 << 14  # splats at a time: some MB of temporary memory a thread
 _LOG_RANGE = 80.0  # of log scales, either way, so that squares of scales stay finite
-
 _BRIGHTEST = 1e18  # its square is a float32
 
 

@@ -18,9 +18,7 @@ from .field import Array, Field, Index
 
 Rows = NDArray[np.int32]
 Costs = NDArray[np.float32]
-
 NEIGHBOURS = 8  # neighbours that each splat may be merged with
-
 BATCH = 0.1  # most that a round removes; a third of that takes longer and looks the same
 
 LOOKED_AT = 0.03
@@ -45,9 +43,7 @@ SHIFTS = np.array([[0.0, 0, 0], [0.21, 0.13, 0.17], [-0.11, 0.23, -0.19], [0.15,
 """Offset of each curve, scene sizes, so that their cells do not meet in one place."""
 
 WINDOW = 6  # candidates: this many places before and behind, on each curve
-
 SMALL = 128  # up to this many points, all are compared with all
-
 _CHUNK = 1 << 14  # pairs or points at a time: some MB of temporary memory a thread
 _SCANNED = 1 << 18  # pairs at a time that are only looked at
 _NOBODY = np.uint64(2**64 - 1)  # sorts behind every candidate

@@ -42,7 +42,6 @@ ALONE, ALONE_BY_REGIONS = 0.55, 0.6
 deleted, one stage reaches half of all splats. Regions take two: one of four regions lost 0.5 dB."""
 
 PENALTY = 2.0  # merge penalty if half of the splats are removed
-
 _CHUNK = 1 << 14  # splats copied at a time: some MB
 
 

@@ -21,7 +21,6 @@ from ..visibility.projection import disc_axes
 from .field import Array, Field, Footprint, Index, across, footprint, normalized, packed
 
 Real = NDArray[np.floating[Any]]
-
 FLATTEST = 1e-14  # least eigenvalue of a covariance over their sum; rounding hides smaller ones
 
 ASIDE = 0.1

@@ -33,14 +33,12 @@ COLOR, DEGREE_1, OPACITY, MEAN, SCALE, TURN = (
 the harmonics, opacity logit; by its own axes mean, log scales and turn."""
 
 COUNT = 22
-
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
 
 LEAST_WEIGHT = ALPHA_CUT
 """Hits of less weight T a are left out: a quarter less work than 1e-3, equal results to 0.01 dB."""
 
 HUBER = 1.0  # root mean squares of a view above which errors count linearly, see `_trust`
-
 _LEAST_ERROR = 1e-10  # squared; keeps a division finite
 
 

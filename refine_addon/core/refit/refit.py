@@ -35,7 +35,6 @@ DAMPING, LEAST_DAMPING = 4.0, 0.1
 the parameters only near by."""
 
 CARRIED = 0.5  # part of the gradient G'd left by a round that counts in the next
-
 MORE_DAMPING = 8.0  # factor of k after a round that lost
 
 MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
@@ -43,7 +42,6 @@ MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
 round takes as long as merging."""
 
 MOST_ROUNDS = 100  # limit of the option; after some ten none gains
-
 LEAST_GAIN = 0.05  # dB on validation rays; rounds end below
 
 ONE_PLACE = "nothing was refitted: what fits views in one place looks worse from others"

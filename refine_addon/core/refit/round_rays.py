@@ -48,11 +48,8 @@ SHIFT, MAX_SHIFT = 0.7, 0.1
 """Move of a view in a round, about: in distances to the next view; at most in scene sizes."""
 
 HELD = 1 << 23  # bytes that stay in memory; small scenes need no file
-
 LARGEST = np.float32(1e36)  # coefficient of the harmonics: 25 of them add up to a float32
-
 FARTHEST = 1e18  # step from a camera, world units; its square fits into a float32
-
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
 _CHUNK = 1 << 14
 _EVERY = 2  # validation rays go through every second row of a round's rays

@@ -29,13 +29,9 @@ from .source import Tile, bytes_of
 from .writing import waiting_in
 
 _AHEAD = 3  # groups of items for each thread that are sent ahead, whose results may wait here
-
 _TOGETHER = 16  # most items in a group: each group takes scheduler and coordinator about 15 ms
-
 _TURNS = 4  # least groups for each thread, so that all end at about the same time
-
 _INTERVAL = 0.2  # seconds between two looks whether to go on
-
 _ALONE = 60.0  # seconds without any worker after which a job ends
 
 _MEMORY = {
@@ -46,7 +42,6 @@ _MEMORY = {
 chunk take longer than the work."""
 
 _CONNECT = 10  # seconds to find a scheduler, and a worker
-
 _TRIES = 3  # times that workers are checked if all are lost meanwhile
 
 

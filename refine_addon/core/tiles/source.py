@@ -19,7 +19,6 @@ from ..whole_file import Url
 from . import storage
 
 ROWS = 1 << 16  # of a tile, read together: 15 MB at degree 3
-
 _HEADER = 1 << 16  # bytes that are read of a tile for its header, which hardly ever has more
 _PIECE = 1 << 24  # bytes beside the rows that are copied at a time
 

@@ -52,7 +52,6 @@ BEHIND = 1e-4
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
 _MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
-
 _CROSSING = 1e-3  # least s of `_disc_extent`; with less, a disc is partly behind the camera
 _NO_END = 1e9  # px; beyond any image
 

@@ -23,7 +23,6 @@ MIX = np.uint64(0x9E3779B97F4A7C15)
 _CHUNK = 1 << 16  # rows that are computed together, which limits temporary memory
 _SAMPLE = 10_000  # least positions for the medians in `nearby_order`; more change them little
 _FARTHEST = 1e100  # in sizes; positions are clipped to it there, so that their squares are finite
-
 _BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
 _SPREAD_BITS = (
     (32, 0x1F00000000FFFF),
