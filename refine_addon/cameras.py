@@ -15,10 +15,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .core.affine import QUARTER, QUARTERS, quaternion
+from .core.affine import QUARTER, QUARTERS, UNKNOWN_AXES, quaternion
 from .core.errors import RefineError
 from .core.views import View, ViewSet
-from .mesh.layout import LAYOUT, is_native
+from .mesh.layout import AXES, LAYOUT, is_native
 
 WEIGHT = "refine_weight"  # Custom property of a camera object: the weight of its view, 1 without it
 SOURCE = "refine_view"  # Custom property of an imported camera: its view in the file, exact, JSON
@@ -142,8 +142,8 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
 
 
 def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -> int | None:
-    """Quarter turns about x (0, 1, -1) after which an imported camera looks as in its file; None if
-    after none. `axes`: (3, 3) rotation to the world of an object with splats as in their file."""
+    """Quarter turns about x after which an imported camera looks as in its file; None if by none.
+    `axes`: (3, 3) rotation to the world of an object with splats as in their file."""
     source = _source(obj)
     if not source:
         return None
@@ -346,9 +346,11 @@ def _turn(
     depsgraph: bpy.types.Depsgraph,
 ) -> int | None:
     """Quarter turns about x that these cameras need, the same for all; None if unknown: the splats
-    or more than half of the cameras were not imported, or cameras differ."""
+    or more than half of the cameras were not imported, cameras differ, or nobody named the axes of
+    an SPZ."""
     data = None if splats is None else splats.data
-    if splats is None or data is None or not (LAYOUT in data or is_native(data)):
+    ours = data is not None and (LAYOUT in data or is_native(data))
+    if splats is None or not ours or data.get(AXES) == UNKNOWN_AXES:
         return None
     linear = world_matrix(splats, depsgraph)[:3, :3]
     scale = np.cbrt(np.linalg.det(linear))

@@ -59,7 +59,8 @@ def _rules(options: argparse.Namespace) -> dict[str, object]:
     needs = f"needs Blender: {BLENDER} {name}"
     decides = name in ("prune", "score", "clean", "lod")
     file = output is not None and decides and names_file(output)
-    flags = {o: f"--{o.replace('_', '-')}" for o in ("object", "clean", "pictures", *ROLES)}
+    alone = ("object", "clean", "pictures", "spz_axes", *ROLES)
+    flags = {o: f"--{o.replace('_', '-')}" for o in alone}
     nameless = "objects can be named in Blender only; here give box:... or sphere:x,y,z,radius"
     return {
         f"render {needs}": name == "render" and not scene,
@@ -69,8 +70,8 @@ def _rules(options: argparse.Namespace) -> dict[str, object]:
         "expected either INPUT files or --object NAME": (
             name in ("prune", "score") and bool(options.inputs) == bool(obj)
         ),
-        "--model goes with INPUT files; an object's model is set in the panel": (
-            obj and options.model
+        "--model and --spz-axes go with INPUT files; the panel sets them for objects": (
+            obj and (options.model or options.spz_axes)
         ),
         "--clean goes with INPUT files, not with --object": obj and options.clean,
         f"--object {needs} ...": obj and not scene,

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core import METHODS, REASONS, Budget, Cleaning, Levels, Merge, RefineError, Refit
+from ..core.affine import AXES
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.lod import SHARES
@@ -72,6 +73,9 @@ lod --psnr DB,DB,...    instead of --levels: how close each stays to the origina
 --degree D              leave out harmonics above this degree, 0 to 4
 --model MODEL           how the splats are drawn, if the file does not say or is wrong: default,
                         antialiased (Mip-Splatting, gsplat, Brush's mip) or 2dgs (discs)
+--spz-axes AXES         of .spz files that name none, read or written: rub (y up, z back, as SPZ has
+                        it: splats are turned) or rdf (as they stand); by default cameras decide
+                        where there are some, else as they stand
 --dry-run               decide and report, but write no splats; --pictures are drawn
 --report FILE.json      write a report as JSON
 --overwrite             replace files that exist
@@ -80,7 +84,7 @@ lod --psnr DB,DB,...    instead of --levels: how close each stays to the origina
 """Help of each option; after a subcommand where it differs there."""
 
 _REST = "--report --overwrite --quiet"
-_VIEWS = f"--cameras --source --views --remove-inside --keep-inside --model {_REST}"
+_VIEWS = f"--cameras --source --views --remove-inside --keep-inside --model --spz-axes {_REST}"
 _MORE = "--rounds --clean --protect --pictures --together --workers --dry-run"
 BLENDER = "blender -b scene.blend --command refine"
 _COMMANDS = f"""
@@ -111,7 +115,7 @@ inputs+ -o --levels --psnr --method --rounds --protect {_VIEWS}
   refine lod in.ply --cameras cameras.json --psnr 45,40,35 -o levels/in.spz
 
 convert: write files of splats as one, in another format
-inputs+ output --degree --model {_REST}
+inputs+ output --degree --model --spz-axes {_REST}
   refine convert in.ply out.spz
   refine convert room.ply statue.spz both.sog --degree 1
 
@@ -240,7 +244,7 @@ _TYPES: dict[str, Callable[[str], Any]] = {
 """Placeholder in the help -> parser of the value; others take any text."""
 
 _NAMES = {"-o": "output", "--levels": "shares"}  # Options whose attribute has another name
-_CHOICES = {"METHOD": tuple(METHODS), "MODEL": MODELS, "D": tuple(range(5))}
+_CHOICES = {"METHOD": tuple(METHODS), "MODEL": MODELS, "AXES": AXES, "D": tuple(range(5))}
 
 
 class _Parser(argparse.ArgumentParser):

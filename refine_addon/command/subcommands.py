@@ -77,7 +77,7 @@ def _how(run: Run, name: str) -> dict[str, Any]:
     if options.object:
         return how | {"demands": _of_object(options)}
     zones = tuple(_zone(*named) for named in _named(options))
-    return how | {"zones": zones, "model": options.model}
+    return how | {"zones": zones, "model": options.model, "axes": options.spz_axes}
 
 
 def _prune(run: Run, source: Path | str, output: Path | None) -> dict[str, Any]:
@@ -192,7 +192,7 @@ def _convert(run: Run, _first: str) -> dict[str, Any]:
     options = run.options
     report = core.convert_files(
         options.inputs, options.output, degree=options.degree, model=options.model,
-        overwrite=options.overwrite,
+        axes=options.spz_axes, overwrite=options.overwrite,
     ).report  # fmt: skip
     line = f"{report['splats']['before']:,} splats{_files(report)}"
     return run.say(" + ".join(map(str, options.inputs)), line, report)

@@ -11,12 +11,19 @@ from numpy.typing import NDArray
 from . import spherical_harmonics
 from .errors import RefineError
 from .execute import chunks
-from .splats import Splats, rotation_matrices
+from .splats import Splats, assign, rotation_matrices
 
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
 
-QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}  # turns about x by number of quarters
+HALF = QUARTER @ QUARTER  # half a turn about x
+
+QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T, 2: HALF}
+"""Turns about x by number of quarters."""
+
+AXES = ("rub", "rdf")
+"""Axes of an SPZ: right, up, back as SPZ documents them, or right, down, front as in a PLY."""
+UNKNOWN_AXES = "?"  # neither the SPZ nor anybody else names its axes
 _UNIFORM = 1e-4  # largest relative difference of the scales of a matrix that counts as uniform
 _FLAT = 1e-9  # smallest over largest scale up to which a matrix counts as flat
 
@@ -98,6 +105,18 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
             else splats.sh_rest
         ),
     )
+
+
+def turned(splats: Splats, axes: str) -> Splats:
+    """Splats, in their own types, turned from axes x, y, z with letters of "rdflub" to "rdf".
+
+    Half turns change no digit, and are their own inverses.
+    """
+    matrix, result = np.eye(4), splats.take(np.arange(len(splats)))
+    matrix[:3, :3] = np.vstack([np.eye(3), -np.eye(3)])[["rdflub".index(a) for a in axes]].T
+    for piece in chunks(len(splats), _CHUNK):
+        assign(result.take(piece), transformed(splats.take(piece), matrix))
+    return result
 
 
 def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:

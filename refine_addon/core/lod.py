@@ -360,6 +360,7 @@ def lod_file(
     *,
     zones: Sequence[Zone] = (),
     model: Model | None = None,
+    axes: str | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
@@ -373,7 +374,7 @@ def lod_file(
         A folder, made if missing; a file in it that gives the names (`level_paths`); or the index
         of a streamed SOG, ``lod-meta.json``.
     views, levels, method, progress, threads : see `lod`
-    zones, model, overwrite : see `prune_file`
+    zones, model, axes, overwrite : see `prune_file`
 
     Returns
     -------
@@ -390,7 +391,7 @@ def lod_file(
         else _into_folder(file, path, len(levels), overwrite)
     )
     with output as (add, finish):
-        scene = read_scene(source, zones, model)
+        scene = read_scene(source, zones, model, axes=axes, views=views)
         clock.lap("read_s")
         demands, entries, notes, remarks = scene.demands, list[dict[str, Any]](), list[str](), {}
         summary: dict[str, Any] = {"settings": method.facts(), "volumes": list(demands.facts)}

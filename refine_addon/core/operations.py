@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .affine import is_uniform, transformed
+from .affine import AXES, UNKNOWN_AXES, is_uniform, transformed
 from .cleaning.clean import Cleaning
 from .cleaning.clean import clean as clean_splats
 from .errors import RefineError
@@ -22,10 +22,12 @@ from .formats.format import Format
 from .formats.ply import SplatFile
 from .formats.ply_columns import other_properties
 from .formats.registry import format_named, read_splats, refuse_unknown_size, write_splats
+from .formats.spz import turned_from
 from .formats.streamed_sog import INDEX
 from .methods import DEFAULT, Method
 from .pictures import PictureFiles
 from .prune import prune, score
+from .quality.alignment import alignment
 from .quality.psnr import psnr_against
 from .report import Clock, kept_and_removed, prices, scored, scoring_notes, seen_by
 from .result import Result, file_of
@@ -53,17 +55,32 @@ class Scene:
     notes: tuple[str, ...] = ()
 
 
+def by_cameras(file: SplatFile, views: ViewSet) -> SplatFile:
+    """The file; an SPZ that does not name its axes is turned if the views see it better then."""
+    if file.axes != UNKNOWN_AXES:
+        return file
+    found = alignment(file.splats(), views, views)
+    if found.turn == 2:
+        return turned_from(AXES[0], file, "since the cameras fit that better")
+    remark = f"{file.path.name}: not turned; these cameras cannot tell whether its y points up"
+    return file if found.fineness else replace(file, remarks=(*file.remarks, remark))
+
+
 def read_scene(
     path: Path | str,
     zones: Sequence[Zone] = (),
     model: Model | None = None,
     form: Format | None = None,
+    axes: str | None = None,
+    views: ViewSet | None = None,
 ) -> Scene:
     """Read a file of splats, of any format, into memory; its frame is that of views and zones.
 
-    `model` is how splats are drawn if the file does not say, `form` the output's format, for sizes.
+    `model` and `axes` count if the file does not say, see `read_splats`; without `axes` the views
+    decide on those of an SPZ. `form` is the output's format, for sizes.
     """
-    file = read_splats(path, model)
+    file = read_splats(path, model, axes=axes)
+    file = file if views is None else by_cameras(file, views)
     splats = file.splats()
     return Scene(
         str(file.path), file.stored_bytes, splats, forced(zones, splats.means), lambda: file,
@@ -139,7 +156,7 @@ def run(
             after = None  # splats of a lossy file, read again
             lossy = None if form is None or views is None else written
             if lossy is not None and (rays or pictures):
-                after = _reread(lossy, scene.matrix)
+                after = _reread(lossy, file.axes.strip(UNKNOWN_AXES), scene.matrix)
             if lossy is not None and views is not None and result.scores:
                 psnr = None
                 if rays is not None and after is not None:
@@ -163,7 +180,7 @@ def run(
     return result
 
 
-def _reread(path: Path, matrix: NDArray[np.float64] | None) -> Splats | None:
+def _reread(path: Path, axes: str, matrix: NDArray[np.float64] | None) -> Splats | None:
     """Splats of a lossy file in the views' frame; None if unreadable or `matrix` is not uniform."""
     matrix = np.eye(4) if matrix is None else matrix
     try:
@@ -172,7 +189,7 @@ def _reread(path: Path, matrix: NDArray[np.float64] | None) -> Splats | None:
         return None
     if not is_uniform(matrix):
         return None
-    splats = read_splats(path).splats()
+    splats = read_splats(path, axes=axes or None).splats()
     return splats if np.array_equal(matrix, np.eye(4)) else transformed(splats, matrix)
 
 
@@ -219,6 +236,7 @@ def prune_file(
     cleaning: Cleaning | None = None,
     pictures: PictureFiles | None = None,
     model: Model | None = None,
+    axes: str | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
     progress: Progress = silent,
@@ -234,6 +252,7 @@ def prune_file(
     cleaning : Cleaning, optional; what to clean away first, the budget then counts the rest
     pictures : PictureFiles, optional; where pictures before and after go
     model : Model, optional; where the file does not say how splats are drawn, or is wrong
+    axes : {"rub", "rdf"}, optional; of an SPZ, see `read_splats`; without, the views decide
     overwrite : bool, whether files may be replaced
     dry_run : bool, whether to decide as for the output and write no splats
 
@@ -249,15 +268,15 @@ def prune_file(
         refuse_unknown_size(None if output is None else expanded(output))
     return _run_file(
         source, output, prune_scene(views, budget, method, cleaning, threads=threads),
-        zones, model, overwrite=overwrite, dry_run=dry_run, views=views,
+        views, zones, model, axes, overwrite=overwrite, dry_run=dry_run,
         pictures=pictures, progress=progress, threads=threads,
     )  # fmt: skip
 
 
-def _run_file(source, output, decide, zones, model, **how: Any) -> Result:
+def _run_file(source, output, decide, views, zones, model, axes, **how: Any) -> Result:
     return run(
-        lambda form: read_scene(source, zones, model, form), decide,
-        None if output is None else expanded(output), source=expanded(source), **how,
+        lambda form: read_scene(source, zones, model, form, axes, views), decide,
+        None if output is None else expanded(output), source=expanded(source), views=views, **how,
     )  # fmt: skip
 
 
@@ -269,6 +288,7 @@ def clean_file(
     *,
     zones: Sequence[Zone] = (),
     model: Model | None = None,
+    axes: str | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
@@ -294,7 +314,7 @@ def clean_file(
         return Result(cleaned.keep, report)
 
     return _run_file(
-        source, output, decide, zones, model,
+        source, output, decide, views, zones, model, axes,
         overwrite=overwrite, progress=progress, threads=threads,
     )  # fmt: skip
 
@@ -336,13 +356,14 @@ def score_file(
     *,
     zones: Sequence[Zone] = (),
     model: Model | None = None,
+    axes: str | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
     """Write a file with the float property ``refine_score``; see `prune_file` and `score`."""
     return _run_file(
-        source, output, score_scene(views, method, threads), zones, model,
+        source, output, score_scene(views, method, threads), views, zones, model, axes,
         overwrite=overwrite, progress=progress, threads=threads,
     )  # fmt: skip
 
@@ -387,6 +408,7 @@ def convert_files(
     morton: bool = False,
     level: int = 0,
     model: Model | None = None,
+    axes: str | None = None,
     overwrite: bool = False,
 ) -> Result:
     """Write the splats of files to another, in the format that its suffix names.
@@ -401,6 +423,7 @@ def convert_files(
     morton : bool, whether splats are sorted along a Z-shaped (Morton) curve, near ones together
     level : int, of a streamed SOG; 0 is the finest
     model : Model, optional; see `prune_file`
+    axes : {"rub", "rdf"}, optional; see `read_splats`
 
     Raises
     ------
@@ -424,11 +447,11 @@ def convert_files(
 
     def read(form: Format | None) -> Scene:
         if alone:
-            return read_scene(sources[0], model=model, form=form)
+            return read_scene(sources[0], model=model, form=form, axes=axes)
         paths = [expanded(path) for path in sources]
         streamed = [path.name.lower().endswith(INDEX) for path in paths]
         files = [
-            read_splats(path, model, level if has_levels or not any(streamed) else 0)
+            read_splats(path, model, level if has_levels or not any(streamed) else 0, axes)
             for path, has_levels in zip(paths, streamed, strict=True)
         ]
         for file in files:
@@ -450,7 +473,7 @@ def convert_files(
             order = nearby_order(splats.means[rows]) if len(rows) else rows
             splats = splats.take(np.concatenate([rows[order], np.flatnonzero(~finite)]))
         stored = sum(file.stored_bytes for file in files)
-        file = file_of(splats, files[0].path, stored)
+        file = replace(file_of(splats, files[0].path, stored), axes=files[0].axes)
         lost = {name for each in files for name in other_properties(each.rows.dtype.names or ())}
         names = ", ".join(sorted(lost))
         return Scene(

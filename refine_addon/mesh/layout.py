@@ -28,6 +28,7 @@ _NATIVE_NAMES = f"{BASE}, {SCALE}, {ROTATION}"
 _FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")  # Types of `BASE`: in 5.3, and in older versions
 _MOST = 24  # Harmonics of degree 4, without the constant
 LAYOUT = "refine_layout"  # Custom property of the mesh: layout of its file, JSON
+AXES = "refine_spz_axes"  # Custom property of the mesh: `SplatFile.axes` of what was imported
 MODEL = "refine_model"  # Custom property of the mesh: one of `splats.MODELS`, set by the user
 
 

@@ -480,6 +480,7 @@ def _scene(
     checked: SplatObject, demands: Demands, harmonics: bool | None, form: Format | None
 ) -> Scene:
     """The object in the world, which is also the views' frame."""
+    axes = checked.mesh.get(mesh_layout.AXES, "")
     row, fixed = mesh_attributes.file_size(checked)
     sizes: tuple[float, int] = (row, fixed)
     if form is not None:
@@ -490,7 +491,7 @@ def _scene(
         row * len(checked) + fixed,
         gather([checked], whole=harmonics),
         demands.forced(checked),
-        lambda: mesh_attributes.file_from_object(checked),
+        lambda: replace(mesh_attributes.file_from_object(checked), axes=axes),
         sizes,
         _matrix(checked),
         (*modifier_notes(checked.obj), *drift_notes(checked)),

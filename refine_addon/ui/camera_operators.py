@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import bpy
 import mathutils
 import numpy as np
-from bpy.props import BoolProperty, IntProperty
+from bpy.props import IntProperty
 
-from ..cameras import UPRIGHT, CameraChoice
+from ..cameras import CameraChoice
+from ..core.affine import QUARTERS
 from ..core.errors import RefineError
 from ..core.quality.curve import in_words
 from ..mesh import edit as mesh_edit
@@ -69,13 +70,17 @@ _MARGIN = 1.1  # Distance of a camera over the least that frames all
 
 
 class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
-    """Turn the cameras that decide a quarter about the world's X axis, and drop the scores"""
+    """Turn the cameras that decide about the world's X axis, and drop the scores"""
 
     bl_idname = "refine.turn_cameras"
     bl_label = "Turn the Cameras"
     bl_options = {"REGISTER", "UNDO"}
 
-    back: BoolProperty(name="Back", description="Turn from z up to y down, the opposite of Upright")
+    quarters: IntProperty(
+        name="Quarters",
+        description="Quarter turns: 1 from y down to z up as Upright does, -1 back, 2 for an SPZ",
+        default=1, min=-1, max=2,
+    )  # fmt: skip
 
     def act(self, context: bpy.types.Context) -> Answer:
         """Turn them, or the parents that animate them."""
@@ -87,8 +92,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
         ]
         for checked in group:
             mesh_edit.check_writable(checked.obj)
-        turn = mathutils.Matrix(UPRIGHT.tolist())
-        turn = turn.inverted() if self.back else turn
+        turn = mathutils.Matrix(QUARTERS[self.quarters].tolist()).to_4x4()
         parent = None
         for root in roots:
             if root.animation_data:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy.types import Context
 from bpy_extras.io_utils import ExportHelper
 
+from ..core.affine import AXES
 from ..core.execute import Progress, report
 from ..core.formats import sog
 from ..core.formats.ply import SplatFile
@@ -88,6 +90,11 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         items=_FORMATS,
         options={"SKIP_SAVE"},
     )
+    spz_y_up: BoolProperty(
+        name="SPZ y Up",
+        description="Write splats with y down into an SPZ as it is documented: y up, z back",
+        options={"SKIP_SAVE"},
+    )
     settled = _FORMATS[0][0]  # Format at the last `check`
 
     @staticmethod
@@ -116,9 +123,10 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         checked, moved = mesh_layout.check(context.object), self.apply_transform
         target = expanded(bpy.path.abspath(self.filepath))
         refuse_existing(target, overwrite=self.overwrite)
-        file = splat_group.read_for_export(checked, apply_transform=moved)
+        read = splat_group.read_for_export(checked, apply_transform=moved)
         notes = splat_group.export_notes(checked, apply_transform=moved)
-        return [], (file, target, self.overwrite, notes)
+        axes = AXES[0] if self.spz_y_up else checked.mesh.get(mesh_layout.AXES, "")
+        return [], (lambda: replace(read(), axes=axes), target, self.overwrite, notes)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> SplatFile:

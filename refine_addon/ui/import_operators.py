@@ -14,12 +14,14 @@ from bpy.types import Context
 from bpy_extras.io_utils import ImportHelper
 
 from ..cameras import SHEAR, SOURCE, UPRIGHT, create_cameras, known_turn
+from ..core.affine import AXES
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError
 from ..core.execute import Progress, part, report
 from ..core.formats.ply import SplatFile
 from ..core.formats.registry import INDEX_NAMES, READ_SUFFIXES, read_splats
 from ..core.formats.streamed_sog import INDEX
+from ..core.operations import by_cameras
 from ..core.quality.alignment import Alignment
 from ..core.views import ViewSet
 from ..mesh import attributes as mesh_attributes
@@ -189,6 +191,12 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
+    spz_y_up: BoolProperty(
+        name="SPZ y Up",
+        description="Turn an SPZ that does not name its axes from y up, z back, as SPZ is "
+        "documented, to y down. Without it imported cameras decide, else it stays as it stands",
+        options={"SKIP_SAVE"},
+    )
     cameras: BoolProperty(
         name="With Cameras",
         description="Import the cameras that lie beside the file, or up to three folders above it",
@@ -214,6 +222,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         """Draw the options, and name the cameras that would come along."""
         layout, browser = self.layout, context.space_data
         layout.prop(self, "upright")
+        layout.prop(self, "spz_y_up")
         path = self._paths()[0]
         folder = path.parent
         if path.name.lower().endswith(INDEX):
@@ -234,21 +243,22 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         """The files to read, and the camera file beside them if wanted."""
         paths = self._paths()
         cameras = cameras_beside(paths[0].parent) if self.cameras else None
-        return [], (paths, cameras, self.level)
+        return [], (paths, cameras, (self.level, AXES[0] if self.spz_y_up else None))
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> tuple[list[SplatFile], ViewSet | None, list[Any]]:
         """Files, views, and errors of unreadable ones, which stop no others."""
-        (paths, cameras, level), files, views, errors = job, [], None, []
+        (paths, cameras, how), files, views, errors = job, [], None, []
         for index, path in enumerate(paths):
             progress_of_file = part(progress, index / len(paths), (index + 1) / len(paths))
             try:
-                files.append(_read(path, level, progress_of_file))
+                files.append(_read(path, how, progress_of_file))
             except FAILURES as error:
                 errors.append(error)
         if cameras is not None and files:
             try:
                 views = read_cameras(cameras)
+                files = [by_cameras(file, views) for file in files]
             except FAILURES as error:
                 errors.append(error)
         return files, views, errors
@@ -290,6 +300,8 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
 
     def _import(self, context: Context, file: SplatFile) -> bpy.types.Object:
         mesh = mesh_attributes.mesh_from_file(file)
+        if file.axes:
+            mesh[mesh_layout.AXES] = file.axes
         mesh_drift.stamp(mesh)
         obj = bpy.data.objects.new(mesh.name, mesh)
         if self.upright:
@@ -312,9 +324,9 @@ class REFINE_FH_ply(_Dropped, bpy.types.FileHandler):
     )
 
 
-def _read(path: Path, level: int, progress: Progress) -> SplatFile:
+def _read(path: Path, how: tuple[int, str | None], progress: Progress) -> SplatFile:
     report(progress, 0.0, "")
-    file = read_splats(path, level=level)
+    file = read_splats(path, None, *how)
     if not len(file):
         raise RefineError(f"{path}: holds no splats")
     for start in range(0, len(file), _ROWS):

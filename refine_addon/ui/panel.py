@@ -183,7 +183,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         if text := alignment.turned():
             wrapped.label(self.layout, context, text[:1].upper() + text[1:], icon="ERROR")
             button = self.layout.operator("refine.turn_cameras")
-            button.back = alignment.turn < 0
+            button.quarters = alignment.turn
         if record:
             plan = plans.shown(obj, settings) or {}
             camera_operators.draw(self.layout, record, plan.get("views", {}))

@@ -12,7 +12,7 @@ import pytest
 from tests.e2e.inside.clouds import as_cloud
 from tests.strategies import ply_of
 
-from .conftest import ROOM, applied, export, splats_of
+from .conftest import ROOM, applied, export, read, splats_of
 
 
 def test_every_format_is_exported_and_imported(addon, few, few_file, tmp_path):
@@ -32,6 +32,23 @@ def test_every_format_is_exported_and_imported(addon, few, few_file, tmp_path):
         assert len(read) == len(layout) == 3976
         for name in read.rows.dtype.names:
             assert np.array_equal(stored[name], read.rows[name]), name
+
+
+def test_an_spz_is_turned_as_asked_or_by_cameras_beside_it_and_turned_back(addon, room, tmp_path):
+    """Half a turn about x. Without either it stands, and how the cameras fit is not known."""
+    made, again = tmp_path / "a.spz", tmp_path / "b.spz"
+    (tmp_path / "cameras.json").symlink_to(ROOM / "cameras.json")
+    bpy.ops.refine.export_ply(filepath=str(made), spz_y_up=True)
+    for asked, signs in ({"cameras": True}, 1), ({"spz_y_up": True}, 1), ({}, [1, -1, -1]):
+        bpy.ops.refine.import_ply(filepath=str(made), **asked)
+        obj = bpy.context.object
+        bpy.ops.refine.export_ply(filepath=str(again), overwrite=True)
+        views = addon.cameras.CameraChoice.of_scene(bpy.context.scene).views(bpy.context, obj)
+        means = addon.core.read_splats(made, axes="rub").splats().means
+
+        assert np.array_equal(read(addon, obj, "position"), means * signs)
+        assert np.array_equal(addon.core.read_splats(again, axes="rub").splats().means, means)
+        assert views.turn == (0 if asked else None)
 
 
 def test_all_formats_can_be_dropped_and_picked(addon):

@@ -96,7 +96,7 @@ def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
     report = addon.objects.splat_group.prune_object(
         obj.name, views, core.Budget(ratio=0.5), core.ClosedForm(), dry_run=True
     )
-    bpy.ops.refine.turn_cameras(back=turn_back)
+    bpy.ops.refine.turn_cameras(quarters=-1 if turn_back else 1)
     assert addon.mesh.scores.record(obj.data) is addon.ui.plans.stored(obj, settings) is None
     left = {"refine_score", "refine_rank", "refine_remove", "refine_scored"}
     assert not left & set(obj.data.attributes.keys())

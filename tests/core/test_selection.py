@@ -55,17 +55,6 @@ def test_budgets_are_nested(values, data):
     assert not (harsh & ~mild).any()
 
 
-@given(values=scores(), order=st.randoms(use_true_random=False))
-def test_where_no_scores_are_equal_the_order_in_the_file_is_nothing(values, order):
-    """The kept set of shuffled splats is the shuffled kept set."""
-    values = np.unique(values)
-    shuffle = np.array(order.sample(range(len(values)), len(values)))
-    budget = Budget(ratio=0.5)
-    expected = select(scored(values), budget)[shuffle]
-
-    np.testing.assert_array_equal(expected, select(scored(values[shuffle]), budget))
-
-
 @pytest.mark.parametrize(
     ("ratio", "count", "expected"),
     [
@@ -209,13 +198,3 @@ def test_ranks_of_more_splats_than_float32_can_tell_apart_are_distinct():
     assert (np.diff(shares) > 0.0).all()
     assert (shares <= quotients).all()
     assert (shares[0], shares[-1]) == (quotients[0], 1.0)
-
-
-def test_a_round_of_a_very_large_scene_scores_as_all_rounds_at_once():
-    """50 million places: where a round ends, the next goes on; a thousand of each part tell."""
-    count = 50_000_000
-    for start in (1, count // 4, count // 2 - 500, 3 * count // 4, count - 999):
-        places = np.arange(start, start + 1000)
-        shares = shares_gone(places, count)
-        assert (np.diff(shares) > 0.0).all()
-        np.testing.assert_array_equal(shares[600:], shares_gone(places[600:], count))

@@ -706,6 +706,7 @@ def test_the_command_prunes_as_python_does(store, capsys, monkeypatch):
         (f"prune s3://in/a -o s3://out {FAST}", "a: expected a name that ends in .ply"),
         (f"prune a.ply -o out.ply {FAST}", "-o out.ply is one file, expected a folder"),
         (f"prune a.ply -o out {FAST} --clean", "--clean does not go with --together"),
+        (f"prune a.ply -o o {FAST} --spz-axes rub", "--spz-axes does not go with"),
         (f"prune a.ply -o o {FAST} --protect sphere:0,0,0,1", "--protect does not go with"),
         (f"prune a.ply {FAST}", "expected -o OUT "),
         (f"prune a.ply -o out {FAST} --workers 0", "expected 1 or more"),

@@ -9,7 +9,6 @@ import signal
 import stat
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -226,27 +225,6 @@ def test_a_name_taken_while_the_block_ran_is_not_lost(tmp_path, monkeypatch, fat
     assert contents(tmp_path) == {"out": b"early"}
     written(tmp_path / "out", b"replaced")
     assert contents(tmp_path) == {"out": b"replaced"}
-
-
-@pytest.mark.parametrize("overwrite", [False, True])
-def test_many_writers_of_one_name_leave_one_whole_file(tmp_path, overwrite):
-    """Eight at once, 100 kB each: that of one; without leave to replace, of the first."""
-    refused = []
-
-    def write(letter: int) -> None:
-        try:
-            with whole_file(tmp_path / "out", overwrite=overwrite) as stream:
-                for _ in range(100):
-                    stream.write(bytes([letter]) * 1000)
-        except RefineError as error:
-            refused.append(str(error))
-
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(write, b"ABCDEFGH"))
-
-    ((name, content),) = contents(tmp_path).items()
-    assert (name, content) == ("out", content[:1] * 100_000)
-    assert (0 if overwrite else 7) == len(refused)
 
 
 @pytest.mark.slow

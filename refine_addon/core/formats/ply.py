@@ -79,6 +79,7 @@ class SplatFile:
     indexing: tuple[str, ...] = ()  # other elements whose rows hold indices of splats
     origin: Origin | None = None  # set where the file is no binary PLY
     remarks: tuple[str, ...] = ()  # sentences for the user on how it was read
+    axes: str = ""  # of an SPZ: `affine.AXES` or `UNKNOWN_AXES`; other files are written with them
 
     def __len__(self) -> int:
         return len(self.rows)

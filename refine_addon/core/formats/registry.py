@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..affine import AXES, UNKNOWN_AXES, turned
 from ..errors import RefineError
 from ..mapped import file_bytes
 from ..place import LARGEST_NUMBER, Place, refuse_pointer
@@ -37,7 +38,9 @@ NOT_WRITTEN += tuple(form.suffix for form in READERS if form.write is None)
 _HEAD = 1 << 16  # first bytes, which identify the format; the header of a compressed PLY has fewer
 
 
-def read_splats(path: Path | str, model: Model | None = None, level: int = 0) -> SplatFile:
+def read_splats(
+    path: Path | str, model: Model | None = None, level: int = 0, axes: str | None = None
+) -> SplatFile:
     """Open a file of splats of any format, recognised by its content.
 
     A plain PLY is mapped. Other formats become the plain PLY of the same splats, in memory.
@@ -47,6 +50,9 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
     path : path-like, ``~`` is the home folder
     model : {"default", "antialiased", "2dgs"}, optional; overrides what the file states
     level : int, of a streamed SOG, 0 is the finest; other files have only 0
+    axes : {"rub", "rdf"}, optional
+        Axes of an SPZ that does not name its own, and of those written of this file: y up and z
+        back, for which splats are turned, or as they stand.
 
     Returns
     -------
@@ -56,6 +62,8 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
     ------
     RefineError : if the file is missing, damaged, of no format that is read, or lacks the level
     """
+    if axes not in (None, *AXES):
+        raise RefineError(f"axes is {axes!r}, expected one of {', '.join(AXES)}")
     path = expanded(path)
     data = file_bytes(path)
     head = data[:_HEAD].tobytes()
@@ -64,9 +72,13 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
     if level and form is not streamed_sog.READER:
         raise RefineError(f"{path}: has no level {level}: only {streamed_sog.INDEX} has levels")
     if form is None:
-        return read_plain(path, data).drawn_as(model)
+        return replace(read_plain(path, data).drawn_as(model), axes=axes or "")
     file = streamed_sog.read(path, data, level) if level else form.read(path, data)
-    return file.drawn_as(model).without_third_scale()
+    file = file.drawn_as(model).without_third_scale()
+    named = file.axes.strip(UNKNOWN_AXES)
+    if named or (file.axes and axes == AXES[0]):
+        return spz.turned_from(named or AXES[0], file, "as it says" if named else "as asked")
+    return replace(file, axes=axes or file.axes)
 
 
 def format_named(path: Path | Url) -> Format | None:
@@ -74,9 +86,8 @@ def format_named(path: Path | Url) -> Format | None:
     name = path.name.lower()
     form = next((form for form in FORMATS if name.endswith(form.suffix)), None)
     if form is None and name.endswith(NOT_WRITTEN):
-        problem = f"{path.suffix} is not written,"
-        if name.endswith(streamed_sog.INDEX):
-            problem = "holds levels, which lod makes;"
+        levels = "holds levels, which lod makes;" if name.endswith(streamed_sog.INDEX) else ""
+        problem = levels or f"{path.suffix} is not written,"
         raise RefineError(f"{path}: {problem} expected one of {', '.join(SUFFIXES)}")
     return form
 
@@ -159,6 +170,8 @@ def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: 
     if not good.any():
         Place(path).fail(f"none of the {len(splats)} splats can be drawn: nothing to write")
     splats = (splats if good.all() else splats.take(good)).up_to_degree(form.degree)
+    if form is spz.FORMAT and file.axes == AXES[0]:
+        splats = turned(splats, AXES[0])
     return replace(splats, sh_dc=_tame(splats.sh_dc), sh_rest=_tame(splats.sh_rest))
 
 
@@ -205,12 +218,15 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
     held = f"{suffix} holds harmonics of degree {form.degree}, the file has degree {degree}"
     stated = f"{suffix} does not say that splats are {model}: say so when it is read (model)"
     undrawn = f"{lost} of the kept splats cannot be drawn and {suffix} cannot hold them: left out"
+    up, is_spz = file.axes == AXES[0], form is spz.FORMAT
     said = {
         f"{suffix} {form.loss} (docs/conventions.md, Formats)": True,
         f"{held}: the others are left out": degree > form.degree,
         stated: model not in form.models,
         f"{suffix} does not hold {', '.join(extra)}: left out": extra,
         undrawn: lost,
+        f"coordinates go to {suffix} turned to y up and z back": is_spz and up,
+        f"coordinates go to {suffix} as they stand, y up is documented": is_spz and not up,
     }
     return [*file.remarks, *(sentence for sentence, applies in said.items() if applies)]
 

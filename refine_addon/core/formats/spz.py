@@ -11,14 +11,18 @@ import io
 import math
 import struct
 import zlib
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from ..affine import AXES, UNKNOWN_AXES, turned
 from ..errors import RefineError
 from ..place import GZIP, SPZ, Place, is_spz
 from ..splats import MODELS, above_constant, opacity, opacity_logits, unit_quaternions
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
+from .ply import SplatFile
+from .ply_columns import values_by_name
 
 NAME, SUFFIX = "SPZ", ".spz"
 
@@ -28,6 +32,10 @@ _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_AT = struct.Struct("<I12x")  # behind the header in version 4: byte of the table of streams
 _STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, packed and unpacked
 _ANTIALIASED = 1  # bit of the flags: trained with antialiasing
+_SYSTEMS = "ldb rdb lub rub ldf rdf luf ruf lfd rfd lfu rfu lbd rbd lbu rbu"
+"""Axes x, y and z that the extension SPZ_ADOBE_coordinate_system names, by a number from 1."""
+_NAMES_AXES = struct.pack("<II", 0xADBE0003, 4)  # type and length before that number
+_MOST_EXTENSIONS = 1 << 16  # bytes of extensions that are read
 _VERSIONS = (2, 3, 4)
 _ONE_TURN, _ZSTD = 2, 4  # versions with rotations as x y z, and with zstd streams
 _DEGREES = 5  # how many, from 0
@@ -93,7 +101,18 @@ def _read(path, data):
         splats.quaternions[piece] = _rotations(stored["rotation"])
         rest = stored["rest"].reshape(splats.sh_rest[piece].shape)
         splats.sh_rest[piece] = (rest - np.float32(128.0)) / np.float32(128.0)
-    return file
+    # Extensions stand in front of the streams of version 4, else behind the splats.
+    held = data[:_MOST_EXTENSIONS] if header.version == _ZSTD else body[ends[-1] :]
+    number = int.from_bytes(held.tobytes().partition(_NAMES_AXES)[2][:4], "little")
+    return replace(file, axes=dict(enumerate(_SYSTEMS.split(), 1)).get(number, UNKNOWN_AXES))
+
+
+def turned_from(axes: str, file: SplatFile, why: str) -> SplatFile:
+    """An SPZ whose axes have these letters, turned in place to those of a PLY."""
+    for name, values in values_by_name(turned(file.splats(), axes)).items():
+        file.rows[name] = values
+    remark = f"{file.path.name}: brought from axes {axes.upper()} to those of a PLY, RDF, {why}"
+    return replace(file, axes=AXES[0], remarks=(*file.remarks, remark))
 
 
 def _parsed(path, head, size):
@@ -128,11 +147,11 @@ def _unpacked(path, data):
         for at in range(0, len(data), _STEP):
             if not engine.eof:
                 body += engine.decompress(data[at : at + _STEP].data)
-                del body[needed:]  # extensions, which are not read
+                del body[needed + _MOST_EXTENSIONS :]
     except zlib.error as error:
         where = f"its gzip stream breaks behind byte {at} ({error})"
         Place(path).fail(f"a damaged SPZ file: {where}")
-    if len(body) == needed and not engine.eof:
+    if len(body) >= needed and not engine.eof:
         Place(path).fail("truncated: the gzip stream has no end")
     return header, np.frombuffer(body, np.uint8)[_HEADER.size :]
 
@@ -209,8 +228,7 @@ def _rotations(block):
 def _write(stream, splats):
     """Write version 3; refuse coordinates beyond 8388607, the largest that it holds."""
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
-    fraction = _fraction(splats)
-    flags = _ANTIALIASED if splats.model == "antialiased" else 0
+    fraction, flags = _fraction(splats), _ANTIALIASED if splats.model == "antialiased" else 0
     header = _Header(SPZ, 3, count, splats.sh_degree, fraction, flags, 0)
     blocks = {name: np.empty((count, n), np.uint8) for name, n in header.widths().items()}
     for piece in pieces(count):
@@ -221,10 +239,9 @@ def _write(stream, splats):
         blocks["color"][piece] = codes(np.asarray(batch.sh_dc, np.float64) * _COLOR_STEP + 0.5)
         steps = (np.asarray(batch.log_scales, np.float64) - _LOWEST_SCALE) * _SCALE_STEPS
         blocks["scale"][piece] = np.rint(np.clip(steps, 0.0, 255.0))
-        turns = _packed_rotations(batch.quaternions)
-        blocks["rotation"][piece] = turns.view(np.uint8).reshape(-1, 4)
-        scaled = np.clip(batch.sh_rest, -1.0, 1.0) * np.float32(128.0)
-        steps = np.rint(scaled).astype(np.int16) + 128  # 128 is 0
+        blocks["rotation"][piece] = _packed_rotations(batch.quaternions)
+        steps = np.rint(np.clip(batch.sh_rest, -1.0, 1.0) * np.float32(128.0))
+        steps = steps.astype(np.int16) + 128  # 128 is 0
         for bucket, band in zip(_BUCKETS, (slice(3), slice(3, None)), strict=True):
             steps[:, band] = (steps[:, band] + bucket // 2) // bucket * bucket
         blocks["rest"][piece] = np.minimum(steps, 255).reshape(len(batch), rest)
@@ -254,7 +271,7 @@ def _packed_rotations(quaternions):
         size = np.rint(np.abs(others[:, index]) * (511.0 * math.sqrt(2.0))).astype(np.uint32)
         sign = (others[:, index] < 0.0).astype(np.uint32) << np.uint32(9)
         packed = (packed << np.uint32(10)) | sign | np.minimum(size, np.uint32(511))
-    return packed.astype("<u4")
+    return packed.astype("<u4").view(np.uint8).reshape(-1, 4)
 
 
 _LOSS = "holds positions in 24 bits, all else in 8 to 10, and harmonics in 4 to 5"

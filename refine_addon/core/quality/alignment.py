@@ -3,8 +3,9 @@
     fineness = mean over pixels of the sum of  T_i alpha_i / (1 + (s_i / (FINE side))^2)
 
 s and side, px, are geometric means of a footprint's standard deviations and of the image's sides.
-Much finer pictures after a quarter turn about x mean that only one of the files was turned upright.
-From far away all pictures are fine, so distant views are named, too (`SMALL`).
+From far away all pictures are fine, so beyond a distance d, a share of the cameras' distances from
+their middle, splats count as large as they would be there. Much finer pictures after a turn
+about x mean that only one of the files was turned. Distant views are named, too (`SMALL`).
 """
 
 from __future__ import annotations
@@ -38,10 +39,15 @@ RAYS = 1024
 FINE = 0.015
 """Standard deviation at which a splat is half as fine as a point, as a share of the image."""
 
+NEAR = 0.3
+"""The distance d over the median distance of the views from their middle."""
+
 BETTER = 1.5
 """Factor by which turned cameras must see finer pictures."""
 
-LEAST = 0.04
+_FARTHEST = 1e9  # largest depth over d: its square fits float32
+
+LEAST = 0.005
 """Pictures less fine show too little to decide by."""
 
 ONE_WAY = 0.95
@@ -61,9 +67,9 @@ SMALL = 0.02
 class Alignment:
     """Whether the views are to be turned, and which are far away from the splats."""
 
-    turn: int = 0  # quarters about x (`affine.QUARTER`) to turn the views by: 0, 1 or -1
+    turn: int = 0  # quarters about x (`affine.QUARTERS`) to turn the views by: 0, 1, -1 or 2
     known: bool = False  # by the import; else it was measured
-    fineness: tuple[float, ...] = ()  # as they are, turned by a quarter, and back; or ()
+    fineness: tuple[float, ...] = ()  # turned by each of `affine.QUARTERS`; or ()
     far: tuple[str, ...] = ()  # names of the views that see the splats from far away
 
     def notes(self) -> list[str]:
@@ -74,14 +80,15 @@ class Alignment:
         """A sentence if the views are to be turned, else ""."""
         if not self.turn:
             return ""
+        angle = "half" if self.turn == 2 else "a quarter"
         if self.known:
             return (
                 "cameras and splats do not share an up axis: only one of them was imported "
-                "upright; turn the cameras a quarter about X"
+                f"upright; turn the cameras {angle} about X"
             )
         now, turned = self.fineness[0], self.fineness[list(QUARTERS).index(self.turn)]
         return (
-            "cameras and splats do not seem to share an up axis: turned a quarter about X, the "
+            f"cameras and splats do not seem to share an up axis: turned {angle} about X, the "
             f"cameras would see pictures {min(turned / max(now, 1e-9), 99.0):.1f} times as fine"
         )
 
@@ -178,15 +185,20 @@ def _fineness(splats, views, progress, threads):
         sample, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
     ordered = [view for view, _ in views.by_distance()]
+    near = NEAR * views.middle()[1] ** 0.5 / scene.size
 
     def of_turned(item):
         rotation, (number, view) = item
         with np.errstate(under="ignore"):
-            footprints = projection.project(gaussians, scene, view.turned(rotation))
+            view = view.turned(rotation)
+            footprints = projection.project(gaussians, scene, view)
             rays = cast(footprints, *pixels(view, number, RAYS / len(ordered)))
             square = np.zeros(len(gaussians))  # px^2
             square[footprints.index] = footprints.sigmas[0] * footprints.sigmas[1] / stand_for
             square /= FINE**2 * view.width * view.height
+            if near:
+                depths = projection.coordinates(gaussians.means, scene, view)[2]
+                square *= np.clip(depths / near, 1.0, _FARTHEST) ** 2
             _, owner, weight = rays.contributions()
             return float((weight / (1.0 + square[rays.hit[owner]])).sum()) / rays.count
 
