@@ -114,7 +114,7 @@ def _prune_together(run: Run, label: str) -> dict[str, Any]:
     tiles = [
         f"{located(tile['input']).name}: {tile['kept']:,} of {tile['before']:,} splats "
         f"({(tile['before'] - tile['kept']) / max(tile['before'], 1):.1%} removed), "
-        f"{_sizes(tile['input_bytes'], tile['output_bytes'])}"
+        f"{sizes_in_words(tile['input_bytes'], '->', tile['output_bytes'])}"
         for tile in report["tiles"]
     ]
     return _say_pruned(run, label, report, *tiles)
@@ -240,12 +240,8 @@ def _written(splats: Mapping[str, Any]) -> str:
 def _files(report: dict[str, Any]) -> str:
     """Number of splats written, if some were left out, and file sizes before and after."""
     files = report["files"]
-    return f"{_written(report['splats'])}, {_sizes(files['input_bytes'], files['output_bytes'])}"
-
-
-def _sizes(before: int, after: int | None) -> str:
-    """File sizes before and after; `after` is None where only writing would show it."""
-    return f"of {size_in_words(before)}" if after is None else sizes_in_words(before, "->", after)
+    sizes = sizes_in_words(files["input_bytes"], "->", files["output_bytes"])
+    return f"{_written(report['splats'])}, {sizes}"
 
 
 def _by_method(predicted: Mapping[str, Any], without: str = "") -> str:

@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,11 @@ from .execute import Cancelled, Progress, part, report, seconds, silent, stages
 from .formats import registry
 from .formats.format import Format
 from .formats.ply import SplatFile
-from .formats.ply_columns import other_properties
-from .formats.registry import format_named, read_splats, refuse_unknown_size, write_splats
+from .formats.ply_columns import Changes, other_properties
+from .formats.registry import format_named, read_splats, write_splats
 from .formats.spz import turned_from
 from .formats.streamed_sog import INDEX
-from .methods import DEFAULT, Method
+from .methods import DEFAULT, ClosedForm, Method
 from .pictures import PictureFiles
 from .prune import prune, score
 from .quality.alignment import alignment
@@ -38,6 +39,9 @@ from .visibility.scene import nearby_order
 from .volumes import Forced, Zone, forced
 from .whole_file import expanded, refuse_existing, refuse_mapped
 
+TRIES = 4  # most times that a file is written to find how many splats fit a size
+SAMPLE = 1 << 16  # about so many splats are written before, for the first of these
+CLOSE, AIM = 0.98, 0.99  # least share of a size that is used, and that the next try aims at
 PROPERTY = "refine_score"  # the property of a PLY that holds the scores
 
 
@@ -50,7 +54,8 @@ class Scene:
     splats: Splats  # in the frame of the views
     demands: Forced
     file: Callable[[], SplatFile]  # what is written, in the source's frame
-    sizes: tuple[float, int]  # bytes of a splat in the output, and of the rest
+    sizes: tuple[float, int]  # bytes of a splat in a plain PLY, and of the rest
+    form: Format | None = None  # of the output, None for plain PLY
     matrix: NDArray[np.float64] | None = None  # (4, 4), source to views
     notes: tuple[str, ...] = ()
 
@@ -77,14 +82,14 @@ def read_scene(
     """Read a file of splats, of any format, into memory; its frame is that of views and zones.
 
     `model` and `axes` count if the file does not say, see `read_splats`; without `axes` the views
-    decide on those of an SPZ. `form` is the output's format, for sizes.
+    decide on those of an SPZ. `form` is the output's format.
     """
     file = read_splats(path, model, axes=axes)
     file = file if views is None else by_cameras(file, views)
     splats = file.splats()
     return Scene(
         str(file.path), file.stored_bytes, splats, forced(zones, splats.means), lambda: file,
-        registry.row_sizes(file, form),
+        (file.row_bytes, file.fixed_bytes), form,
     )  # fmt: skip
 
 
@@ -131,8 +136,9 @@ def run(
         file = scene.file()
         result = replace(result, source=file, matrix=scene.matrix)
         keep, columns = result.keep, result.changed(file.rows)
-        size = registry.written_size(file, form, keep, columns)
-        if written is not None:
+        if written is None:
+            size = registry.written_size(file, form, keep, columns)
+        else:
             write_splats(written, file, keep, columns=columns, overwrite=overwrite, threads=threads)
             size = written.stat().st_size
         if save is not None:
@@ -211,11 +217,26 @@ def prune_scene(
             left = cleaned.keep if demands.removed is None else cleaned.keep | demands.removed
             splats, demands = splats.take(left), demands.of(left)
             progress = part(progress, 0.3, 1.0)
-        result = prune(
-            splats, views, budget, method,
-            protected=demands.protected, removed=demands.removed, sizes=scene.sizes,
-            reusable=reusable, partial=True, clock=clock, progress=progress, threads=threads,
-        )  # fmt: skip
+
+        fits = budget.max_mb is not None and scene.form is not None
+
+        def pruned(method: Method, sizes: tuple[float, int], **more: Any) -> Result:
+            return prune(
+                splats, views, budget, method, sizes=sizes, partial=True, threads=threads,
+                protected=demands.protected, removed=demands.removed, reusable=reusable or fits,
+                **more,
+            )  # fmt: skip
+
+        def changed(result: Result) -> list[tuple[NDArray[np.bool_], Changes]]:
+            result = replace(result if left is None else result.for_all(left), matrix=scene.matrix)
+            return [(result.keep, result.changed(files[0].rows))]
+
+        if fits:
+            files, methods = [scene.file()], {ClosedForm(method.views): silent, method: progress}
+            ways = [(partial(pruned, each, clock=clock), how) for each, how in methods.items()]
+            result = to_size(budget, scene.form, files, changed, ways)
+        else:
+            result = pruned(method, scene.sizes, progress=progress, clock=clock)
         if left is not None:
             result = result.for_all(left)
             result.report["cleaned"] = cleaned.facts()
@@ -223,6 +244,48 @@ def prune_scene(
         return result
 
     return decide
+
+
+def to_size(
+    budget: Budget,
+    form: Format | None,
+    files: Sequence[SplatFile],
+    changed: Callable[[Result], Sequence[tuple[NDArray[np.bool_], Changes]]],
+    ways: Sequence[tuple[Callable[..., Result], Progress]],
+) -> Result:
+    """Result that fits `Budget.max_mb` in a format, and hardly less, by writing a few tries.
+
+    `changed(result)` has the kept rows and new columns of each file. A way is
+    ``pruned(sizes, scores=..., progress=...)`` and its progress, the cheapest first: what follows
+    begins with as many splats. `RefineError` if nothing fits.
+    """
+
+    def written(changes):
+        pairs = zip(files, changes, strict=True)
+        return sum(registry.written_size(file, form, *each) for file, each in pairs)
+
+    step, limit = max(sum(map(len, files)) // SAMPLE, 1), math.floor(1e6 * (budget.max_mb or 0.0))
+    some = [(np.arange(len(file)) % step == 0,) for file in files]
+    goal = AIM * limit / written(some) * sum(int(np.count_nonzero(rows)) for (rows,) in some)
+    for pruned, progress in ways:
+        kept, size, best, scores = 0, 0, None, None
+        for number in range(TRIES):
+            done = 1.0 - 0.5**number
+            told = part(progress, done, (1.0 + done) / 2.0)
+            result = pruned((limit / goal, 0), scores=scores, progress=told)
+            fewer, kept = kept, int(np.count_nonzero(result.keep))
+            less, size = size, written(changed(result))
+            best = result if size <= limit or result.stopped else best
+            enough = best is result and (size >= CLOSE * limit or kept == len(result.keep))
+            if enough or kept == fewer:
+                break
+            slope = (size - less) / (kept - fewer)
+            goal = max(kept + (AIM * limit - size) / (slope if slope > 0.0 else size / kept), 1.0)
+            scores = result.scores if result.merged is None else None
+        if best is None:
+            raise RefineError(f"max_mb is {budget.max_mb}, {kept:,} splats take {size / 1e6:g}")
+        goal, result = int(np.count_nonzero(best.keep)), best
+    return result
 
 
 def prune_file(
@@ -264,8 +327,6 @@ def prune_file(
     ------
     RefineError, Cancelled : see `read_splats`, `prune` and `write_splats`
     """
-    if budget.max_mb is not None:
-        refuse_unknown_size(None if output is None else expanded(output))
     return _run_file(
         source, output, prune_scene(views, budget, method, cleaning, threads=threads),
         views, zones, model, axes, overwrite=overwrite, dry_run=dry_run,

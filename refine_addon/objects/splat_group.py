@@ -21,7 +21,6 @@ from ..core.errors import RefineError
 from ..core.formats.format import Format
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
-from ..core.formats.registry import refuse_unknown_size
 from ..core.lod import Level
 from ..core.methods import DEFAULT, Merge, Method, Occlusion
 from ..core.operations import Scene, prune_scene, run, score_scene
@@ -431,8 +430,6 @@ def prune_object(
     compares = method.name != "closed-form" or budget.psnr is not None or pictures is not None
     harmonics = True if method.changes else None if compares else False
     target = None if output is None else expanded(output)
-    if budget.max_mb is not None:
-        refuse_unknown_size(target)
     if save:
         mesh_edit.check_deletable(checked.obj)
         if not bpy.data.filepath:
@@ -482,17 +479,14 @@ def _scene(
     """The object in the world, which is also the views' frame."""
     axes = checked.mesh.get(mesh_layout.AXES, "")
     row, fixed = mesh_attributes.file_size(checked)
-    sizes: tuple[float, int] = (row, fixed)
-    if form is not None:
-        degree = min(mesh_layout.sh_degree(checked.mesh), form.degree)
-        sizes = form.sizes(len(checked), degree) if form.sizes else (0.0, 0)
     return Scene(
         f"{bpy.data.filepath}#{checked.obj.name}",
         row * len(checked) + fixed,
         gather([checked], whole=harmonics),
         demands.forced(checked),
         lambda: replace(mesh_attributes.file_from_object(checked), axes=axes),
-        sizes,
+        (row, fixed),
+        form,
         _matrix(checked),
         (*modifier_notes(checked.obj), *drift_notes(checked)),
     )

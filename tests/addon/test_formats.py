@@ -106,14 +106,13 @@ def test_a_json_file_that_is_dropped_is_one_of_splats_by_its_name(addon, monkeyp
 
 @pytest.mark.usefixtures("few")
 def test_an_object_is_pruned_to_a_size_in_another_format(addon, room_views, tmp_path):
-    """3,200 bytes hold 100 splats of a .splat; the size of a .spz does not follow from them."""
+    """3,200 bytes hold 100 splats of a .splat; 2 % fewer may be there, and so in a .spz."""
     core, prune = addon.core, addon.objects.splat_group.prune_object
     asked = "room", room_views, core.Budget(max_mb=0.0032), core.ClosedForm()
-    report = prune(*asked, output=tmp_path / "a.splat")
-
-    assert len(core.read_splats(tmp_path / "a.splat")) == report["splats"]["kept"] == 100
-    with pytest.raises(core.RefineError, match=r"a size cannot be kept to in \.spz"):
-        prune(*asked, output=tmp_path / "a.spz")
+    for path in (tmp_path / "a.splat", tmp_path / "a.spz"):
+        report = prune(*asked, output=path)
+        assert len(core.read_splats(path)) == report["splats"]["kept"]
+        assert 3136 <= path.stat().st_size <= 3200
 
 
 def test_the_images_of_blender_are_those_of_pillow(addon):

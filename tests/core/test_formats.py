@@ -14,6 +14,7 @@ import pytest
 
 from refine_addon.command import main
 from refine_addon.core import (
+    METHODS,
     Budget,
     RefineError,
     Splats,
@@ -193,27 +194,23 @@ def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
             read_splats(path)
 
 
+@pytest.mark.parametrize("method", ["closed-form", "merge"])
 @pytest.mark.parametrize("suffix", SUFFIX)
-def test_a_size_is_kept_to_or_refused_where_only_writing_tells_it(tmp_path, suffix, cameras):
-    """Room for half a splat more than 300 and for all else: 300 stay, and the file fits."""
-    (tmp_path / "in.ply").write_bytes(ply_of(scene(1)))
-    form, path = FORMATS[SUFFIX.index(suffix)], tmp_path / f"out{suffix}"
-    if not form.sizes:
-        with pytest.raises(RefineError, match=f"a size cannot be kept to in {suffix}, which is c"):
-            prune_file(tmp_path / "in.ply", path, cameras, Budget(max_mb=0.01))
-        asked = prune_file(tmp_path / "in.ply", path, cameras, Budget(keep=300), dry_run=True)
-        assert asked.report["files"]["output_bytes"] is None
-        assert not path.exists()
-        return
-    row, fixed = form.sizes(COUNT, min(1, form.degree))
-    budget = Budget(max_mb=(fixed + 300.5 * row) / 1e6)
-    planned = prune_file(tmp_path / "in.ply", path, cameras, budget, dry_run=True).report
-    assert not path.exists()
-    report = prune_file(tmp_path / "in.ply", path, cameras, budget).report
-    assert report["splats"]["kept"] == len(read_splats(path)) == 300
-    assert 300 * row <= path.stat().st_size <= budget.max_mb * 1e6
-    assert report["files"]["output_bytes"] == path.stat().st_size
-    assert path.stat().st_size <= planned["files"]["output_bytes"] <= budget.max_mb * 1e6
+def test_a_size_is_kept_to(tmp_path, suffix, cameras, method):
+    """Never above, at most 2 % below; a dry run tells the same. In 100 bytes nothing fits."""
+    source, path = tmp_path / "in.ply", tmp_path / f"out{suffix}"
+    source.write_bytes(ply_of(scene(1, 5 * COUNT)))
+    whole = written(tmp_path, suffix, scene(1, 5 * COUNT)).stat().st_size / 1e6
+    for share in (0.3, 0.7):
+        asked = source, path, cameras, Budget(max_mb=share * whole), METHODS[method]()
+        planned = prune_file(*asked, dry_run=True).report["files"]["output_bytes"]
+        prune_file(*asked, overwrite=True)
+        assert 0.98 * share * whole <= path.stat().st_size / 1e6 <= share * whole
+        assert planned == path.stat().st_size
+    all_of_it = prune_file(*asked[:3], Budget(max_mb=2 * whole), overwrite=True).report
+    assert all_of_it["splats"]["removed"] == 0
+    with pytest.raises(RefineError, match=r"max_mb is 0\.0001|max_mb is 1e-05"):
+        prune_file(*asked[:3], Budget(max_mb=1e-5), overwrite=True)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs permissions")

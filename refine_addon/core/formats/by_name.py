@@ -184,8 +184,5 @@ def _named(suffix):
 
 
 _LOSS = "holds colour, opacity and rotation in 8 bits each"
-_BYTES = _SPLAT.itemsize, 0
-SPLAT = Format(
-    ".splat", ".splat", _named(".splat"), _read_splat, _write_splat, 0, _LOSS, lambda *_: _BYTES
-)
+SPLAT = Format(".splat", ".splat", _named(".splat"), _read_splat, _write_splat, 0, _LOSS)
 KSPLAT = Format(".ksplat", ".ksplat", _named(".ksplat"), _read_ksplat)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..place import Place
-from ..splats import MODELS, SH_C0, above_constant, opacity, unit_quaternions
+from ..splats import MODELS, SH_C0, opacity, unit_quaternions
 from ..visibility.scene import nearby_order
 from . import ply
 from .format import Format, join_largest, new_file, pieces, set_colors, split_largest
@@ -154,9 +154,7 @@ def _write(stream, splats):
         turns = _packed(others / np.sqrt(2.0) + 0.5, _TURNS)
         packed[piece, 1] = turns | (largest.astype(np.uint32) << np.uint32(30))
         packed[piece, 2] = _packed(_places(scales, ends[:, 6:12]), _PLACES)
-        shares = np.empty((len(batch), 4))
-        shares[:, :3] = _places(colors, ends[:, 12:])
-        shares[:, 3] = opacity(batch.opacity_logits)
+        shares = np.column_stack([_places(colors, ends[:, 12:]), opacity(batch.opacity_logits)])
         packed[piece, 3] = _packed(shares, _CHANNELS)
         planes = np.asarray(batch.sh_rest, np.float64).transpose(0, 2, 1).reshape(len(batch), rest)
         # Cut off, not rounded, since a code stands for the middle of its step.
@@ -181,18 +179,10 @@ def _header(count, rest):
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // SPLATS)}"]
     lines += [f"property float {name}" for name in (*_POSITION, *_SCALE, *_COLOR)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
-    if rest:
-        lines += [f"element sh {count}"]
-        lines += [f"property uchar f_rest_{index}" for index in range(rest)]
+    lines += [f"element sh {count}"] if rest else []
+    lines += [f"property uchar f_rest_{index}" for index in range(rest)]
     return "\n".join([*lines, "end_header", ""]).encode()
 
 
-def _sizes(count, degree):
-    """Bytes of a splat, and at most of the rest: with a full last chunk and the longest header."""
-    rest = 3 * above_constant(degree)
-    chunk, header = 18 * 4, ply.with_model(_header(count, rest), "antialiased")
-    return 16 + rest + chunk / SPLATS, len(header) + chunk
-
-
 _LOSS = "holds every value in 8 to 11 bits, and sorts the splats"
-FORMAT = Format(NAME, ".compressed.ply", _matches, _read, _write, 3, _LOSS, _sizes, MODELS)
+FORMAT = Format(NAME, ".compressed.ply", _matches, _read, _write, 3, _LOSS, MODELS)

@@ -32,8 +32,6 @@ class Format:
     write: Callable[[BinaryIO, Splats], None] | None = None
     degree: int = 0  # highest of the harmonics
     loss: str = ""  # what is lost, as a sentence whose subject is the suffix
-    # (count, degree) -> bytes of a splat, most bytes of the rest; None if compressed as a whole.
-    sizes: Callable[[int, int], tuple[float, int]] | None = None
     models: tuple[Model, ...] = MODELS[:1]  # those that a file can name
 
 

@@ -92,12 +92,6 @@ def _json(attributes, count, low, high):
     return text + b" " * (-len(text) % 4), at
 
 
-def _sizes(count, degree):
-    longest, count = [-1.1754943508222875e-38] * 3, max(count, 1)
-    text, body = _json(_attributes(degree), count, longest, longest)
-    return body / count, gltf.HEADER.size + 2 * gltf.CHUNK.size + len(text)
-
-
 _LOSS = "holds activated values in single precision, with y up"
-FORMAT = Format(NAME, ".glb", gltf.matches, gltf.read, _write, gltf.DEGREE, _LOSS, _sizes)
+FORMAT = Format(NAME, ".glb", gltf.matches, gltf.read, _write, gltf.DEGREE, _LOSS)
 READER = Format("glTF", ".gltf", named_json(".gltf"), gltf.read)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -182,23 +182,15 @@ def _tame(colors):
     return np.clip(colors, -LARGEST_NUMBER, LARGEST_NUMBER)
 
 
-def row_sizes(file: SplatFile, form: Format | None, count: int | None = None) -> tuple[float, int]:
-    """Bytes of a splat in a format, and at most of the rest; both 0 if compressed as a whole."""
-    if form is None:
-        return file.row_bytes, file.fixed_bytes
-    degree, count = min(file.splats().sh_degree, form.degree), len(file) if count is None else count
-    return form.sizes(count, degree) if form.sizes else (0.0, 0)
-
-
 def written_size(
     file: SplatFile, form: Format | None, keep: NDArray[np.bool_], columns: Changes = None
-) -> int | None:
-    """Bytes that `write_splats` would write at most; None for a format compressed as a whole."""
-    if form is None:
+) -> int:
+    """Bytes that `write_splats` would write; but for a plain PLY they are written and dropped."""
+    if form is None or form.write is None:
         return file.size(keep, columns)
-    count = int(np.count_nonzero(keep))
-    row, fixed = row_sizes(file, form, count)
-    return math.ceil(row * count) + fixed if form.sizes else None
+    with tempfile.TemporaryFile() as stream:
+        form.write(stream, held_splats(file.path, form, file, keep, columns))
+        return stream.seek(0, 2)  # to its end
 
 
 def left_out(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> int:
@@ -229,12 +221,3 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
         f"coordinates go to {suffix} as they stand, y up is documented": is_spz and not up,
     }
     return [*file.remarks, *(sentence for sentence, applies in said.items() if applies)]
-
-
-def refuse_unknown_size(output: Path | None) -> None:
-    """Raise `RefineError` if the output is of a format compressed as a whole, or not written."""
-    form = None if output is None else format_named(output)
-    if form is not None and form.sizes is None:
-        problem = f"a size cannot be kept to in {form.suffix}, which is compressed as a whole"
-        fixed = ", ".join(other.suffix for other in FORMATS if other.sizes)
-        raise RefineError(f"{problem}: choose another budget, or write .ply, {fixed}")
