@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import bpy
@@ -207,9 +208,10 @@ def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, tmp_p
     export, read = addon.ui.export_operators.REFINE_OT_export_ply, addon.ui.import_operators
     at_once, later = (tmp_path / f"{name}{suffix}" for name in ("now", "later"))
     bpy.ops.refine.export_ply(filepath=str(at_once))
-    options = {"overwrite": False, "apply_transform": False}
+    options = {"overwrite": False, "apply_transform": False, "spz_y_up": False}
     ended = until(*start(export, filepath=str(later), **options)[:2])
-    options = {"files": [], "directory": "", "upright": False, "cameras": False, "level": 0}
+    options = {"files": [], "directory": "", "level": 0}
+    options |= dict.fromkeys(("upright", "cameras", "spz_y_up"), False)
     operator, context, said = start(read.REFINE_OT_import_ply, filepath=str(later), **options)
     imported = until(operator, context)
     obj = bpy.context.view_layer.objects.active
@@ -230,12 +232,11 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, tmp_path, monke
         begun.set()
         free.wait(600.0)
 
-    held = SimpleNamespace(
-        suffix=".splat", degree=form.degree, write=write, loss="", sizes=None, models=form.models
-    )
+    held = replace(form, write=write)
     monkeypatch.setattr(addon.core.formats.registry, "format_named", lambda _path: held)
     export, out = addon.ui.export_operators.REFINE_OT_export_ply, tmp_path / "out.splat"
     options = {"filepath": str(out), "overwrite": False, "apply_transform": False}
+    options |= {"spz_y_up": False}
     operator, context, _ = start(export, **options)
     assert begun.wait(60.0)
     operator.modal(context, event("ESC"))

@@ -100,8 +100,7 @@ STRETCH = np.array([[2, 0.3, 0], [0, 1, 0], [0, 0, 0.5]])
 def test_a_transform_moves_means_covariances_and_colours(linear):
     """M mean + t and M covariance M'; of colours the nearest harmonics, which a rotation has.
 
-    A stretch has none that are exact, and is refused unless colours may stay.
-    """
+    A stretch has none that are exact, and is refused unless colours may stay."""
     splats, matrix = some(), affine(linear, [1, -2, 3])
     stretch = linear is STRETCH
     moved = transformed(splats, matrix, rotate_sh=not stretch)
@@ -225,8 +224,7 @@ def test_points_that_are_moved_one_by_one_or_into_a_plane_have_no_map(linear):
     """The others have one, as Apply > Rotation & Scale leaves them: M p + t, in float32.
 
     20 of 4,000 went their own ways, one is not finite; 100 lie on a slanted plane, as a mirror
-    modifier merges what is near it.
-    """
+    modifier merges what is near it."""
     before = points()
     after = mapped(before, linear, [5.0, -2.0, 0.1])
     after[::200] += points(20, 1.0, seed=1)
@@ -243,8 +241,7 @@ def test_points_that_are_moved_one_by_one_or_into_a_plane_have_no_map(linear):
 def test_a_plane_is_turned_and_scaled_as_a_whole_but_a_line_or_four_points_are_not():
     """What lies across it follows by the scale within it, and is not mirrored: 3 R.
 
-    Any four points have an affine map in common; a line can be turned about itself.
-    """
+    Any four points have an affine map in common; a line can be turned about itself."""
     plane, line, few = points(), points(100), points(4)
     plane[:, 2], line[:, 1:] = 1.0, 0.0
     (move,) = affine_moves(plane, mapped(plane, 3.0 * TURN))

@@ -52,8 +52,7 @@ FLOATER = made([[0.1, 0.0, 2.0]], 0.06, 0.8, 0.1)
 def test_what_views_see_past_goes_as_being_in_front():
     """All six views see the dark splat at half the depth of the white wall; nothing is near it.
 
-    So a seventh is expected to see past it by (6 + 1) / (6 + 2).
-    """
+    So a seventh is expected to see past it by (6 + 1) / (6 + 2)."""
     splats = joined(wall(), FLOATER)
     cleaned = clean(splats, cameras())
     assert np.flatnonzero(~cleaned.keep).tolist() == [SIDE**2]
@@ -133,8 +132,7 @@ def test_where_nothing_floats_nothing_is_cleaned_away(splats):
     """None, or one with nothing behind it; a wall, whose splats support each other.
 
     A cluster of 100 splats or more is a thing, wherever it is, and what is vast and lies behind all
-    is the last that the light meets.
-    """
+    is the last that the light meets."""
     cleaned = clean(splats, cameras())
     assert cleaned.keep.all()
     assert cleaned.in_words() == "nothing to clean away"
@@ -164,8 +162,7 @@ def test_a_cloud_of_faint_splats_stays_but_for_what_is_solid_in_it():
 
     Each of the cloud changes pixels by .09 x .03, .69 of 255, and eight faint ones touch it: 1.35^8
     times .085 is .94. The dark splat changes them by 40 of 255 or more; held by eight that stay it
-    needs 8^sqrt(8) x .085 = 31.
-    """
+    needs 8^sqrt(8) x .085 = 31."""
     places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.03, (9, 3))
     alone = made(places[:1], 0.06, 0.09, 0.87)
     cloud = made(places, 0.06, 0.09, 0.87)
@@ -186,8 +183,7 @@ def test_floaters_in_a_veil_are_found_once_it_is_gone():
 def test_faint_splats_near_a_camera_are_haze_and_stay_unless_asked():
     """Each changes a pixel by .006 x .1, .15 of 255, less than the .22 that six views ask for.
 
-    One is .1 scene sizes off the cameras, the other .4.
-    """
+    One is .1 scene sizes off the cameras, the other .4."""
     fog = made([[0.1, 0.0, 0.5], [-0.1, 0.0, 2.0]], 0.012, 0.006, 0.8)
     asked = clean(joined(wall(), fog), cameras(), Cleaning(("front", "haze")))
     assert asked.counts() == {"front": 0, "haze": 1}

@@ -60,8 +60,7 @@ def test_shapes_have_the_reason_of_their_kind(splat, expected):
     """At f = 60 and 80 px across; the scene's size is 4.76, so giants are longer than .71.
 
     A needle reaches 60 x .4 / 2 = 12 px, over 4; the short one 1.2. A flake is as wide as long.
-    What is near reaches 24 px but is small; what is far is long but reaches 16 px, under 20.
-    """
+    What is near reaches 24 px but is small; what is far is long but reaches 16 px, under 20."""
     assert reasons(splat, views=12) == {expected: 1}
 
 
@@ -70,8 +69,7 @@ def test_shapes_have_the_reason_of_their_kind(splat, expected):
 def test_a_giant_may_lie_at_a_surface_by_less_than_half(monkeypatch, half, expected):
     """A solid square at its depth stops 25 % of the light near it; one of twice the side 89 %.
 
-    In the colour of the wall it changes no pixel, and stays.
-    """
+    In the colour of the wall it changes no pixel, and stays."""
     monkeypatch.setattr(support, "RAYS", 600)
     side = np.linspace(-half, half, 32)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))

@@ -162,8 +162,7 @@ def three_splats() -> tuple[Splats, ViewSet]:
     """Three splats on the axis of one view at depths 1, 2 and 3, opacity 1/2, black, grey, white.
 
     Scales 1 along each axis of the first, so that area 1; 2, 2, 1 of the second: area 4; 3, 1, 1 of
-    the third: area 3.
-    """
+    the third: area 3."""
     scales = [[1, 1, 1], [2, 2, 1], [3, 1, 1]]
     splats = splats_of([[0, 0, 1], [0, 0, 2], [0, 0, 3]], 0.5, scales, [0.0, 0.5, 1.0])
     return splats, ViewSet((view(),))
