@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import whole_file
 from .errors import RefineError
 from .execute import Progress, report, seconds, silent, stages
 from .formats import registry, sog
@@ -37,14 +38,6 @@ from .splats import Model, Splats, among_all
 from .views import ViewSet
 from .visibility import frustum
 from .volumes import Zone, must_go
-from .whole_file import (
-    expanded,
-    mode_of,
-    new_folder,
-    refuse_existing,
-    refuse_mapped,
-    refuse_one_file,
-)
 
 MAX_LEVELS = 16  # the last of so many halvings would hold 0.0015 % of the splats
 SHARES = (0.5, 0.25, 0.12, 0.06)  # shares kept, by default
@@ -289,14 +282,14 @@ def _into_folder(source, target, count, overwrite):
 
     def finish():
         more = level_paths(source, target, MAX_LEVELS)[len(written) :]
-        return [f"{path.name} is of another run" for path in more if mode_of(path)]
+        return [f"{path.name} is of another run" for path in more if whole_file.mode_of(path)]
 
-    with new_folder(paths[0].parent):
-        refuse_one_file(paths)
+    with whole_file.new_folder(paths[0].parent):
+        whole_file.refuse_one_file(paths)
         for path in paths:
-            refuse_existing(path, overwrite=overwrite)
-            refuse_mapped(path, source)
-        old = [path for path in paths if mode_of(path)]
+            whole_file.refuse_existing(path, overwrite=overwrite)
+            whole_file.refuse_mapped(path, source)
+        old = [path for path in paths if whole_file.mode_of(path)]
         try:
             yield add, finish
         except BaseException:
@@ -384,7 +377,7 @@ def lod_file(
     ------
     RefineError, Cancelled : then new files are deleted, and a streamed SOG is as it was
     """
-    clock, path, file = Clock(), expanded(target), expanded(source)
+    clock, path, file = Clock(), whole_file.expanded(target), whole_file.expanded(source)
     output = (
         _streamed(path, views, overwrite)
         if is_streamed(path)

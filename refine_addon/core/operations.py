@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -136,11 +137,10 @@ def run(
         file = scene.file()
         result = replace(result, source=file, matrix=scene.matrix)
         keep, columns = result.keep, result.changed(file.rows)
-        if written is None:
-            size = registry.written_size(file, form, keep, columns)
-        else:
+        if written is not None:
             write_splats(written, file, keep, columns=columns, overwrite=overwrite, threads=threads)
-            size = written.stat().st_size
+        dry = (file, form, keep, columns)
+        size = registry.written_size(*dry) if written is None else written.stat().st_size
         if save is not None:
             save(result, written)
         clock.lap("write_s")
@@ -246,6 +246,14 @@ def prune_scene(
     return decide
 
 
+def row_in(form: Format | None, files: Sequence[SplatFile]) -> float:
+    """About how many bytes a splat of files takes in a format: mean of some, spread evenly."""
+    step = max(sum(map(len, files)) // SAMPLE, 1)
+    some = [np.arange(len(file)) % step == 0 for file in files]
+    size = sum(map(registry.written_size, files, itertools.repeat(form), some))
+    return size / sum(map(np.count_nonzero, some))
+
+
 def to_size(
     budget: Budget,
     form: Format | None,
@@ -264,9 +272,8 @@ def to_size(
         pairs = zip(files, changes, strict=True)
         return sum(registry.written_size(file, form, *each) for file, each in pairs)
 
-    step, limit = max(sum(map(len, files)) // SAMPLE, 1), math.floor(1e6 * (budget.max_mb or 0.0))
-    some = [(np.arange(len(file)) % step == 0,) for file in files]
-    goal = AIM * limit / written(some) * sum(int(np.count_nonzero(rows)) for (rows,) in some)
+    limit = math.floor(1e6 * (budget.max_mb or 0.0))
+    goal = AIM * limit / row_in(form, files)
     for pruned, progress in ways:
         kept, size, best, scores = 0, 0, None, None
         for number in range(TRIES):

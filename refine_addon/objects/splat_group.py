@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 from ..cameras import world_matrix
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
+from ..core.execute import silent
 from ..core.formats.format import Format
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
 from ..core.lod import Level
 from ..core.methods import DEFAULT, Merge, Method, Occlusion
-from ..core.operations import Scene, prune_scene, run, score_scene
+from ..core.operations import Scene, prune_scene, run, score_scene, to_size
 from ..core.pictures import PictureFiles
+from ..core.prune import prune
 from ..core.result import Result
 from ..core.scores import Scores
 from ..core.selection import Budget, rank
@@ -219,6 +221,24 @@ def stored_arguments(
         # The longest row counts, so that the file is never larger than the budget.
         "sizes": (max(row for row, _ in sizes), sum(fixed for _, fixed in sizes)),
     }
+
+
+def sized(
+    arguments: dict[str, Any], form: Format, reads: Sequence[Callable[[], SplatFile]]
+) -> dict[str, Any]:
+    """Arguments of `prune` with the size of a splat in a format, of those that deletion keeps."""
+    files = [read() for read in reads]
+    starts = np.cumsum([len(file) for file in files])[:-1]
+
+    def pruned(sizes: tuple[float, int], **_: Any) -> Result:
+        return prune(**arguments | {"method": Occlusion(), "sizes": sizes})
+
+    kept = to_size(
+        arguments["budget"], form, files,
+        lambda result: [(keep, None) for keep in np.split(result.keep, starts)], [(pruned, silent)],
+    ).keep  # fmt: skip
+    limit = 1e6 * arguments["budget"].max_mb
+    return arguments | {"sizes": (limit / np.count_nonzero(kept), 0)}
 
 
 def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:

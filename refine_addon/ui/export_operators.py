@@ -15,28 +15,21 @@ from bpy_extras.io_utils import ExportHelper
 
 from ..core.affine import AXES
 from ..core.execute import Progress, report
-from ..core.formats import sog
+from ..core.formats import registry, sog
 from ..core.formats.ply import SplatFile
-from ..core.formats.registry import (
-    FORMATS,
-    SUFFIXES,
-    format_named,
-    held_splats,
-    notes,
-    without_suffix,
-    write_splats,
-)
+from ..core.formats.registry import SUFFIXES, notes, write_splats
 from ..core.formats.streamed_sog import INDEX, StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 from ..objects import splat_group
+from . import properties
 from .operator_bases import Answer, Job, OnSplats
 
 _FORMATS = (
     (".ply", ".ply", "In the layout that was imported"),
-    *((form.suffix, form.suffix, f"It {form.loss}") for form in FORMATS),
+    *((form.suffix, form.suffix, f"It {form.loss}") for form in registry.FORMATS),
 )
 """Export formats as Blender lists them, with tooltips."""
 
@@ -90,11 +83,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         items=_FORMATS,
         options={"SKIP_SAVE"},
     )
-    spz_y_up: BoolProperty(
-        name="SPZ y Up",
-        description="Write splats with y down into an SPZ as it is documented: y up, z back",
-        options={"SKIP_SAVE"},
-    )
+    spz_y_up: BoolProperty(**properties.SPZ_Y_UP)
     settled = _FORMATS[0][0]  # Format at the last `check`
 
     @staticmethod
@@ -110,7 +99,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     def check(self, _context: Context) -> bool:
         """Match name and format, whichever changed; whether either did."""
         before = self.filepath, self.suffix
-        name = without_suffix(self.filepath)
+        name = registry.without_suffix(self.filepath)
         typed = self.filepath[len(name) :].lower()
         if typed in SUFFIXES and self.suffix == self.settled:
             self.suffix = typed
@@ -140,7 +129,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     def put(self, _context: Context, _group: list[SplatObject], job: Any, file: SplatFile) -> None:
         """Report what was written."""
         _, target, _, of_object = job
-        if (form := format_named(target)) is not None:
+        if (form := registry.format_named(target)) is not None:
             self.report({"INFO"}, "; ".join(notes(file, form, np.ones(len(file), np.bool_))))
         self.say(of_object, f"Wrote the splats to {self.filepath}")
 
@@ -186,7 +175,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
             scene = None
             for number, file in enumerate(files):
                 report(progress, number / len(files), f"level {number}")
-                splats = held_splats(target, sog.FORMAT, file(), None, {})
+                splats = registry.held_splats(target, sog.FORMAT, file(), None, {})
                 scene = scene or StreamedSog(splats.means, width, folder)
                 scene.add(splats)
             assert scene is not None

@@ -191,12 +191,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
-    spz_y_up: BoolProperty(
-        name="SPZ y Up",
-        description="Turn an SPZ that does not name its axes from y up, z back, as SPZ is "
-        "documented, to y down. Without it imported cameras decide, else it stays as it stands",
-        options={"SKIP_SAVE"},
-    )
+    spz_y_up: BoolProperty(**properties.SPZ_Y_UP)
     cameras: BoolProperty(
         name="With Cameras",
         description="Import the cameras that lie beside the file, or up to three folders above it",

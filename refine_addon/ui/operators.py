@@ -153,19 +153,21 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
         for member in group:
             mesh_edit.check_deletable(member.obj)
         forced = splat_group.forced(context.scene, group)
-        frames = splat_group.frames_of(group)
-        return group, (apply_arguments(context, group, forced), forced, frames)
+        frames, form = splat_group.frames_of(group), context.scene.refine.to_form()
+        reads = [splat_group.read_for_export(member) for member in group] if form else []
+        return group, (apply_arguments(context, group, forced), forced, frames, form, reads)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> _Applied:
         """The kept splats and their new values."""
-        arguments, _, frames = job
+        arguments, _, frames, form, reads = job
+        arguments = splat_group.sized(arguments, form, reads) if form else arguments
         result = prune(**arguments, partial=True, progress=progress)
         return _Applied(result, splat_group.changes(frames, result))
 
     def put(self, context: Context, group: Members, job: Any, applied: Any) -> None:
         """Delete removed splats, and change kept ones."""
-        (arguments, forced, _), result = job, applied.result
+        (arguments, forced, *_), result = job, applied.result
         context.view_layer.update()
         if arguments["method"].changes:  # volumes may have moved meanwhile
             splat_group.check_forced(context.scene, group, forced)

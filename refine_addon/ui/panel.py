@@ -208,6 +208,8 @@ class REFINE_PT_prune(_InSidebar, bpy.types.Panel):
         column = _named_column(layout)
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
+        if settings.budget == "max_mb":
+            column.prop(settings, "max_mb_in")
         row = layout.row(align=True)
         row.operator("refine.score", icon="CAMERA_DATA")
         apply = row.row(align=True)

@@ -17,6 +17,7 @@ from ..cameras import SOURCE, WEIGHT, CameraChoice, render_size
 from ..core.errors import RefineError
 from ..core.execute import in_time
 from ..core.methods import ClosedForm, Occlusion
+from ..core.operations import row_in
 from ..core.prune import prune
 from ..core.quality.alignment import Alignment
 from ..core.quality.curve import Quality, Way, expected_seconds, in_words, out_of_reach, parted
@@ -39,6 +40,8 @@ WAYS: dict[str, Way] = {"occlusion": "delete", "merge": "merge", "refit": "refit
 """What each method does after scoring with occlusion."""
 
 _last: list[tuple[Any, dict[str, Any]]] = []  # The last plan, behind its key; empty without one
+
+_rows: list[Any] = []  # What a splat takes in a format, behind format and objects
 
 _waiting: list[tuple[str, str]] = []
 """Scene and objects, by name, to be marked when the slider rests."""
@@ -179,6 +182,7 @@ def _key(obj: bpy.types.Object, settings: Any) -> Any:
         for item in demands.listed(settings.id_data)
     ]
     budget = (settings.budget, getattr(settings, settings.budget), settings.method)
+    budget += (settings.max_mb_in,)
     return scorings, budget, settings.protect, volumes, images.look(bpy.context.preferences)
 
 
@@ -231,8 +235,14 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     count, curve = len(scores.values), scores.quality
     rest = np.ones(count, np.bool_) if removed is None else ~removed
     left, way = int(np.count_nonzero(rest)), WAYS.get(settings.method, "delete")
-    about = budget.psnr is not None and way != "delete"
-    if about:  # what merging reaches is predicted
+    form, uids = settings.to_form(), [member.mesh.session_uid for member in group]
+    if form is not None:
+        if (form, uids, count) != (_rows or [None])[0]:
+            files = [mesh_attributes.file_from_object(member) for member in group]
+            _rows[:] = [(form, uids, count), row_in(form, files)]
+        arguments["sizes"] = (_rows[1], 0)
+    about = form is not None or (budget.psnr is not None and way != "delete")
+    if budget.psnr is not None and way != "delete":  # what merging reaches is predicted
         stays = 0 if protected is None else int(np.count_nonzero(protected & rest))
         gone = math.floor(quality_of(scores).share(budget.psnr, way) * left)
         arguments["budget"] = Budget(keep=max(left - min(gone, left - stays), 1))
@@ -401,5 +411,5 @@ def unregister() -> None:
     """Stop the timer, and forget all plans."""
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
-    for kept in (_last, _waiting, _values):
+    for kept in (_last, _waiting, _values, _rows):
         kept.clear()

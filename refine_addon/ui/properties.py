@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -19,7 +20,9 @@ from bpy.props import (
 
 from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
+from ..core.formats.format import Format
 from ..core.formats.ply import REQUIRED
+from ..core.formats.registry import SUFFIXES, format_named
 from ..core.lod import Levels
 from ..core.methods import METHODS as CORE_METHODS
 from ..core.methods import Merge, Method
@@ -54,6 +57,12 @@ BUDGETS = (
     ("psnr", "Quality", "Remove as many splats as leave the pictures this close to the unpruned"),
 )
 """Kinds of budget, by core's names."""
+
+SPZ_Y_UP: dict[str, Any] = {
+    "name": "SPZ y Up", "options": {"SKIP_SAVE"},
+    "description": "In an SPZ y points up and z back, as it is documented, in other files y down. "
+    "Not ticked, imported cameras decide, or an SPZ is read and written as it stands",
+}  # fmt: skip
 
 UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
@@ -207,6 +216,10 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         min=1e-6,
         update=_plan_again,
     )
+    max_mb_in: EnumProperty(
+        name="In", description="Format of the exported file",
+        items=[(end, end, "") for end in SUFFIXES], update=_plan_again,
+    )  # fmt: skip
     psnr: FloatProperty(
         name="PSNR (dB)",
         description="How close the pictures of the cameras stay to those of all splats, in dB: "
@@ -251,6 +264,10 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         value = getattr(self, self.budget)
         amount: dict[str, Any] = {self.budget: value if self.budget == "keep" else decimal(value)}
         return Budget(**amount)
+
+    def to_form(self) -> Format | None:
+        """Format whose file's size is the budget; None for plain PLY and other budgets."""
+        return format_named(Path(self.max_mb_in)) if self.budget == "max_mb" else None
 
     def to_levels(self) -> Levels:
         """Core's levels of detail."""

@@ -104,15 +104,24 @@ def test_a_json_file_that_is_dropped_is_one_of_splats_by_its_name(addon, monkeyp
     assert (answer == {"ASKED"}) == (not expected)
 
 
-@pytest.mark.usefixtures("few")
-def test_an_object_is_pruned_to_a_size_in_another_format(addon, room_views, tmp_path):
-    """3,200 bytes hold 100 splats of a .splat; 2 % fewer may be there, and so in a .spz."""
-    core, prune = addon.core, addon.objects.splat_group.prune_object
-    asked = "room", room_views, core.Budget(max_mb=0.0032), core.ClosedForm()
-    for path in (tmp_path / "a.splat", tmp_path / "a.spz"):
-        report = prune(*asked, output=path)
-        assert len(core.read_splats(path)) == report["splats"]["kept"]
-        assert 3136 <= path.stat().st_size <= 3200
+@pytest.mark.parametrize("method", ["occlusion", "merge"])
+def test_an_object_is_pruned_to_a_size_in_another_format(addon, few, room_views, tmp_path, method):
+    """By the panel and by the command: at most 40 kB and hardly fewer; the plan is near."""
+    core, paths, settings = (
+        addon.core,
+        (tmp_path / "a.spz", tmp_path / "b.spz"),
+        bpy.context.scene.refine,
+    )
+    settings.method, settings.views, settings.budget = method, 4, "max_mb"
+    asked = core.Budget(max_mb=0.04), core.METHODS[method](4)
+    addon.objects.splat_group.prune_object(few.name, room_views, *asked, output=paths[0])
+    bpy.ops.refine.score()
+    settings.max_mb, settings.max_mb_in = 0.04, ".spz"
+    plan = addon.ui.plans.stored(few, settings)
+    bpy.ops.refine.apply()
+    bpy.ops.refine.export_ply(filepath=str(paths[1]))
+    assert all(39_200 <= path.stat().st_size <= 40_000 for path in paths)
+    assert plan["kept"] == pytest.approx(len(few.data.vertices), rel=0.15)
 
 
 def test_the_images_of_blender_are_those_of_pillow(addon):
