@@ -19,7 +19,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
-from .operator_bases import Answer, AtOnce, OnSplats
+from .operator_bases import AtOnce, OnSplats
 from .wrapped import counted
 
 _MOST = 8  # Cameras shown
@@ -74,7 +74,6 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.turn_cameras"
     bl_label = "Turn the Cameras"
-    bl_options = {"REGISTER", "UNDO"}
 
     quarters: IntProperty(
         name="Quarters",
@@ -82,7 +81,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
         default=1, min=-1, max=2,
     )  # fmt: skip
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> None:
         """Turn them, or the parents that animate them."""
         context.view_layer.update()  # or what a script just made stands at the origin
         cameras = _deciding(context)
@@ -108,7 +107,6 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
         for checked in group:
             mesh_scores.forget(checked)  # the cameras stood elsewhere
         self.report({"INFO"}, f"Turned {counted(len(cameras), 'camera')}; score again")
-        return {"FINISHED"}
 
 
 class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
@@ -116,11 +114,10 @@ class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.add_ring"
     bl_label = "Add a Ring of Cameras"
-    bl_options = {"REGISTER", "UNDO"}
 
     count: IntProperty(name="Cameras", description="Number of cameras", default=16, min=3, max=360)
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> None:
         """Add them."""
         means = demands.finite_means(mesh_layout.check(context.object))
         low, high = np.percentile(means, _INNER, axis=0)
@@ -146,7 +143,6 @@ class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
             ring.objects.link(camera)
         _join(context, ring)
         self.report({"INFO"}, f"Added {self.count} cameras in '{ring.name}'; score again")
-        return {"FINISHED"}
 
 
 def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:

@@ -16,7 +16,6 @@ from bpy_extras.io_utils import ExportHelper
 from ..core.affine import AXES
 from ..core.execute import Progress, report
 from ..core.formats import registry, sog
-from ..core.formats.ply import SplatFile
 from ..core.formats.registry import SUFFIXES, notes, write_splats
 from ..core.formats.streamed_sog import INDEX, StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
@@ -35,8 +34,10 @@ _FORMATS = (
 
 
 class Exporting(Job, OnSplats, ExportHelper):
-    """An operator that writes the active object's splats, and does not change it."""
+    """An operator that writes the active object's splats, and does not change it.
+    `gather` ends the job with warnings; `compute` gives sentences on what was written."""
 
+    bl_options = {"REGISTER", "PRESET"}
     apply_transform: BoolProperty(
         name="Apply Transform",
         description="Write the splats as they stand in the world: positions, rotations, scales "
@@ -60,11 +61,12 @@ class Exporting(Job, OnSplats, ExportHelper):
             self.filepath = self.new_name(context.object)
         return ExportHelper.invoke(self, context, event)
 
-    def say(self, notes: list[str], what: str) -> None:
+    def put(self, _context: Context, _group: list[SplatObject], job: Any, told: Any) -> None:
         """Report what was written, with notes."""
-        for note in notes:
+        for note in job[-1]:
             self.report({"WARNING"}, note)
-        self.report({"INFO"}, what)
+        for text in told:
+            self.report({"INFO"}, text)
 
 
 class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
@@ -72,7 +74,6 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
 
     bl_idname = "refine.export_ply"
     bl_label = "Export Splats"
-    bl_options = {"REGISTER", "PRESET"}
     doing = "Writing splats"
 
     filename_ext = ".ply"
@@ -118,20 +119,14 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         return [], (lambda: replace(read(), axes=axes), target, self.overwrite, notes)
 
     @staticmethod
-    def compute(job: Any, progress: Progress) -> SplatFile:
+    def compute(job: Any, progress: Progress) -> list[str]:
         """Write the file."""
         read, target, overwrite, _ = job
         report(progress, 0.0, target.name)
-        file = read()
+        file, form = read(), registry.format_named(target)
         write_splats(target, file, overwrite=overwrite)
-        return file
-
-    def put(self, _context: Context, _group: list[SplatObject], job: Any, file: SplatFile) -> None:
-        """Report what was written."""
-        _, target, _, of_object = job
-        if (form := registry.format_named(target)) is not None:
-            self.report({"INFO"}, "; ".join(notes(file, form, np.ones(len(file), np.bool_))))
-        self.say(of_object, f"Wrote the splats to {self.filepath}")
+        told = notes(file, form, np.ones(len(file), np.bool_))
+        return [*told, f"Wrote the splats to {target}"]
 
 
 class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
@@ -139,7 +134,6 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
 
     bl_idname = "refine.export_levels"
     bl_label = "Export Levels"
-    bl_options = {"REGISTER", "PRESET"}
     doing = "Writing levels"
 
     filename_ext = ""
@@ -168,8 +162,8 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
         return [], (files, float(width), target, self.overwrite, list(dict.fromkeys(notes)))
 
     @staticmethod
-    def compute(job: Any, progress: Progress) -> int:
-        """Write the levels; their number."""
+    def compute(job: Any, progress: Progress) -> list[str]:
+        """Write the levels."""
         files, width, target, overwrite, _ = job
         with folder_for(target, overwrite=overwrite) as folder:
             scene = None
@@ -180,12 +174,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
                 scene.add(splats)
             assert scene is not None
             scene.publish(target, overwrite=overwrite)
-        return len(files)
-
-    def put(self, _context: Context, _group: list[SplatObject], job: Any, count: int) -> None:
-        """Report what was written."""
-        _, _, target, _, notes = job
-        self.say(notes, f"Wrote {count} levels, the finest as it is, to {target}")
+        return [f"Wrote {len(files)} levels, the finest as it is, to {target}"]
 
 
 def _draw_menu(menu: bpy.types.Menu, _context: Context) -> None:

@@ -20,7 +20,7 @@ from ..mesh.layout import SplatObject
 from ..objects import demands, splat_group
 from ..objects.demands import Demands
 from . import operator_bases, plans
-from .operator_bases import Answer, AtOnce, Job, Needing, OnSplats, idle, on_splats, tooltips
+from .operator_bases import AtOnce, Job, OnSplats, idle, on_splats, tooltips
 from .operators import chosen_views
 
 ROLES = (
@@ -65,19 +65,18 @@ class RefineVolume(bpy.types.PropertyGroup):
     )
 
 
-class REFINE_OT_add_volume(AtOnce, Needing, bpy.types.Operator):
+class REFINE_OT_add_volume(AtOnce, bpy.types.Operator):
     """Add a volume to the list"""
 
     bl_idname = "refine.add_volume"
     bl_label = "Add Volume"
-    bl_options = {"REGISTER", "UNDO"}
     needs = (idle, on_splats)
 
     role: EnumProperty(name="Role", description="What happens to the splats inside", items=ROLES)
     shape: EnumProperty(name="Shape", description="The volume to add", items=SHAPES)
     description = tooltips("role", ROLES)
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> None:
         """Add it, and select it to be moved; the splats stay active."""
         checked = mesh_layout.check(context.object)
         if self.shape == "SELECTED":
@@ -88,7 +87,6 @@ class REFINE_OT_add_volume(AtOnce, Needing, bpy.types.Operator):
             item = context.scene.refine.volumes.add()
             item.role = self.role
             item.object = obj
-        return {"FINISHED"}
 
 
 def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -127,20 +125,18 @@ def _new_empty(
     return obj
 
 
-class REFINE_OT_drop_volume(Needing, bpy.types.Operator):
+class REFINE_OT_drop_volume(AtOnce, bpy.types.Operator):
     """Remove the volume from the list; the object stays"""
 
     bl_idname = "refine.drop_volume"
     bl_label = "Remove from List"
-    bl_options = {"REGISTER", "UNDO"}
 
     index: IntProperty(name="Index", description="Place in the list", min=0)
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> None:
         """Remove it."""
         context.scene.refine.volumes.remove(self.index)
         plans.mark_again(context)
-        return {"FINISHED"}
 
 
 _MARKS = {"STAY": mesh_edit.PROTECT, "GO": mesh_edit.MUST_GO}
@@ -157,12 +153,11 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.protect"
     bl_label = "Mark Splats"
-    bl_options = {"REGISTER", "UNDO"}
 
     mark: EnumProperty(name="Mark", description="The mark to set", items=_ITEMS)
     description = tooltips("mark", _ITEMS)
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> None:
         """Write the marks; a splat has one of the two."""
         obj = context.object
         mesh_edit.check_writable(obj)
@@ -177,7 +172,6 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
             marked = np.zeros_like(chosen) if marked is None else marked
             mesh_edit.mark_by_hand(obj, np.where(chosen, value, marked), name)
         plans.mark_again(context)
-        return {"FINISHED"}
 
 
 class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
@@ -185,7 +179,6 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.find_floaters"
     bl_label = "Find Floaters"
-    bl_options = {"REGISTER", "UNDO"}
     doing = "Looking for floaters"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
@@ -228,12 +221,11 @@ class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.delete"
     bl_label = "Delete Splats"
-    bl_options = {"REGISTER", "UNDO"}
 
     what: EnumProperty(name="What", description="Which splats go", items=WHAT)
     description = tooltips("what", WHAT)
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> None:
         """Delete them, except protected ones, and report their number."""
         checked, settings = mesh_layout.check(context.object), context.scene.refine
         forced = Demands.of_scene(context.scene).forced(checked)
@@ -250,7 +242,6 @@ class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
         outcome = splat_group.delete_splats(checked, ~going)
         plans.refresh(context)
         self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, kept {outcome.kept:,}")
-        return {"FINISHED"}
 
 
 CLASSES = (

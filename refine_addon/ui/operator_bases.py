@@ -178,17 +178,13 @@ class Running:
         return "keeps the result so far" if keeps else "cancels"
 
     @property
-    def factor(self) -> float:
-        """Share done, 0 to 1."""
-        return self.worker.fraction
-
-    @property
     def share(self) -> str:
         """Share done and time left, short enough for a bar."""
         if self.waits:
             return "done"
-        left = self._left.seconds(self.factor)
-        return f"{self.factor:.0%}" + ("" if left is None else f", about {in_time(left)} left")
+        done = self.worker.fraction
+        left = self._left.seconds(done)
+        return f"{done:.0%}" + ("" if left is None else f", about {in_time(left)} left")
 
     @property
     def sentence(self) -> str:
@@ -291,6 +287,7 @@ def tooltips(name: str, items: Sequence[Sequence[Any]]) -> Any:
 class Needing:
     """An operator that can run if all its `needs` are met; Blender shows the first unmet one."""
 
+    bl_options = {"REGISTER", "UNDO"}
     needs: tuple[Need, ...] = (idle,)
 
     @classmethod
@@ -314,19 +311,20 @@ class OnScored(OnSplats):
     needs = (*OnSplats.needs, scored)
 
 
-class AtOnce:
+class AtOnce(Needing):
     """An operator without a thread."""
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> None:
         """Do it; `FAILURES` are reported as errors."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do it, or report why not."""
         try:
-            return self.act(context)
+            self.act(context)
         except FAILURES as error:
             return fail(self, error)
+        return {"FINISHED"}
 
 
 class Job:

@@ -64,7 +64,6 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.score"
     bl_label = "Score"
-    bl_options = {"REGISTER", "UNDO"}
     doing = "Scoring splats"
 
     def gather(self, context: Context) -> tuple[Members, Any]:
@@ -202,7 +201,6 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.levels"
     bl_label = "Make Levels"
-    bl_options = {"REGISTER", "UNDO"}
     doing = "Making levels"
 
     needs = (*OnSplats.needs, in_object_mode)

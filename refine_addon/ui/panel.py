@@ -31,7 +31,7 @@ from . import (
     wrapped,
 )
 from .marks import ROLES
-from .operator_bases import Answer, AtOnce, Needing, idle, in_object_mode, tooltips
+from .operator_bases import Answer, AtOnce, idle, in_object_mode, tooltips
 from .plans import cached
 from .properties import HINTS, METHODS
 from .select_operators import REFINE_PT_select
@@ -76,15 +76,14 @@ def _instances(context: bpy.types.Context) -> str:
     return "Make the empty local first: a library has it" if obj.library else ""
 
 
-class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):
+class REFINE_OT_make_real(AtOnce, bpy.types.Operator):
     """Turn the splats that the active object instances into objects, which can be scored"""
 
     bl_idname = "refine.make_real"
     bl_label = "Make Splats Real"
-    bl_options = {"REGISTER", "UNDO"}
     needs = (idle, in_object_mode, _instances)
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> None:
         """Copy them with their data to where they are seen, and hide the instance."""
         empty, real = context.object, []
         for place in list(placings([empty])):
@@ -102,7 +101,6 @@ class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):
         for copy in real:
             copy.select_set(True)
         context.view_layer.objects.active = real[0]
-        return {"FINISHED"}
 
 
 def _draw_instances(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
@@ -306,7 +304,7 @@ def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *name
     replaces a bar by a label that is drawn later."""
     now = operator_bases.now()
     if now is not None and now.operator in names:
-        layout.progress(factor=now.factor, text=now.share)
+        layout.progress(factor=now.worker.fraction, text=now.share)
         wrapped.label(layout, context, now.sentence)
 
 

@@ -249,7 +249,8 @@ def draw_buttons(layout: bpy.types.UILayout) -> None:
     text = "Render Animation"
     column.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
     if (running := now()) is not None and running.operator == "refine.render":
-        column.progress(factor=running.factor, text=f"{running.worker.what}: {running.share}")
+        text = f"{running.worker.what}: {running.share}"
+        column.progress(factor=running.worker.fraction, text=text)
 
 
 def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:

@@ -23,7 +23,7 @@ from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
 from . import plans, wrapped
-from .operator_bases import Answer, AtOnce, Job, OnSplats, tooltips
+from .operator_bases import AtOnce, Job, OnSplats, tooltips
 from .select_tools import MODES, SHAPES, selected_count
 
 ACTIONS = (
@@ -50,12 +50,11 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.select"
     bl_label = "Select"
-    bl_options = {"REGISTER", "UNDO"}
 
     action: EnumProperty(name="Action", description="What to do", items=ACTIONS)
     description = tooltips("action", ACTIONS)
 
-    def act(self, context: Context) -> Answer:
+    def act(self, context: Context) -> None:
         """Do it."""
         obj = context.object
         mesh_edit.check_writable(obj)
@@ -70,7 +69,6 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
         else:
             wanted = {"ALL": ~hidden, "NONE": np.zeros_like(chosen), "INVERT": ~chosen}
             selection.select(obj, wanted[self.action])
-        return {"FINISHED"}
 
 
 class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
@@ -78,20 +76,18 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.select_by"
     bl_label = "Select By"
-    bl_options = {"REGISTER", "UNDO"}
 
     what: EnumProperty(name="What", description="The splats to select", items=SETS)
     mode: EnumProperty(name="Mode", description="How they combine with the selection", items=MODES)
     description = tooltips("what", SETS)
 
-    def act(self, context: Context) -> Answer:
+    def act(self, context: Context) -> None:
         """Select them."""
         checked = mesh_layout.check(context.object)
         taken = self._taken(context, checked) & ~selection.hidden(checked.obj)
         before = selection.selected(checked.obj)
         selection.select(checked.obj, picking.combined(before, taken, self.mode))
         self.report({"INFO"}, f"{selection.count(checked.obj):,} splats are selected")
-        return {"FINISHED"}
 
     def _taken(self, context: Context, checked: SplatObject) -> NDArray[np.bool_]:
         settings, columns = context.scene.refine, mesh_attributes.stored_columns(checked)
@@ -119,7 +115,6 @@ class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.grow_selection"
     bl_label = "Grow Selection"
-    bl_options = {"REGISTER", "UNDO"}
     doing = "Looking for neighbours"
 
     shrink: BoolProperty(name="Shrink", description="Deselect those at the edge")
@@ -149,9 +144,8 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.separate_selected"
     bl_label = "Separate Selected"
-    bl_options = {"REGISTER", "UNDO"}
 
-    def act(self, context: Context) -> Answer:
+    def act(self, context: Context) -> None:
         """Copy the object, and delete from each the other's splats."""
         checked = mesh_layout.check(context.object)
         chosen = _some(checked.obj, selection.selected(checked.obj))
@@ -174,7 +168,6 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
         apart.select_set(False)  # selected objects are pruned together
         plans.refresh(context)
         self.report({"INFO"}, f"'{apart.name}' has {mesh_layout.splat_count(apart.data):,} splats")
-        return {"FINISHED"}
 
 
 def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from ..mesh.layout import SplatObject
 from ..objects import splat_group, transforms
 from ..viewport import draw as viewport_draw
 from . import plans, wrapped
-from .operator_bases import Answer, AtOnce, Job, OnSplats, in_object_mode
+from .operator_bases import AtOnce, Job, OnSplats, in_object_mode
 from .wrapped import counted
 
 _SOON = 0.1  # Seconds until new splats are stamped: Blender's operator is over by then
@@ -33,7 +33,6 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.bake_transform"
     bl_label = "Bake Transform"
-    bl_options = {"REGISTER", "UNDO"}
     needs = (*OnSplats.needs, in_object_mode)
 
     location: BoolProperty(
@@ -42,14 +41,13 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
         default=True,
     )
 
-    def act(self, context: Context) -> Answer:
+    def act(self, context: Context) -> None:
         """Bake the transforms of the selected objects."""
         group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
         for note in transforms.bake(group, location=self.location):
             self.report({"WARNING"}, note)
         plans.refresh(context)
         self.report({"INFO"}, f"Baked the transform of {counted(len(group), 'object')}")
-        return {"FINISHED"}
 
 
 class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
@@ -57,7 +55,6 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
 
     bl_idname = "refine.mend"
     bl_label = "Mend Splats"
-    bl_options = {"REGISTER", "UNDO"}
     needs = (*OnSplats.needs, in_object_mode)
     doing = "Mending splats"
 
