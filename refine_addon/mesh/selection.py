@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import attributes as mesh_attributes
-from .edit import check_writable
+from .edit import check_writable, mark
 from .layout import SplatObject, check, splat_count
 
 HIDDEN = ".hide_vert"
@@ -89,11 +89,7 @@ def _store(
         bmesh.update_edit_mesh(mesh, loop_triangles=False, destructive=False)
         return
     for name, flags in ((name_of(mesh), wanted), (HIDDEN, out_of_sight)):
-        if flags.any():
-            mesh_attributes.write_attribute(mesh, name, "BOOLEAN", flags)
-        else:
-            mesh_attributes.remove_attribute(mesh, name)
-    mesh_attributes.updated(mesh)
+        mark(obj, name, flags, even_none=False)
 
 
 def _in_edit_mode(obj: bpy.types.Object) -> bool:

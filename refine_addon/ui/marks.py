@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import bpy
@@ -9,9 +10,8 @@ import numpy as np
 from bpy.props import EnumProperty, IntProperty, PointerProperty
 from bpy.types import Context
 
-from ..core.cleaning.clean import Cleaned, Cleaning, clean
+from ..core.cleaning.clean import Cleaning, clean
 from ..core.errors import RefineError
-from ..core.execute import Progress
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -182,19 +182,14 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
     doing = "Looking for floaters"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """The arguments of `clean`, in the world."""
+        """A call of `clean`, in the world."""
         checked, settings = mesh_layout.check(context.object), context.scene.refine
         mesh_edit.check_writable(checked.obj)
         cleaning = Cleaning(settings.to_reasons(), settings.views)
         forced = splat_group.forced(context.scene, [checked])
         masks = {"protected": forced.protected, "removed": forced.removed}
-        return [checked], ((splat_group.gather([checked]), chosen_views(context), cleaning), masks)
-
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> Cleaned:
-        """The floaters."""
-        arguments, masks = job
-        return clean(*arguments, **masks, progress=progress)
+        splats, views = splat_group.gather([checked]), chosen_views(context)
+        return [checked], partial(clean, splats, views, cleaning, **masks)
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, cleaned: Any) -> None:
         """Store the floaters, show them, report them."""

@@ -342,8 +342,8 @@ class Job:
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> Any:
-        """The result; on any thread, with arrays only."""
-        raise NotImplementedError
+        """The result; on any thread, with arrays only. By default it calls the job."""
+        return job(progress=progress)
 
     def put(
         self, context: bpy.types.Context, group: list[SplatObject], job: Any, result: Any

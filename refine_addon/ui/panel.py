@@ -35,7 +35,7 @@ from .operator_bases import Answer, AtOnce, idle, in_object_mode, tooltips
 from .plans import cached
 from .properties import HINTS, METHODS
 from .select_operators import REFINE_PT_select
-from .wrapped import counted
+from .wrapped import InSidebar, counted
 
 MODES = (
     ("OFF", "Off", "Show the plain points of the mesh again"),
@@ -114,12 +114,6 @@ def _draw_instances(layout: bpy.types.UILayout, context: bpy.types.Context) -> b
     return True
 
 
-class _InSidebar:
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "REFINE"
-
-
 def _named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
     column = layout.column()
     column.use_property_split = True
@@ -127,7 +121,7 @@ def _named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
     return column
 
 
-class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
+class REFINE_PT_splats(InSidebar, bpy.types.Panel):
     """Splats to prune, and their display."""
 
     bl_label = "1 Splats"
@@ -148,7 +142,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         _draw_progress(layout, context, "refine.import_ply")
 
 
-class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
+class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
     """Cameras that decide."""
 
     bl_label = "2 Cameras"
@@ -187,7 +181,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
             camera_operators.draw(self.layout, record, plan.get("views", {}))
 
 
-class REFINE_PT_prune(_InSidebar, bpy.types.Panel):
+class REFINE_PT_prune(InSidebar, bpy.types.Panel):
     """Method, budget, and their cost."""
 
     bl_label = "3 Prune"
@@ -222,7 +216,7 @@ class REFINE_PT_prune(_InSidebar, bpy.types.Panel):
         _draw_progress(layout, context, "refine.score", "refine.apply", "refine.compare")
 
 
-class REFINE_PT_clean(_InSidebar, bpy.types.Panel):
+class REFINE_PT_clean(InSidebar, bpy.types.Panel):
     """Floaters."""
 
     bl_label = "Clean"
@@ -246,7 +240,7 @@ class REFINE_PT_clean(_InSidebar, bpy.types.Panel):
         _draw_progress(layout, context, "refine.find_floaters")
 
 
-class REFINE_PT_protect(_InSidebar, bpy.types.Panel):
+class REFINE_PT_protect(InSidebar, bpy.types.Panel):
     """Protected splats and those removed by the user."""
 
     bl_label = "Protect"
@@ -280,7 +274,7 @@ class REFINE_PT_protect(_InSidebar, bpy.types.Panel):
             layout.operator("refine.delete", text="Delete Now", icon="TRASH").what = "VOLUMES"
 
 
-class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):
+class REFINE_PT_deliver(InSidebar, bpy.types.Panel):
     """Export, levels, render."""
 
     bl_label = "Deliver"
@@ -295,8 +289,8 @@ class REFINE_PT_deliver(_InSidebar, bpy.types.Panel):
         column.operator("refine.levels", icon="MOD_DECIM")
         if splat_group.has_levels(obj):
             column.operator("refine.export_levels", icon="EXPORT")
-        names = ("refine.export_ply", "refine.levels", "refine.export_levels")
-        _draw_progress(layout, context, *names)
+        names = ("export_ply", "levels", "export_levels", "render")
+        _draw_progress(layout, context, *(f"refine.{name}" for name in names))
 
 
 def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:

@@ -18,7 +18,7 @@ from .. import main_thread
 from ..core.execute import Cancelled
 from ..render import card, engine, meshes
 from .images import put
-from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle, now
+from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle
 from .wrapped import counted
 
 _ENDS = (Cancelled, *FAILURES, RuntimeError)  # Exceptions that end a render and are no bugs
@@ -243,14 +243,11 @@ def _draw_whole() -> None:
 
 
 def draw_buttons(layout: bpy.types.UILayout) -> None:
-    """Draw the panel's buttons and a render's progress."""
+    """Draw the panel's buttons."""
     column = layout.column(align=True)
     column.operator("refine.render", text="Render with Splats", icon="RENDER_STILL")
     text = "Render Animation"
     column.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
-    if (running := now()) is not None and running.operator == "refine.render":
-        text = f"{running.worker.what}: {running.share}"
-        column.progress(factor=running.worker.fraction, text=text)
 
 
 def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:

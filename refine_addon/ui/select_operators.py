@@ -217,12 +217,9 @@ class SelectSettings:
     )
 
 
-class REFINE_PT_select(bpy.types.Panel):
+class REFINE_PT_select(wrapped.InSidebar, bpy.types.Panel):
     """The selection, its tools and its uses."""
 
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "REFINE"
     bl_label = "Select"
     bl_options = {"DEFAULT_CLOSED"}
 

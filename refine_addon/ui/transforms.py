@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import bpy
@@ -12,7 +13,7 @@ from bpy.props import BoolProperty
 from bpy.types import Context
 
 from ..core.errors import RefineError
-from ..core.execute import Progress, run_all
+from ..core.execute import run_all
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -59,19 +60,15 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
     doing = "Mending splats"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """Selected objects with drift, and a callable each that computes new values."""
+        """Selected objects with drift, and a call that computes each one's new values."""
         mesh_layout.check(context.object)
         chosen = splat_group.chosen(context.view_layer, context.object)
         drifted = {obj.data: obj for obj in chosen if of(obj)}
         group = [mesh_layout.check(obj) for obj in drifted.values()]
         for each in group:
             mesh_edit.check_changeable(each.obj)
-        return group, [transforms.read_to_move(each, mend=True)[1] for each in group]
-
-    @staticmethod
-    def compute(moves: Any, progress: Progress) -> Any:
-        """New values, by property, and the number of mended splats, of each object."""
-        return run_all(lambda move: move(), moves, progress=progress, threads=1)
+        moves = [transforms.read_to_move(each, mend=True)[1] for each in group]
+        return group, partial(run_all, lambda move: move(), moves, threads=1)
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, mended: Any) -> None:
         """Mend the objects."""

@@ -1,4 +1,4 @@
-"""Sentences in a panel, wrapped to its width: Blender cuts what is wider."""
+"""Common parts of panels: their tab; sentences wrapped to its width, which Blender would cut."""
 
 from __future__ import annotations
 
@@ -10,6 +10,14 @@ import bpy
 _TAKEN = 52  # Pixels of a sidebar at scale 1 without text: margins, tabs, scroll bar
 _ICON = 30  # Pixels of an icon and its gaps at scale 1
 _USUAL = 280  # Pixels of the sidebar if unknown: its default at scale 1
+
+
+class InSidebar:
+    """A panel of the tab REFINE."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "REFINE"
 
 
 def label(

@@ -311,9 +311,3 @@ def hide_points(depsgraph: bpy.types.Depsgraph | None, refused: Container[int] |
 def is_edited(obj: bpy.types.Object) -> bool:
     """Whether splats are in edit mode, in this object or another with the same data."""
     return obj.mode == "EDIT" or getattr(obj.data, "is_editmode", False)
-
-
-def graphs() -> Iterator[bpy.types.Depsgraph]:
-    """Dependency graphs of all windows."""
-    for window in bpy.context.window_manager.windows:
-        yield window.view_layer.depsgraph

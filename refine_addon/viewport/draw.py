@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
 from . import overlays, shader
-from .content import Content, every, graphs, hide_points, is_edited, placings
+from .content import Content, every, hide_points, is_edited, placings
 from .view import Camera, View
 
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
@@ -191,8 +191,9 @@ def _redraw() -> None:
 
 def _hide_points() -> None:
     """Hide Blender's points of drawn splats in all windows, or show them again."""
-    for depsgraph in graphs():
-        hide_points(depsgraph, None if _state.mode == "OFF" else _state.content.refused)
+    refused = None if _state.mode == "OFF" else _state.content.refused
+    for window in bpy.context.window_manager.windows:
+        hide_points(window.view_layer.depsgraph, refused)
 
 
 def _areas() -> list[bpy.types.Area]:
