@@ -49,11 +49,6 @@ def store(
     `together`, if scored with other objects: its id, splats of all, ranks among all, (N,)."""
     mesh_edit.check_writable(checked.obj)
     mesh = checked.mesh
-    if len(checked) != len(scores.values):
-        raise RefineError(
-            f"object '{checked.obj.name}': has {len(checked)} splats, was scored with "
-            f"{len(scores.values)}; score it again"
-        )
     ranks = together[2] if together else rank(scores.values)
     new_record = json.dumps(
         {
@@ -169,11 +164,6 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
 def store_floaters(checked: SplatObject, cleaned: Cleaned) -> None:
     """Write floaters and their record to an object's mesh."""
     mesh_edit.check_writable(checked.obj)
-    if len(checked) != len(cleaned.keep):
-        raise RefineError(
-            f"object '{checked.obj.name}': has {len(checked)} splats, but had {len(cleaned.keep)} "
-            "when floaters were found; find them again"
-        )
     reasons = np.zeros(len(cleaned.keep), np.int32)
     for number, name in enumerate(REASONS, start=1):
         reasons[cleaned.by_reason[name]] = number

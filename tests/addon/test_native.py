@@ -162,22 +162,6 @@ def test_merging_changes_what_others_are_merged_into(addon, cloud):
     assert np.abs(np.linalg.norm(turns, axis=1) - 1.0).max() < 3e-7
 
 
-@pytest.mark.usefixtures("room_cameras")
-def test_points_come_back_where_apply_fails(addon, cloud, monkeypatch):
-    """The copy that stood by takes its place, and its name."""
-    bpy.ops.refine.score()
-    scored, name = contents(addon, cloud), cloud.data.name
-
-    def refuse(*_arguments):
-        raise addon.core.RefineError("refused")
-
-    monkeypatch.setattr(addon.mesh.attributes, "write_rows", refuse)
-    with pytest.raises(RuntimeError, match="refused"):
-        bpy.ops.refine.apply()
-    assert contents(addon, cloud) == scored
-    assert [data.name for data in bpy.data.pointclouds] == [name]
-
-
 def test_point_clouds_that_are_no_splats_are_refused_in_a_sentence(addon, core):
     """Plain points; what an old Blender left of 5.3's; harmonics of no degree; a wrong type."""
     base, scale = ("radiance:base", FOUR, 4), ("scale", "FLOAT_VECTOR", 3)

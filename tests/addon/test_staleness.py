@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bpy
-import numpy as np
 import pytest
 
 from .conftest import keep_mask
@@ -119,13 +118,3 @@ def test_apply_goes_by_the_old_scores_and_says_so(addon, quarter, capfd, moved):
     bpy.ops.refine.apply()
     assert len(quarter.data.vertices) == keep.sum()
     assert ("from before a change (object moved)" in capfd.readouterr().out) == moved
-
-
-def test_scores_of_another_mesh_are_not_stored(addon, quarter, room_views):
-    """Someone deleted a vertex while the scoring ran."""
-    method, check = addon.core.ClosedForm(), addon.mesh.layout.check
-    splats = addon.objects.splat_group.gather([check(quarter)])
-    scores = addon.core.score(splats, room_views, method)
-    addon.mesh.edit.delete_vertices(quarter, np.arange(9_939) == 7)
-    with pytest.raises(addon.core.RefineError, match="9938 splats, was scored with 9939"):
-        addon.mesh.scores.store(check(quarter), scores, method)
