@@ -268,8 +268,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
                 errors.append(error)
         if not imported:
             raise RefineError("; ".join(map(described, errors)))
-        for error in errors:
-            self.report({"WARNING"}, described(error))
+        self.warn(map(described, errors))
         for obj in context.selected_objects:
             obj.select_set(False)
         for obj in imported:
@@ -302,8 +301,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         if self.upright:
             obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
         operator_bases.target_collection(context).objects.link(obj)
-        for note in mesh_attributes.import_notes(file):
-            self.report({"WARNING"}, note)
+        self.warn(mesh_attributes.import_notes(file))
         return obj
 
 

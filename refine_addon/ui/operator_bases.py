@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from functools import partial
 from typing import Any, NamedTuple
@@ -297,6 +297,11 @@ class Needing:
         if missing:
             cls.poll_message_set(missing)
         return not missing
+
+    def warn(self, notes: Iterable[str]) -> None:
+        """Report each note as a warning."""
+        for note in notes:
+            self.report({"WARNING"}, note)
 
 
 class OnSplats(Needing):

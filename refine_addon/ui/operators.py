@@ -116,8 +116,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         )
         modifiers = [note for each in group for note in splat_group.modifier_notes(each.obj)]
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
-        for note in (*scoring_notes(scores), *modifiers, *drifts):
-            self.report({"WARNING"}, note)
+        self.warn((*scoring_notes(scores), *modifiers, *drifts))
 
 
 class _Applied(NamedTuple):
@@ -186,8 +185,7 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
             + sizes_in_words(outcome.bytes_before, "->", outcome.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
-        for note in drifts:
-            self.report({"WARNING"}, note)
+        self.warn(drifts)
         if changed:
             self.report(
                 {"WARNING"},
@@ -230,8 +228,7 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         ]
         text = f"Made '{collection.name}', hidden: {', '.join(counts)} splats"
         self.report({"INFO"}, f"{text}; show one by its eye in the Outliner")
-        for note in wanted.notes({level.goal: level.remark for level in levels}):
-            self.report({"WARNING"}, note)
+        self.warn(wanted.notes({level.goal: level.remark for level in levels}))
 
 
 class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):

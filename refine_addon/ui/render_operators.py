@@ -213,8 +213,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         what = counted(len(shared.frames), "frame") if self.animation else "Rendered"
         among = f" among what {shared.engine} rendered" if shared.engine else ""
         self.report({"INFO"}, f"{what}: {shared.splats:,} splats{among}, {seconds:.1f} s")
-        for sentence in engine.left_out(context.scene):
-            self.report({"WARNING"}, sentence)
+        self.warn(engine.left_out(context.scene))
         return {"FINISHED"}
 
     def _stopped(self, context: bpy.types.Context, error: BaseException) -> Answer:

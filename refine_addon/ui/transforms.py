@@ -45,8 +45,7 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: Context) -> None:
         """Bake the transforms of the selected objects."""
         group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
-        for note in transforms.bake(group, location=self.location):
-            self.report({"WARNING"}, note)
+        self.warn(transforms.bake(group, location=self.location))
         plans.refresh(context)
         self.report({"INFO"}, f"Baked the transform of {counted(len(group), 'object')}")
 
