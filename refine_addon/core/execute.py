@@ -25,6 +25,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -361,10 +362,7 @@ def _in_processes(work, items, number, tell):
             finally:
                 free.append(process)
 
-        def stop():
-            for process in team:
-                process.kill()
-
+        stop = partial(_kill, team)
         try:
             _tell_all(team, ("task", task))
             if REPLACES_MAPPED:
@@ -400,18 +398,21 @@ def _taken(number: int) -> list[_Process]:
     """Processes nobody else uses, idle or new; or raise `_LostError`."""
     with _lock:
         team = [process for process in _idle if process.ready]
-        for process in set(_idle) - set(team):
-            process.kill()
+        _kill(set(_idle) - set(team))
         _idle[:] = team[number:]
         team = team[:number]
     try:
         while len(team) < number:
             team.append(_Process())
     except OSError as error:
-        for process in team:
-            process.kill()
+        _kill(team)
         raise _LostError from error
     return team
+
+
+def _kill(team: Iterable[_Process]) -> None:
+    for process in team:
+        process.kill()
 
 
 @atexit.register

@@ -9,7 +9,6 @@ many to be worked on at once are divided into regions, which any process can wor
 from __future__ import annotations
 
 import contextlib
-import errno
 import math
 import mmap
 import os
@@ -24,9 +23,10 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import RefineError, reason_of
+from .errors import RefineError
 from .execute import checkpoint, chunks
 from .splats import ARRAYS, Splats
+from .whole_file import explained
 
 Result = TypeVar("Result")
 REGION = 1 << 20  # most splats of a region; merging takes about 900 bytes of each
@@ -46,7 +46,7 @@ class Mapped:
         self.path, self.dtype, self.shape = path, dtype, shape
         self.ndim, self.size = len(shape), math.prod(shape)
         self.nbytes = self.size * dtype.itemsize
-        with reading(path):
+        with explained(path, "cannot be read", Interrupted):
             if path.stat().st_size != self.nbytes:
                 raise Interrupted(f"{path}: is damaged")
 
@@ -59,7 +59,7 @@ class Mapped:
     def __getitem__(self, key: Any) -> Any:
         if not self.size:
             return np.empty(self.shape, self.dtype)[key]
-        with reading(self.path):
+        with explained(self.path, "cannot be read", Interrupted):
             return np.array(np.memmap(self.path, self.dtype, "r", 0, self.shape)[key])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -76,7 +76,8 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
     files: dict[str, BinaryIO] = {}
     kinds: dict[str, tuple[Any, int, tuple[int, ...]]] = {}  # type, rows, further axes
     try:
-        with writing(folder), contextlib.ExitStack() as held:  # closing writes what is buffered
+        # Closing writes what is buffered.
+        with explained(folder, "cannot be written", Interrupted), contextlib.ExitStack() as held:
             for piece in pieces:
                 for name, values in piece.items():
                     if name not in files:
@@ -85,7 +86,7 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
                     files[name].write(np.ascontiguousarray(values).data)
                     dtype, rows, further = kinds.get(name, (values.dtype, 0, values.shape[1:]))
                     kinds[name] = dtype, rows + len(values), further
-        with writing(folder):
+        with explained(folder, "cannot be written", Interrupted):
             if folder.exists():
                 shutil.rmtree(folder)
             unfinished.rename(folder)
@@ -108,7 +109,7 @@ def note(job: Path, stage: str, result: Result) -> Result:
     path = job / f"{stage}.done"
     temporary = path.with_name(f"{secrets.token_hex(8)}.tmp")
     try:
-        with writing(path):
+        with explained(path, "cannot be written", Interrupted):
             with temporary.open("xb") as stream:
                 pickle.dump(result, stream, protocol=5)
             temporary.replace(path)
@@ -123,32 +124,12 @@ def noted(job: Path, stage: str) -> tuple[bool, Any]:
     path = job / f"{stage}.done"
     if not path.exists():
         return False, None
-    with reading(path), path.open("rb") as stream:
+    with explained(path, "cannot be read", Interrupted), path.open("rb") as stream:
         # Unpickling can run code in the file, so files of other users are not read.
         if not hasattr(os, "getuid") or os.fstat(stream.fileno()).st_uid == os.getuid():
             with contextlib.suppress(Interrupted, EOFError, ValueError, pickle.PickleError):
                 return True, pickle.load(stream)
     return False, None
-
-
-@contextlib.contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Raise `Interrupted` in place of the system's errors in reading a file of a job."""
-    try:
-        yield
-    except OSError as error:
-        raise Interrupted(f"{path}: cannot be read ({reason_of(error)})") from error
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Raise `Interrupted` in place of the system's errors in writing a file of a job."""
-    try:
-        yield
-    except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        reason = "no space left on the disk" if full else f"cannot be written ({reason_of(error)})"
-        raise Interrupted(f"{path}: {reason}") from error
 
 
 # Splats in files.
@@ -243,7 +224,7 @@ def in_one(
 
 def file_bytes(path: Path) -> NDArray[np.uint8]:
     """Bytes of a file, memory-mapped, (n,); `RefineError` if it is no file or cannot be read."""
-    try:
+    with explained(path, "cannot be read", errors=(OSError, ValueError)):
         state = path.stat()
         if not stat.S_ISREG(state.st_mode):  # opening a pipe would wait for a writer
             kind = "folder" if path.is_dir() else "device"
@@ -252,5 +233,3 @@ def file_bytes(path: Path) -> NDArray[np.uint8]:
             if not state.st_size:
                 return np.empty(0, np.uint8)
             return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
-    except (OSError, ValueError) as error:
-        raise RefineError(f"{path}: cannot be read ({reason_of(error)})") from error

@@ -189,11 +189,8 @@ def surfaces(
 
 def combined(before: NDArray[np.bool_], chosen: NDArray[np.bool_], mode: Mode) -> NDArray[np.bool_]:
     """A selection, (N,) bool, changed by chosen splats, (N,) bool."""
-    if mode == "ADD":
-        return before | chosen
-    if mode == "SUBTRACT":
-        return before & ~chosen
-    return before & chosen if mode == "INTERSECT" else chosen
+    both = before & chosen
+    return {"ADD": before | chosen, "SUBTRACT": before ^ both, "INTERSECT": both}.get(mode, chosen)
 
 
 def polygon(corners: Sequence[tuple[float, float]], width: int, height: int) -> NDArray[np.bool_]:

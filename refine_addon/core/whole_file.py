@@ -12,13 +12,14 @@ import stat
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from .errors import RefineError, reason_of
 from .execute import REPLACES_MAPPED, checkpoint
 
 ABANDONED = 86_400.0  # seconds after which a temporary file is deleted: a killed run left it
 
+_UNWRITTEN, _UNCHANGED = "cannot be written", "; nothing was changed"
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.:-]+://")
 """Scheme of a URL: two letters at least, since one would be a drive of Windows."""
 
@@ -76,9 +77,8 @@ def mode_of(path: Path) -> int:
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
     """Raise `RefineError` early if writing `path` would replace a file, or could not work."""
-    with _explained(
-        path, (OSError, ValueError)
-    ):  # a name too long, a folder that may not be entered
+    # A name too long, a folder that may not be entered.
+    with explained(path, _UNWRITTEN, errors=(OSError, ValueError), end=_UNCHANGED):
         behind = Path(os.path.realpath(path)).parent  # of a link, where it leads
         mode, folder, above = mode_of(path), mode_of(behind), mode_of(path.parent)
     if stat.S_ISDIR(mode):
@@ -103,14 +103,23 @@ def refuse_one_file(paths: Iterable[Path]) -> None:
 
 def refuse_mapped(path: Path, source: Path) -> None:
     """Raise `RefineError` if `path` is the mapped file `source`, which cannot be replaced."""
-    same = False
     with contextlib.suppress(OSError, ValueError):
-        same = not REPLACES_MAPPED and path.samefile(source)
-    if same:
-        raise RefineError(
-            f"{path}: is the file being read, which this system cannot replace; "
-            "write to another name"
-        )
+        if not REPLACES_MAPPED and path.samefile(source):
+            problem = "is the file being read, which this system cannot replace"
+            raise RefineError(f"{path}: {problem}; write to another name")
+
+
+@contextlib.contextmanager
+def explained(
+    path: Path, problem: str, kind: Any = RefineError, *, errors: Any = OSError, end: str = ""
+) -> Iterator[None]:
+    """Raise an error of a `kind`, a `RefineError`, with the reason in place of the system's."""
+    try:
+        yield
+    except errors as error:
+        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+        why = "no space left on the disk" if full else f"{problem} ({reason_of(error)})"
+        raise kind(f"{path}: {why}{end}") from error
 
 
 @contextlib.contextmanager
@@ -118,11 +127,9 @@ def new_folder(path: Path) -> Iterator[None]:
     """Make a folder and its parents; after the block, new ones that are empty are deleted."""
     new: list[Path] = []
     try:
-        try:
+        with explained(path, "cannot be made", errors=(OSError, ValueError)):
             new += itertools.takewhile(lambda folder: not mode_of(folder), (path, *path.parents))
             path.mkdir(parents=True, exist_ok=True)
-        except (OSError, ValueError) as error:
-            raise RefineError(f"{path}: cannot be made ({reason_of(error)})") from error
         yield
     finally:
         for folder in new:
@@ -146,7 +153,7 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
             if left.lstat().st_mtime < time.time() - ABANDONED:
                 left.unlink()
     temporary = target.with_name(f".refine-{secrets.token_hex(8)}.tmp")
-    with _explained(path):
+    with explained(path, _UNWRITTEN, end=_UNCHANGED):
         try:
             old = mode_of(target)
             # A new file gets the permissions that the user wants; it is made private while empty.
@@ -160,7 +167,7 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
                     # By descriptor: the folder's owner may have put a link of that name there.
                     os.chmod(file.fileno() if os.chmod in os.supports_fd else temporary, mode)
             checkpoint()  # cancelled while the file was written: leave none
-            _rename(temporary, target, overwrite)
+            _rename(temporary, target, path, overwrite)
         finally:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
@@ -169,16 +176,16 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
 def publish(finished: Path, path: Path, *, overwrite: bool) -> None:
     """Rename a finished file to `path` on the same disk, with the rules of `whole_file`."""
     refuse_existing(path, overwrite=overwrite)
-    with _explained(path):
+    with explained(path, _UNWRITTEN, end=_UNCHANGED):
         target = Path(os.path.realpath(path))
         if mode := mode_of(target):
             finished.chmod(mode & 0o777)
-        _rename(finished, target, overwrite)
+        _rename(finished, target, path, overwrite)
         finished.unlink(missing_ok=True)  # after a hard link it is a second name of the file
 
 
-def _rename(finished: Path, target: Path, overwrite: bool) -> None:
-    """Rename a file; without `overwrite`, `FileExistsError` if the target exists by now."""
+def _rename(finished: Path, target: Path, path: Path, overwrite: bool) -> None:
+    """Rename a file; without `overwrite`, `RefineError`, with `path`, if the target exists."""
     if overwrite:
         finished.replace(target)
         return
@@ -186,19 +193,6 @@ def _rename(finished: Path, target: Path, overwrite: bool) -> None:
         os.link(finished, target)
     except OSError as error:
         if target.exists():
-            raise FileExistsError from error
-        finished.rename(target)  # this file system has no hard links
-
-
-@contextlib.contextmanager
-def _explained(path: Path, errors: tuple[type[Exception], ...] = (OSError,)) -> Iterator[None]:
-    """Raise `RefineError` in place of these errors."""
-    try:
-        yield
-    except errors as error:
-        problem = f"cannot be written ({reason_of(error)}); nothing was changed"
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            problem = "no space left on the disk; nothing was changed"
-        if isinstance(error, FileExistsError):
             problem = "another program created this file in the meantime; it was left as it is"
-        raise RefineError(f"{path}: {problem}") from error
+            raise RefineError(f"{path}: {problem}") from error
+        finished.rename(target)  # this file system has no hard links

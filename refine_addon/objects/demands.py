@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import world_matrix
-from ..core import volumes as core_volumes
 from ..core.affine import moved
 from ..core.errors import RefineError
-from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Volume, Zone
+from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Volume, Zone, forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
@@ -58,7 +57,7 @@ class Demands:
             return Forced(protected)
         means = world_means(checked) if self.zones else np.empty((0, 3))
         try:
-            return core_volumes.forced(self.zones, means, protected, out)
+            return forced(self.zones, means, protected, out)
         except RefineError as error:
             raise RefineError(f"object '{checked.obj.name}': {error}") from error
 

@@ -260,8 +260,8 @@ class Change(NamedTuple):
     `columns`, new values of these M by property, in the object's frame."""
 
     keep: NDArray[np.bool_]
-    rows: NDArray[np.int64]
-    columns: dict[str, NDArray[Any]]
+    rows: NDArray[np.int64] = np.empty(0, np.int64)
+    columns: dict[str, NDArray[Any]] = {}
 
 
 def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
@@ -279,7 +279,7 @@ def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
         keep = result.keep[rows]
         start, first = first, first + int(np.count_nonzero(keep))
         if merged is None:
-            parts.append(_deletion(keep))
+            parts.append(Change(keep))
             continue
         changing = np.flatnonzero(merged.changed[start:first])
         splats = merged.splats.take(start + changing).up_to_degree(frame.degree)
@@ -288,10 +288,6 @@ def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
         columns = {name: np.ascontiguousarray(v) for name, v in values_by_name(splats).items()}
         parts.append(Change(keep, changing, columns))
     return parts
-
-
-def _deletion(keep: NDArray[np.bool_]) -> Change:
-    return Change(keep, np.empty(0, np.int64), {})
 
 
 def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
@@ -319,7 +315,7 @@ def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
 
 def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     """Delete an object's splats outside `keep`, (N,); see `apply`."""
-    return apply([checked], [_deletion(keep)])
+    return apply([checked], [Change(keep)])
 
 
 def reduce_object(checked: SplatObject, change: Change) -> None:

@@ -15,7 +15,7 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -34,38 +34,28 @@ SHORT_LINE = 400
 image stands there, and its line is shorter."""
 
 
-@dataclass(frozen=True)
-class Model:
+class Model(NamedTuple):
     """A camera model, whose parameters are the focal lengths, cx, cy, then those of distortion."""
 
     name: str  # as in ``cameras.txt``
     focals: int  # number: 2, 1 if fx = fy, 0 for a panorama
-    count: int  # of parameters
-    fisheye: bool = False  # the distance from the centre grows with the angle, not its tangent
+    parameters: int  # number
+
+    @property
+    def fisheye(self) -> bool:
+        """Whether the distance from the centre grows with the angle, not its tangent."""
+        return "FISHEYE" in self.name
 
 
-MODELS = {
-    0: Model("SIMPLE_PINHOLE", 1, 3),
-    1: Model("PINHOLE", 2, 4),
-    2: Model("SIMPLE_RADIAL", 1, 4),
-    3: Model("RADIAL", 1, 5),
-    4: Model("OPENCV", 2, 8),
-    5: Model("OPENCV_FISHEYE", 2, 8, fisheye=True),
-    6: Model("FULL_OPENCV", 2, 12),
-    7: Model("FOV", 2, 5),
-    8: Model("SIMPLE_RADIAL_FISHEYE", 1, 4, fisheye=True),
-    9: Model("RADIAL_FISHEYE", 1, 5, fisheye=True),
-    10: Model("THIN_PRISM_FISHEYE", 2, 12, fisheye=True),
-    11: Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 16, fisheye=True),
-    12: Model("SIMPLE_DIVISION", 1, 4),
-    13: Model("DIVISION", 2, 5),
-    14: Model("SIMPLE_FISHEYE", 1, 3, fisheye=True),
-    15: Model("FISHEYE", 2, 4, fisheye=True),
-    16: Model("EUCM", 2, 6),
-    17: Model("EQUIRECTANGULAR", 0, 2),
-}  # by number in ``cameras.bin``
+_MODELS = """
+SIMPLE_PINHOLE 1 3, PINHOLE 2 4, SIMPLE_RADIAL 1 4, RADIAL 1 5, OPENCV 2 8, OPENCV_FISHEYE 2 8,
+FULL_OPENCV 2 12, FOV 2 5, SIMPLE_RADIAL_FISHEYE 1 4, RADIAL_FISHEYE 1 5, THIN_PRISM_FISHEYE 2 12,
+RAD_TAN_THIN_PRISM_FISHEYE 2 16, SIMPLE_DIVISION 1 4, DIVISION 2 5, SIMPLE_FISHEYE 1 3, FISHEYE 2 4,
+EUCM 2 6, EQUIRECTANGULAR 0 2"""
+MODELS = [Model(name, int(f), int(p)) for name, f, p in map(str.split, _MODELS.split(","))]
+"""By number in ``cameras.bin``."""
 
-MODELS_BY_NAME = {model.name: model for model in MODELS.values()}
+MODELS_BY_NAME = {model.name: model for model in MODELS}
 
 
 def counted(count: int, thing: str) -> str:
@@ -189,10 +179,10 @@ def _binary_cameras(file: CameraPlace) -> Iterator[Any]:
     """Yield place, id and `_lens` of each camera."""
     for data, row, place in _rows(file, "camera", 24 + 8 * 2):
         camera_id, model_id, *size = data.take("IiQQ", row)
-        if model_id not in MODELS:
-            place.fail(f"unknown camera model {model_id}, expected 0 to {max(MODELS)}")
+        if not 0 <= model_id < len(MODELS):
+            place.fail(f"unknown camera model {model_id}, expected 0 to {len(MODELS) - 1}")
         model = MODELS[model_id]
-        values = data.take(f"{model.count}d", f"parameters of {row}")
+        values = data.take(f"{model.parameters}d", f"parameters of {row}")
         yield place, camera_id, _lens(place, model, size, values)
 
 
@@ -226,9 +216,9 @@ def _text_cameras(file: CameraPlace) -> Iterator[Any]:
         if model is None:
             place.fail(f"unknown camera model {name[:40]!r}, expected {', '.join(MODELS_BY_NAME)}")
         numbers = [_parsed(place, field) for field in fields[:-1]]
-        if len(numbers) != 2 + model.count:
+        if len(numbers) != 2 + model.parameters:
             place.fail(
-                f"expected width, height and {model.count} parameters of {model.name}, "
+                f"expected width, height and {model.parameters} parameters of {model.name}, "
                 f"got {len(numbers)} numbers"
             )
         yield place, _parsed(place, camera_id, int), _lens(place, model, numbers[:2], numbers[2:])

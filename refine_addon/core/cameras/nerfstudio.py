@@ -27,13 +27,8 @@ LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6  # of a ``transform_matrix``; divided out
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PANORAMA_KEYS = ("equirectangular", "latlong")  # of instant-ngp
 
-LENSES = {**MODELS_BY_NAME, "FISHEYE624": Model("FISHEYE624", 1, 15, fisheye=True)}
+LENSES = {**MODELS_BY_NAME, "FISHEYE624": Model("FISHEYE624", 1, 15)}
 """Models by name; that of Project Aria's lenses has no number in COLMAP."""
-
-PANORAMAS = {
-    *("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R"),
-    *("VR180_L", "VR180_R", "ORTHOPHOTO"),
-}  # models that a pinhole cannot approximate
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # tried for sizes; NeRF synthetic names lack one
 
@@ -128,14 +123,14 @@ def _lens(place: CameraPlace, values: Mapping[str, Any]) -> list[Model]:
     distorted = any(values.get(key) for key in DISTORTIONS)
     fisheye = "ftheta_p0" in values or (distorted and values.get("is_fisheye"))
     name = at.text(values.get("camera_model", "OPENCV_FISHEYE" if fisheye else "OPENCV"))
-    panorama = next((key for key in PANORAMA_KEYS if key in values), None)
-    if name in PANORAMAS or panorama:
-        what = name if name in PANORAMAS else panorama
+    panorama = next((key for key in PANORAMA_KEYS if key in values), "")
+    model = LENSES.get(name)
+    if panorama or (model and not model.focals):
+        what = panorama or name
         place.fail(f"{what!r} cameras are not pinholes, expected a perspective camera")
-    if name not in LENSES:
-        models = ", ".join(model for model in LENSES if model not in PANORAMAS)
+    if model is None:
+        models = ", ".join(lens for lens in LENSES if LENSES[lens].focals)
         at.fail(f"unknown model {name[:40]!r}, expected one of {models}")
-    model = LENSES[name]
     return [model] if model.fisheye or distorted else []
 
 

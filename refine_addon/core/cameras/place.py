@@ -11,10 +11,10 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RefineError, reason_of
+from ..errors import RefineError
 from ..place import LARGEST_NUMBER, Place, foreign_kind, refuse_pointer
 from ..views import View, is_orthonormal
-from ..whole_file import mode_of
+from ..whole_file import explained, mode_of
 
 SMALLEST_LENGTH = 1e-6  # focal length, px, or scale
 LARGEST_SIDE = 1_000_000  # of an image, px
@@ -85,10 +85,8 @@ class CameraPlace(Place):
 
 def kind_of(path: Path) -> int:
     """Type of `path` (`stat.S_IFMT`), 0 if it does not exist; `RefineError` if unknown."""
-    try:
+    with explained(path, "cannot be read", errors=(OSError, ValueError)):
         return stat.S_IFMT(mode_of(path))
-    except (OSError, ValueError) as error:
-        Place(path).fail(f"cannot be read ({reason_of(error)})")
 
 
 def is_file(path: Path) -> bool:
@@ -104,16 +102,14 @@ def is_folder(path: Path) -> bool:
 @contextmanager
 def opened(place: Place) -> Iterator[tuple[BinaryIO, bytes]]:
     """Open a file; yields it with its first bytes. Refuses empty files and LFS pointers."""
-    try:
-        with place.path.open("rb") as stream:
-            head = stream.read(SNIFFED_BYTES)
-            if not head:
-                place.fail("the file is empty, expected cameras")
-            refuse_pointer(place.path, head)
-            stream.seek(0)
-            yield stream, head
-    except (OSError, ValueError) as error:
-        place.fail(f"cannot be read ({reason_of(error)})")
+    reading = explained(place.path, "cannot be read", errors=(OSError, ValueError))
+    with reading, place.path.open("rb") as stream:
+        head = stream.read(SNIFFED_BYTES)
+        if not head:
+            place.fail("the file is empty, expected cameras")
+        refuse_pointer(place.path, head)
+        stream.seek(0)
+        yield stream, head
 
 
 def read_json(path: Path) -> object:

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
 import plyfile
@@ -254,47 +254,46 @@ def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
     kinds = {prop.name: prop.val_dtype for prop in properties}
     missing = [name for name in REQUIRED if name not in kinds]
     rest = [name for name in kinds if name.startswith("f_rest_")]
-    problem = ""
     if "packed_position" in kinds:
-        problem = "a compressed splat PLY: 'refine convert IN OUT.ply' makes a plain one of it"
-    elif missing and missing != [THIRD_SCALE]:
+        what = "'refine convert IN OUT.ply' makes a plain one of it"
+        _refuse(path, f"a compressed splat PLY: {what}")
+    if missing and missing != [THIRD_SCALE]:
         mesh = any(name in INDEXING for name in names)
         guess = f"a {'mesh' if mesh else 'point cloud'}, not splats"
         guess = "incomplete splats" if "opacity" in kinds else guess
         has = (_listed([*kinds]) or "no property") + ", ..." * (len(kinds) > _NAMES_SHOWN)
-        problem = f"{guess}: vertex lacks {', '.join(missing)} (it has {has})"
-    elif len(rest) not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(len(rest))):
-        problem = f"found {len(rest)} f_rest properties, "
-        problem += "expected f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
-    for name, kind in () if problem else kinds.items():
+        _refuse(path, f"{guess}: vertex lacks {', '.join(missing)} (it has {has})")
+    if len(rest) not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(len(rest))):
+        wanted = "f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
+        _refuse(path, f"found {len(rest)} f_rest properties, expected {wanted}")
+    for name, kind in kinds.items():
         if name in lists:
-            problem = f"property {shown(name)} is a list, expected one number a splat"
-        elif kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
-            problem = f"property {shown(name)} is of type {kind}, expected float or double"
-    for element in () if problem else header.elements[:vertex]:
+            _refuse(path, f"property {shown(name)} is a list, expected one number a splat")
+        if kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
+            _refuse(path, f"property {shown(name)} is of type {kind}, expected float or double")
+    for element in header.elements[:vertex]:
         if has_lists(element):
-            problem = f"element {shown(element.name)} has a list and stands before the splats, "
-            problem += "expected it behind them"
-    if problem:
-        raise RefineError(f"{path}: {problem}")
+            what = f"element {shown(element.name)} has a list and stands before the splats"
+            _refuse(path, f"{what}, expected it behind them")
     return header, vertex
+
+
+def _refuse(path: Path | Url, problem: str) -> NoReturn:
+    raise RefineError(f"{path}: {problem}")
 
 
 def read_header(path: Path | Url, head: bytes) -> Header:
     """Header from a file's first `HEADER_LIMIT` bytes; `RefineError`, with its line, if wrong."""
-    raw, problem = raw_header(head), ""
+    raw = raw_header(head)
     if not head:
-        problem = "the file is empty, expected a PLY"
-    elif not re.match(rb"ply[\r\n]", head):
+        _refuse(path, "the file is empty, expected a PLY")
+    if not re.match(rb"ply[\r\n]", head):
         refuse_pointer(path, head)
-        problem = foreign_kind(path, head)
-        problem = (
-            problem or f"not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
-        )
-    elif raw is None:
-        problem = f"header without end: no 'end_header' line in the first {len(head)} bytes"
-    if problem or raw is None:
-        raise RefineError(f"{path}: {problem}")
+        got = f"not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
+        _refuse(path, foreign_kind(path, head) or got)
+    if raw is None:
+        what = f"no 'end_header' line in the first {len(head)} bytes"
+        _refuse(path, f"header without end: {what}")
     plain, counts = _plain(path, raw)
     try:
         data = plyfile.PlyData.read(io.BytesIO(plain))

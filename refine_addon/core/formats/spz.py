@@ -119,20 +119,18 @@ def _parsed(path, head, size):
     """Header of a file of `size` bytes; `RefineError` for more splats than it can hold."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
     header = _Header(*_HEADER.unpack(head))
-    problem = ""
+    place = Place(path)
     if header.magic != SPZ:
-        problem = f"no SPZ file: its gzip stream begins with {header.magic!r}, expected {SPZ!r}"
-    elif header.version not in _VERSIONS:
-        problem = f"SPZ version {header.version}, expected {', '.join(map(str, _VERSIONS))}"
-    elif header.degree >= _DEGREES:
-        problem = f"byte 12: harmonics of degree {header.degree}, expected 0 to {_DEGREES - 1}"
-    elif header.fraction > _LARGEST_CODE.bit_length():
-        problem = f"byte 13: {header.fraction} fractional bits, expected 0 to 23"
-    elif header.needed() > _INFLATION * size:
-        problem = f"truncated: {header.splats} splats need {header.needed()} bytes unpacked, "
-        problem += f"a file of {size} bytes holds at most {_INFLATION * size}"
-    if problem:
-        Place(path).fail(problem)
+        place.fail(f"no SPZ file: its gzip stream begins with {header.magic!r}, expected {SPZ!r}")
+    if header.version not in _VERSIONS:
+        place.fail(f"SPZ version {header.version}, expected {', '.join(map(str, _VERSIONS))}")
+    if header.degree >= _DEGREES:
+        place.fail(f"byte 12: harmonics of degree {header.degree}, expected 0 to {_DEGREES - 1}")
+    if header.fraction > _LARGEST_CODE.bit_length():
+        place.fail(f"byte 13: {header.fraction} fractional bits, expected 0 to 23")
+    if header.needed() > _INFLATION * size:
+        problem = f"truncated: {header.splats} splats need {header.needed()} bytes unpacked"
+        place.fail(f"{problem}, a file of {size} bytes holds at most {_INFLATION * size}")
     return header
 
 

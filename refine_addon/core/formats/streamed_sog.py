@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RefineError, reason_of
+from ..errors import RefineError
 from ..execute import checkpoint
 from ..place import Place, described, named_json
 from ..splats import Splats, assign, rotation_matrices, scales
 from ..visibility.scene import nearby_order
-from ..whole_file import mode_of, new_folder, refuse_existing, whole_file
+from ..whole_file import explained, mode_of, new_folder, refuse_existing, whole_file
 from .format import Format, new_file, pieces
 from .ply import SplatFile
 from .sog import GENERATOR, IMAGES, META, Bundle, bundle_beside, contents
@@ -256,11 +256,11 @@ def folder_for(path: Path, *, overwrite: bool) -> Iterator[Path]:
             raise RefineError(f"{path}: is a link, expected the index itself, beside its folders")
         refuse_existing(path, overwrite=overwrite)
         _folders_of(path)
-        try:
-            with tempfile.TemporaryDirectory(prefix=".refine-", dir=path.parent) as folder:
-                yield Path(folder)
-        except OSError as error:
-            raise RefineError(f"{path}: cannot be written ({reason_of(error)})") from error
+        with (
+            explained(path, "cannot be written"),
+            tempfile.TemporaryDirectory(prefix=".refine-", dir=path.parent) as folder,
+        ):
+            yield Path(folder)
 
 
 def _folders_of(path: Path) -> list[str]:

@@ -25,6 +25,7 @@ from ...version import VERSION
 from ..errors import RefineError
 from ..execute import Progress, alone, report
 from ..mapped import Interrupted
+from ..whole_file import explained
 from .source import Tile, bytes_of
 from .writing import waiting_in
 
@@ -70,10 +71,9 @@ def cluster(workers: int | str) -> Iterator[Cluster]:
                 raise Interrupted(
                     f"workers ended while they were started ({error}); try again"
                 ) from error
-        try:
+        problem = "no Dask scheduler answers there"
+        with explained(scheduler, problem, errors=(OSError, ValueError)):
             client = held.enter_context(distributed.Client(scheduler, timeout=_CONNECT))
-        except (OSError, ValueError) as error:
-            raise RefineError(f"{scheduler}: no Dask scheduler answers there ({error})") from error
         yield Cluster(client)
 
 

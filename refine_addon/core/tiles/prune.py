@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...version import VERSION
-from ..errors import RefineError, reason_of
+from ..errors import RefineError
 from ..execute import Cancelled, Progress, on, seconds, silent, stages
 from ..mapped import Interrupted, note, noted, on_disk, once, pieces, write
 from ..methods import DEFAULT, Method
@@ -25,7 +25,7 @@ from ..result import Result
 from ..selection import Budget
 from ..splats import Model
 from ..views import ViewSet
-from ..whole_file import Url
+from ..whole_file import Url, explained
 from .cluster import Cluster
 from .source import Tile, copied, tiles_at
 from .storage import identity, located, new_folder
@@ -173,11 +173,9 @@ def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
     """Make and lock the folder of a job within the block; it stays if the job can go on."""
     if job.is_symlink():
         raise RefineError(f"{job}: is a link, expected a folder of an earlier run; remove the link")
-    try:
+    with explained(job, "cannot be made"):
         waiting_in(job).mkdir(parents=True, exist_ok=True)
         lock = (job / "lock").open("wb")
-    except OSError as error:
-        raise RefineError(f"{job}: cannot be made ({reason_of(error)})") from error
     stays = True
     try:
         with lock:
@@ -200,7 +198,9 @@ def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
                 raise
     finally:
         if not stays:  # after the lock is closed: Windows removes no open file
-            _remove(job)
+            for _ in range(2):  # Ctrl-C may come meanwhile
+                with contextlib.suppress(KeyboardInterrupt):
+                    shutil.rmtree(job, ignore_errors=True)
 
 
 def _lock(job: Path, lock: Any) -> None:
@@ -212,14 +212,6 @@ def _lock(job: Path, lock: Any) -> None:
         raise RefineError(f"{job}: another run is at work on the same job") from error
     except OSError:
         pass  # this file system has no locks
-
-
-def _remove(job: Path) -> None:
-    """Remove a folder with its content, also if Ctrl-C comes meanwhile."""
-    try:
-        shutil.rmtree(job, ignore_errors=True)
-    except KeyboardInterrupt:
-        shutil.rmtree(job, ignore_errors=True)
 
 
 def _digest(output, tiles, views, budget, method):

@@ -18,9 +18,9 @@ from ..errors import RefineError
 from ..execute import Progress, run, seconds
 from ..formats.ply import with_count, with_model, write_rows
 from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
-from ..mapped import Interrupted, Mapped, note, noted, writing
+from ..mapped import Interrupted, Mapped, note, noted
 from ..splats import Splats
-from ..whole_file import Url, refuse_one_file
+from ..whole_file import Url, explained, refuse_one_file
 from . import storage
 from .source import ROWS, Tile, bytes_of, rows_of
 
@@ -160,7 +160,7 @@ def _write_tile(job, tiles, kept, places, number):
     if not waiting.exists():
         unfinished = waiting_in(job) / f"{number:06d}-{secrets.token_hex(8)}.tmp"
         try:
-            with writing(waiting):
+            with explained(waiting, "cannot be written", Interrupted):
                 _write_rows(tiles, kept, number, unfinished)
                 unfinished.replace(waiting)
         finally:
