@@ -35,7 +35,6 @@ LONG = zipped("a.txt", *(f"{'x' * 200}{i}.webp" for i in range(500)), "meta.json
 
 FOREIGN = [
     ("in.splat", bytes(64), f"a .splat file: {READ}"),
-    ("IN.SPLAT", bytes(64), f"a .splat file: {READ}"),
     ("in.splat", b"\x1f\x8b" + bytes(62), "a .splat file"),  # as gzip begins
     ("in.ksplat", bytes(4096), f"a .ksplat file: {READ}"),
     ("in.spz", gzip.compress(SPZ), f"an SPZ file: {READ}"),
