@@ -336,7 +336,7 @@ def views_from_frames(
     finally:
         scene.frame_set(before[0], subframe=before[1])
         scene.camera = before[2]
-    return ViewSet(tuple(views))
+    return ViewSet(tuple(views), exact=True)
 
 
 def _turn(

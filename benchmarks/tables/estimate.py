@@ -29,7 +29,6 @@ from refine_addon.core import Merge, Method, Occlusion, Refit, prune
 from refine_addon.core.errors import RefineError
 from refine_addon.core.prune import with_quality
 from refine_addon.core.quality.curve import Way
-from refine_addon.core.report import little_seen
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import ViewSet
@@ -119,14 +118,14 @@ class Between:
 
     - estimate: Of the views between, dB.
     - held, (H,) float64: PSNR of each held-out view, dB.
-    - warned: Whether the report says that views from elsewhere may lose more.
+    - between: Views in between that decided, too.
     """
 
     way: Way
     ratio: float
     estimate: float
     held: NDArray[np.float64]
-    warned: bool
+    between: int
 
     def line(self, name: str) -> str:
         """Return it as a line of the table."""
@@ -134,7 +133,7 @@ class Between:
         return (
             f"{name:12}{self.way:10}{self.ratio:9.1%}{self.estimate:10.2f}{mean:10.2f}"
             f"{error:8.2f}{self.estimate - mean:+8.2f}{np.median(self.held):8.2f}"
-            f"{'  warned' if self.warned else ''}"
+            f"{self.between:4} between"
         )
 
 
@@ -159,9 +158,8 @@ def measure_between(
                     f"of {len(views)} views nothing is told of what lies between them"
                 )
             renders = evaluator.evaluate(result.splats).renders
-            assert result.scores is not None
-            warned = bool(little_seen(result.scores.seen))
-            yield Between(way, ratio, estimate, np.asarray(renders.values["psnr"]), warned)
+            between = result.report["views"]["between"]
+            yield Between(way, ratio, estimate, np.asarray(renders.values["psnr"]), between)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

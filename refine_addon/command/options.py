@@ -54,6 +54,8 @@ lod --psnr DB,DB,...    instead of --levels: how close each stays to the origina
 --rounds N              with --method refit: number of rounds at most (default: 2 to 4, by what they
                         gain)
 --views N               use at most N views, spread out evenly; 0 uses all (default {Merge.views})
+--exact                 no views between the cameras decide, too, where there are few cameras; so
+                        it is with --source frames
 --clean                 first remove floaters, as clean does; the budget applies to the rest
 --reasons R,R,...       which to remove, of {", ".join(REASONS)}
                         (default {",".join(Cleaning.reasons)})
@@ -89,7 +91,7 @@ _MORE = "--rounds --clean --protect --pictures --together --workers --dry-run"
 BLENDER = "blender -b scene.blend --command refine"
 _COMMANDS = f"""
 prune: remove the splats the cameras would miss least
-inputs* --object --save -o --ratio --keep --max-mb --psnr --method {_MORE} {_VIEWS}
+inputs* --object --save -o --ratio --keep --max-mb --psnr --method --exact {_MORE} {_VIEWS}
   refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply
   refine prune *.ply --cameras cameras.json --psnr 40 -o pruned
   refine prune in.ply --cameras sparse/0 --max-mb 5 --method refit -o out.ply
@@ -99,7 +101,7 @@ inputs* --object --save -o --ratio --keep --max-mb --psnr --method {_MORE} {_VIE
   {BLENDER} prune --object Splats --source frames:1:250:10 --save
 
 score: write files with a float property refine_score
-inputs* --object -o --method {_VIEWS}
+inputs* --object -o --method --exact {_VIEWS}
   refine score in.ply --cameras cameras.json -o scored.ply
   {BLENDER} score --object Splats -o scored.ply
 

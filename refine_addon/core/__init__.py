@@ -22,7 +22,7 @@ from .scores import Scores
 from .selection import Budget, rank, select
 from .splats import Splats
 from .tiles.prune import prune_tiles
-from .views import View, ViewSet, with_views_between
+from .views import View, ViewSet
 from .volumes import Box, MovedVolume, Solid, Sphere, Zone, forced
 
 __all__ = [
@@ -68,6 +68,5 @@ __all__ = [
     "score",
     "score_file",
     "select",
-    "with_views_between",
     "write_splats",
 ]

@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar
 
 from .errors import RefineError
 from .refit import refit
+from .views import ViewSet
 
 
 @dataclass(frozen=True)
 class Method:
-    """Settings of all methods: at most `views` views are used, spread evenly; 0 uses all."""
+    """Settings of all methods.
+
+    At most `views` views decide, spread evenly; 0 uses all. Where there are fewer, and those left
+    out lose much more, views between them decide, too, unless `exact`, as for a locked shot.
+    """
 
     name: ClassVar[str]  # in panel, command and report
 
     changes: ClassVar[bool] = False  # whether kept splats may change; if not, rows stay to the bit
 
     views: int = 64
+    exact: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.views < 0:
             raise RefineError(f"views is {self.views}, expected 0 (all) or more")
+
+    def between(self, used: ViewSet) -> int:
+        """Most views between those used that may decide, too: two for each."""
+        fewer = max((self.views or Method.views) - len(used), 0)
+        return 0 if self.exact or used.exact else min(2 * len(used), fewer)
 
     def facts(self) -> dict[str, Any]:
         """Name and settings as plain JSON values."""

@@ -114,8 +114,9 @@ def score(
                 scores = replace(scores, ray_sample=rays)
         else:
             scores = occlusion.score(
-                splats, used, settled=settled, progress=scoring, threads=threads
-            )
+                splats, used, settled=settled, most_between=method.between(used),
+                progress=scoring, threads=threads,
+            )  # fmt: skip
     scores = _with_views(scores, splats, views, used, threads)
     return with_quality(scores, protected=protected, progress=estimating, threads=threads)
 
@@ -323,12 +324,12 @@ class _Prune:
         scoring, making = stages(
             progress, seconds("measure", count, views), expected * (2.2 if goal else 1.0)
         )
-        measurement = None
+        measurement, most_between = None, self.method.between(self.used)
         if self.budget.needs_scores:
             scores = self._scores(scoring)
         else:
             scores, measurement = occlusion.score_once(
-                self.splats, self.used, few_views=goal is None,
+                self.splats, self.used, few_views=goal is None, most_between=most_between,
                 progress=scoring, threads=self.threads,
             )  # fmt: skip
             scores = _with_views(scores, self.splats, self.views, self.used, self.threads)
@@ -340,30 +341,40 @@ class _Prune:
             report(making, 0.0, "selecting")
             keep, plain = self._select(scores)
             self.clock.lap("select_s")
-        deletes = replace(self, method=Occlusion(self.method.views), scores=given)
+        deletes = replace(
+            self, method=Occlusion(self.method.views, exact=self.method.exact), scores=given
+        )
+        beside = None  # in views that did not decide
+        if goal is None and scores.between is not None:
+            beside = psnr_kept(scores.between, keep, threads=self.threads)
         will_do = not refits and (  # so that merging need not be tried
-            deletion_will_do(plain) if goal is None
+            all(map(deletion_will_do, (plain, beside))) if goal is None
             else quality_of(scores).share(goal, "merge") <= PLAIN
         )  # fmt: skip
         if will_do:
             return self._deleted(deletes.delete(making), None)
         if measurement is None:
             scores, measurement = occlusion.score_once(
-                self.splats, self.used, few_views=True, progress=making, threads=self.threads
-            )
+                self.splats, self.used, few_views=True, most_between=most_between,
+                progress=making, threads=self.threads,
+            )  # fmt: skip
         if goal is None:
             outcome = self._to_count(keep, scores, measurement, making)
         else:
             outcome = self._to_psnr(goal, scores, measurement, making)
         self.clock.lap("merge_s")
-        if not refits and self._deletion_is_as_good(keep, plain, outcome):
+        between = self._between(scores, outcome)
+        pairs = [(plain, outcome.reached)]
+        if beside is not None and between is not None:
+            pairs.append((beside, between))
+        if not refits and self._deletion_is_as_good(keep, outcome, *pairs):
             return self._deleted(deletes.delete(silent, outcome), outcome)
         # Where a PSNR is asked for, deletion keeps another number of splats.
         measured = outcome.psnr if goal is not None else {"delete": plain, **outcome.psnr}
         final = outcome.final
         summary = reports.of_prune(
             scores, final.keep, self.budget, self.method, self.sizes, self.clock,
-            psnr=outcome.reached, between=self._between(scores, outcome), measured=measured,
+            psnr=outcome.reached, between=between, measured=measured,
             outcome=outcome, timed=True,
         )  # fmt: skip
         merged = None if outcome.done == "delete" else final
@@ -415,13 +426,17 @@ class _Prune:
             return keep, scores.quality.at(1.0 - float(np.mean(keep)))
         return keep, None
 
-    def _deletion_is_as_good(self, keep, plain: float | None, outcome: Outcome) -> bool:
-        """Whether deletion, keeping (N,) at `plain` dB, is about as good."""
-        if plain is None or outcome.reached is None:
+    def _deletion_is_as_good(self, keep, outcome: Outcome, *pairs: tuple[Any, Any]) -> bool:
+        """Whether deletion, keeping (N,), is about as good.
+
+        `pairs` are the PSNR of deletion and of merging, dB, in views that decided and in others.
+        """
+        if None in itertools.chain(*pairs):
             return True
         if self.budget.psnr is None:
-            return plain > outcome.reached - AS_GOOD
-        missed = outcome.reached < self.budget.psnr - CLOSE and outcome.reached < plain
+            return all(deleted > merged - AS_GOOD for deleted, merged in pairs)
+        (plain, reached), *_ = pairs
+        missed = reached < self.budget.psnr - CLOSE and reached < plain
         return missed or np.count_nonzero(keep) <= len(outcome.merged.splats)
 
     def _expected_seconds(self, left: int) -> tuple[float, float, float]:
@@ -460,7 +475,7 @@ class _Prune:
         if plain is not None and psnr is not None and plain > psnr:
             outcome = replace(outcome, merged=deleted, done="delete")
         del merged, deleted  # one of them is not needed while splats are refitted
-        outcome = self._refitted(outcome, refitting)
+        outcome = self._refitted(outcome, scores.deciding or used, refitting)
         if outcome.refitted is None or outcome.stopped is not None:
             return outcome
         return replace(outcome, psnr=outcome.psnr | {"refit": estimated(outcome.refitted.splats)})
@@ -498,7 +513,7 @@ class _Prune:
         assert best is not None  # every try gives one
         return best
 
-    def _refitted(self, outcome: Outcome, progress: Progress) -> Outcome:
+    def _refitted(self, outcome: Outcome, views: ViewSet, progress: Progress) -> Outcome:
         """Refit to the views' pictures of the unpruned splats; if cancelled, the rounds so far."""
         assert isinstance(self.method, Refit)
         merged, start = outcome.merged, time.perf_counter()
@@ -509,7 +524,7 @@ class _Prune:
         try:
             for reached in refit_rounds(
                 merged.splats, self.splats if self.origin is None else self.origin.splats,
-                self.used, self.method.rounds,
+                views, self.method.rounds,
                 protected=None if self.protected is None else self.protected[merged.keep],
                 progress=lambda fraction, _what: progress(fraction, REFITTING),
                 threads=self.threads,
@@ -564,7 +579,7 @@ def merge_down(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Merged:
-    """Merge splats until `count` are left, by all `views`; errors as by `score`.
+    """Merge splats until `count` are left, by `views` and those between; errors as by `score`.
 
     `scored` comes from `occlusion.score_once`. `began` is the number before earlier merges:
     deletion before merging, and the merge penalty, depend on the share removed since then.
@@ -573,6 +588,7 @@ def merge_down(
     if scored is None:
         scored = occlusion.score_once(splats, views, few_views=True, threads=threads)
     scores, measured = scored
+    views = scores.deciding or views
     began = total if began is None else began
     # How many of all are deleted before any are merged, and how many of those are still there.
     deleted = max(min(math.floor(FIRST * began), began - count), 0)

@@ -24,10 +24,6 @@ NOT_PREDICTED = (
 
 MANY_UNSEEN = 0.05  # share of unseen splats from which the command says how many were removed
 
-LITTLE_SEEN = 0.19
-"""Share of splats in at most one view from which on other views may lose more than predicted. In
-five scenes it is 0.197 or more for 8 views or 16 adjacent ones, at most 0.180 for 12 spread out."""
-
 PRICED = (0.3, 0.5, 0.7, 0.9)  # shares removed whose cost a scoring predicts
 
 
@@ -70,25 +66,28 @@ def sizes_in_words(first: int, between: str, second: int) -> str:
 def scoring_notes(scores: Scores) -> list[str]:
     """Notes on a scoring for the user, one sentence each."""
     notes = [*scores.notes, *(scores.alignment.notes() if scores.alignment else ())]
+    if scores.views_between:
+        notes.append(f"few cameras: {scores.views_between} views between them decide, too")
     if scores.undrawable:
         notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
     return notes
 
 
 def seen_by(
-    seen: NDArray[np.int32], undrawable: int, given: int, used: int
+    seen: NDArray[np.int32], undrawable: int, given: int, used: int, between: int = 0
 ) -> dict[str, dict[str, int]]:
     """Counts of splats and views for every report; `seen`, (N,), counts the views of each splat."""
     unseen = int(np.count_nonzero(seen == 0))
     return {
         "splats": {"before": len(seen), "undrawable": undrawable, "unseen": unseen},
-        "views": {"given": given, "used": used},
+        "views": {"given": given, "used": used, "between": between},
     }
 
 
 def scored(scores: Scores) -> dict[str, dict[str, int]]:
     """`seen_by` for the splats and views of a scoring."""
-    return seen_by(scores.seen, scores.undrawable, scores.views_given, scores.views_used)
+    given, used = scores.views_given, scores.views_used
+    return seen_by(scores.seen, scores.undrawable, given, used, scores.views_between)
 
 
 def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
@@ -139,11 +138,8 @@ def of_prune(
     ]
     if between is not None and parted(psnr, between):
         notes.append(
-            f"views between these lose more, {in_words(between)}: have views in between decide "
-            "too, or remove less"
+            f"views between these lose more, {in_words(between)}: add cameras, or remove less"
         )
-    if between is not None:
-        notes.append(little_seen(scores.seen))
     estimates = dict(measured)
     if tried is not None and budget.psnr is None:  # of as many kept splats
         estimates = {**tried.psnr, **estimates}
@@ -203,24 +199,6 @@ def deleted_note(plain: float | None, tried: float | None) -> str:
     elif plain is not None:
         why = "nobody would see what merging gains"
     return f"rows stay as they were, the others are deleted: {why}"
-
-
-def little_seen(seen: NDArray[np.int32]) -> str:
-    """Sentence if many splats lie in at most one view, so that other views may lose more; or "".
-
-    `seen`, (N,), counts the views of each splat. The share of splats in exactly one view is about
-    the share that one more view adds (Good 1953).
-
-    >>> little_seen(np.array([0, 1, 2, 3]))
-    '50% of the splats lie in one view or none: views from elsewhere may lose more than predicted'
-    """
-    share = np.count_nonzero(seen < 2) / max(len(seen), 1)
-    if share < LITTLE_SEEN:
-        return ""
-    return (
-        f"{share:.0%} of the splats lie in one view or none: views from elsewhere may lose more "
-        "than predicted"
-    )
 
 
 def prices(scores: Scores, took: float) -> list[dict[str, Any]]:

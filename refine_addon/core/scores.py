@@ -12,6 +12,7 @@ from .errors import RefineError
 from .quality.alignment import Alignment
 from .quality.curve import Quality
 from .splats import among_all
+from .views import ViewSet
 from .visibility.cast import RaySample
 
 _DISTINCT = 1 << 24  # largest number of equal steps from 0 to 1 that are distinct in float32
@@ -31,12 +32,14 @@ class Scores:
     notes : tuple of str, sentences for the user
     method : str, name of the method
     views_given : int, number of views from which those used were chosen
+    views_between : int, number of views between these that decide, too
     ray_sample : RaySample, validation rays, which estimate the PSNR of any choice of the splats
     between : RaySample, likewise for views in between
     quality : Quality, estimated PSNR by the share removed, in the order of the scores
     alignment : Alignment, whether the views fit the splats
     settled : int, number of the lowest scores that are in final order; None for all
     scored : (N,) bool, which splats were scored; None for all, see `for_all`
+    deciding : ViewSet, the views used and those between them that decide, too
     """
 
     values: NDArray[np.float32]
@@ -47,12 +50,14 @@ class Scores:
     notes: tuple[str, ...] = ()
     method: str = ""
     views_given: int = 0
+    views_between: int = 0
     ray_sample: RaySample | None = None
     between: RaySample | None = None
     quality: Quality | None = None
     alignment: Alignment | None = None
     settled: int | None = None
     scored: NDArray[np.bool_] | None = None
+    deciding: ViewSet | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
         """Scores of all N splats, from these of the splats in `rest`, (N,) bool; others get 0."""

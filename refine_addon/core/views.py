@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 from .errors import RefineError
 
 ORTHONORMAL = 1e-3  # largest error of a rotation's entries: files may have only four decimals
-WIDEST = math.radians(90.0)  # views turned farther from each other get no view in between
-MOST_BETWEEN = 1000  # most views in between: each is compared with all others, which takes minutes
 FAR = 1000.0  # distance, in extents of the splats, of a view that stands in for parallel rays
-_CANDIDATES = 64  # nearest views of each that may be its neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +108,13 @@ class ViewSet:
     views : tuple of View, at least one of positive weight
     note : str, for the user: what their source says and is ignored, such as lens distortion
     turn : int, optional; quarter turns about x (`affine.QUARTER`) from their frame to the splats'
+    exact : bool, whether no views between these decide, see `Method`: those of a locked shot
     """
 
     views: tuple[View, ...]
     note: str = ""
     turn: int | None = None
+    exact: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
@@ -245,78 +244,6 @@ def refuse_other(views: object) -> None:
         raise RefineError(
             f"views is a {type(views).__name__}, expected a ViewSet: ViewSet((view, ...))"
         )
-
-
-def views_between(views: ViewSet, most: int) -> list[View]:
-    """At most `most` views halfway between neighbours, chosen as by `ViewSet.spread`.
-
-    By `ViewSet.places`, neighbours have no third view nearer to their middle than they are (Gabriel
-    graph, Gabriel and Sokal 1969). Centres and rotations are means, the lens is that of one of the
-    two. Neither the frame matters, nor the order of views whose names differ.
-    """
-    ordered = [view for view, _ in views.by_distance()]
-    if most < 1 or len(ordered) < 2:
-        return []
-    centers = np.array([view.center for view in ordered])
-    place = ViewSet(tuple(ordered)).places()
-    halfway = [
-        view
-        for first, second in _neighbours(place)
-        if (centers[first] != centers[second]).any()
-        and (view := _halfway(ordered[first], ordered[second])) is not None
-    ]
-    return list(ViewSet(tuple(halfway)).spread(most)) if halfway else []
-
-
-def with_views_between(views: ViewSet, count: int) -> ViewSet:
-    """Views with up to `count` more in between, and views between those, until there are as many.
-
-    `RefineError` unless `count` is 0 to `MOST_BETWEEN`.
-    """
-    if not 0 <= count <= MOST_BETWEEN:
-        raise RefineError(f"views in between are {count:,}, expected 0 to {MOST_BETWEEN:,}")
-    while count > 0:
-        more = views_between(views, count)
-        if not more:
-            break
-        views, count = replace(views, views=(*views, *more)), count - len(more)
-    return views
-
-
-def _neighbours(place):
-    """Pairs of neighbours among places, (V, 6), the smaller number first, ascending."""
-    pairs = []
-    for number, here in enumerate(place):
-        distance = _distances(place, here)  # (V,)
-        nearest = np.argsort(distance, kind="stable")[: _CANDIDATES + 1]
-        for other in nearest[nearest > number].tolist():
-            # A place is nearer to the middle if and only if it sees the two at an obtuse angle.
-            squares = distance + _distances(place, place[other])
-            squares[[number, other]] = np.inf
-            if squares.min() >= distance[other]:
-                pairs.append((number, other))
-    return sorted(pairs)
-
-
-def _distances(place, here):
-    """Squared distances of places from one, (V,), rounded: equal ones stay equal."""
-    return np.round(np.sum((place - here) ** 2, axis=1), 9)
-
-
-def _halfway(one, other):
-    """View halfway between two; None if they look too far apart or one is mirrored."""
-    one, other = sorted((one, other), key=lambda view: view.name)
-    # Singular values of the mean are 1 and the cosine of half the angle between both.
-    left, size, right = np.linalg.svd((one.rotation + other.rotation) / 2.0)
-    if size[-1] < math.cos(WIDEST / 2.0):
-        return None
-    return replace(
-        one,
-        rotation=left @ right,
-        center=(one.center + other.center) / 2.0,
-        weight=one.weight / 2.0 + other.weight / 2.0,
-        name=f"{one.name} - {other.name}",
-    )
 
 
 def pinhole(

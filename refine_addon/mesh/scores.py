@@ -57,6 +57,7 @@ def store(
             "method": scores.method,
             "views_given": scores.views_given,
             "views_used": scores.views_used,
+            "views_between": scores.views_between,
             "undrawable": scores.undrawable,
             "weights": scores.facts,
             "notes": scores.notes,
@@ -156,6 +157,7 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
         notes=tuple(first.get("notes", ())),
         method=first.get("method", ""),
         views_given=first["views_given"],
+        views_between=first.get("views_between", 0),
         quality=Quality.from_facts(first.get("quality")) if whole else None,
         scored=None if scored.all() else scored,
     )

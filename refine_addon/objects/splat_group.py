@@ -159,7 +159,11 @@ def _matrix(checked: SplatObject) -> NDArray[np.float64]:
 def possible(group: Sequence[SplatObject], method: Method) -> Method:
     """The method, or `Occlusion` for merging where an object's scale is uneven."""
     even = all(is_uniform(_matrix(member)) for member in group)
-    return method if even or not isinstance(method, Merge) else Occlusion(method.views)
+    return (
+        method
+        if even or not isinstance(method, Merge)
+        else Occlusion(method.views, exact=method.exact)
+    )
 
 
 def modifier_notes(obj: bpy.types.Object) -> list[str]:

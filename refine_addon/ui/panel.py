@@ -163,6 +163,7 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
         elif settings.source != "ACTIVE":
             count = cached("cameras", context, lambda: len(_cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
+            layout.prop(settings, "exact")
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
             return
@@ -343,6 +344,8 @@ def _draw_plan(
         wrapped.label(layout, context, plan["error"], icon="ERROR")
         return
     views = f"by {record['views_used']} of {counted(record['views_given'], 'view')}"
+    if record.get("views_between"):
+        views += f" and {record['views_between']} between"
     wrapped.label(layout, context, f"{plans.sentence(plan)}, {views}", icon="CHECKMARK")
     if plan["remark"]:
         wrapped.label(layout, context, plan["remark"], icon="INFO")

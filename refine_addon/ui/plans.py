@@ -21,7 +21,7 @@ from ..core.operations import row_in
 from ..core.prune import prune
 from ..core.quality.alignment import Alignment
 from ..core.quality.curve import Quality, Way, expected_seconds, in_words, out_of_reach, parted
-from ..core.report import MANY_UNSEEN, little_seen, sizes_in_words
+from ..core.report import MANY_UNSEEN, sizes_in_words
 from ..core.selection import Budget, quality_of
 from ..core.splats import MODELS
 from ..mesh import attributes as mesh_attributes
@@ -154,8 +154,6 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
     if unseen >= MANY_UNSEEN * plan["splats"]:
         go = f"{plan['unseen_gone'] / unseen:.0%} of these go"
         texts.append(f"{unseen / plan['splats']:.0%} of the splats lie in no view; {go}")
-    elif curve is not None and curve.between is not None:
-        texts.append(plan["little_seen"])
     return [_sentence(text) for text in texts if text]
 
 
@@ -230,7 +228,9 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     settings, record = scene.refine, mesh_scores.record(obj.data) or {}
     group = splat_group.members(bpy.context.view_layer, mesh_layout.check(obj))
     forced, budget = splat_group.refresh(scene, group), settings.to_budget()
-    arguments = splat_group.stored_arguments(group, budget, forced, Occlusion(settings.views))
+    arguments = splat_group.stored_arguments(
+        group, budget, forced, Occlusion(settings.views, exact=settings.exact)
+    )
     scores, protected, removed = (arguments[name] for name in ("scores", "protected", "removed"))
     count, curve = len(scores.values), scores.quality
     rest = np.ones(count, np.bool_) if removed is None else ~removed
@@ -270,7 +270,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     return {
         **outcome._asdict(), "splats": count, "about": about, "share": share, "becomes": becomes,
         "quality": curve, "closed": closed, "seconds": seconds, "remark": remark, "views": views,
-        "unseen": int(np.count_nonzero(unseen)), "little_seen": little_seen(scores.seen[rest]),
+        "unseen": int(np.count_nonzero(unseen)),
         "unseen_gone": int(np.count_nonzero(unseen & ~keep)),
     }  # fmt: skip
 
@@ -285,7 +285,7 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
         "must_go": _marked(obj, 2),
         "model": obj.data.get(mesh_layout.MODEL, MODELS[0]),
         # All methods but the closed form score by occlusion.
-        "settings": [method.name == "closed-form", method.views],
+        "settings": [method.name == "closed-form", method.views, method.exact],
     }
 
 

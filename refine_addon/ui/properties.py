@@ -175,6 +175,10 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         set=_set_model,
     )
     source: EnumProperty(name="Cameras", description="Cameras that decide", items=SOURCES)
+    exact: BoolProperty(
+        name="Exactly These",
+        description="No views between the cameras decide, too, where there are few cameras",
+    )
     collection: PointerProperty(
         name="Collection", description="The collection of the cameras", type=bpy.types.Collection
     )
@@ -257,7 +261,7 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
 
     def to_method(self) -> Method:
         """Core's method."""
-        return CORE_METHODS[self.method](self.views)
+        return CORE_METHODS[self.method](self.views, exact=self.exact)
 
     def to_budget(self) -> Budget:
         """Core's budget."""

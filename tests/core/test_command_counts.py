@@ -76,7 +76,7 @@ def test_every_report_says_what_was_seen_by_how_many_views(broken, capsys):
     assert BROKEN < unseen < WHOLE / 2
     for command, options in runs.items():
         entry = told(broken, command, *options)
-        assert entry["views"] == {"given": 6, "used": 2}
+        assert entry["views"] == {"given": 6, "used": 2, "between": 0}
         facts = {name: entry["splats"][name] for name in ("before", "undrawable", "unseen")}
         assert facts == {"before": WHOLE, "undrawable": BROKEN, "unseen": unseen}
         said = capsys.readouterr().out

@@ -218,10 +218,11 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     dark = np.zeros((1, 200))
     errors = np.stack([right * rng.uniform(0.9, 1.1, 200) for _ in range(4)])
     floors = coverage.floor(np.array([1.0, 1, 4]), np.array([0, 3, 0], np.int32), 0.5)
-    found = coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])
-    most = coverage.floor_weights([(wrong, right, errors)])
+    good, bad = (right, wrong), (wrong, right)
+    found, lost = coverage.floor_weights([(*good, errors), (*good, dark)], good)
+    most, _ = coverage.floor_weights([(*bad, errors)], good)
     plain, glare = (
-        coverage.floor_weights([(right, wrong, np.vstack([errors, wrong * bright]))])
+        coverage.floor_weights([(*good, np.vstack([errors, wrong * bright]))], good)[0]
         for bright in (1.0, 1e6)
     )
     np.testing.assert_allclose(floors, np.array([1.0, 0.25, 2.0]) * 0.75)
@@ -230,8 +231,10 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     assert min(most[:2]) > 0.3
     assert min(most[2:]) == pytest.approx(max(coverage.FLOOR_WEIGHTS))
     assert plain == pytest.approx(glare)
+    assert lost == pytest.approx(0.0, abs=0.01)
+    assert coverage.floor_weights([(wrong, wrong, errors)], good)[1] > 1.0
     for nothing in ([], [(right, wrong, dark)]):
-        assert coverage.floor_weights(nothing) == [1.0] * len(coverage.SHARES)
+        assert coverage.floor_weights(nothing, good) == ([1.0] * len(coverage.SHARES), 0.0)
 
 
 def test_what_lies_behind_all_cameras_does_not_all_go():

@@ -54,12 +54,17 @@ def _with_floor(scores, floors, weight):
     return _unit(scores) + weight * floors
 
 
-def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
-    """Best weight of the floor for each of `SHARES`; all 1 if no view left out has an error.
+def floor_weights(
+    folds: Iterable[tuple[NDArray[np.float64], ...]],
+    whole: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> tuple[list[float], float]:
+    """Best weight of the floor for each of `SHARES`, and what views lose more if left out, dB.
 
-    A fold is scores and floors, (n,), by the views that stay, and errors in the others, (views, n).
+    Weights are 1 and the loss is 0 if no view left out has an error. A fold is scores and floors,
+    (n,), by the views that stay, and errors in the others, (views, n); `whole` are scores and
+    floors by all. The loss is the mean from a half removed, at these weights.
     """
-    losses = []
+    losses, left_out = [], []
     for scores, floors, errors in folds:
         views = errors[errors.any(axis=1)]  # (v, n)
         if scores.any() and len(views):
@@ -67,14 +72,21 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
                 _losses(_with_floor(scores, floors, weight), views) for weight in FLOOR_WEIGHTS
             ]
             losses.append(np.stack(tried, axis=1))  # (v, weights, shares)
+            left_out.append(views)
     if not losses:
-        return [1.0] * len(SHARES)
+        return [1.0] * len(SHARES), 0.0
     table = np.mean(np.concatenate(losses), axis=0)  # (weights, shares)
+    least = table.min(axis=0)
     logs = np.log(np.maximum(FLOOR_WEIGHTS, _NO_WEIGHT))  # (weights,)
     table += np.outer(logs / math.log(10.0), DOUBTS)
     nearly = np.exp(np.maximum((table.min(axis=0) - table) / TIED, -50.0))  # 1 for the best
     best = np.exp(logs @ nearly / nearly.sum(axis=0))  # (shares,)
-    return [max(pair) for pair in zip(best.tolist(), LEAST_FLOOR_WEIGHTS, strict=True)]
+    weights = [max(pair) for pair in zip(best.tolist(), LEAST_FLOOR_WEIGHTS, strict=True)]
+    errors, more = np.concatenate(left_out), []
+    for number in range(SHARES.index(0.5), len(SHARES)):
+        losing = _losses(_with_floor(*whole, weights[number]), errors)[:, number]
+        more.append(least[number] - np.mean(losing))
+    return weights, float(np.mean(more)) * 10.0 / math.log(10.0)
 
 
 def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:

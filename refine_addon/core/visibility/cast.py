@@ -81,6 +81,11 @@ class RaySample:
         self.splat_rows = np.asarray(gaussians.index)
         self.rays: list[Rays | None] = [None] * len(views)
 
+    def extend(self, views: Sequence[tuple[View, float]]) -> None:
+        """Cast rays of more views, too: of all `views`, the first of which are those so far."""
+        self.rays += [None] * (len(views) - len(self.views))
+        self.views = views
+
     def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:
         """Colours in which view `number` sees the splats that its rays hit, (3, u) float64."""
         return colors_from(self.splats, self.splat_rows[rays.hit], self.views[number][0])

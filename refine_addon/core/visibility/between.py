@@ -1,0 +1,149 @@
+"""Views between the cameras: what they alone see, no camera tells of."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..execute import run_all
+from ..splats import rotation_matrices, unit_quaternions
+from ..views import View, ViewSet
+from . import projection
+from .cast import cast
+from .projection import Gaussians
+from .scene import Scene
+
+WIDEST = math.radians(90.0)  # views turned farther from each other get no view in between
+
+CLEAR = 0.5  # least transmittance between two views that stand in the same free space
+
+BESIDE, TURNED = 0.3, 0.35  # how far `views_beside` move at most, scene sizes, and turn, radians
+
+_TRIES = 8  # places beside a view
+
+_CANDIDATES = 64  # nearest views of each that may be its neighbours
+
+_FOCAL = 1000.0  # px of `transmittance`: a ray is a thousandth of its length wide
+
+
+def views_between(
+    views: ViewSet,
+    most: int,
+    within: tuple[Gaussians, Scene] | None = None,
+    threads: int | None = 1,
+) -> list[View]:
+    """At most `most` views halfway between neighbours, chosen as by `ViewSet.spread`.
+
+    By `ViewSet.places`, neighbours have no third view nearer to their middle than they are (Gabriel
+    graph, Gabriel and Sokal 1969). Centres and rotations are means, the lens is that of one of the
+    two. Neither the frame matters, nor the order of views whose names differ. `within` a scene
+    neighbours are not hidden from each other by its splats.
+    """
+    ordered = [view for view, _ in views.by_distance()]
+    if most < 1 or len(ordered) < 2:
+        return []
+    pairs = [
+        (ordered[one], ordered[two]) for one, two in _neighbours(ViewSet(tuple(ordered)).places())
+    ]
+
+    def halfway(pair: tuple[View, View]) -> View | None:
+        one, two = pair
+        if (one.center == two.center).all() or (view := _halfway(one, two)) is None:
+            return None
+        hidden = within and transmittance(*within, one.center, two.center) < CLEAR
+        return None if hidden else view
+
+    found = [view for view in run_all(halfway, pairs, threads=threads) if view is not None]
+    return list(ViewSet(tuple(found)).spread(most)) if found else []
+
+
+def with_views_between(
+    views: ViewSet, count: int, gaussians: Gaussians, scene: Scene, threads: int | None = 1
+) -> list[View]:
+    """Up to `count` views between neighbours in free space, between those, and so on."""
+    found: list[View] = []
+    while more := views_between(
+        replace(views, views=(*views, *found)), count - len(found), (gaussians, scene), threads
+    ):
+        found += more
+    return found
+
+
+def views_beside(views: ViewSet, most: int, gaussians: Gaussians, scene: Scene) -> list[View]:
+    """At most `most` views moved and turned from `views`, in the free space in front of these.
+
+    They move about as far as the third view from there, see `BESIDE`, and turn by about `TURNED`.
+    """
+    centers, found = views.centers, []
+    for number, (view, _) in enumerate(ViewSet(tuple(views.spread(most))).by_distance()):
+        away = np.sort(np.linalg.norm(centers - view.center, axis=1))[1:4]
+        random = np.random.default_rng(number)
+        for _ in range(_TRIES):
+            step = random.normal(size=3) * (1.0, 0.4, 1.0) / math.sqrt(3.0)
+            step *= min(away[-1] if len(away) else np.inf, BESIDE * scene.size)
+            turn = 0.5 * TURNED * random.normal(size=3) * (0.4, 1.0, 0.1)
+            turned = rotation_matrices(unit_quaternions(np.array([[1.0, *turn]])))[0]
+            moved = replace(
+                view, center=view.center + step @ view.rotation, name=f"beside {view.name}",
+                rotation=turned @ view.rotation,
+            )  # fmt: skip
+            if transmittance(gaussians, scene, view.center, moved.center) > CLEAR:
+                found.append(moved)
+                break
+    return found
+
+
+def transmittance(
+    gaussians: Gaussians, scene: Scene, start: NDArray[np.float64], end: NDArray[np.float64]
+) -> float:
+    """Share of the light that passes from `start` to another place, `end`, (3,) world units."""
+    step = end - start
+    if not (length := float(np.linalg.norm(step))):
+        return 1.0
+    along = step / length
+    across = np.cross(np.eye(3)[np.argmin(np.abs(along))], along)
+    across /= np.linalg.norm(across)
+    rotation, pixel = np.stack([across, np.cross(along, across), along]), np.zeros(1, np.int64)
+    ray = View(rotation, start, _FOCAL, _FOCAL, 0.5, 0.5, 1, 1, far=length)
+    with np.errstate(under="ignore"):
+        hits = cast(projection.project(gaussians, scene, ray), pixel, pixel)
+        return float(np.exp(hits.log_passed.sum(dtype=np.float64)))
+
+
+def _neighbours(place):
+    """Pairs of neighbours among places, (V, 6), the smaller number first, ascending."""
+    pairs = []
+    for number, here in enumerate(place):
+        distance = _distances(place, here)  # (V,)
+        nearest = np.argsort(distance, kind="stable")[: _CANDIDATES + 1]
+        for other in nearest[nearest > number].tolist():
+            # A place is nearer to the middle if and only if it sees the two at an obtuse angle.
+            squares = distance + _distances(place, place[other])
+            squares[[number, other]] = np.inf
+            if squares.min() >= distance[other]:
+                pairs.append((number, other))
+    return sorted(pairs)
+
+
+def _distances(place, here):
+    """Squared distances of places from one, (V,), rounded: equal ones stay equal."""
+    return np.round(np.sum((place - here) ** 2, axis=1), 9)
+
+
+def _halfway(one, other):
+    """View halfway between two; None if they look too far apart or one is mirrored."""
+    one, other = sorted((one, other), key=lambda view: view.name)
+    # Singular values of the mean are 1 and the cosine of half the angle between both.
+    left, size, right = np.linalg.svd((one.rotation + other.rotation) / 2.0)
+    if size[-1] < math.cos(WIDEST / 2.0):
+        return None
+    return replace(
+        one,
+        rotation=left @ right,
+        center=(one.center + other.center) / 2.0,
+        weight=one.weight / 2.0 + other.weight / 2.0,
+        name=f"{one.name} - {other.name}",
+    )
