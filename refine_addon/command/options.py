@@ -111,7 +111,7 @@ inputs+ -o --reasons --protect {_VIEWS}
   refine clean in.ply --cameras cameras.json --reasons front,isolated -o out.ply
 
 lod: write levels of detail, and report the quality of each
-inputs+ -o --levels --psnr --method --rounds --protect {_VIEWS}
+inputs+ -o --levels --psnr --method --exact --rounds --protect {_VIEWS}
   refine lod in.ply --cameras cameras.json -o levels
   refine lod in.ply --cameras cameras.json -o web/lod-meta.json
   refine lod in.ply --cameras cameras.json --psnr 45,40,35 -o levels/in.spz

@@ -83,9 +83,8 @@ def score(
     """
     if rounds < 1:
         raise RefineError(f"rounds is {rounds}, expected 1 or more")
-    return _score(splats, views, rounds, settled, sampling, False, most_between, progress, threads)[
-        0
-    ]
+    how = rounds, settled, sampling, False, most_between
+    return _score(splats, views, *how, progress, threads)[0]
 
 
 def score_once(
