@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import sys
 import threading
 import time
@@ -797,6 +798,26 @@ def test_workers_that_are_not_there_are_told_in_a_sentence(monkeypatch):
     words = r"tcp://127\.0\.0\.1:1: no Dask scheduler answers"
     with pytest.raises(RefineError, match=words), cluster.cluster("tcp://127.0.0.1:1"):
         pass
+
+
+@needs_dask
+def test_an_address_where_something_else_answers_is_told_in_a_sentence():
+    """A web server: Dask took "HTTP/1.1" for a length, and could not allocate 3.07 EiB."""
+
+    def answer():
+        with server.accept()[0] as connection:
+            connection.recv(1)
+            connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+            connection.recv(1 << 16)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=answer)
+        thread.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        words = f"{address}: no Dask scheduler answers there"
+        with pytest.raises(RefineError, match=words), cluster.cluster(address):
+            pass
+        thread.join()
 
 
 @pytest.mark.slow

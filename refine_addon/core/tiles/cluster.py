@@ -72,7 +72,7 @@ def cluster(workers: int | str) -> Iterator[Cluster]:
                     f"workers ended while they were started ({error}); try again"
                 ) from error
         problem = "no Dask scheduler answers there"
-        with explained(scheduler, problem, errors=(OSError, ValueError)):
+        with explained(scheduler, problem, errors=Exception):  # what answers may be misread
             client = held.enter_context(distributed.Client(scheduler, timeout=_CONNECT))
         yield Cluster(client)
 
