@@ -34,6 +34,10 @@ class Method:
         fewer = max((self.views or Method.views) - len(used), 0)
         return 0 if self.exact or used.exact else min(2 * len(used), fewer)
 
+    def deleting(self) -> Occlusion:
+        """Occlusion with the same settings."""
+        return Occlusion(self.views, exact=self.exact)
+
     def facts(self) -> dict[str, Any]:
         """Name and settings as plain JSON values."""
         return {"method": self.name, **asdict(self)}

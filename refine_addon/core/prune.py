@@ -21,7 +21,7 @@ from .errors import RefineError
 from .execute import Cancelled, Progress, part, report, return_freed, seconds, silent, stages
 from .formats.ply import SplatFile
 from .merging.merge import Merged, copied, merge, stage_counts, stage_seconds
-from .methods import DEFAULT, ClosedForm, Method, Occlusion, Refit
+from .methods import DEFAULT, ClosedForm, Method, Refit
 from .quality.alignment import alignment
 from .quality.curve import AS_GOOD, PLAIN, Way, deletion_will_do, left_to_lose, needed
 from .quality.psnr import psnr_against, psnr_kept, quality_curve
@@ -341,9 +341,7 @@ class _Prune:
             report(making, 0.0, "selecting")
             keep, plain = self._select(scores)
             self.clock.lap("select_s")
-        deletes = replace(
-            self, method=Occlusion(self.method.views, exact=self.method.exact), scores=given
-        )
+        deletes = replace(self, method=self.method.deleting(), scores=given)
         beside = None  # in views that did not decide
         if goal is None and scores.between is not None:
             beside = psnr_kept(scores.between, keep, threads=self.threads)

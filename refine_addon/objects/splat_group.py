@@ -23,7 +23,7 @@ from ..core.formats.format import Format
 from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
 from ..core.lod import Level
-from ..core.methods import DEFAULT, Merge, Method, Occlusion
+from ..core.methods import DEFAULT, Merge, Method
 from ..core.operations import Scene, prune_scene, run, score_scene, to_size
 from ..core.pictures import PictureFiles
 from ..core.prune import prune
@@ -159,11 +159,7 @@ def _matrix(checked: SplatObject) -> NDArray[np.float64]:
 def possible(group: Sequence[SplatObject], method: Method) -> Method:
     """The method, or `Occlusion` for merging where an object's scale is uneven."""
     even = all(is_uniform(_matrix(member)) for member in group)
-    return (
-        method
-        if even or not isinstance(method, Merge)
-        else Occlusion(method.views, exact=method.exact)
-    )
+    return method if even or not isinstance(method, Merge) else method.deleting()
 
 
 def modifier_notes(obj: bpy.types.Object) -> list[str]:
@@ -235,7 +231,7 @@ def sized(
     starts = np.cumsum([len(file) for file in files])[:-1]
 
     def pruned(sizes: tuple[float, int], **_: Any) -> Result:
-        return prune(**arguments | {"method": Occlusion(), "sizes": sizes})
+        return prune(**arguments | {"method": arguments["method"].deleting(), "sizes": sizes})
 
     kept = to_size(
         arguments["budget"], form, files,

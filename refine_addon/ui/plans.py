@@ -16,7 +16,7 @@ from bpy.app.handlers import persistent
 from ..cameras import SOURCE, WEIGHT, CameraChoice, render_size
 from ..core.errors import RefineError
 from ..core.execute import in_time
-from ..core.methods import ClosedForm, Occlusion
+from ..core.methods import ClosedForm
 from ..core.operations import row_in
 from ..core.prune import prune
 from ..core.quality.alignment import Alignment
@@ -228,9 +228,8 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     settings, record = scene.refine, mesh_scores.record(obj.data) or {}
     group = splat_group.members(bpy.context.view_layer, mesh_layout.check(obj))
     forced, budget = splat_group.refresh(scene, group), settings.to_budget()
-    arguments = splat_group.stored_arguments(
-        group, budget, forced, Occlusion(settings.views, exact=settings.exact)
-    )
+    method = settings.to_method().deleting()
+    arguments = splat_group.stored_arguments(group, budget, forced, method)
     scores, protected, removed = (arguments[name] for name in ("scores", "protected", "removed"))
     count, curve = len(scores.values), scores.quality
     rest = np.ones(count, np.bool_) if removed is None else ~removed
@@ -241,8 +240,9 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
             files = [mesh_attributes.file_from_object(member) for member in group]
             _rows[:] = [(form, uids, count), row_in(form, files)]
         arguments["sizes"] = (_rows[1], 0)
-    about = form is not None or (budget.psnr is not None and way != "delete")
-    if budget.psnr is not None and way != "delete":  # what merging reaches is predicted
+    predicted = budget.psnr is not None and way != "delete"
+    about = predicted or form is not None
+    if predicted:
         stays = 0 if protected is None else int(np.count_nonzero(protected & rest))
         gone = math.floor(quality_of(scores).share(budget.psnr, way) * left)
         arguments["budget"] = Budget(keep=max(left - min(gone, left - stays), 1))

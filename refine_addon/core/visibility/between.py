@@ -17,15 +17,10 @@ from .projection import Gaussians
 from .scene import Scene
 
 WIDEST = math.radians(90.0)  # views turned farther from each other get no view in between
-
 CLEAR = 0.5  # least transmittance between two views that stand in the same free space
-
 BESIDE, TURNED = 0.3, 0.35  # how far `views_beside` move at most, scene sizes, and turn, radians
-
 _TRIES = 8  # places beside a view
-
 _CANDIDATES = 64  # nearest views of each that may be its neighbours
-
 _FOCAL = 1000.0  # px of `transmittance`: a ray is a thousandth of its length wide
 
 
@@ -78,7 +73,7 @@ def views_beside(views: ViewSet, most: int, gaussians: Gaussians, scene: Scene) 
     They move about as far as the third view from there, see `BESIDE`, and turn by about `TURNED`.
     """
     centers, found = views.centers, []
-    for number, (view, _) in enumerate(ViewSet(tuple(views.spread(most))).by_distance()):
+    for number, (view, _) in enumerate(views.spread(most).by_distance()):
         away = np.sort(np.linalg.norm(centers - view.center, axis=1))[1:4]
         random = np.random.default_rng(number)
         for _ in range(_TRIES):
