@@ -7,66 +7,46 @@ In short::
     result.write("pruned.spz")
 """
 
-from .cameras.read import read_cameras
-from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
-from .errors import RefineError
-from .execute import Cancelled
-from .formats.ply import SplatFile, read_ply
-from .formats.registry import read_splats, write_splats
-from .lod import Level, Levels, lod, lod_file
-from .methods import METHODS, ClosedForm, Merge, Method, Occlusion, Refit
-from .operations import Move, clean_file, convert_files, prune_file, score_file
-from .prune import prune, score
-from .result import Result
-from .scores import Scores
-from .selection import Budget, rank, select
-from .splats import Splats
-from .tiles.prune import prune_tiles
-from .views import View, ViewSet
-from .volumes import Box, MovedVolume, Solid, Sphere, Zone, forced
-
-__all__ = [
-    "METHODS",
-    "REASONS",
-    "Box",
-    "Budget",
-    "Cancelled",
-    "Cleaned",
-    "Cleaning",
-    "ClosedForm",
-    "Level",
-    "Levels",
-    "Merge",
-    "Method",
-    "Move",
-    "MovedVolume",
-    "Occlusion",
-    "RefineError",
-    "Refit",
-    "Result",
-    "Scores",
-    "Solid",
-    "Sphere",
-    "SplatFile",
-    "Splats",
-    "View",
-    "ViewSet",
-    "Zone",
-    "clean",
-    "clean_file",
-    "convert_files",
-    "forced",
-    "lod",
-    "lod_file",
-    "prune",
-    "prune_file",
-    "prune_tiles",
-    "rank",
-    "read_cameras",
-    "read_ply",
-    "read_splats",
-    "score",
-    "score_file",
-    "select",
-    "write_splats",
-]
+from .cameras.read import read_cameras as read_cameras
+from .cleaning.clean import REASONS as REASONS
+from .cleaning.clean import Cleaned as Cleaned
+from .cleaning.clean import Cleaning as Cleaning
+from .cleaning.clean import clean as clean
+from .errors import RefineError as RefineError
+from .execute import Cancelled as Cancelled
+from .formats.ply import SplatFile as SplatFile
+from .formats.ply import read_ply as read_ply
+from .formats.registry import read_splats as read_splats
+from .formats.registry import write_splats as write_splats
+from .lod import Level as Level
+from .lod import Levels as Levels
+from .lod import lod as lod
+from .lod import lod_file as lod_file
+from .methods import METHODS as METHODS
+from .methods import ClosedForm as ClosedForm
+from .methods import Merge as Merge
+from .methods import Method as Method
+from .methods import Occlusion as Occlusion
+from .methods import Refit as Refit
+from .operations import Move as Move
+from .operations import clean_file as clean_file
+from .operations import convert_files as convert_files
+from .operations import prune_file as prune_file
+from .operations import score_file as score_file
+from .prune import prune as prune
+from .prune import score as score
+from .result import Result as Result
+from .scores import Scores as Scores
+from .selection import Budget as Budget
+from .selection import rank as rank
+from .selection import select as select
+from .splats import Splats as Splats
+from .tiles.prune import prune_tiles as prune_tiles
+from .views import View as View
+from .views import ViewSet as ViewSet
+from .volumes import Box as Box
+from .volumes import MovedVolume as MovedVolume
+from .volumes import Solid as Solid
+from .volumes import Sphere as Sphere
+from .volumes import Zone as Zone
+from .volumes import forced as forced
