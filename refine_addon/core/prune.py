@@ -179,8 +179,8 @@ def prune(
         Removed first, unless protected; the budget counts them. The others are scored, merged and
         compared with pictures as if these had never been there.
     scores : Scores, optional
-        Of an earlier `score`. A merging method measures anew: it uses them, if of occlusion, for a
-        budget by score, and where deletion is as good.
+        Of an earlier `score`. A merging method measures anew: it uses them, if of occlusion, where
+        deletion is as good.
     sizes : (float, int), optional; bytes of a splat and of the rest of the output, for `max_mb`
     origin : Origin, optional; the splats before an earlier merging prune, for comparing pictures
     reusable : bool, whether scores are to serve other budgets; else scoring ends at this one
@@ -324,18 +324,15 @@ class _Prune:
         scoring, making = stages(
             progress, seconds("measure", count, views), expected * (2.2 if goal else 1.0)
         )
-        measurement, most_between = None, self.method.between(self.used)
-        if self.budget.needs_scores:
-            scores = self._scores(scoring)
-        else:
-            scores, measurement = occlusion.score_once(
-                self.splats, self.used, few_views=goal is None, most_between=most_between,
-                progress=scoring, threads=self.threads,
-            )  # fmt: skip
-            scores = _with_views(scores, self.splats, self.views, self.used, self.threads)
-            if goal is not None:
-                scores = with_quality(scores, protected=self.protected, threads=self.threads)
-            self.clock.lap("score_s")
+        scores, measurement = occlusion.score_once(
+            self.splats, self.used, few_views=goal is None,
+            most_between=self.method.between(self.used),
+            progress=scoring, threads=self.threads,
+        )  # fmt: skip
+        scores = _with_views(scores, self.splats, self.views, self.used, self.threads)
+        if goal is not None:
+            scores = with_quality(scores, protected=self.protected, threads=self.threads)
+        self.clock.lap("score_s")
         keep, plain = np.ones(count, np.bool_), None
         if not (refits and goal is not None):
             report(making, 0.0, "selecting")
@@ -351,11 +348,6 @@ class _Prune:
         )  # fmt: skip
         if will_do:
             return self._deleted(deletes.delete(making), None)
-        if measurement is None:
-            scores, measurement = occlusion.score_once(
-                self.splats, self.used, few_views=True, most_between=most_between,
-                progress=making, threads=self.threads,
-            )  # fmt: skip
         if goal is None:
             outcome = self._to_count(keep, scores, measurement, making)
         else:

@@ -24,8 +24,6 @@ class Budget:
     ratio : float in [0, 1), share to remove: exactly ``floor(ratio * N)`` splats
     keep : int, number of kept splats, at least 1; all if there are fewer
     max_mb : float, largest size of the file, megabytes of 1e6 bytes
-    threshold : float, splats with a lower score are removed
-    min_seen : float, splats in fewer than this percentage of the views are removed
     psnr : float, least estimated PSNR of the views' pictures against the unpruned splats', dB
 
     Raises
@@ -39,8 +37,6 @@ class Budget:
     ratio: float | None = None
     keep: int | None = None
     max_mb: float | None = None
-    threshold: float | None = None
-    min_seen: float | None = None
     psnr: float | None = None
 
     def __post_init__(self) -> None:
@@ -53,8 +49,6 @@ class Budget:
             "ratio": ("0 <= ratio < 1", lambda: 0 <= value < 1),
             "keep": ("a whole number of at least 1", lambda: value >= 1 and value % 1 == 0),
             "max_mb": ("a positive number", lambda: 0 < value < math.inf),
-            "threshold": ("a number", lambda: -math.inf < value < math.inf),
-            "min_seen": ("a percentage, 0 to 100", lambda: 0 <= value <= 100),
             "psnr": (f"more than 0 and less than {PSNR_CAP:g} dB", lambda: 0 < value < PSNR_CAP),
         }
         expected, holds = checks[self.kind]
@@ -66,25 +60,20 @@ class Budget:
         """Name of the value that is given."""
         return next(name for name, value in vars(self).items() if value is not None)
 
-    @property
-    def needs_scores(self) -> bool:
-        """Whether the number of removed splats depends on the scores of a method."""
-        return self.threshold is not None or self.min_seen is not None
-
     def after(self, gone: int, count: int) -> Budget:
         """Budget for the rest of `count` splats, of which `gone` are removed already.
 
         The removed ones count as removed by this budget.
 
         >>> Budget(ratio=0.5).after(20, 100), Budget(ratio=0.5).after(70, 100).removals(30)
-        (Budget(ratio=None, keep=50, max_mb=None, threshold=None, min_seen=None, psnr=None), 0)
+        (Budget(ratio=None, keep=50, max_mb=None, psnr=None), 0)
         """
         if self.ratio is None:
             return self
         return Budget(keep=count - max(self.removals(count) or 0, gone))
 
     def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
-        """Number of splats to remove, of `count`; None if that depends on the scores.
+        """Number of splats to remove, of `count`; None for a PSNR, where the scores decide.
 
         For `max_mb`, `row_bytes` is the size of a splat in the file and `fixed_bytes` that of the
         rest; `RefineError` if a single splat does not fit.
@@ -130,47 +119,19 @@ def select(
     Raises
     ------
     RefineError
-        If no splat would be kept, more would be removed than `Scores.settled`, or there is no curve
-        for a PSNR.
+        If more would be removed than `Scores.settled`, or there is no curve for a PSNR.
     """
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`
     free = keep.copy() if protected is None else ~protected
-    removals = _removals(scores, budget, row_bytes, fixed_bytes)
-    if budget.threshold is not None:
-        keep[free & (values < single(budget.threshold))] = False
-    elif budget.min_seen is not None:
-        keep[free & (scores.seen < least_seen(budget.min_seen, scores.views_used))] = False
-    elif removals:
+    removals = budget.removals(len(values), row_bytes, fixed_bytes)
+    if removals is None:
+        removals = math.floor(quality_of(scores).share(budget.psnr or 0.0) * len(values))
+    if removals:
         _remove_lowest(keep, values, free, removals)
-    refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
-    if scores.settled is not None and budget.min_seen is None:
+    if scores.settled is not None:
         _refuse_unsettled(scores, budget, ~keep)
     return keep
-
-
-def single(threshold: float) -> np.float32:
-    """A threshold as float32, like scores; infinite if it is larger than any of them can be."""
-    with np.errstate(over="ignore"):
-        return np.float32(threshold)
-
-
-def _removals(scores: Scores, budget: Budget, row_bytes: float, fixed_bytes: int) -> int | None:
-    """Number of lowest scores that a budget removes; None if it decides on each splat alone."""
-    if budget.psnr is not None:
-        return math.floor(quality_of(scores).share(budget.psnr) * len(scores.values))
-    return budget.removals(len(scores.values), row_bytes, fixed_bytes)
-
-
-def least_seen(percentage: float, views: int) -> int:
-    """Least number of views in which a kept splat lies; exact: 25 % of 64 views are 16."""
-    return math.ceil(Fraction(repr(float(percentage))) * views / 100)
-
-
-def refuse_none_left(budget: Budget, before: int, after: int) -> None:
-    """Raise `RefineError` if no splat would be kept."""
-    if not after:
-        raise RefineError(f"{budget.kind} would remove all {before} splats; nothing was removed")
 
 
 def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -> None:

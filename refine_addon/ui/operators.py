@@ -169,8 +169,7 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
         context.view_layer.update()
         if arguments["method"].changes:  # volumes may have moved meanwhile
             splat_group.check_forced(context.scene, group, forced)
-        by_scores = arguments["budget"].needs_scores or not result.merged
-        changed = plans.stale(context, *(each.obj for each in group)) if by_scores else []
+        changed = [] if result.merged else plans.stale(context, *(each.obj for each in group))
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
         outcome = splat_group.apply(group, applied.changes)
         plans.refresh(context)

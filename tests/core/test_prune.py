@@ -192,13 +192,12 @@ def test_scoring_for_one_budget_decides_what_scores_for_all_would(splats, views,
 
 @pytest.mark.slow
 def test_scores_of_one_budget_are_refused_for_a_larger_one(splats, views):
-    """What they say of the splats that stayed is not final; views seen are."""
+    """What they say of the splats that stayed is not final."""
     protected = np.arange(len(splats)) % 5 == 0
     scores = prune(splats, views, Budget(ratio=0.2), Occlusion(8), protected=protected).scores
     settled = int(0.3 * len(splats)) + np.count_nonzero(protected)
     assert scores.settled == settled
     assert select(scores, Budget(keep=len(splats) - settled)).sum() == len(splats) - settled
-    assert select(scores, Budget(min_seen=50)).any()
     assert select(scores, Budget(ratio=0.35), protected=protected).sum() > 0
     assert select(scores, Budget(ratio=0.0), protected=~protected).all()
     assert not select(scores, Budget(psnr=scores.quality.psnr[-1] + 0.1)).all()
@@ -206,7 +205,6 @@ def test_scores_of_one_budget_are_refused_for_a_larger_one(splats, views):
         (Budget(keep=len(splats) - settled - 1), None, rf"up to {settled} of {len(splats)}"),
         (Budget(ratio=0.45), protected, "score again, for all budgets"),
         (Budget(psnr=scores.quality.psnr[-1] - 0.1), None, "score again"),
-        (Budget(threshold=0.9), None, "score again"),
     ):
         with pytest.raises(RefineError, match=words):
             select(scores, budget, protected=shield)
@@ -226,16 +224,6 @@ def test_hidden_copies_are_deleted_and_rows_stay(small, views, tmp_path):
     np.testing.assert_array_equal(result.keep, named.keep)
     assert read_ply(out).rows.tobytes() == read_ply(path).rows[result.keep].tobytes()
     assert any("rows stay as they were" in note for note in result.report["notes"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("budget", [Budget(threshold=0.5), Budget(min_seen=60.0)])
-@pytest.mark.parametrize("method", [FEW, Refit(12, 1)])
-def test_any_budget_goes_with_any_method(splats, views, method, budget):
-    """As many stay as by deleting with the scores that the method looks at."""
-    result, wanted = (prune(splats, views, budget, each) for each in (method, DELETING))
-    assert np.count_nonzero(result.keep) == np.count_nonzero(wanted.keep)
-    assert (result.merged is None) == (result.report["method"]["done"] == "occlusion")
 
 
 @pytest.mark.parametrize("method", METHODS.values())

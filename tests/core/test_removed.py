@@ -45,7 +45,7 @@ REST = ~REMOVED
 
 DELETED = [
     Budget(ratio=0.5), Budget(ratio=0.1), Budget(keep=150), Budget(keep=1), Budget(max_mb=0.004),
-    Budget(threshold=0.4), Budget(min_seen=40.0), Budget(psnr=35.0),
+    Budget(psnr=35.0),
 ]  # fmt: skip
 MERGED = [Budget(ratio=0.5), Budget(keep=1), Budget(psnr=35.0)]
 

@@ -93,45 +93,6 @@ def test_a_size_is_met_by_as_many_splats_as_fit(megabytes, row, fixed, count):
     assert kept == count or fixed + (kept + 1) * row > size
 
 
-def test_a_threshold_removes_what_scores_below_it():
-    """Equal to it stays; what is protected stays; none may be left over.
-
-    Beyond the range of single precision it is infinite, without a warning from any NumPy.
-    """
-    values = scored([0.0, 0.5, 1.0, np.inf])
-    protected = np.array([True, False, False, False])
-
-    def kept(threshold, **more):
-        return select(values, Budget(threshold=threshold), **more).tolist()
-
-    assert kept(1.0) == [False, False, True, True]
-    assert kept(1.0, protected=protected) == [True, False, True, True]
-    assert kept(-1.0) == [True] * 4
-    assert kept(3.4028235677973366e38) == [False] * 3 + [True]
-    with pytest.raises(RefineError, match="threshold would remove all 4 splats; nothing was"):
-        select(scored([0, 1, 1, 2]), Budget(threshold=2.5))
-
-
-@pytest.mark.parametrize(
-    ("percent", "views", "least"),
-    [
-        (25, 64, 16),  # 16 of 64 is not fewer than a quarter
-        (0, 64, 0),
-        (1, 64, 1),  # .64 views, and no splat lies in part of a view
-        (0.1, 1000, 1),  # of binary floating point, a little more than 1
-        (100, 7, 7),
-        (28.999999999999996, 100, 29),
-    ],
-)
-def test_splats_in_too_few_views_go(percent, views, least):
-    """Fewer than that share: the least number that stays is its ceiling."""
-    seen = np.arange(views + 1)
-    keep = select(scored(np.ones(views + 1), seen, views), Budget(min_seen=percent))
-
-    assert least == int(np.argmax(keep))
-    assert keep[least:].all()
-
-
 NAN, INF = float("nan"), float("inf")
 
 
@@ -141,8 +102,6 @@ NAN, INF = float("nan"), float("inf")
         ("ratio", (-0.1, 1, 1.5, NAN, INF, -INF, 10**400), "expected 0 <= ratio < 1"),
         ("keep", (0, -1, 1.5, NAN, INF), "expected a whole number of at least 1"),
         ("max_mb", (0, -1, NAN, INF), "expected a positive number"),
-        ("threshold", (NAN, INF, -INF), "expected a number"),
-        ("min_seen", (-1, 100.5, NAN, INF), "expected a percentage, 0 to 100"),
         ("psnr", (-1, 0, 100, NAN, INF), "expected more than 0 and less than 100 dB"),
     ],
 )
@@ -154,10 +113,10 @@ def test_a_budget_that_cannot_be_is_refused_with_its_name(name, values, expected
     for value in values:
         with pytest.raises(RefineError, match=re.escape(f"{name} is {value}, {expected}")):
             Budget(**{name: value})
-    with pytest.raises(RefineError, match="expected one of ratio, keep, max_mb, threshold, min_"):
+    with pytest.raises(RefineError, match="expected one of ratio, keep, max_mb, psnr, got"):
         Budget()
-    with pytest.raises(RefineError, match=re.escape("got ['min_seen', 'psnr']")):
-        Budget(min_seen=50, psnr=3)
+    with pytest.raises(RefineError, match=re.escape("got ['keep', 'psnr']")):
+        Budget(keep=50, psnr=3)
     with pytest.raises(RefineError, match="max_mb needs to know how many bytes"):
         select(scored([1, 2]), Budget(max_mb=1.0))
 

@@ -176,8 +176,7 @@ def store(request, tmp_path, monkeypatch):
 WAYS = [
     *((CLOSED, budget, None) for budget in (
         Budget(ratio=0.1),  # among the equal ones, which are those from the 253rd to the 653rd
-        Budget(ratio=0.0), Budget(keep=1), Budget(max_mb=0.4), Budget(threshold=0.05),
-        Budget(min_seen=30), Budget(psnr=36.0),
+        Budget(ratio=0.0), Budget(keep=1), Budget(max_mb=0.4), Budget(psnr=36.0),
     )),
     (OCCLUSION, Budget(ratio=0.7), None),
     (OCCLUSION, Budget(psnr=36.0), None),
@@ -304,7 +303,6 @@ def test_one_tile_or_budget_at_fault_stops_all(tmp_path, tiles):
     mip.write_bytes(header + b"comment SplatRenderMode: mip\nelement" + rows)
     shutil.copy(tiles[0], more)
     for paths, budget, words in [
-        (tiles, Budget(threshold=1e30), "would remove all 5000 splats"),
         (tiles, Budget(max_mb=0.001), "too small for one splat of 248 bytes"),
         ([*tiles, more], HALF, "more: is a folder, expected a PLY file"),
         ([*tiles, tiles[2]], HALF, r"d\.ply: is given twice$"),
