@@ -119,6 +119,10 @@ class Layout:
         """Type of a row of the file."""
         return _row(self.columns)
 
+    def file_bytes(self, count: int) -> int:
+        """Bytes of a file of so many splats, up to the digits of their number in the header."""
+        return len(self.header) + self.row_dtype.itemsize * count
+
     @property
     def model(self) -> Model:
         """How the splats are drawn, one of `splats.MODELS`."""
@@ -282,13 +286,12 @@ def sh_degree(mesh: bpy.types.Mesh) -> int:
     return REST_COUNTS.get(rest_count(mesh), 0)
 
 
-def export_bytes(obj: bpy.types.Object) -> int | None:
-    """Size of the exported file, bytes; None if it cannot be exported. Cheap enough to draw."""
+def layout_if_any(obj: bpy.types.Object | None) -> Layout | None:
+    """`layout_of`; None without splats, or where they cannot be exported."""
     try:
-        layout = layout_of(obj)
+        return layout_of(obj) if looks_like_splats(obj) else None
     except RefineError:
         return None
-    return len(layout.header) + layout.row_dtype.itemsize * splat_count(obj.data)
 
 
 def rest_count(mesh: bpy.types.Mesh) -> int:

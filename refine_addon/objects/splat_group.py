@@ -66,17 +66,18 @@ class Outcome(NamedTuple):
         return cls(kept, count - kept, *sizes)
 
 
-def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.types.Object]:
+def chosen(active: bpy.types.Object) -> list[bpy.types.Object]:
     """Selected splat objects by name, or the active one if not selected. Quick enough to draw."""
-    selected = [obj for obj in layer.objects.selected if mesh_layout.looks_like_splats(obj)]
+    objects = bpy.context.view_layer.objects
+    selected = [obj for obj in objects.selected if mesh_layout.looks_like_splats(obj)]
     if active not in selected:
         return [active]
     return sorted(selected, key=lambda obj: obj.name)
 
 
-def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
+def members(active: bpy.types.Object) -> Members:
     """Checked objects of `chosen`; `RefineError` if two share their data."""
-    group = [active if o == active.obj else mesh_layout.check(o) for o in chosen(layer, active.obj)]
+    group = [mesh_layout.check(obj) for obj in chosen(active)]
     owners: dict[bpy.types.Mesh, str] = {}
     for member in group:
         other = owners.setdefault(member.mesh, member.obj.name)

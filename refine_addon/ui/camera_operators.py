@@ -86,9 +86,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
         context.view_layer.update()  # or what a script just made stands at the origin
         cameras = _deciding(context)
         roots = _roots(cameras, context.object)
-        group = [
-            mesh_layout.check(obj) for obj in splat_group.chosen(context.view_layer, context.object)
-        ]
+        group = [mesh_layout.check(obj) for obj in splat_group.chosen(context.object)]
         for checked in group:
             mesh_edit.check_writable(checked.obj)
         turn = mathutils.Matrix(QUARTERS[self.quarters].tolist()).to_4x4()

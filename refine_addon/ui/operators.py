@@ -50,11 +50,6 @@ def apply_arguments(context: Context, group: Members, forced: Forced) -> dict[st
     return splat_group.stored_arguments(group, settings.to_budget(), forced, method, views)
 
 
-def selected(context: Context) -> Members:
-    """The selected splat objects, checked; see `splat_group.members`."""
-    return splat_group.members(context.view_layer, mesh_layout.check(context.object))
-
-
 def _of_objects(group: Members) -> str:
     return f" of {len(group)} objects" if len(group) > 1 else ""
 
@@ -70,7 +65,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         """The arguments of `score`, and `plans.origin` of each object."""
         settings = context.scene.refine
         method, views = settings.to_method(), chosen_views(context)
-        group = selected(context)
+        group = splat_group.members(context.object)
         for member in group:
             mesh_edit.check_writable(member.obj)
         quality = method.name != "closed-form" or settings.budget == "psnr"
@@ -84,7 +79,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
             "removed": forced.removed,
             "quality": quality,
         }
-        return group, (arguments, [plans.origin(context, member.obj) for member in group])
+        return group, (arguments, [plans.origin(member.obj) for member in group])
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> tuple[Scores, NDArray[np.int64], float]:
@@ -147,7 +142,7 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
 
     def gather(self, context: Context) -> tuple[Members, Any]:
         """The arguments of `prune`, the demands, and the input of `changes`."""
-        group = selected(context)
+        group = splat_group.members(context.object)
         for member in group:
             mesh_edit.check_deletable(member.obj)
         forced = splat_group.forced(context.scene, group)
@@ -169,7 +164,7 @@ class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
         context.view_layer.update()
         if arguments["method"].changes:  # volumes may have moved meanwhile
             splat_group.check_forced(context.scene, group, forced)
-        changed = [] if result.merged else plans.stale(context, *(each.obj for each in group))
+        changed = [] if result.merged else plans.stale(*(each.obj for each in group))
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
         outcome = splat_group.apply(group, applied.changes)
         plans.refresh(context)
@@ -241,7 +236,7 @@ class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
     def gather(self, context: Context) -> tuple[Members, Any]:
         """Apply's arguments, the splats, the active camera's view, and the present plan."""
         view = CameraChoice("ACTIVE").views(context, context.object)[0]
-        group = selected(context)
+        group = splat_group.members(context.object)
         forced = splat_group.forced(context.scene, group)
         arguments = apply_arguments(context, group, forced)
         splats = arguments["splats"] or splat_group.gather(group, whole=None)

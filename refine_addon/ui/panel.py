@@ -10,7 +10,6 @@ from bpy.props import EnumProperty
 from mathutils import Matrix
 
 from ..cameras import CameraChoice, known_turn
-from ..core.errors import RefineError
 from ..core.formats.ply import stated_model
 from ..core.quality.alignment import Alignment
 from ..core.report import size_in_words
@@ -109,7 +108,7 @@ def _draw_instances(layout: bpy.types.UILayout, context: bpy.types.Context) -> b
         return False
     count = sum(mesh_layout.splat_count(place.obj.data) for place in placings([context.object]))
     text = f"{count:,} splats of collection '{context.object.instance_collection.name}'"
-    wrapped.label(layout, context, text, icon="OUTLINER_OB_GROUP_INSTANCE")
+    wrapped.label(layout, text, icon="OUTLINER_OB_GROUP_INSTANCE")
     layout.operator("refine.make_real")
     return True
 
@@ -131,15 +130,13 @@ class REFINE_PT_splats(InSidebar, bpy.types.Panel):
         layout, obj = self.layout, context.object
         layout.operator("refine.import_ply", icon="IMPORT")
         if mesh_layout.looks_like_splats(obj):
-            _draw_objects(layout, context, splat_group.chosen(context.view_layer, obj))
+            _draw_objects(layout, splat_group.chosen(obj))
         elif obj is not None and mesh_layout.lost_base(obj):
-            text = "Colours were lost: open it in Blender 5.2"
-            wrapped.label(layout, context, text, icon="ERROR")
+            wrapped.label(layout, "Colours were lost: open it in Blender 5.2", icon="ERROR")
         elif not _draw_instances(layout, context):
-            text = "Select an object that holds splats"
-            wrapped.label(layout, context, text, icon="INFO")
+            wrapped.label(layout, "Select an object that holds splats", icon="INFO")
         _draw_modes(layout, obj if mesh_layout.looks_like_splats(obj) else None)
-        _draw_progress(layout, context, "refine.import_ply")
+        _draw_progress(layout, "refine.import_ply")
 
 
 class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
@@ -161,7 +158,8 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
             frames = counted(len(settings.to_frames(context.scene)), "frame")
             layout.label(text=frames, icon="CAMERA_DATA")
         elif settings.source != "ACTIVE":
-            count = cached("cameras", context, lambda: len(_cameras(context)))
+            choice = CameraChoice.of_scene(context.scene)
+            count = cached("cameras", lambda: len(choice.cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
             layout.prop(settings, "exact")
         obj = context.object
@@ -169,12 +167,12 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
             return
         record = _record(obj)
         if record is None:
-            turn = cached("turn", context, lambda: known_turn(context, obj))
+            turn = cached("turn", lambda: known_turn(context, obj))
             alignment = Alignment(turn, known=True)
         else:
             alignment = Alignment.from_facts(record.get("alignment"))
         if text := alignment.turned():
-            wrapped.label(self.layout, context, text[:1].upper() + text[1:], icon="ERROR")
+            wrapped.label(self.layout, text[:1].upper() + text[1:], icon="ERROR")
             button = self.layout.operator("refine.turn_cameras")
             button.quarters = alignment.turn
         if record:
@@ -208,13 +206,13 @@ class REFINE_PT_prune(InSidebar, bpy.types.Panel):
         apply = row.row(align=True)
         apply.enabled = record is not None
         apply.operator("refine.apply", icon="TRASH")
-        _draw_plan(layout, context, record, plan)
+        _draw_plan(layout, obj, record, plan)
         layout.operator("refine.compare", icon="IMAGE_DATA")
         if record and (text := operators.measured(obj, settings)):
-            wrapped.label(layout, context, text, icon="CHECKMARK")
+            wrapped.label(layout, text, icon="CHECKMARK")
         if plan and plan.get("quality"):
             images.draw_chart(layout, plan["quality"])
-        _draw_progress(layout, context, "refine.score", "refine.apply", "refine.compare")
+        _draw_progress(layout, "refine.score", "refine.apply", "refine.compare")
 
 
 class REFINE_PT_clean(InSidebar, bpy.types.Panel):
@@ -238,7 +236,7 @@ class REFINE_PT_clean(InSidebar, bpy.types.Panel):
             layout.label(text=text, icon="TRASH")
             text = "Delete Floaters"
             layout.operator("refine.delete", text=text, icon="TRASH").what = "FLOATERS"
-        _draw_progress(layout, context, "refine.find_floaters")
+        _draw_progress(layout, "refine.find_floaters")
 
 
 class REFINE_PT_protect(InSidebar, bpy.types.Panel):
@@ -266,7 +264,7 @@ class REFINE_PT_protect(InSidebar, bpy.types.Panel):
                 row.label(text=f"{count:,}")
             row.operator("refine.drop_volume", text="", icon="X").index = index
         if "error" in record:
-            wrapped.label(layout, context, record["error"], icon="ERROR")
+            wrapped.label(layout, record["error"], icon="ERROR")
             return
         if record.get("protected"):
             layout.label(text=f"Stay: {record['protected']:,}", icon="LOCKED")
@@ -291,66 +289,61 @@ class REFINE_PT_deliver(InSidebar, bpy.types.Panel):
         if splat_group.has_levels(obj):
             column.operator("refine.export_levels", icon="EXPORT")
         names = ("export_ply", "levels", "export_levels", "render")
-        _draw_progress(layout, context, *(f"refine.{name}" for name in names))
+        _draw_progress(layout, *(f"refine.{name}" for name in names))
 
 
-def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
+def _draw_progress(layout: bpy.types.UILayout, *names: str) -> None:
     """Draw the progress if one of these operators runs. Called last in a panel, since Blender 4.3
     replaces a bar by a label that is drawn later."""
     now = operator_bases.now()
     if now is not None and now.operator in names:
         layout.progress(factor=now.worker.fraction, text=now.share)
-        wrapped.label(layout, context, now.sentence)
+        wrapped.label(layout, now.sentence)
 
 
-def _draw_objects(
-    layout: bpy.types.UILayout, context: bpy.types.Context, objects: Sequence[bpy.types.Object]
-) -> None:
-    obj = context.object
+def _draw_objects(layout: bpy.types.UILayout, objects: Sequence[bpy.types.Object]) -> None:
+    obj = bpy.context.object
     count = sum(mesh_layout.splat_count(each.data) for each in objects)
     degree = max(mesh_layout.sh_degree(each.data) for each in objects)
     several = len(objects) > 1
     name = f"{len(objects)} objects, one scene" if several else obj.name
     text = f"{name}: {count:,} splats, SH degree {degree}"
-    size = None if several else cached("size", context, lambda: mesh_layout.export_bytes(obj))
-    text += f", {size_in_words(size)}" if size is not None else ""
-    wrapped.label(layout, context, text, icon="OUTLINER_OB_POINTCLOUD")
+    stored = None if several else cached("layout", lambda: mesh_layout.layout_if_any(obj))
+    text += f", {size_in_words(stored.file_bytes(count))}" if stored else ""
+    wrapped.label(layout, text, icon="OUTLINER_OB_POINTCLOUD")
     if several:
         text = f"Score, Apply, Compare and Mend take all; other buttons '{obj.name}' alone"
-        wrapped.label(layout, context, text, icon="INFO")
-    transforms.draw(layout, context, objects)
-    if not several and cached("model", context, lambda: _model_is_open(obj)):
-        _named_column(layout).prop(context.scene.refine, "model")
+        wrapped.label(layout, text, icon="INFO")
+    transforms.draw(layout, objects)
+    if stored and (
+        mesh_layout.MODEL in obj.data or not stated_model(stored.header, stored.row_dtype)
+    ):  # chosen, or not named by the file
+        _named_column(layout).prop(bpy.context.scene.refine, "model")
 
 
-def _draw_plan(
-    layout: bpy.types.UILayout,
-    context: bpy.types.Context,
-    record: dict[str, Any] | None,
-    plan: dict[str, Any] | None,
-) -> None:
-    obj = context.object
+def _draw_plan(layout: bpy.types.UILayout, obj: Any, record: Any, plan: Any) -> None:
     if record is None:
         lost = mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes
         text = "Splats were deleted: score again" if lost else "Score to see what it costs"
-        wrapped.label(layout, context, text, icon="INFO")
+        wrapped.label(layout, text, icon="INFO")
         return
-    if changed := _changes(context, obj):
-        text = f"Score again: {', '.join(changed)}"
-        wrapped.label(layout, context, text, icon="ERROR")
+    objects = splat_group.chosen(obj)
+    question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
+    if changed := cached(question, lambda: plans.stale(*objects)):
+        wrapped.label(layout, f"Score again: {', '.join(changed)}", icon="ERROR")
     if plan is None:
         return  # a timer makes it
     if "error" in plan:
-        wrapped.label(layout, context, plan["error"], icon="ERROR")
+        wrapped.label(layout, plan["error"], icon="ERROR")
         return
     views = f"by {record['views_used']} of {counted(record['views_given'], 'view')}"
     if record.get("views_between"):
         views += f" and {record['views_between']} between"
-    wrapped.label(layout, context, f"{plans.sentence(plan)}, {views}", icon="CHECKMARK")
+    wrapped.label(layout, f"{plans.sentence(plan)}, {views}", icon="CHECKMARK")
     if plan["remark"]:
-        wrapped.label(layout, context, plan["remark"], icon="INFO")
+        wrapped.label(layout, plan["remark"], icon="INFO")
     for text in plans.warnings(plan, record):
-        wrapped.label(layout, context, text, icon="ERROR")
+        wrapped.label(layout, text, icon="ERROR")
 
 
 def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
@@ -369,25 +362,6 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
 
 def _record(obj: bpy.types.Object | None) -> dict[str, Any] | None:
     return mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
-
-
-def _model_is_open(obj: bpy.types.Object) -> bool:
-    """Whether the user can choose the model: the file does not name it, or it was chosen."""
-    try:
-        layout = mesh_layout.layout_of(obj)
-    except RefineError:
-        return False
-    return mesh_layout.MODEL in obj.data or not stated_model(layout.header, layout.row_dtype)
-
-
-def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
-    return CameraChoice.of_scene(context.scene).cameras(context)
-
-
-def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
-    objects = splat_group.chosen(context.view_layer, obj)
-    question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
-    return cached(question, context, lambda: plans.stale(context, *objects))
 
 
 CLASSES = (

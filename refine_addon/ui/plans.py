@@ -172,7 +172,7 @@ def _is_ours(obj: bpy.types.Object) -> bool:
 
 
 def _key(obj: bpy.types.Object, settings: Any) -> Any:
-    meshes = [each.data for each in splat_group.chosen(bpy.context.view_layer, obj)]
+    meshes = [each.data for each in splat_group.chosen(obj)]
     counts = [mesh_layout.splat_count(mesh) for mesh in meshes]
     scorings = [(mesh.session_uid, mesh.get(mesh_scores.RECORD)) for mesh in meshes], counts
     volumes = [
@@ -210,7 +210,7 @@ def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> Non
     for obj in objects:
         if obj not in done:
             leading.append(obj)
-            done.update(splat_group.chosen(bpy.context.view_layer, obj) if _can_have(obj) else [])
+            done.update(splat_group.chosen(obj) if _can_have(obj) else [])
     bpy.context.view_layer.update()  # or volumes that a script moved are still elsewhere
     for obj in reversed(dict.fromkeys(leading)):
         if _can_have(obj):
@@ -226,7 +226,7 @@ def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> Non
 
 def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     settings, record = scene.refine, mesh_scores.record(obj.data) or {}
-    group = splat_group.members(bpy.context.view_layer, mesh_layout.check(obj))
+    group = splat_group.members(obj)
     forced, budget = splat_group.refresh(scene, group), settings.to_budget()
     method = settings.to_method().deleting()
     arguments = splat_group.stored_arguments(group, budget, forced, method)
@@ -275,13 +275,14 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
+def origin(obj: bpy.types.Object) -> dict[str, Any]:
     """An object's transform, the panel's cameras, and the settings that decide: JSON."""
-    method = context.scene.refine.to_method()
+    scene = bpy.context.scene
+    method = scene.refine.to_method()
     return {
         "matrix": np.array(obj.matrix_world).tolist(),
-        "frame": context.scene.frame_current,
-        "cameras": _cameras(context),
+        "frame": scene.frame_current,
+        "cameras": _cameras(scene),
         "must_go": _marked(obj, 2),
         "model": obj.data.get(mesh_layout.MODEL, MODELS[0]),
         # All methods but the closed form score by occlusion.
@@ -289,12 +290,12 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
     }
 
 
-def stale(context: bpy.types.Context, *objects: bpy.types.Object) -> list[str]:
+def stale(*objects: bpy.types.Object) -> list[str]:
     """Changes since any object was scored, in few words; none without an origin or in edit mode."""
     changes: dict[str, None] = {}
     for obj in (each for each in objects if each.mode != "EDIT"):  # there marks cannot be read
         record = mesh_scores.record(obj.data) or {}
-        now = origin(context, obj)
+        now = origin(obj)
         try:
             then = {name: record["origin"][name] for name in now}
             source, others = then["cameras"][0], now["cameras"]
@@ -327,15 +328,14 @@ def _marked(obj: bpy.types.Object, kind: int) -> list[int]:
     return mesh_scores.digest(mesh_attributes.read_attribute(obj.data, mesh_edit.FORCE) == kind)
 
 
-def _cameras(context: bpy.types.Context) -> list[Any]:
+def _cameras(scene: bpy.types.Scene) -> list[Any]:
     """Numbers by which a change of the deciding cameras is noticed, JSON."""
-    scene, settings = context.scene, context.scene.refine
-    if settings.source == "FRAMES":
-        frames = settings.to_frames(scene)
-        name = scene.camera.name if scene.camera else ""
+    choice = CameraChoice.of_scene(scene)
+    if choice.source == "FRAMES":
+        frames, name = choice.frames, scene.camera.name if scene.camera else ""
         return ["FRAMES", frames.start, frames.stop, frames.step, name]
-    cameras = CameraChoice(settings.source, settings.collection).cameras(context)
-    chosen = ["SELECTED" if settings.source == "SELECTED" else "OTHERS", len(cameras)]
+    cameras = choice.cameras(bpy.context)
+    chosen = ["SELECTED" if choice.source == "SELECTED" else "OTHERS", len(cameras)]
     if not cameras:
         return chosen
     (width, height), aspect = render_size(scene)
@@ -358,13 +358,14 @@ def _numbers(camera: bpy.types.Object, frame: tuple[int, int, float]) -> tuple[f
     )
 
 
-def cached(what: Hashable, context: bpy.types.Context, compute: Callable[[], Value]) -> Value:
+def cached(what: Hashable, compute: Callable[[], Value]) -> Value:
     """Value of `compute` (of the scene, active object, settings), kept until anything changes.
     A script's silent changes, such as custom properties, show after the next change."""
-    obj, settings = context.object, context.scene.refine
+    scene, obj = bpy.context.scene, bpy.context.object
+    settings = scene.refine
     names = set(settings.bl_rna.properties.keys()) - {"rna_type", "name"}
     values = repr([getattr(settings, name) for name in sorted(names)])
-    key = (what, context.scene.session_uid, obj and obj.session_uid, values)
+    key = (what, scene.session_uid, obj and obj.session_uid, values)
     if key not in _values:
         _values[key] = compute()
     return _values[key]

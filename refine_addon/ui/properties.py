@@ -107,13 +107,8 @@ def _mark_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
 
 
 def _model(_settings: RefineSettings) -> int:
-    obj = getattr(bpy.context, "object", None)
-    if not mesh_layout.looks_like_splats(obj):
-        return 0
-    try:
-        return MODELS.index(mesh_layout.layout_of(obj).model)
-    except RefineError:
-        return 0
+    layout = mesh_layout.layout_if_any(getattr(bpy.context, "object", None))
+    return MODELS.index(layout.model) if layout else 0
 
 
 def _set_model(_settings: RefineSettings, value: int) -> None:

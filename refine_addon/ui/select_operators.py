@@ -241,7 +241,7 @@ class REFINE_PT_select(wrapped.InSidebar, bpy.types.Panel):
         row.prop(settings, "select_hidden")
         row.prop(settings, "select_connected")
         if obj.mode == "EDIT":
-            wrapped.label(layout, context, "More in object mode", icon="INFO")
+            wrapped.label(layout, "More in object mode", icon="INFO")
             return
         grid = layout.grid_flow(columns=3, even_columns=True, align=True)
         for action, text, _, icon, _ in ACTIONS:

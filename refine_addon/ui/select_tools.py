@@ -315,7 +315,7 @@ def _draw_settings(
 
 def selected_count(context: Context) -> int:
     """Number of selected splats of the active object."""
-    return cached("selected", context, lambda: selection.count(context.object))
+    return cached("selected", lambda: selection.count(context.object))
 
 
 def _draw_brush(context: Context, _tool: bpy.types.WorkSpaceTool, place: tuple[int, int]) -> None:

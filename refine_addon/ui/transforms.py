@@ -44,7 +44,7 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
 
     def act(self, context: Context) -> None:
         """Bake the transforms of the selected objects."""
-        group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
+        group = splat_group.members(context.object)
         self.warn(transforms.bake(group, location=self.location))
         plans.refresh(context)
         self.report({"INFO"}, f"Baked the transform of {counted(len(group), 'object')}")
@@ -61,8 +61,7 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
         """Selected objects with drift, and a call that computes each one's new values."""
         mesh_layout.check(context.object)
-        chosen = splat_group.chosen(context.view_layer, context.object)
-        drifted = {obj.data: obj for obj in chosen if of(obj)}
+        drifted = {obj.data: obj for obj in splat_group.chosen(context.object) if of(obj)}
         group = [mesh_layout.check(obj) for obj in drifted.values()]
         for each in group:
             mesh_edit.check_changeable(each.obj)
@@ -100,11 +99,11 @@ def _warnings(context: Context) -> list[str]:
     ]
 
 
-def draw(layout: bpy.types.UILayout, context: Context, objects: Sequence[bpy.types.Object]) -> None:
+def draw(layout: bpy.types.UILayout, objects: Sequence[bpy.types.Object]) -> None:
     """Draw the objects' drift, and the buttons that move splats."""
     drifts = [drift for drift in map(of, objects) if drift]
     for sentence in dict.fromkeys(s for drift in drifts for s in drift.sentences):
-        wrapped.label(layout, context, sentence, icon="ERROR")
+        wrapped.label(layout, sentence, icon="ERROR")
     if any(drift.mendable for drift in drifts):
         layout.operator("refine.mend", icon="MODIFIER")
     if len(objects) == 1 and objects[0].matrix_basis != mathutils.Matrix():

@@ -20,16 +20,14 @@ class InSidebar:
     bl_category = "REFINE"
 
 
-def label(
-    layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE"
-) -> None:
+def label(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
     """Draw a sentence in as many lines as it takes, with the icon at the first."""
-    scale = context.preferences.system.ui_scale or 1.0  # there is none without a screen
-    region = context.region
+    preferences, region = bpy.context.preferences, bpy.context.region
+    scale = preferences.system.ui_scale or 1.0  # there is none without a screen
     room = (region.width if region else _USUAL * scale) - _TAKEN * scale
     if icon != "NONE":
         room -= _ICON * scale
-    points = context.preferences.ui_styles[0].widget.points * scale
+    points = preferences.ui_styles[0].widget.points * scale
     column = layout.column(align=True)
     column.scale_y = 0.8  # the lines of one sentence stand closer together than buttons
     for line in lines(text, int(room), points):

@@ -41,7 +41,7 @@ def test_the_room_comes_back_and_is_what_its_file_is(addon, core, room, tmp_path
     checked = addon.mesh.layout.check(room)
     export(addon, checked, tmp_path / "out.ply")
     assert (tmp_path / "out.ply").read_bytes() == ROOM_PLY.read_bytes()
-    assert addon.mesh.layout.export_bytes(room) == ROOM_PLY.stat().st_size
+    assert checked.layout.file_bytes(len(checked)) == ROOM_PLY.stat().st_size
     expected, got = (
         core.read_ply(ROOM_PLY).splats(),
         addon.mesh.attributes.splats_from_object(checked),
@@ -57,7 +57,7 @@ def test_the_room_comes_back_and_is_what_its_file_is(addon, core, room, tmp_path
 
     room.data.attributes.remove(room.data.attributes["f_rest_7"])
     del room.data["refine_layout"]
-    assert addon.mesh.layout.export_bytes(room) is None
+    assert addon.mesh.layout.layout_if_any(room) is None
 
 
 def test_every_degree_and_extra_property_comes_back(addon, make_splats, through):
@@ -109,7 +109,7 @@ def test_meshes_of_blenders_own_importer_and_of_kiri_are_read(addon, make_splats
     obj = bpy.context.object
     export(addon, layout.check(obj), target)
     assert target.read_bytes() == source.read_bytes()
-    assert target.stat().st_size == layout.export_bytes(obj)  # what the panel says
+    assert target.stat().st_size == layout.layout_of(obj).file_bytes(50)  # what the panel says
 
     obj["3DGS_Mesh_Type"] = "vert"
     obj.data.attributes.new("KIRI_3DGS_Paint", "FLOAT", "POINT")

@@ -144,9 +144,9 @@ def test_what_is_marked_to_go_goes_before_all_others(addon, quarter, room_camera
     best = np.argsort(-read(quarter.data, "refine_score"), kind="stable")[:100]
     choose(addon, quarter, best)
     bpy.ops.refine.protect(mark="GO")
-    assert addon.ui.plans.stale(bpy.context, quarter) == ["what must go changed"]
+    assert addon.ui.plans.stale(quarter) == ["what must go changed"]
     bpy.ops.refine.score()
-    assert addon.ui.plans.stale(bpy.context, quarter) == []
+    assert addon.ui.plans.stale(quarter) == []
     bpy.ops.refine.select_by(what="GOING")
     going = np.flatnonzero(read(quarter.data, "refine_remove")).tolist()
     assert chosen(addon, quarter) == going

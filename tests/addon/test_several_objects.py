@@ -52,7 +52,7 @@ def test_both_halves_keep_what_the_whole_room_keeps(
     assert bpy.ops.refine.score() == {"FINISHED"}
     plan = addon.ui.plans.stored(halves[1], settings)
     assert (plan["splats"], plan["kept"]) == (COUNT, COUNT - 7_951)
-    members = group.members(bpy.context.view_layer, addon.mesh.layout.check(halves[1]))
+    members = group.members(halves[1])
     together = addon.mesh.scores.stored_scores(members)
     assert (together.quality is None) == (method == "closed-form")
     assert all(addon.mesh.scores.stored_scores([one]).quality is None for one in members)
@@ -80,7 +80,7 @@ def test_marks_and_sentence_are_those_of_the_selection(addon, halves):
     assert "of 4,939" in plans.sentence(plans.stored(halves[1], settings))
     halves[0].select_set(True)
     halves[1].select_set(False)
-    assert addon.objects.splat_group.chosen(bpy.context.view_layer, halves[1]) == [halves[1]]
+    assert addon.objects.splat_group.chosen(halves[1]) == [halves[1]]
 
 
 def test_objects_that_cannot_be_scored_together_are_named(halves):

@@ -11,7 +11,7 @@ from .conftest import keep_mask
 def hints(addon, obj):
     """Return what the panel would say of an object's scores."""
     bpy.context.view_layer.update()
-    return addon.ui.plans.stale(bpy.context, obj)
+    return addon.ui.plans.stale(obj)
 
 
 def test_what_changed_since_scoring_is_said(addon, quarter, room_cameras, tmp_path):

@@ -111,7 +111,7 @@ def test_bake_transform_keeps_splats_children_and_scores(addon, imported, stand,
     np.testing.assert_allclose(child.matrix_world, place, atol=1e-5)
     assert_alike(stand(imported), before)
     assert told_of(addon, imported) == []
-    assert addon.ui.plans.stale(bpy.context, imported) == []
+    assert addon.ui.plans.stale(imported) == []
 
 
 def test_an_uneven_scale_is_baked_as_near_as_harmonics_come(addon, imported):

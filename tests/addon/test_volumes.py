@@ -71,7 +71,7 @@ def stale(addon, obj):
     """Return what the panel says of the scores once the scene is evaluated."""
     bpy.context.view_layer.update()
     addon.ui.plans.refresh(bpy.context)
-    return addon.ui.plans.stale(bpy.context, obj)
+    return addon.ui.plans.stale(obj)
 
 
 def command(addon, words):
