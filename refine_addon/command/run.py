@@ -16,7 +16,7 @@ from typing import Any, Literal, TextIO
 import numpy as np
 
 from ..core import RefineError, ViewSet, read_cameras
-from ..core.errors import printable, reason_of
+from ..core.errors import described, printable, reason_of
 from ..core.execute import Progress, TimeLeft, in_time
 from ..core.formats.registry import names_file
 from ..core.report import MANY_UNSEEN
@@ -24,12 +24,6 @@ from ..core.whole_file import new_folder, whole_file
 from ..version import VERSION
 
 _CLEAR = "\r\x1b[K"
-
-
-def described(error: Exception) -> str:
-    """Message of an error, with the file if the system raised it."""
-    file = getattr(error, "filename", None)
-    return f"{file}: {error.strerror}" if file else reason_of(error)
 
 
 def complain(text: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import core
 from ..core import RefineError, Zone
+from ..core.errors import described
 from ..core.execute import in_time
 from ..core.formats.ply_columns import other_properties
 from ..core.formats.registry import without_suffix
@@ -24,7 +25,7 @@ from ..core.tiles.storage import located
 from ..core.volumes import Role, Volume
 from .checks import check, check_report
 from .options import ROLES, complete, make_parser
-from .run import Run, complain, described, flush
+from .run import Run, complain, flush
 
 
 def run(arguments: Sequence[str], *, scene: bool) -> int:

@@ -25,6 +25,15 @@ def reason_of(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
+def described(error: Exception) -> str:
+    """An error as a sentence, with the file if the system raised it."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error})" if str(error) else "not enough memory"
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return reason_of(error)
+
+
 class RefineError(Exception):
     """Bad input. The message is for the user: file, place, what was got, what was expected."""
 

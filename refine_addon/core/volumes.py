@@ -297,18 +297,19 @@ def forced(
         for zone, mask in inside
     )
     protect, remove, keep = (
-        _any(*(mask for zone, mask in inside if zone.role == role))
+        any_of(*(mask for zone, mask in inside if zone.role == role))
         for role in ("protect", "remove", "keep")
     )
-    protected = _any(protected, protect)
-    removed = _any(removed, remove, None if keep is None else ~keep)
+    protected = any_of(protected, protect)
+    removed = any_of(removed, remove, None if keep is None else ~keep)
     if removed is not None:
         gone = must_go(removed, protected)
         removed = np.zeros_like(removed) if gone is None else gone
     return Forced(protected, removed, facts)
 
 
-def _any(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+def any_of(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Splats in any mask, (N,) bool; None if all are None."""
     given = [mask for mask in masks if mask is not None]
     return reduce(or_, given) if given else None
 

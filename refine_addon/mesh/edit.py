@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 import bpy
 import numpy as np
@@ -112,11 +112,11 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         )
 
 
-def mark(obj: bpy.types.Object, name: str, values: NDArray[Any], *, even_none: bool = True) -> None:
-    """Set a point attribute to `values`, (N,) bool or int32.
-    Without `even_none` it is removed where all values are 0."""
+def mark(obj: bpy.types.Object, name: str, values: NDArray[Any]) -> None:
+    """Set a point attribute to `values`, (N,) bool or int32, or remove it if all are 0.
+    `REMOVE` stays: it tells that it is known what goes."""
     check_writable(obj)
-    if even_none or values.any():
+    if name == REMOVE or values.any():
         kind = "BOOLEAN" if values.dtype == np.bool_ else "INT"
         mesh_attributes.write_attribute(obj.data, name, kind, values)
     elif name in obj.data.attributes:
@@ -126,28 +126,17 @@ def mark(obj: bpy.types.Object, name: str, values: NDArray[Any], *, even_none: b
     mesh_attributes.updated(obj.data)
 
 
-def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
-    """Mark splats, (N,) bool, as those that the previews show as removed."""
-    mark(obj, REMOVE, remove)
-
-
-def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Splats protected by `PROTECT` or by the attribute or vertex group `name`, where it is above
-    0, (N,). None with neither; `RefineError` if the object has no such name."""
-    marked = marks(obj, PROTECT)
-    if not name:
-        return marked
-    named = _named_mask(obj, name)
-    return named if marked is None else named | marked
-
-
-def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
-    attribute = obj.data.attributes.get(name)
+def named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
+    """Splats that an attribute or a vertex group protects, where it is above 0, (N,); or None."""
     # A splat's own properties protect nothing.
     if has(obj.data, name, *MARKING) and name not in REQUIRED:
         return mesh_attributes.read_attribute(obj.data, name) > 0
-    if name in obj.vertex_groups:
-        return group_weights(obj, name) > 0.0
+    return group_weights(obj, name) > 0.0 if name in obj.vertex_groups else None
+
+
+def refuse_name(obj: bpy.types.Object, name: str) -> NoReturn:
+    """Raise `RefineError` for a name by which `named_mask` is None."""
+    attribute = obj.data.attributes.get(name)
     what = f" ('{name}' is {attribute.data_type} on {attribute.domain})" if attribute else ""
     no_groups = " (a point cloud has no vertex groups)" if obj.type == "POINTCLOUD" else ""
     raise RefineError(
@@ -160,11 +149,6 @@ def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     """Splats marked by hand with `PROTECT` or `MUST_GO`, (N,); None without the attribute."""
     marked = has(obj.data, name, "BOOLEAN")
     return mesh_attributes.read_attribute(obj.data, name) if marked else None
-
-
-def mark_by_hand(obj: bpy.types.Object, marked: NDArray[np.bool_], name: str = PROTECT) -> None:
-    """Mark exactly the splats of `marked`, (N,), with `PROTECT` or `MUST_GO`."""
-    mark(obj, name, marked, even_none=False)
 
 
 def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:

@@ -176,28 +176,24 @@ def store_floaters(checked: SplatObject, cleaned: Cleaned) -> None:
     mesh_attributes.updated(checked.mesh)
 
 
-def floater_counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None:
-    """Number of floaters for each reason; None without a search since splats were deleted."""
+def floaters(
+    mesh: bpy.types.Mesh | bpy.types.PointCloud,
+) -> dict[str, tuple[int, float]] | None:
+    """Floaters for each reason, and the share of further views that see past them, 0 if unknown.
+    None without a search since splats were deleted."""
 
-    def read(content: Any) -> dict[str, int] | None:
-        current = content["splats"] == splat_count(mesh) and REASON in mesh.attributes
-        return {name: int(content["counts"][name]) for name in REASONS} if current else None
+    def read(content: Any) -> dict[str, tuple[int, float]] | None:
+        if content["splats"] != splat_count(mesh) or REASON not in mesh.attributes:
+            return None
+        counts, sure = content["counts"], content["sure"]
+        return {name: (int(counts[name]), float(sure[name] or 0.0)) for name in REASONS}
 
     return recorded(mesh, FLOATERS, read)
 
 
-def floater_surety(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, float]:
-    """Share of further views that see past the splats of a reason, 0 to 1; unknown ones absent."""
-
-    def read(content: Any) -> dict[str, float]:
-        return {name: float(sure) for name, sure in content["sure"].items() if sure is not None}
-
-    return recorded(mesh, FLOATERS, read) or {}
-
-
 def floater_mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
-    """Floaters of these reasons, (N,) bool; `RefineError` where `floater_counts` is None."""
-    if floater_counts(checked.mesh) is None:
+    """Floaters of these reasons, (N,) bool; `RefineError` where `floaters` is None."""
+    if floaters(checked.mesh) is None:
         raise RefineError(f"object '{checked.obj.name}': find floaters first")
     numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
     return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)

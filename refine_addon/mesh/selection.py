@@ -89,7 +89,7 @@ def _store(
         bmesh.update_edit_mesh(mesh, loop_triangles=False, destructive=False)
         return
     for name, flags in ((name_of(mesh), wanted), (HIDDEN, out_of_sight)):
-        mark(obj, name, flags, even_none=False)
+        mark(obj, name, flags)
 
 
 def _in_edit_mode(obj: bpy.types.Object) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,18 @@ from numpy.typing import NDArray
 from ..cameras import world_matrix
 from ..core.affine import moved
 from ..core.errors import RefineError
-from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Volume, Zone, forced
+from ..core.volumes import (
+    Box,
+    Forced,
+    MovedVolume,
+    Role,
+    Solid,
+    Sphere,
+    Volume,
+    Zone,
+    any_of,
+    forced,
+)
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
@@ -48,10 +59,18 @@ class Demands:
 
     def forced(self, checked: SplatObject) -> Forced:
         """Protected and removed splats of an object."""
-        protected = None
-        for name in ("", *self.names):
-            mask = mesh_edit.protected_mask(checked.obj, name)
-            protected = mask if protected is None or mask is None else protected | mask
+        return self.of_each([checked])[0]
+
+    def of_each(self, group: Sequence[SplatObject]) -> list[Forced]:
+        """The same for each object. A name protects in the objects that have it, at least one."""
+        by_name = [[mesh_edit.named_mask(m.obj, name) for m in group] for name in self.names]
+        for name, masks in zip(self.names, by_name, strict=True):
+            if all(mask is None for mask in masks):
+                mesh_edit.refuse_name(group[-1].obj, name)
+        return [self._forced(*each) for each in zip(group, *by_name, strict=True)]
+
+    def _forced(self, checked: SplatObject, *named: NDArray[np.bool_] | None) -> Forced:
+        protected = any_of(mesh_edit.marks(checked.obj, mesh_edit.PROTECT), *named)
         out = mesh_edit.marks(checked.obj, mesh_edit.MUST_GO)
         if not self.zones and out is None:
             return Forced(protected)
@@ -61,32 +80,8 @@ class Demands:
         except RefineError as error:
             raise RefineError(f"object '{checked.obj.name}': {error}") from error
 
-    def of_each(self, group: Sequence[SplatObject]) -> list[Forced]:
-        """The same for each object. A name protects in the objects that have it, at least one."""
-        if len(group) == 1:
-            return [self.forced(group[0])]
-        having = {name: _having(group, name) for name in self.names}
-        return [
-            replace(self, names=tuple(n for n in self.names if member in having[n])).forced(member)
-            for member in group
-        ]
-
 
 NONE = Demands()
-
-
-def _having(group: Sequence[SplatObject], name: str) -> list[SplatObject]:
-    """Objects with a protecting vertex group or attribute of that name, at least one."""
-    having, error = [], None
-    for member in group:
-        try:
-            mesh_edit.protected_mask(member.obj, name)
-            having.append(member)
-        except RefineError as refused:
-            error = refused
-    if error is not None and not having:
-        raise error
-    return having
 
 
 def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
@@ -156,13 +151,13 @@ def _mark(checked: SplatObject, forced: Forced, reasons: Collection[str]) -> Non
     for number, mask in ((2, removed), (1, forced.protected)):
         if mask is not None:
             force[mask] = number
-    mesh_edit.mark(checked.obj, mesh_edit.FORCE, force, even_none=False)
+    mesh_edit.mark(checked.obj, mesh_edit.FORCE, force)
     if mesh_scores.record(mesh) is None:
-        going, searched = force == 2, mesh_scores.floater_counts(mesh) is not None
+        going, searched = force == 2, mesh_scores.floaters(mesh) is not None
         if searched:
             going |= (force != 1) & mesh_scores.floater_mask(checked, reasons)
         if searched or removed is not None:
-            mesh_edit.mark_removed(checked.obj, going)
+            mesh_edit.mark(checked.obj, mesh_edit.REMOVE, going)
         else:
             mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
     if forced.facts or forced.protected is not None or removed is not None:

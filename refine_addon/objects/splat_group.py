@@ -245,7 +245,7 @@ def sized(
 def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
     """Mark splats outside `keep`, (N,) of all objects."""
     for member, going in zip(group, parts_of(~keep, group), strict=True):
-        mesh_edit.mark_removed(member.obj, going)
+        mesh_edit.mark(member.obj, mesh_edit.REMOVE, going)
 
 
 class Frame(NamedTuple):

@@ -16,7 +16,7 @@ from bpy_extras.io_utils import ImportHelper
 from ..cameras import SHEAR, SOURCE, UPRIGHT, create_cameras, known_turn
 from ..core.affine import AXES
 from ..core.cameras.read import cameras_in, read_cameras
-from ..core.errors import RefineError
+from ..core.errors import RefineError, described
 from ..core.execute import Progress, part, report
 from ..core.formats.ply import SplatFile
 from ..core.formats.registry import INDEX_NAMES, READ_SUFFIXES, read_splats
@@ -30,7 +30,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from ..viewport import draw
 from . import operator_bases, properties
-from .operator_bases import FAILURES, Answer, Job, Needing, described, idle, in_object_mode
+from .operator_bases import FAILURES, Answer, Job, Needing, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 

@@ -170,7 +170,7 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
                 continue
             marked = mesh_edit.marks(obj, name)
             marked = np.zeros_like(chosen) if marked is None else marked
-            mesh_edit.mark_by_hand(obj, np.where(chosen, value, marked), name)
+            mesh_edit.mark(obj, name, np.where(chosen, value, marked))
         plans.mark_again(context)
 
 

@@ -14,12 +14,13 @@ import bpy
 from bpy.app.handlers import persistent
 
 from .. import main_thread
-from ..core.errors import RefineError
+from ..core.errors import RefineError, described
 from ..core.execute import Cancelled, Progress, TimeLeft, checked_by, in_time, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
+from ..viewport import draw as viewport_draw
 
 _STEP = 0.05  # Seconds between two looks at the thread
 PATIENCE = 0.7  # Seconds that a cancelled thread has to end before it is left alone
@@ -32,13 +33,6 @@ def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
     """Report an error to the user; CANCELLED."""
     operator.report({"ERROR"}, described(error))
     return {"CANCELLED"}
-
-
-def described(error: Exception) -> str:
-    """One of `FAILURES` as a sentence."""
-    if isinstance(error, MemoryError):
-        return f"not enough memory ({error})" if str(error) else "not enough memory"
-    return str(error)
 
 
 class Worker:
@@ -238,13 +232,10 @@ def _clear_bars() -> None:
 
 def redraw_panels(context: bpy.types.Context) -> None:
     """Redraw the sidebars of the 3D views, and not the views themselves."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type != "VIEW_3D":
-                continue
-            for region in area.regions:
-                if region.type == "UI":
-                    region.tag_redraw()
+    for area in viewport_draw.areas(context):
+        for region in area.regions:
+            if region.type == "UI":
+                region.tag_redraw()
 
 
 def in_object_mode(context: bpy.types.Context) -> str:

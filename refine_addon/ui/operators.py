@@ -29,6 +29,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..objects import splat_group
 from ..objects.splat_group import Change, Members
+from ..viewport import draw as viewport_draw
 from . import plans
 from .images import put
 from .operator_bases import Answer, Job, OnScored, OnSplats, in_object_mode
@@ -278,12 +279,7 @@ def measured(obj: bpy.types.Object, settings: Any) -> str:
 
 def _show(context: Context, images: list[bpy.types.Image]) -> None:
     manager = context.window_manager
-    shown = [
-        area.spaces.active.image
-        for window in manager.windows
-        for area in window.screen.areas
-        if area.type == "IMAGE_EDITOR"
-    ]
+    shown = [area.spaces.active.image for area in viewport_draw.areas(context, "IMAGE_EDITOR")]
     if all(image in shown for image in images):
         return
     before = set(manager.windows)

@@ -226,12 +226,12 @@ class REFINE_PT_clean(InSidebar, bpy.types.Panel):
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.row(align=True).prop(settings, "strength", expand=True)
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
-        counts = mesh_layout.looks_like_splats(obj) and mesh_scores.floater_counts(obj.data)
-        if counts:
-            reasons, sure = settings.to_reasons(), mesh_scores.floater_surety(obj.data)
-            total = sum(counts[name] for name in reasons)
+        by_reason = mesh_layout.looks_like_splats(obj) and mesh_scores.floaters(obj.data)
+        if by_reason:
+            going = [by_reason[name] for name in settings.to_reasons()]
+            total = sum(count for count, _ in going)
+            certain = sum(count * sure for count, sure in going)
             text = f"{total:,} of {mesh_layout.splat_count(obj.data):,} float"
-            certain = sum(counts[name] * sure.get(name, 0.0) for name in reasons)
             text += f", {100.0 * certain / total:.0f} % sure" if certain else ""
             layout.label(text=text, icon="TRASH")
             text = "Delete Floaters"

@@ -17,6 +17,7 @@ from bpy.props import BoolProperty
 from .. import main_thread
 from ..core.execute import Cancelled
 from ..render import card, engine, meshes
+from ..viewport import draw as viewport_draw
 from .images import put
 from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle
 from .wrapped import counted
@@ -200,11 +201,10 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         alphas = picture[3:]
         straight = np.concatenate([picture[:3] / np.maximum(alphas, 1e-6), alphas])
         image = put(IMAGE, np.moveaxis(straight, 0, -1).clip(0.0, 1.0))
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                shown = getattr(area.spaces.active, "image", None)
-                if area.type == "IMAGE_EDITOR" and shown and shown.type == "RENDER_RESULT":
-                    area.spaces.active.image = image
+        for area in viewport_draw.areas(bpy.context, "IMAGE_EDITOR"):
+            shown = area.spaces.active.image
+            if shown and shown.type == "RENDER_RESULT":
+                area.spaces.active.image = image
 
     def _finished(self, context: bpy.types.Context) -> Answer:
         self._show()

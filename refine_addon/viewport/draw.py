@@ -160,7 +160,7 @@ def _tick() -> float | None:
     if _state.mode == "OFF":
         return None
     ready = _state.content.ready()
-    for region in (region for area in _areas() for region in area.regions):
+    for region in (region for area in areas(bpy.context) for region in area.regions):
         view = _state.views.get(region.as_pointer())
         if region.type == "WINDOW" and (view is None or ready or view.due()):
             region.tag_redraw()
@@ -185,7 +185,7 @@ def _read_edited() -> float | None:
 
 
 def _redraw() -> None:
-    for area in _areas():
+    for area in areas(bpy.context):
         area.tag_redraw()
 
 
@@ -196,9 +196,10 @@ def _hide_points() -> None:
         hide_points(window.view_layer.depsgraph, refused)
 
 
-def _areas() -> list[bpy.types.Area]:
-    windows = bpy.context.window_manager.windows
-    return [a for window in windows for a in window.screen.areas if a.type == "VIEW_3D"]
+def areas(context: bpy.types.Context, kind: str = "VIEW_3D") -> list[bpy.types.Area]:
+    """Areas of a type in all windows."""
+    windows = context.window_manager.windows
+    return [a for window in windows for a in window.screen.areas if a.type == kind]
 
 
 @persistent

@@ -94,7 +94,7 @@ def test_a_merge_is_refused_when_other_splats_must_stay_since(addon, obj, start,
     bpy.context.view_layer.update()
     operator, context, said = start(addon.ui.operators.REFINE_OT_apply)
     if change == "marks":
-        addon.mesh.edit.mark_by_hand(obj, np.arange(3976) < 200)
+        addon.mesh.edit.mark(obj, addon.mesh.edit.PROTECT, np.arange(3976) < 200)
     else:
         volume.location, volume.scale = (0.0, 0.0, 0.0), (100.0, 100.0, 100.0)
 

@@ -32,7 +32,7 @@ def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
     bpy.ops.refine.find_floaters()
     assert (~expected.keep)[moved].mean() > 0.8
     np.testing.assert_array_equal(read(addon, obj, "refine_remove"), ~expected.keep)
-    found, counts = addon.mesh.scores.floater_counts(obj.data), {}
+    found, counts = {k: n for k, (n, _) in addon.mesh.scores.floaters(obj.data).items()}, {}
     assert {name: found[name] for name in expected.settings.reasons} == expected.counts()
     assert len(obj.data.vertices) == 3976
     for strength in ("CAREFUL", "USUAL", "STRONG"):
@@ -48,9 +48,9 @@ def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
     assert not read(addon, obj, "refine_remove")[moved].any()
     scores = addon.mesh.scores
     obj.data.vertices.add(1)  # the note says of how many splats it is; a damaged one counts as none
-    assert scores.floater_counts(obj.data) is None
+    assert scores.floaters(obj.data) is None
     obj.data[scores.FLOATERS] = '{"splats": 3977}'
-    assert scores.floater_counts(obj.data) is None
+    assert scores.floaters(obj.data) is None
 
 
 def test_what_goes_is_what_floats_or_must_go_and_with_scores_what_the_budget_removes(
@@ -83,19 +83,19 @@ def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     reasons = bpy.context.scene.refine.to_reasons()
     goes = scores.floater_mask(addon.mesh.layout.check(obj), reasons)
     opacities = read(addon, obj, "opacity")
-    addon.mesh.edit.mark_by_hand(obj, goes)
+    addon.mesh.edit.mark(obj, addon.mesh.edit.PROTECT, goes)
     with pytest.raises(RuntimeError, match="no splat floats, or all floaters must stay"):
         delete(what="FLOATERS")
     assert len(obj.data.vertices) == 3976
     assert scores.record(obj.data) is not None
-    assert scores.floater_counts(obj.data) is not None
+    assert scores.floaters(obj.data) is not None
 
     spared = goes & (np.cumsum(goes) % 2 == 0)
     assert spared.sum() > 10
-    addon.mesh.edit.mark_by_hand(obj, spared)
+    addon.mesh.edit.mark(obj, addon.mesh.edit.PROTECT, spared)
     assert delete(what="FLOATERS") == {"FINISHED"}
     np.testing.assert_array_equal(read(addon, obj, "opacity"), opacities[~goes | spared])
     assert scores.record(obj.data) is None
-    assert scores.floater_counts(obj.data) is None
+    assert scores.floaters(obj.data) is None
     with pytest.raises(RuntimeError, match="find floaters first"):
         delete(what="FLOATERS")

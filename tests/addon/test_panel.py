@@ -143,10 +143,10 @@ def test_floaters_and_what_cameras_and_curve_say_are_drawn(addon, draw, few):
     assert "score again with a PSNR as budget" in " ".join(draw())
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()
-    drawn, counts, sure = draw(), scores.floater_counts(few.data), scores.floater_surety(few.data)
-    reasons = settings.to_reasons()
-    total = sum(counts[name] for name in reasons)
-    known = sum(counts[name] * sure.get(name, 0.0) for name in reasons) / total
+    drawn, found = draw(), scores.floaters(few.data)
+    going = [found[name] for name in settings.to_reasons()]
+    total = sum(count for count, _ in going)
+    known = sum(count * sure for count, sure in going) / total
     assert f"{total:,} of 3,976 float, {100.0 * known:.0f} % sure" in drawn
     assert "chart" in drawn
     assert any(re.match(r"\d+: [\d,]+, about \d+ dB", text) for text in drawn)
