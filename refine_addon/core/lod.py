@@ -332,9 +332,9 @@ def viewing_distance(splats: Splats, views: ViewSet) -> float:
 
     A streamed SOG's chunks are at most this wide: far ends are at most twice as far as near ones.
     """
-    means = splats.means[:: max(len(splats) // _SAMPLE, 1)].astype(np.float64)
     distances = [np.empty(0)]
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+        means = splats.means[:: max(len(splats) // _SAMPLE, 1)].astype(np.float64)
         for view in views.spread(_VIEWS):
             local = view.rotation @ (means - view.center).T  # (3, n)
             planes = frustum.clip_planes(view, float(np.finfo(np.float64).tiny))

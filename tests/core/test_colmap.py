@@ -271,6 +271,7 @@ ROWS = [
     ("images.bin", binary_images([]), "no registered image, expected at least one"),
     ("images.bin", UNTERMINATED, NAMELESS),
     ("cameras.txt", "#\n\n1 LENS 64 48 1 2 3", "line 3: unknown camera model 'LENS'"),
+    ("cameras.txt", "\x1c", "line 1: unknown camera model ''"),  # white space to str alone
     ("cameras.txt", CAMERA, "line 1: expected width, height and 4 parameters of P"),
     ("cameras.txt", f"{'9' * 5000}{CAMERA[1:]} 24", ID),
     ("cameras.txt", "1 PINHOLE 64.5 48 100 120 32 24", "width: expected a whole number of p"),

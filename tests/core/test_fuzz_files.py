@@ -10,7 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from refine_addon.core import Budget, RefineError, prune, read_cameras
+from refine_addon.core import (
+    Budget,
+    ClosedForm,
+    Levels,
+    Move,
+    RefineError,
+    Refit,
+    convert_files,
+    lod_file,
+    prune,
+    prune_file,
+    read_cameras,
+)
 from refine_addon.core.formats.ply_columns import splats_from_columns
 from tests.fuzz import TARGETS, Crash, attempt, fuzz
 from tests.hostile import refused
@@ -37,6 +49,21 @@ def test_the_fuzzer_notices_what_is_wrong(tmp_path):
     for use in (lambda _: int("x"), unnamed, lambda _: np.float32(1e30) * np.float32(1e30)):
         with pytest.raises(Crash):
             attempt({"in.ply": b""}, use, tmp_path)
+
+
+@pytest.mark.parametrize("bits", [0x7FA00000, 0x7F800000], ids=["signalling NaN", "infinity"])
+def test_splats_of_no_number_are_moved_kept_and_in_levels_without_a_warning(
+    cameras, tmp_path, bits
+):
+    """Twelve of 20, so that some of the ten that are kept are among them."""
+    source, names = tmp_path / "in.ply", splat_names(1)
+    data = np.frombuffer(plain_ply(20, 1), np.uint8).copy()
+    data[-20 * 4 * len(names) :].view("<u4")[: 12 * len(names)] = bits
+    source.write_bytes(data)
+    convert_files([source], tmp_path / "turned.ply", moves=[Move(rotate=(10.0, 0.0, 0.0))])
+    lod_file(source, tmp_path / "lod-meta.json", cameras, Levels((0.7,)), ClosedForm())
+    result = prune_file(source, tmp_path / "out.ply", cameras, Budget(keep=10), Refit(rounds=1))
+    assert np.count_nonzero(result.keep) == 10
 
 
 ANY_BITS = st.tuples(st.sampled_from(splat_names(1)), st.integers(0, 19), st.integers(0, 2**32 - 1))

@@ -295,7 +295,7 @@ def test_cameras_far_away_are_named():
     assert alignment(splats.take(np.arange(7)), at(-500)).far == ()
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e38, 0.0])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 3e38, 0.0])
 def test_absurd_splats_are_measured_without_a_warning(value):
     splats = cloud()
     splats.means[::2] = value

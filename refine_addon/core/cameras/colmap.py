@@ -211,11 +211,11 @@ def _text_cameras(file: CameraPlace) -> Iterator[Any]:
     for place, line in _lines(file):
         if not line:
             continue
-        camera_id, name, *fields = [*line.decode("utf-8", "replace").split(), ""]
+        camera_id, name, *fields = [*line.decode("utf-8", "replace").split(), "", ""]
         model = MODELS_BY_NAME.get(name)
         if model is None:
             place.fail(f"unknown camera model {name[:40]!r}, expected {', '.join(MODELS_BY_NAME)}")
-        numbers = [_parsed(place, field) for field in fields[:-1]]
+        numbers = [_parsed(place, field) for field in fields[:-2]]
         if len(numbers) != 2 + model.parameters:
             place.fail(
                 f"expected width, height and {model.parameters} parameters of {model.name}, "

@@ -265,8 +265,9 @@ def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) 
         columns[name] = np.empty((len(rows), *values.shape[1:]), kind)
 
     def copy(piece: slice) -> None:
-        for name, column in columns.items():
-            column[piece] = getattr(splats, name)[rows[piece]]
+        with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
+            for name, column in columns.items():
+                column[piece] = getattr(splats, name)[rows[piece]]
 
     run_all(copy, chunks(len(rows), _CHUNK), threads=threads)
     return replace(splats, **columns)

@@ -189,7 +189,7 @@ def _fineness(splats, views, progress, threads):
 
     def of_turned(item):
         rotation, (number, view) = item
-        with np.errstate(under="ignore"):
+        with np.errstate(over="ignore", under="ignore"):
             view = view.turned(rotation)
             footprints = projection.project(gaussians, scene, view)
             rays = cast(footprints, *pixels(view, number, RAYS / len(ordered)))
