@@ -36,14 +36,6 @@ from .properties import HINTS, METHODS
 from .select_operators import REFINE_PT_select
 from .wrapped import InSidebar, counted
 
-MODES = (
-    ("OFF", "Off", "Show the plain points of the mesh again"),
-    ("SCENE", "Scene", "Show the splats as they are"),
-    ("HEAT", "Heat", "Colour each splat by its rank: dark goes first, yellow goes last"),
-    ("STAYS", "What Stays", "Show what Apply would keep; before scoring, all but What Goes"),
-    ("GOES", "What Goes", "Show what Apply would remove; before scoring, what floats or must go"),
-)
-
 
 class REFINE_OT_view(bpy.types.Operator):
     """Draw the splats in the 3D views; nothing in the scene is changed"""
@@ -52,14 +44,14 @@ class REFINE_OT_view(bpy.types.Operator):
     bl_label = "Show Splats"
     bl_options = {"INTERNAL"}
 
-    mode: EnumProperty(name="Show", description="What is drawn", items=MODES)
+    mode: EnumProperty(name="Show", description="What is drawn", items=viewport_draw.MODES)
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         """Whether there is a window to draw in."""
         return not bpy.app.background
 
-    description = tooltips("mode", MODES)
+    description = tooltips("mode", viewport_draw.MODES)
 
     def execute(self, _context: bpy.types.Context) -> Answer:
         """Draw, or stop."""
@@ -225,15 +217,10 @@ class REFINE_PT_clean(InSidebar, bpy.types.Panel):
         """Draw the strength, its number of floaters, and the buttons."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.row(align=True).prop(settings, "strength", expand=True)
-        layout.operator("refine.find_floaters", icon="VIEWZOOM")
-        by_reason = mesh_layout.looks_like_splats(obj) and mesh_scores.floaters(obj.data)
-        if by_reason:
-            going = [by_reason[name] for name in settings.to_reasons()]
-            total = sum(count for count, _ in going)
-            certain = sum(count * sure for count, sure in going)
-            text = f"{total:,} of {mesh_layout.splat_count(obj.data):,} float"
-            text += f", {100.0 * certain / total:.0f} % sure" if certain else ""
-            layout.label(text=text, icon="TRASH")
+        layout.operator("refine.find_floaters", text="Clean", icon="VIEWZOOM")
+        if text := mesh_scores.floaters_in_words(obj and obj.data, settings.to_reasons()):
+            wrapped.label(layout, text, icon="INFO")
+            layout.operator_context = "EXEC_DEFAULT"
             text = "Delete Floaters"
             layout.operator("refine.delete", text=text, icon="TRASH").what = "FLOATERS"
         _draw_progress(layout, "refine.find_floaters")

@@ -33,7 +33,8 @@ MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (0.45, 0.0, 1.0)}
 tint of the budget, and from `SELECTED`."""
 
 SELECTED, SELECTED_SHARE = (1.0, 0.1, 0.75), 0.6  # Tint of selected splats, and its share
-SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}  # Share of `MARKS`, by mode
+SHARES = {"HEAT": 0.55, "GOES": 0.75}  # Share of `MARKS` in a mode, in others `SHARE`
+SHARE = 0.35
 _LARGEST_KEY = 65535.0
 _LARGEST_HALF = 65504.0
 
@@ -158,12 +159,12 @@ def tinted(
 
 def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> NDArray[np.float32]:
     """Colours, (M, 4), tinted where `force`, (M,), is one of `MARKS`."""
-    if force is None or mode not in SHARES:
+    if force is None:
         return rgba
     mixed = rgba.copy()
     for mark, tint in MARKS.items():
         rows = force == mark
-        mixed[rows] = tinted(mixed[rows], tint, SHARES[mode])
+        mixed[rows] = tinted(mixed[rows], tint, SHARES.get(mode, SHARE))
     return mixed
 
 

@@ -21,8 +21,16 @@ from . import overlays, shader
 from .content import Content, every, hide_points, is_edited, placings
 from .view import Camera, View
 
-MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
-"""Draw nothing, all splats, colours by rank, the splats that Apply keeps, those it removes."""
+MODES = (
+    ("OFF", "Off", "Show the plain points of the mesh again"),
+    ("SCENE", "Scene", "Show the splats as they are"),
+    ("HEAT", "Heat", "Colour each splat by its rank: dark goes first, yellow goes last"),
+    ("STAYS", "What Stays", "Show what Apply would keep; before scoring, all but What Goes"),
+    ("GOES", "What Goes", "Show what Apply would remove; before scoring, what floats or must go"),
+    ("ELLIPSES", "Ellipses", "Show each splat as a solid ellipse, one standard deviation large"),
+    ("CENTERS", "Centres", "Show the centre of each splat as a dot"),
+)
+"""What is drawn: name, label, tooltip."""
 
 SHOWN = "refine_shown"  # Custom property of the scene: the mode when the file was saved
 _TICK = 0.03  # Seconds between two looks at the sorting thread
@@ -40,7 +48,7 @@ _state: Any = SimpleNamespace(
 
 
 def mode() -> str:
-    """The current one of `MODES`."""
+    """Name of the current one of `MODES`."""
     return _state.mode
 
 
@@ -215,7 +223,7 @@ def _saving(*_: object) -> None:
 @persistent
 def _opened(*_: object) -> None:
     wanted = bpy.context.scene.get(SHOWN) if not bpy.app.background else None
-    if wanted in MODES:
+    if wanted in {name for name, *_ in MODES}:
         show(wanted)
     if _state.mode != "OFF":
         for window in bpy.context.window_manager.windows:

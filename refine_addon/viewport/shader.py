@@ -24,6 +24,8 @@ _CONSTANTS = f"""
 #define ALPHA_MAX {ALPHA_MAX}
 #define ALPHA_CUT {ALPHA_CUT}
 #define BEYOND 0.3
+#define CENTER 1.5
+#define RIM 0.7
 #define SELECTED vec3{SELECTED}
 #define SELECTED_SHARE {SELECTED_SHARE}
 """
@@ -36,7 +38,7 @@ struct ViewData {
 };
 """
 """size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, depth
-test, omit splats before `near_depths`."""
+test, omit splats before `near_depths`, shape (0 splats, 1 their ellipses, 2 their centres)."""
 
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
@@ -117,6 +119,15 @@ void main()
   if (!(reach > 0.0)) {
     return;
   }
+  if (view_data.choices.w > 0.5) {
+    reach = 1.0;
+  }
+  if (view_data.choices.w > 1.5) {
+    disc = false;
+    xx = CENTER * CENTER;
+    xy = 0.0;
+    yy = xx;
+  }
 
   /* Axes of the ellipse: eigenvectors times standard deviations. */
   float mean_square = 0.5 * (xx + yy);
@@ -183,6 +194,11 @@ void main()
     square = on_plane ? dot(hit, hit) : blob;
   }
   float alpha = min(ALPHA_MAX, paint.a * exp(-0.5 * square));
+  vec3 shade = paint.rgb;
+  if (view_data.choices.w > 0.5) {
+    alpha = square > 1.0 ? 0.0 : 1.0;
+    shade *= view_data.choices.w < 1.5 && square > RIM ? 0.5 : 1.0;
+  }
   if (alpha < ALPHA_CUT) {
     discard;
   }
@@ -195,7 +211,7 @@ void main()
   if (hidden) {
     discard;
   }
-  color = vec4(paint.rgb * alpha, alpha);
+  color = vec4(shade * alpha, alpha);
 }
 """
 
@@ -277,10 +293,10 @@ def blend(
     numbers: Sequence[float],
     count: int,
 ) -> gpu.types.GPUFrameBuffer:
-    """Clear a picture and draw `count` splats; `numbers`: ``ViewData`` but for its last.
+    """Clear a picture and draw `count` splats; `numbers`: the rest of ``ViewData``.
     `textures`: inputs of the shader of `splats`, held by the caller until drawn."""
     data = np.zeros(24, np.float32)
-    data[:16], data[16:23] = projection.T.reshape(-1), numbers
+    data[:16], data[16 : 16 + len(numbers)] = projection.T.reshape(-1), numbers
     block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(data), data))
     frame = gpu.types.GPUFrameBuffer(color_slots=picture)
     with frame.bind():

@@ -30,6 +30,7 @@ from .arrays import (
 from .content import Atlas, Content, Marks, Slot
 
 REST = 0.2  # Seconds without a change after which a view counts as resting
+SHAPES = {"ELLIPSES": 1, "CENTERS": 2}  # The shader's shape in a mode, in others 0: splats
 TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55  # Tint of splats that the budget removes, and its share
 
 BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)
@@ -133,7 +134,8 @@ class View:
         if self._order is None or self._colors is None:
             return
         self.count = self._order.count
-        self._paint(content, shown, camera, 1 if self.complete else wide, solid)
+        shape = SHAPES.get(mode, 0)
+        self._paint(content, shown, camera, 1 if self.complete else wide, solid, shape)
         _put(self._picture)
 
     def _moves(self, key: bytes) -> bool:
@@ -179,11 +181,11 @@ class View:
             order = _order(_parts(shown, camera), camera.near, mode, most)
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
 
-    def _paint(self, content, shown, camera, pixels, solid):
+    def _paint(self, content, shown, camera, pixels, solid, shape):
         """Draw the splats into the picture, unless it is up to date."""
         depths = _depths(camera.size) if solid else None
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
-        look = (self._order.key, self._colors_key, self._camera_key)
+        look = (self._order.key, self._colors_key, self._camera_key, shape)
         wanted = (*look, size, content.selections)
         if self._picture and wanted == self._drawn and same(depths, self.depths):
             return
@@ -209,7 +211,7 @@ class View:
             "near_depths": farthest,
         }  # referenced until drawn, which the shader does not do
         numbers = (*size, camera.near, camera.size[0] / size[0])
-        numbers += (camera.perspective, depths is not None, False)
+        numbers += (camera.perspective, depths is not None, False, shape)
         shader.blend(self._picture, textures, camera.projection, numbers, self._order.count)
 
 

@@ -73,6 +73,7 @@ def test_the_viewport_shows_splats_as_the_reference_renderer(
         assert psnr(shown, reference(found["camera"], path)) > 28.0, name
     assert (found["after import"], found["still on"]) == ("SCENE", "HEAT")
     assert 0 < found["unscored GOES"] <= found["must go"] < 39_755
+    assert found["ELLIPSES"] == found["CENTERS"] == found["SCENE"]
     assert found["HEAT"] == found["SCENE"] == found["STAYS"] + found["GOES"] <= 39_755
     assert 0 < found["GOES"] <= 39_755 // 2
     assert found["two"] == 2 * found["one hidden"]

@@ -33,7 +33,7 @@ def main(cloud, cameras, models, pictures, blend):
     extension.select(splats)
     bpy.context.scene.refine.method = "closed-form"
     hand.call(refine.score)
-    for mode in ("HEAT", "STAYS", "GOES"):
+    for mode in ("HEAT", "STAYS", "GOES", "ELLIPSES", "CENTERS"):
         hand.call(refine.view, mode=mode)
         found[mode] = yield from hand.shown(f"view-{mode}")
     found |= yield from handle(hand, splats)
