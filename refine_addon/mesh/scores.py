@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.cleaning.clean import REASONS, Cleaned
+from ..core.cleaning.clean import REASONS, Cleaned, in_words
 from ..core.errors import RefineError
 from ..core.methods import Method
 from ..core.quality.curve import Quality
@@ -191,10 +191,20 @@ def floaters(
     return recorded(mesh, FLOATERS, read)
 
 
+def floaters_in_words(mesh: bpy.types.ID | None, reasons: Collection[str]) -> str:
+    """Floaters for these reasons, and how surely they float; "" where `floaters` is None."""
+    found = floaters(mesh) if mesh else None
+    if found is None:
+        return ""
+    going = {name: found[name] for name in reasons}
+    total = sum(count for count, _ in going.values())
+    return f"{total:,} of {splat_count(mesh):,} float: {in_words(going)}"
+
+
 def floater_mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
     """Floaters of these reasons, (N,) bool; `RefineError` where `floaters` is None."""
     if floaters(checked.mesh) is None:
-        raise RefineError(f"object '{checked.obj.name}': find floaters first")
+        raise RefineError(f"object '{checked.obj.name}': find floaters first: Clean")
     numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
     return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)
 

@@ -18,10 +18,10 @@ from ..mesh import scores as mesh_scores
 from ..mesh import selection
 from ..mesh.layout import SplatObject
 from ..objects import demands, splat_group
-from ..objects.demands import Demands
 from . import operator_bases, plans
-from .operator_bases import AtOnce, Job, OnSplats, idle, on_splats, tooltips
+from .operator_bases import Answer, AtOnce, Job, OnSplats, idle, on_splats, tooltips
 from .operators import chosen_views
+from .select_operators import taken
 
 ROLES = (
     ("PROTECT", "Protect Inside", "Splats inside stay, even where they must go", "LOCKED", 0),
@@ -46,10 +46,6 @@ def _changed(_volume: RefineVolume, context: bpy.types.Context) -> None:
     plans.mark_again(context)
 
 
-def _fits(_volume: RefineVolume, obj: bpy.types.Object) -> bool:
-    return demands.can_be_volume(obj)
-
-
 class RefineVolume(bpy.types.PropertyGroup):
     """A volume of the list, at ``scene.refine.volumes``."""
 
@@ -57,7 +53,7 @@ class RefineVolume(bpy.types.PropertyGroup):
         name="Volume",
         description="A closed mesh, or an empty that is shown as a cube or a sphere",
         type=bpy.types.Object,
-        poll=_fits,
+        poll=lambda _volume, obj: demands.can_be_volume(obj),
         update=_changed,
     )
     role: EnumProperty(
@@ -92,8 +88,8 @@ class REFINE_OT_add_volume(AtOnce, bpy.types.Operator):
 def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Selected objects not listed yet; raises `RefineError` if none fits."""
     listed = {item.object for item in context.scene.refine.volumes}
-    objects = [o for o in context.selected_objects if not mesh_layout.looks_like_splats(o)]
-    objects = [obj for obj in objects if obj not in listed]
+    objects = [obj for obj in context.selected_objects if obj not in listed]
+    objects = [obj for obj in objects if not mesh_layout.looks_like_splats(obj)]
     if not objects:
         raise RefineError("no volume: select closed meshes or empties, and the splats last")
     for obj in objects:
@@ -165,17 +161,14 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
         if not chosen.any():
             raise RefineError(f"object '{obj.name}': no splat is selected; select some first")
         for mark, name in _MARKS.items():
-            value = mark == self.mark
-            if not value and name not in obj.data.attributes:
-                continue
-            marked = mesh_edit.marks(obj, name)
-            marked = np.zeros_like(chosen) if marked is None else marked
-            mesh_edit.mark(obj, name, np.where(chosen, value, marked))
+            before = mesh_edit.marks(obj, name)
+            others = False if before is None else before
+            mesh_edit.mark(obj, name, np.where(chosen, mark == self.mark, others))
         plans.mark_again(context)
 
 
 class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
-    """Find splats of the active object that float where cameras see empty space (Esc cancels)"""
+    """Find splats that float where cameras see empty space, and ask whether to delete them"""
 
     bl_idname = "refine.find_floaters"
     bl_label = "Find Floaters"
@@ -197,6 +190,13 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
         plans.refresh(context)
         self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")
 
+    def modal(self, context: Context, event: bpy.types.Event) -> Answer:
+        """At the end ask whether to delete them."""
+        answer = super().modal(context, event)
+        if answer == {"FINISHED"}:
+            bpy.ops.refine.delete("INVOKE_DEFAULT", what="FLOATERS")
+        return answer
+
 
 WHAT = (
     ("SELECTED", "Selected", "Delete the selected splats, except what must stay"),
@@ -204,11 +204,7 @@ WHAT = (
     ("VOLUMES", "By Volumes", "Delete the splats that must go by volumes and marks, and no others"),
 )
 
-_NONE = {
-    "SELECTED": "no splat is selected, or all selected ones must stay",
-    "FLOATERS": "no splat floats, or all floaters must stay",
-    "VOLUMES": "no splat must go by volumes or marks",
-}
+_WORDS = {"SELECTED": "is selected", "FLOATERS": "floats", "VOLUMES": "must go"}
 
 
 class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
@@ -220,20 +216,22 @@ class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
     what: EnumProperty(name="What", description="Which splats go", items=WHAT)
     description = tooltips("what", WHAT)
 
+    def invoke(self, context: Context, event: bpy.types.Event) -> Answer:
+        """Of floaters, say which go, and ask."""
+        reasons = context.scene.refine.to_reasons()
+        text = mesh_scores.floaters_in_words(context.object.data, reasons)
+        if self.what != "FLOATERS" or text.startswith("0 "):
+            return self.execute(context)
+        words = {"title": "Clean", "message": text, "confirm_text": "Delete"}
+        return context.window_manager.invoke_confirm(self, event, **words)
+
     def act(self, context: bpy.types.Context) -> None:
         """Delete them, except protected ones, and report their number."""
-        checked, settings = mesh_layout.check(context.object), context.scene.refine
-        forced = Demands.of_scene(context.scene).forced(checked)
-        if self.what == "SELECTED":
-            going = selection.selected(checked.obj)
-        elif self.what == "FLOATERS":
-            going = mesh_scores.floater_mask(checked, settings.to_reasons())
-        else:
-            going = forced.removed
-        if going is not None and forced.protected is not None:
-            going = going & ~forced.protected
-        if going is None or not going.any():
-            raise RefineError(f"object '{checked.obj.name}': {_NONE[self.what]}")
+        checked = mesh_layout.check(context.object)
+        going = taken(context, checked, self.what) & ~taken(context, checked, "STAYING")
+        if not going.any():
+            what = f"no splat {_WORDS[self.what]}, or all of these must stay"
+            raise RefineError(f"object '{checked.obj.name}': {what}")
         outcome = splat_group.delete_splats(checked, ~going)
         plans.refresh(context)
         self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, kept {outcome.kept:,}")

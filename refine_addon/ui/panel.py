@@ -338,7 +338,7 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
     now, attributes = viewport_draw.mode(), obj.data.attributes if obj else ()
     needs = {"HEAT": mesh_scores.RANK, "STAYS": mesh_edit.REMOVE, "GOES": mesh_edit.REMOVE}
     grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-    for mode, text, _ in MODES[1:]:
+    for mode, text, _ in viewport_draw.MODES[1:]:
         cell = grid.row(align=True)
         cell.enabled = mode == now or mode not in needs or needs[mode] in attributes
         button = cell.operator("refine.view", text=text, depress=mode == now)

@@ -84,30 +84,34 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: Context) -> None:
         """Select them."""
         checked = mesh_layout.check(context.object)
-        taken = self._taken(context, checked) & ~selection.hidden(checked.obj)
+        chosen = taken(context, checked, self.what) & ~selection.hidden(checked.obj)
         before = selection.selected(checked.obj)
-        selection.select(checked.obj, picking.combined(before, taken, self.mode))
+        selection.select(checked.obj, picking.combined(before, chosen, self.mode))
         self.report({"INFO"}, f"{selection.count(checked.obj):,} splats are selected")
 
-    def _taken(self, context: Context, checked: SplatObject) -> NDArray[np.bool_]:
-        settings, columns = context.scene.refine, mesh_attributes.stored_columns(checked)
-        if self.what == "FAINT":
-            return opacity(columns["opacity"]) < settings.select_opacity
-        if self.what == "LARGE":
-            names = (column.name for column in checked.layout.columns)
-            scales = [columns[name] for name in names if name.startswith("scale_")]
-            return np.max(scales, axis=0) > np.log(settings.select_size)
-        if self.what == "FLOATERS":
-            return mesh_scores.floater_mask(checked, settings.to_reasons())
-        if self.what == "GOING":
-            if mesh_edit.REMOVE not in checked.mesh.attributes:
-                raise RefineError(
-                    f"object '{checked.obj.name}': nothing goes yet; score the splats first"
-                )
-            return mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
-        forced = Demands.of_scene(context.scene).forced(checked)
-        mask = forced.removed if self.what == "OUTSIDE" else forced.protected
-        return np.zeros(len(checked), np.bool_) if mask is None else mask
+
+def taken(context: Context, checked: SplatObject, what: str) -> NDArray[np.bool_]:
+    """Splats of one of `SETS`, or of `marks.WHAT`, (N,)."""
+    settings, columns = context.scene.refine, mesh_attributes.stored_columns(checked)
+    if what == "SELECTED":
+        return selection.selected(checked.obj)
+    if what == "FAINT":
+        return opacity(columns["opacity"]) < settings.select_opacity
+    if what == "LARGE":
+        names = (column.name for column in checked.layout.columns)
+        scales = [columns[name] for name in names if name.startswith("scale_")]
+        return np.max(scales, axis=0) > np.log(settings.select_size)
+    if what == "FLOATERS":
+        return mesh_scores.floater_mask(checked, settings.to_reasons())
+    if what == "GOING":
+        if mesh_edit.REMOVE not in checked.mesh.attributes:
+            raise RefineError(
+                f"object '{checked.obj.name}': nothing goes yet; score the splats first"
+            )
+        return mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
+    forced = Demands.of_scene(context.scene).forced(checked)
+    mask = forced.protected if what == "STAYING" else forced.removed
+    return np.zeros(len(checked), np.bool_) if mask is None else mask
 
 
 class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):

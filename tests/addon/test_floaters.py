@@ -84,7 +84,7 @@ def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     goes = scores.floater_mask(addon.mesh.layout.check(obj), reasons)
     opacities = read(addon, obj, "opacity")
     addon.mesh.edit.mark(obj, addon.mesh.edit.PROTECT, goes)
-    with pytest.raises(RuntimeError, match="no splat floats, or all floaters must stay"):
+    with pytest.raises(RuntimeError, match="no splat floats, or all of these must stay"):
         delete(what="FLOATERS")
     assert len(obj.data.vertices) == 3976
     assert scores.record(obj.data) is not None

@@ -136,7 +136,7 @@ def test_of_several_objects_it_says_which_buttons_take_all(draw, few):
 
 
 def test_floaters_and_what_cameras_and_curve_say_are_drawn(addon, draw, few):
-    """How many float and how sure that is, the mean over what goes; scores without an estimate."""
+    """How many float, for what reasons, and how sure that is; scores without an estimate."""
     settings, scores = bpy.context.scene.refine, addon.mesh.scores
     bpy.ops.refine.score()
     settings.budget = "psnr"
@@ -144,10 +144,9 @@ def test_floaters_and_what_cameras_and_curve_say_are_drawn(addon, draw, few):
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()
     drawn, found = draw(), scores.floaters(few.data)
-    going = [found[name] for name in settings.to_reasons()]
-    total = sum(count for count, _ in going)
-    known = sum(count * sure for count, sure in going) / total
-    assert f"{total:,} of 3,976 float, {100.0 * known:.0f} % sure" in drawn
+    total = sum(found[name][0] for name in settings.to_reasons())
+    words = f"{total:,} of 3,976 float: {found['front'][0]:,} in front of surfaces"
+    assert re.search(words + r" \(\d+ % sure\), ", " ".join(drawn))
     assert "chart" in drawn
     assert any(re.match(r"\d+: [\d,]+, about \d+ dB", text) for text in drawn)
 

@@ -57,7 +57,7 @@ def test_what_views_see_past_goes_as_being_in_front():
     cleaned = clean(splats, cameras())
     assert np.flatnonzero(~cleaned.keep).tolist() == [SIDE**2]
     assert cleaned.counts() == {"front": 1, "isolated": 0, "giant": 0, "needle": 0}
-    assert cleaned.in_words() == "1 in front of surfaces (88 %)"
+    assert cleaned.in_words() == "1 in front of surfaces (88 % sure)"
     assert cleaned.facts()["sure"]["front"] == pytest.approx(7 / 8)
 
 

@@ -70,7 +70,7 @@ def test_clean_says_why_and_writes_the_rest(files, capsys):
     facts = told(files, "clean", "-o", files / "out.ply")["cleaned"]
 
     assert len(read_ply(files / "out.ply")) == SIDE**2
-    assert "1 in front of surfaces (88 %); 576 of 577 splats stay" in capsys.readouterr().out
+    assert "1 in front of surfaces (88 % sure); 576 of 577 splats stay" in capsys.readouterr().out
     assert (facts["front"], facts["giant"]) == (1, 0)
     assert facts["sure"] == {"front": 7 / 8, "isolated": None, "giant": None, "needle": None}
 

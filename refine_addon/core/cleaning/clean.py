@@ -8,6 +8,7 @@ how much goes on to a surface behind. Only this evidence decides (`judge`). docs
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -162,20 +163,24 @@ class Cleaned:
         return {**self.counts(), "sure": sure, "words": self.in_words()}
 
     def in_words(self) -> str:
-        """What is removed, why and how surely, such as "2,114 in front of surfaces (96 %)"."""
-        counts, surety = self.counts(), self.surety()
-        words = [
-            f"{counts[name]:,} {text}"
-            + ("" if (sure := surety[name]) is None else f" ({100.0 * sure:.0f} %)")
-            for name, text in REASONS.items()
-            if counts.get(name)
-        ]
-        return ", ".join(words) or "nothing to clean away"
+        """What is removed, why and how surely, such as "2 giant (96 % sure)"."""
+        surety = self.surety()
+        return in_words({name: (n, surety[name]) for name, n in self.counts().items()})
 
     def notes(self) -> list[str]:
         """Notes for the user, in sentences."""
         note = f"{self.undrawable} splats cannot be drawn: no view shows them, and they stay"
         return [note] if self.undrawable else []
+
+
+def in_words(found: Mapping[str, tuple[int, float | None]]) -> str:
+    """Splats to remove by reason, with `Cleaned.surety`; see `Cleaned.in_words`."""
+    words = [
+        f"{count:,} {REASONS[name]}" + (f" ({100.0 * sure:.0f} %)" if sure else "")
+        for name, (count, sure) in found.items()
+        if count
+    ]
+    return ", ".join(words).replace(" %", " % sure", 1) or "nothing to clean away"
 
 
 def clean(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bpy
-from hand import begin_large
+from hand import at_work, begin_large, until
 
 
 def main(cloud, cameras, output, pictures):
@@ -16,10 +16,13 @@ def main(cloud, cameras, output, pictures):
     yield from hand.shown("1-imported")
     found["imported"] = len(splats.data.vertices)
 
-    hand.call(refine.find_floaters)
     hand.call(refine.view, mode="GOES")
+    yield from hand.over()
+    hand.call(refine.find_floaters, "INVOKE_DEFAULT")
+    yield from until(lambda: not at_work(), "they are found")
     yield from hand.shown("2-floaters")
-    hand.call(refine.delete, what="FLOATERS")
+    yield from hand.press("RET")  # Delete
+    yield 1.0
     found["cleaned"] = len(splats.data.vertices)
 
     hand.call(refine.score)
