@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from .images import srgb_of
 from .splats import SH_C0
 
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
+_LUMA = (0.2126, 0.7152, 0.0722)  # shares of red, green and blue in a grey (ITU-R BT.709)
+_GAMMA = 2.2  # of the power that the curve of sRGB is near
 _DIRECTIONS = 4096  # over which stretched harmonics are fitted; degree 4 has 25 coefficients
 
 
@@ -121,6 +124,40 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]
         stored = slice(columns.start - 1, columns.stop - 1)
         _map(matrix, sh_rest[:, stored], rotated[:, stored])
     return rotated
+
+
+def grading(exposure: float, tint: Sequence[float], saturation: float) -> NDArray[np.float64]:
+    """Matrix, (3, 3), that grades colours encoded for display (sRGB), as splats hold them.
+
+    Parameters
+    ----------
+    exposure : stops; each doubles the light, by the power 2.2, and black stays black
+    tint : (3,), factors of red, green and blue
+    saturation : 0 is grey of the same luma, 1 leaves colours as they are; it comes before the tint
+    """
+    grey = np.outer(np.ones(3), _LUMA)
+    saturated = saturation * np.eye(3) + (1.0 - saturation) * grey
+    return np.asarray(2.0 ** (exposure / _GAMMA) * np.diag(tint) @ saturated)
+
+
+def recolored(
+    sh_dc: NDArray[Any], sh_rest: NDArray[Any], matrix: NDArray[np.float64]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Coefficients, (N, 3) and (N, K, 3), of colours that are `matrix`, (3, 3), times the old ones.
+
+    This is exact in all directions, but that `colors` are clipped later. Splats whose old or new
+    coefficients are not finite, in the type of the old ones, keep theirs.
+    """
+    result = np.concatenate([sh_dc[:, None], sh_rest], axis=1)
+    constant = (0.5 * matrix.sum(axis=1) - 0.5) / SH_C0  # black is -0.5 / SH_C0
+    for rows in chunks(len(result), _CHUNK):
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            new = result[rows] @ matrix.T
+            new[:, 0] += constant
+            new = new.astype(result.dtype)
+        good = np.isfinite(new).all(axis=(1, 2))
+        result[rows][good] = new[good]
+    return result[:, 0], result[:, 1:]
 
 
 def encoded(

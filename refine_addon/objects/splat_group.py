@@ -30,6 +30,7 @@ from ..core.prune import prune
 from ..core.result import Result
 from ..core.scores import Scores
 from ..core.selection import Budget, rank
+from ..core.spherical_harmonics import recolored
 from ..core.splats import Splats, joined
 from ..core.views import ViewSet
 from ..core.volumes import Forced
@@ -327,6 +328,18 @@ def reduce_object(checked: SplatObject, change: Change) -> None:
         mesh_drift.renew(checked.mesh)
     mesh_scores.forget_floaters(checked.mesh)
     checked.mesh.pop(mesh_scores.RECORD, None)
+
+
+def grade(checked: SplatObject, rows: NDArray[np.int64], matrix: NDArray[np.float64]) -> None:
+    """Multiply the colours of an object's splats `rows`, (M,), by a (3, 3) matrix; all else stays,
+    to the bit."""
+    mesh_edit.check_changeable(checked.obj)
+    splats = mesh_attributes.splats_from_object(checked).take(rows)
+    sh_dc, sh_rest = recolored(splats.sh_dc, splats.sh_rest, matrix)
+    values = values_by_name(replace(splats, sh_dc=sh_dc, sh_rest=sh_rest))
+    columns = {name: values[name] for name in values if name.startswith("f_")}
+    with mesh_edit.all_or_nothing(checked.obj):
+        mesh_attributes.write_rows(checked, rows, columns)
 
 
 def _check_counts(group: Sequence[SplatObject], count: int) -> None:

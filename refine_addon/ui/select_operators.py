@@ -6,13 +6,14 @@ from typing import Any
 
 import bpy
 import numpy as np
-from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
 from bpy.types import Context
 from numpy.typing import NDArray
 
 from ..core import picking
 from ..core.errors import RefineError
 from ..core.execute import Progress
+from ..core.spherical_harmonics import grading
 from ..core.splats import opacity
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
@@ -23,7 +24,7 @@ from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
 from . import plans, wrapped
-from .operator_bases import AtOnce, Job, OnSplats, tooltips
+from .operator_bases import Answer, AtOnce, Job, OnSplats, tooltips
 from .select_tools import MODES, SHAPES, selected_count
 
 ACTIONS = (
@@ -174,6 +175,37 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
         self.report({"INFO"}, f"'{apart.name}' has {mesh_layout.splat_count(apart.data):,} splats")
 
 
+class REFINE_OT_grade(AtOnce, OnSplats, bpy.types.Operator):
+    """Grade the colours of the selected splats, or of all if none is selected"""
+
+    bl_idname = "refine.grade"
+    bl_label = "Grade Colours"
+
+    exposure: FloatProperty(
+        name="Exposure", description="Stops: each doubles the light, below 0 halves it",
+        min=-10.0, max=10.0, soft_min=-3.0, soft_max=3.0, options={"SKIP_SAVE"},
+    )  # fmt: skip
+    tint: FloatVectorProperty(
+        name="Tint", description="Factors of red, green and blue, as they are displayed (sRGB)",
+        subtype="COLOR_GAMMA", default=(1.0, 1.0, 1.0), min=0.0, max=1.0, options={"SKIP_SAVE"},
+    )  # fmt: skip
+    saturation: FloatProperty(
+        name="Saturation", description="0 is grey, 1 leaves the colours as they are",
+        subtype="FACTOR", default=1.0, min=0.0, max=2.0, options={"SKIP_SAVE"},
+    )  # fmt: skip
+
+    def invoke(self, context: Context, event: bpy.types.Event) -> Answer:
+        """Show the values beside the mouse; each change of one is drawn at once."""
+        return context.window_manager.invoke_props_popup(self, event)
+
+    def act(self, context: Context) -> None:
+        """Grade them."""
+        checked = mesh_layout.check(context.object)
+        chosen = selection.selected(checked.obj)
+        rows = np.flatnonzero(chosen if chosen.any() else ~chosen)
+        splat_group.grade(checked, rows, grading(self.exposure, self.tint, self.saturation))
+
+
 def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The chosen splats, (N,); `RefineError` if there are none."""
     if not chosen.any():
@@ -264,6 +296,7 @@ class REFINE_PT_select(wrapped.InSidebar, bpy.types.Panel):
         for mark, text, icon in marks:
             row.operator("refine.protect", text=text, icon=icon).mark = mark
         column = layout.column(align=True)
+        column.operator("refine.grade", icon="COLOR")
         column.operator("refine.separate_selected", text="Separate", icon="MOD_EXPLODE")
         column.operator("refine.delete", text="Delete", icon="X").what = "SELECTED"
 
@@ -273,4 +306,5 @@ CLASSES = (
     REFINE_OT_select_by,
     REFINE_OT_grow_selection,
     REFINE_OT_separate_selected,
+    REFINE_OT_grade,
 )

@@ -162,6 +162,33 @@ def test_merging_changes_what_others_are_merged_into(addon, cloud):
     assert np.abs(np.linalg.norm(turns, axis=1) - 1.0).max() < 3e-7
 
 
+def test_the_selected_splats_or_all_are_graded_in_both_kinds_of_objects(
+    addon, core, cloud, quarter, exported
+):
+    """The others stay to the bit; of none selected all become black, which is -0.5 / C0."""
+    harmonics, first = core.spherical_harmonics, np.arange(COUNT) < 100
+    matrix = harmonics.grading(1.0, (1.0, 0.5, 0.25), 0.5)
+    for obj in (cloud, quarter):
+        bpy.context.view_layer.objects.active = obj
+        before = exported(obj).splats()
+        addon.mesh.selection.select(obj, first)
+        bpy.ops.refine.grade(exposure=1.0, tint=(1.0, 0.5, 0.25), saturation=0.5)
+        got, graded = (
+            exported(obj).splats(),
+            harmonics.recolored(before.sh_dc, before.sh_rest, matrix),
+        )
+        for name, new in zip(("sh_dc", "sh_rest"), graded, strict=True):
+            np.testing.assert_array_equal(getattr(got, name)[first], new[first])
+            np.testing.assert_array_equal(getattr(got, name)[~first], getattr(before, name)[~first])
+        np.testing.assert_array_equal(got.opacity_logits, before.opacity_logits)
+
+        addon.mesh.selection.select(obj, first & ~first)
+        bpy.ops.refine.grade(tint=(0.0, 0.0, 0.0))
+        black = exported(obj).splats()
+        np.testing.assert_allclose(black.sh_dc, -0.5 / core.splats.SH_C0, rtol=1e-6)
+        assert not black.sh_rest.any()
+
+
 def test_point_clouds_that_are_no_splats_are_refused_in_a_sentence(addon, core):
     """Plain points; what an old Blender left of 5.3's; harmonics of no degree; a wrong type."""
     base, scale = ("radiance:base", FOUR, 4), ("scale", "FLOAT_VECTOR", 3)

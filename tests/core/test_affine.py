@@ -10,7 +10,14 @@ import pytest
 
 from refine_addon.core import RefineError, Splats
 from refine_addon.core.affine import affine_moves, baked, quaternion, transformed
-from refine_addon.core.spherical_harmonics import basis, colors, rotate, stretched
+from refine_addon.core.spherical_harmonics import (
+    basis,
+    colors,
+    grading,
+    recolored,
+    rotate,
+    stretched,
+)
 from refine_addon.core.splats import rotation_matrices
 
 from .test_merging import cloud
@@ -91,6 +98,28 @@ def test_rotated_harmonics_show_the_old_colour_along_the_rotated_direction(matri
     turned = rotate(rest, matrix)
     there = np.einsum("dk,nkc->ndc", basis(where @ matrix.T, degree)[:, 1:], turned)
     np.testing.assert_allclose(there, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3, 4])
+def test_graded_colours_are_a_matrix_times_the_old_ones_in_all_directions(degree):
+    """The inverse gives them back; what is not finite, or would not be, stays to the bit."""
+    splats, matrix = some(degree=degree), grading(0.7, (1.0, 0.5, 0.2), 1.6)
+    splats.sh_dc[:2] = [[np.nan, 1.0, 1.0], [3e38, -3e38, 0.0]]
+    old, where = (splats.sh_dc, splats.sh_rest), directions(50)
+    new = recolored(*old, matrix)
+    expected = colors(where, *old)[2:] @ matrix.T
+    np.testing.assert_allclose(colors(where, *new)[2:], expected, atol=1e-5)
+    for back, stays, before in zip(recolored(*new, np.linalg.inv(matrix)), new, old, strict=True):
+        np.testing.assert_allclose(back[2:], before[2:], atol=1e-5)
+        np.testing.assert_array_equal(stays[:2], before[:2])
+
+
+def test_a_stop_doubles_the_light_and_no_saturation_leaves_luma():
+    """A grey of 0.5 is 0.214 of the light; twice that is 0.687. Orange: 0.2126 + 0.5 x 0.7152."""
+    white = (1.0, 1.0, 1.0)
+    np.testing.assert_allclose(grading(1.0, white, 1.0) @ (0.5 * np.ones(3)), 0.687, atol=0.003)
+    np.testing.assert_allclose(grading(0.0, white, 0.0) @ [1.0, 0.5, 0.0], 0.5702, atol=1e-12)
+    np.testing.assert_array_equal(grading(0.0, white, 1.0), np.eye(3))
 
 
 STRETCH = np.array([[2, 0.3, 0], [0, 1, 0], [0, 0, 0.5]])
