@@ -129,10 +129,9 @@ def alignment(
     threads: int | None = None,
 ) -> Alignment:
     """Whether views are to be turned, by some of `used`, and which are far (docs/method.md, 10)."""
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
     far, in_pictures, count = [], 0, 0
-    with np.errstate(under="ignore"):
+    with np.errstate(under="ignore", invalid="ignore"):  # signalling NaN
+        means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
         for view in views:
             report(progress, 0.0, "checking")
             if view.weight:
