@@ -49,7 +49,6 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
         away = np.maximum(depth[::-1], near)
         ndc = (projection[2, 2] * -away + projection[2, 3]) / away
         limits.append((0.5 * ndc + 0.5).astype(np.float32))
-    farthest = np.ones((1, 1), np.float32)
     textures = {
         "order": (as_texture(order), 1, "R32F"),
         "means": (as_texture(means), 4, "RGBA32F"),
@@ -58,18 +57,15 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
         "colors": (as_texture(colors(packed)), 4, "RGBA16F"),
         "selection": (as_texture(np.zeros(len(packed), np.float32)), 1, "R32F"),
         "matrices": (matrix.astype(np.float32).reshape(1, 12), 4, "RGBA32F"),
-        "depths": (farthest, 1, "R32F"),
-        "near_depths": (farthest, 1, "R32F"),
     }
 
     def paint() -> NDArray[np.float64]:
         shared = {name: shader.texture(*values) for name, values in textures.items()}
         walls = [shader.texture(limit, 1, "R32F") for limit in limits]
+        numbers = (view.near, 1.0, True, 0)
 
         def between(number: int) -> NDArray[np.float64]:
             """Splats before a wall and behind the one before it, (4, H, W), premultiplied."""
-            numbers = (view.width, view.height, view.near, 1.0)
-            numbers += (True, number < len(walls), number > 0)
             ends = {"near_depths": walls[number - 1]} if number else {}
             ends |= {"depths": walls[number]} if walls[number:] else {}
             picture = gpu.types.GPUTexture((view.width, view.height), format="RGBA32F")

@@ -76,13 +76,11 @@ class Slot:
 @dataclass(frozen=True, eq=False)
 class Atlas:
     """Splats of several objects in shared textures, so that they are sorted and blended together.
-    `slots`: by keys of `Placing`. Texels: `means`: mean and slot number; `covariances`: xx, xy, xz,
-    yy; `more_covariances`: yz, zz, model, 0."""
+    `slots`: by keys of `Placing`. Texels of `textures`: "means": mean and slot number;
+    "covariances": xx, xy, xz, yy; "more_covariances": yz, zz, model, 0."""
 
     slots: dict[tuple[int, int], Slot]
-    means: gpu.types.GPUTexture | None
-    covariances: gpu.types.GPUTexture | None
-    more_covariances: gpu.types.GPUTexture | None
+    textures: dict[str, gpu.types.GPUTexture]
 
     @property
     def rows(self) -> int:
@@ -96,7 +94,7 @@ class Content:
 
     def __init__(self) -> None:
         self.pool = ThreadPoolExecutor(1, "refine-view")
-        self.atlas = Atlas({}, None, None, None)
+        self.atlas = Atlas({}, {})
         self.changes = self.selections = 0
         self._selection: tuple[object, gpu.types.GPUTexture] | None = None
         self._held: dict[int, MeshSplats] = {}
@@ -242,12 +240,10 @@ def _atlas(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> Atlas:
         covariances[slot.rows, :6] = packed.covariances[:count]
         covariances[slot.rows, 6] = MODELS.index(packed.model)
         start += count
-    return Atlas(
-        slots,
-        shader.texture(as_texture(means), 4, "RGBA32F"),
-        shader.texture(as_texture(covariances[:, :4]), 4, "RGBA32F"),
-        shader.texture(as_texture(covariances[:, 4:]), 4, "RGBA32F"),
-    )
+    values = {"means": means, "covariances": covariances[:, :4]}
+    values["more_covariances"] = covariances[:, 4:]
+    textures = {n: shader.texture(as_texture(v), 4, "RGBA32F") for n, v in values.items()}
+    return Atlas(slots, textures)
 
 
 def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | None:

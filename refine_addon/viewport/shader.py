@@ -4,7 +4,6 @@ Colours blend display-encoded, as in training; a view's framebuffer blends linea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 
 import gpu
@@ -290,13 +289,17 @@ def blend(
     picture: gpu.types.GPUTexture,
     textures: dict[str, gpu.types.GPUTexture],
     projection: NDArray[np.float64],
-    numbers: Sequence[float],
+    numbers: tuple[float, float, bool, float],
     count: int,
 ) -> gpu.types.GPUFrameBuffer:
-    """Clear a picture and draw `count` splats; `numbers`: the rest of ``ViewData``.
-    `textures`: inputs of the shader of `splats`, held by the caller until drawn."""
+    """Clear a picture and draw `count` splats. `textures`: inputs of the shader of `splats`, held
+    by the caller until drawn; without "depths" or "near_depths" these hide nothing. `numbers`:
+    near plane, texels of depth per pixel, perspective, shape."""
+    nothing = texture(np.ones((1, 1), np.float32), 1, "R32F")
+    hides = [name in textures for name in ("depths", "near_depths")]
     data = np.zeros(24, np.float32)
-    data[:16], data[16 : 16 + len(numbers)] = projection.T.reshape(-1), numbers
+    data[:16], data[16:18] = projection.T.reshape(-1), (picture.width, picture.height)
+    data[18:21], data[21:23], data[23] = numbers[:3], hides, numbers[3]
     block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(data), data))
     frame = gpu.types.GPUFrameBuffer(color_slots=picture)
     with frame.bind():
@@ -307,8 +310,8 @@ def blend(
             gpu.state.depth_test_set("NONE")
             program.bind()
             program.uniform_block("view_data", block)
-            for name, texture in textures.items():
-                program.uniform_sampler(name, texture)
+            for name, held in {"depths": nothing, "near_depths": nothing, **textures}.items():
+                program.uniform_sampler(name, held)
             quad.draw_instanced(program, instance_count=count)
             gpu.state.blend_set("NONE")
     return frame

@@ -195,23 +195,16 @@ class View:
         rows = np.zeros((1 + max(slot.number for slot, _ in shown), 12), np.float32)
         for slot, matrix in shown:
             rows[slot.number] = matrix[:3].reshape(-1)
-        atlas = content.atlas
-        farthest = shader.texture(
-            np.ones((1, 1), np.float32) if depths is None else depths, 1, "R32F"
-        )
         textures = {
+            **content.atlas.textures,
             "order": self._order.texture,
-            "means": atlas.means,
-            "covariances": atlas.covariances,
-            "more_covariances": atlas.more_covariances,
             "colors": self._colors,
             "selection": content.selection(),
             "matrices": shader.texture(rows, 4, "RGBA32F"),
-            "depths": farthest,
-            "near_depths": farthest,
         }  # referenced until drawn, which the shader does not do
-        numbers = (*size, camera.near, camera.size[0] / size[0])
-        numbers += (camera.perspective, depths is not None, False, shape)
+        if depths is not None:
+            textures["depths"] = shader.texture(depths, 1, "R32F")
+        numbers = (camera.near, camera.size[0] / size[0], camera.perspective, shape)
         shader.blend(self._picture, textures, camera.projection, numbers, self._order.count)
 
 
