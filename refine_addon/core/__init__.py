@@ -28,7 +28,6 @@ from .methods import Merge as Merge
 from .methods import Method as Method
 from .methods import Occlusion as Occlusion
 from .methods import Refit as Refit
-from .operations import Move as Move
 from .operations import clean_file as clean_file
 from .operations import convert_files as convert_files
 from .operations import prune_file as prune_file

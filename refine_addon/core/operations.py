@@ -436,42 +436,11 @@ def score_file(
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Move:
-    """A scale, then turns about x, y and z in this order, degrees, then a translation."""
-
-    translate: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (*self.translate, *self.rotate, self.scale))):
-            raise RefineError(f"expected finite numbers to move by, got {self}")
-        if self.scale <= 0.0:
-            raise RefineError(f"scale is {self.scale:g}, expected more than 0")
-
-    @property
-    def matrix(self) -> NDArray[np.float64]:
-        """The move as an affine matrix, (4, 4) float64."""
-        turned = np.eye(3)
-        for axis, degrees in enumerate(self.rotate):
-            one, other = (axis + 1) % 3, (axis + 2) % 3
-            cosine, sine = (f(math.radians(degrees)) for f in (math.cos, math.sin))
-            turn = np.eye(3)
-            turn[[one, other], [one, other]] = cosine
-            turn[one, other], turn[other, one] = -sine, sine
-            turned = turn @ turned
-        matrix = np.eye(4)
-        matrix[:3, :3] = turned * self.scale
-        matrix[:3, 3] = self.translate
-        return matrix
-
-
 def convert_files(
     sources: Sequence[Path | str],
     output: Path | str,
     *,
-    moves: Sequence[Move] = (),
+    matrices: Sequence[NDArray[Any]] = (),
     degree: int | None = None,
     morton: bool = False,
     level: int = 0,
@@ -486,7 +455,7 @@ def convert_files(
     Parameters
     ----------
     sources : sequence of path-like, at least one, in the order of their splats in the output
-    moves : sequence of Move, one for each file, or none
+    matrices : sequence of (4, 4), one for each file, or none; they transform its splats
     degree : int from 0 to 4, optional; harmonics above it are left out
     morton : bool, whether splats are sorted along a Z-shaped (Morton) curve, near ones together
     level : int, of a streamed SOG; 0 is the finest
@@ -495,23 +464,25 @@ def convert_files(
 
     Raises
     ------
-    RefineError : see `read_splats`; also if models differ, files have no such level, or there are
-        no files or another number of moves
+    RefineError : see `read_splats` and `transformed`; also if models differ, files have no such
+        level, or there are no files or another number of matrices
 
     Examples
     --------
     To put a statue into a room, half a unit above::
 
-        moves = (Move(), Move(translate=(0.0, -0.5, 0.0)))
-        convert_files(["room.ply", "statue.spz"], "both.sog", moves=moves)
+        up = np.eye(4)
+        up[1, 3] = -0.5
+        convert_files(["room.ply", "statue.spz"], "both.sog", matrices=[np.eye(4), up])
     """
     if not sources:
         raise RefineError("no files to convert, expected at least one")
-    if moves and len(moves) != len(sources):
-        raise RefineError(f"got {len(moves)} moves, expected {len(sources)}: one for each file")
+    if matrices and len(matrices) != len(sources):
+        count = len(sources)
+        raise RefineError(f"got {len(matrices)} matrices, expected {count}: one for each file")
     if degree not in (None, *range(5)):
         raise RefineError(f"degree is {degree}, expected a whole number from 0 to 4")
-    alone = len(sources) == 1 and not (moves or morton or level) and degree is None
+    alone = len(sources) == 1 and not (matrices or morton or level) and degree is None
 
     def read(form: Format | None) -> Scene:
         if alone:
@@ -528,11 +499,8 @@ def convert_files(
                     f"{file.path}: its splats are {file.model}, those of {files[0].path} "
                     f"{files[0].model}; expected one model, or say which (--model)"
                 )
-        parts = [
-            file.splats() if move == Move() else transformed(file.splats(), move.matrix)
-            for file, move in zip(files, moves or (Move(),) * len(files), strict=True)
-        ]
-        splats = joined(parts)
+        parts = [file.splats() for file in files]
+        splats = joined(list(map(transformed, parts, matrices)) if matrices else parts)
         if degree is not None:
             splats = splats.up_to_degree(degree)
         if morton:  # what is not finite comes last

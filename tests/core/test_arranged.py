@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from refine_addon.command import main
-from refine_addon.core import Move, RefineError, convert_files, read_splats
+from refine_addon.core import RefineError, convert_files, read_splats
 from refine_addon.core.affine import transformed
-from refine_addon.core.splats import ARRAYS
+from refine_addon.core.splats import ARRAYS, rotation_matrices
 from tests.strategies import plain_ply, ply_of
 
 from .test_formats import differences, scene
@@ -57,10 +57,12 @@ def test_files_are_merged_in_their_order(files, capsys):
 
 def test_each_input_is_moved_by_its_own(files):
     """The second by half a turn about z, twice as large, in any format within its bounds."""
-    moves = Move((1, 0, -2)), Move((1, 0, -2), (0, 0, 180), 2)
+    moves = np.eye(4), np.diag([-2.0, -2.0, 2.0, 1.0])
+    for matrix in moves:
+        matrix[:3, 3] = 1, 0, -2
     inputs = [files / "a.ply", files / "b.ply"]
     one, two = (read_splats(path).splats() for path in inputs)
-    convert_files(inputs, files / "out.ply", moves=moves)
+    convert_files(inputs, files / "out.ply", matrices=moves)
     both = read_splats(files / "out.ply").splats()
     np.testing.assert_allclose(both.means[:20], one.means + np.array([1, 0, -2]), atol=1e-6)
     np.testing.assert_allclose(both.means[20:], two.means * [-2, -2, 2] + [1, 0, -2], atol=1e-5)
@@ -68,26 +70,16 @@ def test_each_input_is_moved_by_its_own(files):
     # Of degree 1, the functions of y and x change their sign.
     expected = two.sh_rest[:, :3] * np.array([-1, 1, -1])[:, None]
     np.testing.assert_allclose(both.sh_rest[20:, :3], expected, atol=1e-6)
-    move = Move((0.5, 0.0, 0.0), (10.0, 20.0, 30.0), 1.5)
+    move = np.eye(4)
+    move[:3, :3] = 1.5 * rotation_matrices(np.array([0.9, 0.1, 0.2, 0.3]))
+    move[0, 3] = 0.5
     for suffix, turn in ((".ply", 1e-5), (".splat", 0.07), (".glb", 1e-5)):
-        convert_files(inputs[:1], files / f"out{suffix}", moves=(move,), overwrite=True)
+        convert_files(inputs[:1], files / f"out{suffix}", matrices=[move], overwrite=True)
         found = read_splats(files / f"out{suffix}").splats()
-        apart = differences(found, transformed(one, move.matrix))
+        apart = differences(found, transformed(one, move))
         assert apart["mean"] < 1e-5
         assert apart["log scale"] < 1e-5
         assert apart["rotation"] < turn
-
-
-def test_turns_come_about_x_then_y_then_z():
-    """By hand: z goes to -y about x, and that to x about z. About y, x goes to -z."""
-    point = np.array([0.0, 0.0, 1.0, 1.0])
-
-    np.testing.assert_allclose(Move(rotate=(90, 0, 0)).matrix @ point, [0, -1, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(Move(rotate=(90, 0, 90)).matrix @ point, [1, 0, 0, 1], atol=1e-12)
-    x = np.array([1.0, 0.0, 0.0, 1.0])
-    np.testing.assert_allclose(Move(rotate=(0, 90, 0)).matrix @ x, [0, 0, -1, 1], atol=1e-12)
-    matrix = Move((1, 2, 3), scale=2.0).matrix
-    np.testing.assert_allclose(matrix @ point, [1, 2, 5, 1], atol=1e-12)
 
 
 def test_a_curve_puts_nearby_order(tmp_path):
@@ -150,18 +142,7 @@ def test_a_level_of_a_streamed_sog_is_converted(tmp_path):
         convert_files([plain], out, level=1, overwrite=True)
 
 
-@pytest.mark.parametrize(
-    ("values", "word"),
-    [
-        ({"scale": 0}, "scale is 0, expected more than 0"),
-        ({"scale": float("nan")}, "expected finite numbers to move by"),
-        ({"scale": 1e31}, "scale"),  # beyond what float32 holds; the matrix says so
-    ],
-)
-def test_a_move_that_is_none_is_refused(files, capsys, values, word):
-    """Before any work, as a degree or a name that cannot be is."""
-    with pytest.raises(RefineError, match=word):
-        convert_files([files / "a.ply"], files / "o.ply", moves=(Move(**values),))
+def test_a_degree_or_a_name_that_cannot_be_is_refused(files, capsys):
     assert call(files, "a.ply", "o.ply", "--degree", "5") == 2
     assert call(files, "a.ply", "b.ply", "folder") == 2
     assert "folder: expected a name that ends in .ply" in capsys.readouterr().err
@@ -172,10 +153,12 @@ def test_a_move_that_is_none_is_refused(files, capsys, values, word):
     ("sources", "how", "words"),
     [
         ([], {}, "no files to convert, expected at least one"),
-        (["a.ply"], {"moves": [Move()] * 2}, "got 2 moves, expected 1: one for each file"),
+        (["a.ply"], {"matrices": [1, 1]}, "got 2 matrices, expected 1: one for each file"),
+        (["a.ply"], {"matrices": [np.eye(3)]}, r"expected a finite \(4, 4\) matrix"),
+        (["a.ply"], {"matrices": [np.zeros((4, 4))]}, "flat or not affine"),
         (["a.ply"], {"degree": -1}, "degree is -1, expected a whole number from 0 to 4"),
     ],
-    ids=["no files", "moves", "degree"],
+    ids=["no files", "number", "shape", "flat", "degree"],
 )
 def test_a_call_that_does_not_fit_is_refused(files, sources, how, words):
     with pytest.raises(RefineError, match=words):
