@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .core.execute import Cancelled, checkpoint
+from .core.images import Codec
 
 _STEP = 0.1  # Seconds between two checks of a waiting thread for cancelling
 _LOSSLESS = 100  # Quality at which Blender compresses WebP without loss
@@ -53,27 +54,8 @@ def serve() -> None:
                 answer.set_exception(error)
 
 
-class BlenderImages:
-    """A codec (`refine_addon.core.images.Codec`) on Blender's main thread."""
-
-    def size(self, data: bytes) -> tuple[int, int]:
-        """Width and height from the file's first bytes, a RIFF container, whose first chunk is
-        ``VP8X`` (sizes less 1 in 24 bits each, after 4 bytes), ``VP8L`` (sizes less 1 in 14 bits
-        each, after 1 byte) or ``VP8 `` (sizes in 14 bits each, after 6 bytes)."""
-        kind, start = data[12:16], data[20:30]
-        if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(start) < 10:
-            raise ValueError("not a WebP image")
-        # Of such a file Blender makes a black image.
-        if int.from_bytes(data[4:8], "little") + 8 > len(data):
-            raise ValueError("truncated")
-        if kind == b"VP8X":
-            sides = [int.from_bytes(start[at : at + 3], "little") + 1 for at in (4, 7)]
-        elif kind == b"VP8L":
-            packed = int.from_bytes(start[1:5], "little")
-            sides = [(packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1]
-        else:
-            sides = [int.from_bytes(start[at : at + 2], "little") & 0x3FFF for at in (6, 8)]
-        return sides[0], sides[1]
+class BlenderImages(Codec):
+    """A codec on Blender's main thread."""
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
         """Pixels, (height, width, 4), top row first."""

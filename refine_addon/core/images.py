@@ -7,7 +7,6 @@ sets one, such as Blender's, and without it Pillow is imported when needed.
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import io
 import struct
@@ -143,7 +142,26 @@ class Codec(Protocol):
     """A reader and writer of WebP images."""
 
     def size(self, data: bytes) -> tuple[int, int]:
-        """Width and height in pixels, without unpacking; `ValueError` if damaged."""
+        """Width and height in pixels, without unpacking; `ValueError` if damaged.
+
+        From the first chunk of a RIFF container: ``VP8X`` (sizes less 1 in 24 bits each, after 4
+        bytes), ``VP8L`` (sizes less 1 in 14 bits each, after 1 byte) or ``VP8 `` (sizes in 14 bits
+        each, after 6 bytes).
+        """
+        kind, start = data[12:16], data[20:30]
+        if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(start) < 10:
+            raise ValueError("not a WebP image")
+        # Of such a file Blender makes a black image.
+        if int.from_bytes(data[4:8], "little") + 8 > len(data):
+            raise ValueError("truncated")
+        if kind == b"VP8X":
+            across, down = (int.from_bytes(start[at : at + 3], "little") + 1 for at in (4, 7))
+        elif kind == b"VP8L":
+            packed = int.from_bytes(start[1:5], "little")
+            across, down = (packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1
+        else:
+            across, down = (int.from_bytes(start[at : at + 2], "little") & 0x3FFF for at in (6, 8))
+        return across, down
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
         """Pixels, (height, width, 4), the top row first; `ValueError` if damaged."""
@@ -152,28 +170,18 @@ class Codec(Protocol):
         """WebP image that holds these pixels, (height, width, 4), to the bit."""
 
 
-class _Pillow:
+class _Pillow(Codec):
     """Pillow as a codec."""
 
     def __init__(self) -> None:
         self._image: Any = importlib.import_module("PIL.Image")
 
-    def size(self, data: bytes) -> tuple[int, int]:
-        with self._opened(data) as image:
-            return image.size
-
     def decode(self, data: bytes) -> NDArray[np.uint8]:
-        with self._opened(data) as image:
-            return np.array(image.convert("RGBA"))
-
-    @contextlib.contextmanager
-    def _opened(self, data):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # about large images, which we refuse by their size
-                image = self._image.open(io.BytesIO(data), formats=["WEBP"])
-            with image:
-                yield image
+                with self._image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+                    return np.array(image.convert("RGBA"))
         except (OSError, SyntaxError, self._image.DecompressionBombError) as error:
             raise ValueError(str(error)) from error
 
