@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,10 +59,10 @@ class Tile(NamedTuple):
 def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
     """Tiles of a scene (`tile_at`); `RefineError` also for a file twice, other models, no splat."""
     tiles: list[Tile] = []
-    given: dict[Hashable, Tile] = {}
+    given: dict[str, Tile] = {}
     for path in paths:
         tile = tile_at(path, model)
-        first = given.setdefault(storage.file_key(tile.place), tile)
+        first = given.setdefault(storage.identity(tile.place), tile)
         if first is not tile:
             also = "" if first.path == tile.path else f", also as {first.path}"
             raise RefineError(f"{tile.path}: is given twice{also}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import secrets
 import stat
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +42,6 @@ def identity(path: Path | Url) -> str:
             return name
         path = Path(name.removeprefix(_LOCAL))
     return f"{_LOCAL}{path.resolve()}"
-
-
-def file_key(path: Path | Url) -> Hashable:
-    """Key that is the same for all names of an existing file, hard links included."""
-    name = identity(path)
-    if not name.startswith(_LOCAL):
-        return name
-    with _explained(path, "cannot be read"):
-        status = Path(name.removeprefix(_LOCAL)).stat()
-    return (status.st_dev, status.st_ino) if status.st_ino else name
 
 
 def state(path: Path | Url) -> tuple[int, int | str]:
