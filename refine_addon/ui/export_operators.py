@@ -35,7 +35,8 @@ _FORMATS = (
 
 class Exporting(Job, OnSplats, ExportHelper):
     """An operator that writes the active object's splats, and does not change it.
-    `gather` ends the job with warnings; `compute` gives sentences on what was written."""
+    ``new_name(obj)`` is what the file browser proposes; `gather` ends the job with warnings;
+    `compute` gives sentences on what was written."""
 
     bl_options = {"REGISTER", "PRESET"}
     apply_transform: BoolProperty(
@@ -48,11 +49,6 @@ class Exporting(Job, OnSplats, ExportHelper):
         description="Replace a file or folder of that name",
         options={"SKIP_SAVE"},
     )
-
-    @staticmethod
-    def new_name(obj: bpy.types.Object) -> str:
-        """Name proposed by the file browser."""
-        raise NotImplementedError
 
     def invoke(self, context: Context, event: bpy.types.Event) -> Answer:
         """Ask where; picking an existing file means to replace it."""

@@ -42,10 +42,6 @@ SHAPES = (
 )
 
 
-def _changed(_volume: RefineVolume, context: bpy.types.Context) -> None:
-    plans.mark_again(context)
-
-
 class RefineVolume(bpy.types.PropertyGroup):
     """A volume of the list, at ``scene.refine.volumes``."""
 
@@ -54,10 +50,13 @@ class RefineVolume(bpy.types.PropertyGroup):
         description="A closed mesh, or an empty that is shown as a cube or a sphere",
         type=bpy.types.Object,
         poll=lambda _volume, obj: demands.can_be_volume(obj),
-        update=_changed,
+        update=plans.mark_again,
     )
     role: EnumProperty(
-        name="Role", description="What happens to the splats inside", items=ROLES, update=_changed
+        name="Role",
+        description="What happens to the splats inside",
+        items=ROLES,
+        update=plans.mark_again,
     )
 
 
@@ -132,7 +131,7 @@ class REFINE_OT_drop_volume(AtOnce, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         """Remove it."""
         context.scene.refine.volumes.remove(self.index)
-        plans.mark_again(context)
+        plans.mark_again(self, context)
 
 
 _MARKS = {"STAY": mesh_edit.PROTECT, "GO": mesh_edit.MUST_GO}
@@ -164,7 +163,7 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
             before = mesh_edit.marks(obj, name)
             others = False if before is None else before
             mesh_edit.mark(obj, name, np.where(chosen, mark == self.mark, others))
-        plans.mark_again(context)
+        plans.mark_again(self, context)
 
 
 class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):

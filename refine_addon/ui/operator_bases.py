@@ -301,18 +301,8 @@ class OnSplats(Needing):
     needs: tuple[Need, ...] = (idle, on_splats, out_of_edit_mode)
 
 
-class OnScored(OnSplats):
-    """An operator on the active object, which must be scored."""
-
-    needs = (*OnSplats.needs, scored)
-
-
 class AtOnce(Needing):
-    """An operator without a thread."""
-
-    def act(self, context: bpy.types.Context) -> None:
-        """Do it; `FAILURES` are reported as errors."""
-        raise NotImplementedError
+    """An operator without a thread: ``act(context)`` does it; `FAILURES` are reported as errors."""
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do it, or report why not."""
@@ -324,28 +314,23 @@ class AtOnce(Needing):
 
 
 class Job:
-    """An operator on a thread, with progress bar and Esc, defined by three functions and `doing`,
-    its name while it runs. The window stays usable; the result is refused if objects changed.
+    """An operator on a thread, with progress bar and Esc. The window stays usable; the result is
+    refused if objects changed. A class defines `doing`, its name while it runs, and
+
+    - ``gather(context)``: the objects that `put` writes to, and the job, which is the input of
+      `compute`; raises one of `FAILURES`,
+    - ``put(context, group, job, result)``: write the result to the unchanged objects, all or none.
+
     `partial_step`: the step whose partial result is kept on cancel (`Result.stopped`)."""
 
     doing = partial_step = ""
     by_hand = False  # Whether a user started it; `invoke` sets it, also before a file browser
     _running: Running | None = None
 
-    def gather(self, context: bpy.types.Context) -> tuple[list[SplatObject], Any]:
-        """Objects that `put` writes to, and the input of `compute`; raises one of `FAILURES`."""
-        raise NotImplementedError
-
     @staticmethod
     def compute(job: Any, progress: Progress) -> Any:
         """The result; on any thread, with arrays only. By default it calls the job."""
         return job(progress=progress)
-
-    def put(
-        self, context: bpy.types.Context, group: list[SplatObject], job: Any, result: Any
-    ) -> None:
-        """Write the result to the unchanged objects: all or nothing."""
-        raise NotImplementedError
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Start the work on a thread."""

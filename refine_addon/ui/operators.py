@@ -32,7 +32,7 @@ from ..objects.splat_group import Change, Members
 from ..viewport import draw as viewport_draw
 from . import plans
 from .images import put
-from .operator_bases import Answer, Job, OnScored, OnSplats, in_object_mode
+from .operator_bases import Answer, Job, OnSplats, in_object_mode, scored
 from .wrapped import counted
 
 _SCORED = 0.97  # Share of the time that scoring takes; the rest counts the splats in each view
@@ -127,12 +127,13 @@ class _Applied(NamedTuple):
         return self.result.stopped
 
 
-class REFINE_OT_apply(Job, OnScored, bpy.types.Operator):
+class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
     """Delete the splats that the budget does not keep; Merge and Refit adapt the kept ones"""
 
     bl_idname = "refine.apply"
     bl_label = "Apply"
     bl_options = {"UNDO"}
+    needs = (*OnSplats.needs, scored)
     doing = "Pruning splats"
     partial_step = REFITTING
 
@@ -226,12 +227,13 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         self.warn(wanted.notes({level.goal: level.remark for level in levels}))
 
 
-class REFINE_OT_compare(Job, OnScored, bpy.types.Operator):
+class REFINE_OT_compare(Job, OnSplats, bpy.types.Operator):
     """Draw what the active camera sees before and after Apply, and measure the loss in dB"""
 
     bl_idname = "refine.compare"
     bl_label = "Compare"
     bl_options = {"REGISTER"}
+    needs = (*OnSplats.needs, scored)
     doing = "Comparing"
 
     def gather(self, context: Context) -> tuple[Members, Any]:

@@ -46,11 +46,6 @@ class REFINE_OT_view(bpy.types.Operator):
 
     mode: EnumProperty(name="Show", description="What is drawn", items=viewport_draw.MODES)
 
-    @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        """Whether there is a window to draw in."""
-        return not bpy.app.background
-
     description = tooltips("mode", viewport_draw.MODES)
 
     def execute(self, _context: bpy.types.Context) -> Answer:
@@ -269,7 +264,7 @@ class REFINE_PT_deliver(InSidebar, bpy.types.Panel):
         """Draw the buttons."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.operator("refine.export_ply", icon="EXPORT")
-        render_operators.draw_buttons(layout)
+        render_operators.draw_buttons(layout.column(align=True))
         column = _named_column(layout)
         column.prop(settings, "levels")
         column.operator("refine.levels", icon="MOD_DECIM")

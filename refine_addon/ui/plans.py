@@ -59,8 +59,8 @@ _WORDS = {
 }
 
 
-def changed(context: bpy.types.Context) -> None:
-    """Plan anew once the slider rests, in scripts at once."""
+def changed(_settings: Any, context: bpy.types.Context) -> None:
+    """Plan anew once the slider rests, in scripts at once. Settings call this."""
     obj = getattr(context, "object", None)  # not in every editor
     if bpy.app.background:
         refresh(context)
@@ -75,7 +75,7 @@ def refresh(context: bpy.types.Context) -> None:
         _refresh(context.scene, [obj])
 
 
-def mark_again(context: bpy.types.Context) -> None:
+def mark_again(_settings: Any, context: bpy.types.Context) -> None:
     """Renew the marks on protected and removed splats soon: of the active object or the first
     visible one, and of all that are selected, marked, scored, or searched for floaters."""
     active = getattr(context, "object", None)
@@ -179,8 +179,8 @@ def _key(obj: bpy.types.Object, settings: Any) -> Any:
         (item.role, item.object.session_uid, *map(tuple, item.object.matrix_world))
         for item in demands.listed(settings.id_data)
     ]
-    budget = (settings.budget, getattr(settings, settings.budget), settings.method)
-    budget += (settings.max_mb_in,)
+    amount = getattr(settings, settings.budget)
+    budget = (settings.budget, amount, settings.max_mb_in, settings.method)
     return scorings, budget, settings.protect, volumes, images.look(bpy.context.preferences)
 
 
@@ -382,7 +382,7 @@ def _undone(*_: object) -> None:
     _forget()
     _last.clear()
     if not bpy.app.background:
-        (mark_again if bpy.context.scene.refine.volumes else changed)(bpy.context)
+        (mark_again if bpy.context.scene.refine.volumes else changed)(None, bpy.context)
 
 
 @persistent
@@ -397,7 +397,7 @@ def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
         original = update.id.original
         moved = update.is_updated_transform and isinstance(original, bpy.types.Object)
         if original in shapes or (moved and mesh_layout.looks_like_splats(original)):
-            mark_again(bpy.context)
+            mark_again(None, bpy.context)
             return
 
 

@@ -98,14 +98,6 @@ SOURCES = (
 )
 
 
-def _plan_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
-    plans.changed(context)
-
-
-def _mark_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
-    plans.mark_again(context)
-
-
 def _model(_settings: RefineSettings) -> int:
     layout = mesh_layout.layout_if_any(getattr(bpy.context, "object", None))
     return MODELS.index(layout.model) if layout else 0
@@ -148,7 +140,7 @@ class _Preferred:
         description="How splats are pruned, from instant to best",
         items=METHODS,
         default=Merge.name,
-        update=_plan_again,
+        update=plans.changed,
     )
     views: IntProperty(
         name="Views",
@@ -183,13 +175,13 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         description="How many of the floaters go",
         items=STRENGTHS,
         default="USUAL",
-        update=_mark_again,
+        update=plans.mark_again,
     )
     budget: EnumProperty(
         name="Budget",
         description="How the budget is given",
         items=BUDGETS,
-        update=_plan_again,
+        update=plans.changed,
     )
     percent: FloatProperty(
         name="Remove",
@@ -199,25 +191,25 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         default=50.0,
         min=0.0,
         max=99.99,
-        update=_plan_again,
+        update=plans.changed,
     )
     keep: IntProperty(
         name="Keep",
         description="How many splats stay",
         default=100_000,
         min=1,
-        update=_plan_again,
+        update=plans.changed,
     )
     max_mb: FloatProperty(
         name="MB",
         description="Size of the exported file, in megabytes of a million bytes",
         default=100.0,
         min=1e-6,
-        update=_plan_again,
+        update=plans.changed,
     )
     max_mb_in: EnumProperty(
         name="In", description="Format of the exported file",
-        items=[(end, end, "") for end in SUFFIXES], update=_plan_again,
+        items=[(end, end, "") for end in SUFFIXES], update=plans.changed,
     )  # fmt: skip
     psnr: FloatProperty(
         name="PSNR (dB)",
@@ -226,14 +218,14 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         default=40.0,
         min=1.0,
         max=99.0,
-        update=_plan_again,
+        update=plans.changed,
     )
     protect: StringProperty(
         name="Protect",
         description="Vertex group, or boolean or float point attribute, whose splats stay",
         search=_protectable,
         search_options={"SORT", "SUGGESTION"},
-        update=_plan_again,
+        update=plans.changed,
     )
     volumes: CollectionProperty(
         name="Volumes", description="Objects that mark what must stay and go", type=RefineVolume

@@ -241,21 +241,16 @@ def _draw_whole() -> None:
         window.screen.show_statusbar = window.screen.show_statusbar
 
 
-def draw_buttons(layout: bpy.types.UILayout) -> None:
-    """Draw the panel's buttons."""
-    column = layout.column(align=True)
-    column.operator("refine.render", text="Render with Splats", icon="RENDER_STILL")
-    text = "Render Animation"
-    column.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
+def draw_buttons(layout: bpy.types.UILayout, animation: str = "Render Animation") -> None:
+    """Draw a button, or an entry, for a picture and one for an animation."""
+    layout.operator("refine.render", icon="RENDER_STILL")
+    layout.operator("refine.render", text=animation, icon="RENDER_ANIMATION").animation = True
 
 
 def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
     """Draw the entries of Blender's menu Render."""
-    layout = menu.layout
-    layout.separator()
-    layout.operator("refine.render", icon="RENDER_STILL")
-    text = "Render Animation with Splats"
-    layout.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
+    menu.layout.separator()
+    draw_buttons(menu.layout, "Render Animation with Splats")
 
 
 @persistent

@@ -280,7 +280,7 @@ def test_a_volume_that_moves_marks_all_splats_anew(addon, quarter, room_cameras)
     box.location.x += 0.4
     bpy.context.view_layer.update()
     assert plans.stored(quarter, settings) is None
-    plans.mark_again(bpy.context)
+    plans.mark_again(None, bpy.context)
 
     now = [read(addon, obj, "refine_force") for obj in (quarter, *others)]
     assert not np.array_equal(now[0], before)
