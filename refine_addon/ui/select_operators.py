@@ -23,6 +23,7 @@ from ..mesh import selection
 from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
+from ..viewport import draw as viewport_draw
 from . import plans, wrapped
 from .operator_bases import Answer, AtOnce, Job, OnSplats, tooltips
 from .select_tools import MODES, SHAPES, selected_count
@@ -204,6 +205,7 @@ class REFINE_OT_grade(AtOnce, OnSplats, bpy.types.Operator):
         chosen = selection.selected(checked.obj)
         rows = np.flatnonzero(chosen if chosen.any() else ~chosen)
         splat_group.grade(checked, rows, grading(self.exposure, self.tint, self.saturation))
+        viewport_draw.untint()
 
 
 def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -96,6 +96,7 @@ class Content:
         self.pool = ThreadPoolExecutor(1, "refine-view")
         self.atlas = Atlas({}, {})
         self.changes = self.selections = 0
+        self._tints = True
         self._selection: tuple[object, gpu.types.GPUTexture] | None = None
         self._held: dict[int, MeshSplats] = {}
         self._stale: set[int] = set()
@@ -117,13 +118,19 @@ class Content:
             held.read = held.read._replace(selected=chosen)
             held.marks = held.marks._replace(selected=chosen[held.packed.vertices])
             self.selections += 1
+            self._tints = True
+
+    def untint(self) -> None:
+        """Show selected splats in their own colours until the selection changes."""
+        self._tints = False
+        self.selections += 1
 
     def selection(self) -> gpu.types.GPUTexture:
-        """Texture with a texel for each row of the atlas: 1 if selected, else 0."""
+        """Texture with a texel for each row of the atlas: 1 if tinted as selected, else 0."""
         key = (self.atlas, self.selections)
         if self._selection is None or self._selection[0] != key:
             flags = np.zeros(self.atlas.rows, np.float32)
-            for slot in self.atlas.slots.values():
+            for slot in self.atlas.slots.values() if self._tints else ():
                 if slot.held.marks.selected is not None:
                     flags[slot.rows] = slot.held.marks.selected[: slot.count]
             self._selection = key, shader.texture(as_texture(flags), 1, "R8")
@@ -199,7 +206,9 @@ class Content:
         held.marks = marks = Marks(
             *(None if values is None else values[packed.vertices] for values in held.read)
         )
-        self.selections += not same(before.selected, marks.selected)
+        if not same(before.selected, marks.selected):
+            self.selections += 1
+            self._tints = True
         if not same(before.forced, marks.forced):
             held.marked += 1
             held.kinds = tuple(k for k in MARKS if marks.forced is not None and k in marks.forced)

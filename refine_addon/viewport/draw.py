@@ -75,6 +75,11 @@ def select(mesh: int, chosen: NDArray[np.bool_]) -> None:
         _redraw()
 
 
+def untint() -> None:
+    """Show selected splats in their own colours until the selection changes."""
+    _state.content.untint()
+
+
 def show(wanted: str) -> None:
     """Draw splats in all 3D views, or stop."""
     if wanted == "OFF":

@@ -27,7 +27,7 @@ class Packing:
 def test_splats_are_drawn_as_they_are_packed(addon, few, monkeypatch):
     """100 splats deleted: the old ones are drawn meanwhile, with as many ranks as they are.
     New ranks of the same splats are drawn anew, or *Heat* would not be coloured again."""
-    monkeypatch.setattr(addon.viewport.content.shader, "texture", lambda *_: None)
+    monkeypatch.setattr(addon.viewport.content.shader, "texture", lambda texels, *_: texels)
     content, packing = addon.viewport.content.Content(), Packing()  # there is no graphics card
     content.pool = packing
 
@@ -57,3 +57,11 @@ def test_splats_are_drawn_as_they_are_packed(addon, few, monkeypatch):
     scored, values = slot.held.scored, few.data.attributes[addon.mesh.scores.RANK].data
     values[0].value = 1.0 - values[0].value
     assert drawn().held.scored == scored + 1
+
+    for row in (0, 1):  # selected splats are tinted, but not once graded
+        addon.mesh.selection.select(few, np.arange(3876) == row)
+        drawn()
+        assert content.selection().any()
+        content.untint()
+        drawn()
+        assert not content.selection().any()
