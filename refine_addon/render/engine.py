@@ -28,7 +28,8 @@ from ..core.splats import Splats, drawable, joined
 from ..core.views import View, ViewSet, view_through
 from ..core.visibility.scene import scene_of
 from ..mesh import attributes as mesh_attributes
-from ..mesh.layout import SplatObject, check, splat_count
+from ..mesh.layout import SplatObject, check
+from ..objects.instances import placings
 from . import card, meshes
 
 _FAR = 1e4
@@ -148,12 +149,10 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
     """All splats of a render in the world, instances too, in their colours seen from `eye`.
     Modifiers are ignored, as in the 3D views."""
     parts = []
-    for instance in depsgraph.object_instances:
-        obj = instance.object.original
-        if not meshes.drawn_by_us(obj) or not splat_count(obj.data):
+    for _, obj, matrix, _ in placings(depsgraph):
+        if not meshes.drawn_by_us(obj):
             continue
         checkpoint()
-        matrix = np.array(instance.matrix_world, np.float64)
         if not np.isfinite(matrix).all() or is_flat(matrix):  # such meshes show nothing either
             continue
         evaluated = SimpleNamespace(data=obj.data.evaluated_get(depsgraph))
@@ -178,9 +177,7 @@ def refuse(scene: bpy.types.Scene) -> None:
     """Raise `RefineError` for scenes that cannot be rendered."""
     label = f"scene '{scene.name}'"
     active_camera(scene)
-    instanced = {obj.instance_collection for obj in bpy.data.objects} - {None}
-    members = [member for collection in instanced for member in collection.all_objects]
-    if not any(meshes.drawn_by_us(obj) for obj in (*scene.objects, *members)):
+    if not any(map(meshes.drawn_by_us, bpy.data.objects)):  # instanced ones may be in no scene
         raise RefineError(f"{label}: has no splats to draw; import some, or use Render Image")
     if scene.render.use_multiview:
         raise RefineError(f"{label}: splats are not drawn in stereo; switch off Stereoscopy")

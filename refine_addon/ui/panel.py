@@ -7,7 +7,6 @@ from typing import Any
 
 import bpy
 from bpy.props import EnumProperty
-from mathutils import Matrix
 
 from ..cameras import CameraChoice, known_turn
 from ..core.formats.ply import stated_model
@@ -16,9 +15,8 @@ from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..objects import demands, splat_group
+from ..objects import demands, instances, splat_group
 from ..viewport import draw as viewport_draw
-from ..viewport.content import placings
 from . import (
     camera_operators,
     images,
@@ -54,12 +52,18 @@ class REFINE_OT_view(bpy.types.Operator):
         return {"FINISHED"}
 
 
+def _count(context: bpy.types.Context) -> int:
+    """Number of splats that the active object instances."""
+    counts = (mesh_layout.splat_count(place.obj.data) for place in instances.shown_by(context))
+    return cached("instanced", lambda: sum(counts))
+
+
 def _instances(context: bpy.types.Context) -> str:
     """A need: the active object instances splats."""
     obj = context.object
-    if obj is None or mesh_layout.looks_like_splats(obj) or not any(placings([obj])):
-        return "Select an empty that instances a collection with splats"
-    return "Make the empty local first: a library has it" if obj.library else ""
+    if obj is None or mesh_layout.looks_like_splats(obj) or not _count(context):
+        return "Select an object that instances splats"
+    return "Make the object local first: a library has it" if obj.library else ""
 
 
 class REFINE_OT_make_real(AtOnce, bpy.types.Operator):
@@ -70,31 +74,15 @@ class REFINE_OT_make_real(AtOnce, bpy.types.Operator):
     needs = (idle, in_object_mode, _instances)
 
     def act(self, context: bpy.types.Context) -> None:
-        """Copy them with their data to where they are seen, and hide the instance."""
-        empty, real = context.object, []
-        for place in list(placings([empty])):
-            copy = place.obj.copy()
-            copy.data = place.obj.data.copy()
-            copy.animation_data_clear()
-            copy.constraints.clear()
-            copy.parent = None
-            copy.matrix_world = Matrix(place.matrix)
-            for collection in empty.users_collection:
-                collection.objects.link(copy)
-            real.append(copy)
-        empty.instance_type = "NONE"
-        empty.select_set(False)
-        for copy in real:
-            copy.select_set(True)
-        context.view_layer.objects.active = real[0]
+        """Copy them with their data to where they are seen, and instance them no more."""
+        instances.make_real(context)
 
 
 def _draw_instances(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
     """Draw the active object's instances and the button; whether it instances splats."""
     if _instances(context):
         return False
-    count = sum(mesh_layout.splat_count(place.obj.data) for place in placings([context.object]))
-    text = f"{count:,} splats of collection '{context.object.instance_collection.name}'"
+    text = f"{_count(context):,} instanced splats"
     wrapped.label(layout, text, icon="OUTLINER_OB_GROUP_INSTANCE")
     layout.operator("refine.make_real")
     return True

@@ -1,11 +1,10 @@
-"""The drawn data: splats of meshes, packed once, and their textures; and placements of splats:
-objects of the view layer, and instances of collections.
+"""The drawn data: splats of meshes, packed once, and their textures.
 Blender draws the points of a mesh without faces, and has no switch for that. So the evaluated copy
 of the object, which files, undo and scripts do not see, gets the display type *Bounds*."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -13,7 +12,6 @@ from typing import Any, NamedTuple
 import bpy
 import gpu
 import numpy as np
-from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..core.errors import RefineError
@@ -22,11 +20,10 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh import selection as mesh_selection
-from ..mesh.layout import SplatObject, check, has, looks_like_splats, sh_degree, splat_count
+from ..mesh.layout import SplatObject, check, has, sh_degree
+from ..objects.instances import Key, Placing, placings
 from . import shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
-
-_DEEPEST = 8  # Nesting of instances up to which Blender draws
 
 
 class Marks(NamedTuple):
@@ -76,10 +73,10 @@ class Slot:
 @dataclass(frozen=True, eq=False)
 class Atlas:
     """Splats of several objects in shared textures, so that they are sorted and blended together.
-    `slots`: by keys of `Placing`. Texels of `textures`: "means": mean and slot number;
-    "covariances": xx, xy, xz, yy; "more_covariances": yz, zz, model, 0."""
+    Texels of `textures`: "means": mean and slot number; "covariances": xx, xy, xz, yy;
+    "more_covariances": yz, zz, model, 0."""
 
-    slots: dict[tuple[int, int], Slot]
+    slots: dict[Key, Slot]
     textures: dict[str, gpu.types.GPUTexture]
 
     @property
@@ -145,8 +142,8 @@ class Content:
         return any(held.future and held.future.done() for held in self._held.values())
 
     def update(
-        self, places: Iterable[Placing], existing: Callable[[], set[tuple[int, int]]]
-    ) -> dict[tuple[int, int], NDArray[np.float64]]:
+        self, places: Iterable[Placing], existing: Callable[[], set[Key]]
+    ) -> dict[Key, NDArray[np.float64]]:
         """Prepare placed splats; (4, 4) world matrices of those ready, by key.
         Splats in edit mode are those of the last `read_edited`. `existing`: keys of all splats of
         the file, whose textures are kept."""
@@ -155,7 +152,7 @@ class Content:
                 held.packed, held.future, held.important = held.future.result(), None, None
                 self._mark(held)
         wanted = {}
-        for key, obj, matrix in places:
+        for key, obj, matrix, _ in places:
             mesh = key[1]
             if mesh in self.refused:
                 continue
@@ -194,9 +191,13 @@ class Content:
         )
         signature = (len(checked), held.degree, mesh_attributes.digest(checked))
         if signature != held.signature:
+            equal = [one for one in self._held.values() if one.signature == signature]
+            if packed := next((one.packed for one in equal if not one.future), None):
+                held.packed, held.future, held.important = packed, None, None
+            else:
+                held.future = self.pool.submit(pack, mesh_attributes.splats_from_object(checked))
             held.signature = signature
-            held.future = self.pool.submit(pack, mesh_attributes.splats_from_object(checked))
-        elif held.future is None:
+        if held.future is None:
             self._mark(held)
 
     def _mark(self, held: MeshSplats) -> None:
@@ -219,9 +220,7 @@ class Content:
             held.important = most_important_first(packed, marks.ranks)
         self.changes += 1
 
-    def _place(
-        self, wanted: set[tuple[int, int]], existing: Callable[[], set[tuple[int, int]]]
-    ) -> None:
+    def _place(self, wanted: set[Key], existing: Callable[[], set[Key]]) -> None:
         slots = self.atlas.slots
         fresh = {
             key for key in wanted if key in slots and slots[key].packed is self._held[key[1]].packed
@@ -237,7 +236,7 @@ class Content:
         self.atlas = _atlas(keys, self._held)
 
 
-def _atlas(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> Atlas:
+def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:
     packs = [held[mesh].packed for _, mesh in keys]
     counts = first_of_each([len(packed) for packed in packs], MOST)
     means = np.empty((sum(counts), 4), np.float32)
@@ -259,57 +258,18 @@ def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | Non
     return mesh_attributes.read_attribute(mesh, name) if has(mesh, name, kind) else None
 
 
-class Placing(NamedTuple):
-    """An object with splats and its (4, 4) matrix to the world. `key`: a number that identifies the
-    object and its instancers, and one that identifies the mesh."""
-
-    key: tuple[int, int]
-    obj: bpy.types.Object
-    matrix: NDArray[np.float64]
-
-
-def placings(objects: list[bpy.types.Object]) -> Iterator[Placing]:
-    """Placings of the splats among some objects of a scene, and among their instances."""
-    for obj in objects:
-        yield from _placed(obj, obj.matrix_world, 0, 0)
-
-
-def instanced(objects: list[bpy.types.Object]) -> set[bpy.types.Object]:
-    """Splat objects that some objects instance and that are not among these."""
-    return {place.obj for place in placings(objects)} - set(objects)
-
-
-def every() -> set[tuple[int, int]]:
-    """Keys of all splats of the file."""
-    return {placing.key for placing in placings(list(bpy.data.objects))}
-
-
-def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> Iterator[Placing]:
-    """Placings of an object's own splats, or of its instances', by its matrix to the world."""
-    chain = (chain << 32) + obj.session_uid
-    if looks_like_splats(obj):
-        if splat_count(obj.data):
-            yield Placing((chain, obj.data.session_uid), obj, np.array(matrix, np.float64))
-        return
-    collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
-    if collection is None or depth == _DEEPEST:
-        return
-    base = matrix @ Matrix.Translation(-collection.instance_offset)
-    for member in collection.all_objects:
-        if not member.hide_viewport:
-            yield from _placed(member, base @ member.matrix_world, chain, depth + 1)
-
-
 def hide_points(depsgraph: bpy.types.Depsgraph | None, refused: Container[int] | None) -> None:
-    """Show a view layer's splats as bounding boxes, except `refused` meshes; if None, as points."""
+    """Show a view layer's splats as bounding boxes, except `refused` meshes; if None, as points.
+    Not if the object whose nodes instance them has faces, which would be hidden, too."""
     if depsgraph is None or depsgraph.mode != "VIEWPORT":
         return
-    objects = [obj.original for obj in depsgraph.scene.objects]
-    for obj in filter(looks_like_splats, {*objects, *instanced(objects)}):
-        hidden = refused is not None and obj.data.session_uid not in refused
-        wanted = "BOUNDS" if hidden and not is_edited(obj) else obj.display_type
+    for place in placings(depsgraph):
+        obj = place.obj.original
         evaluated = obj.evaluated_get(depsgraph)
-        if evaluated.is_evaluated and evaluated.display_type != wanted:
+        faces = obj != place.obj and getattr(evaluated.data, "polygons", ())
+        hidden = refused is not None and place.key[1] not in refused and not faces
+        wanted = "BOUNDS" if hidden and not is_edited(obj) else obj.display_type
+        if evaluated.display_type != wanted:
             evaluated.display_type = wanted
 
 

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
+from ..objects.instances import Key, placings
 from . import overlays, shader
-from .content import Content, every, hide_points, is_edited, placings
+from .content import Content, hide_points, is_edited
 from .view import Camera, View
 
 MODES = (
@@ -141,9 +142,10 @@ def _guarded(work: Callable[[], None]) -> None:
 def _draw() -> None:
     context = bpy.context
     region, region_3d, space = context.region, context.region_data, context.space_data
-    visible = [obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)]
+    visible = {obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)}
     refused = len(_state.content.refused)
-    placed = _state.content.update(placings(visible), every)
+    shown = (p for p in placings(context.view_layer.depsgraph) if p.shown_by in visible)
+    placed = _state.content.update(shown, _existing)
     if len(_state.content.refused) > refused:  # Blender is to draw these
         bpy.app.timers.register(_hide_points, first_interval=0.0)
     key = region.as_pointer()
@@ -162,6 +164,15 @@ def _draw() -> None:
     overlays.draw(context, mixed=view.count > 0, has_depths=view.depths is not None)
     if not view.complete and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)
+
+
+def _existing() -> set[Key]:
+    """Keys of all objects of the file, and of the instances in all windows."""
+    splats = filter(looks_like_splats, bpy.data.objects)
+    keys: set[Key] = {((obj.session_uid,), obj.data.session_uid) for obj in splats}
+    for window in bpy.context.window_manager.windows:
+        keys.update(place.key for place in placings(window.view_layer.depsgraph))
+    return keys
 
 
 def _draw_legend() -> None:
@@ -206,6 +217,7 @@ def _hide_points() -> None:
     """Hide Blender's points of drawn splats in all windows, or show them again."""
     refused = None if _state.mode == "OFF" else _state.content.refused
     for window in bpy.context.window_manager.windows:
+        window.view_layer.update()  # else unevaluated splats are drawn as points once
         hide_points(window.view_layer.depsgraph, refused)
 
 
@@ -231,8 +243,6 @@ def _opened(*_: object) -> None:
     if wanted in {name for name, *_ in MODES}:
         show(wanted)
     if _state.mode != "OFF":
-        for window in bpy.context.window_manager.windows:
-            window.view_layer.update()  # else unevaluated splats are drawn as points once
         _hide_points()
         _redraw()
 
@@ -257,7 +267,6 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
 def _undone(*_: object) -> None:
     if _state.mode != "OFF":
         _state.content.has_changed()
-        _hide_points()
 
 
 HANDLERS: dict[Callable[..., None], tuple[str, ...]] = {

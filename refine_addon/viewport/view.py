@@ -12,6 +12,7 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
+from ..objects.instances import Key
 from . import shader
 from .arrays import (
     GOES,
@@ -105,7 +106,7 @@ class View:
     def draw(
         self,
         content: Content,
-        places: dict[tuple[int, int], NDArray[np.float64]],
+        places: dict[Key, NDArray[np.float64]],
         camera: Camera,
         mode: str,
         *,

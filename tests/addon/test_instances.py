@@ -1,10 +1,12 @@
-"""Splats that stand in the scene as instances of collections; windows test how they look."""
+"""Splats that stand in the scene as instances; windows test how they look."""
 
 from __future__ import annotations
 
 import bpy
 import numpy as np
 import pytest
+
+from tests.e2e.inside.clouds import scatter
 
 
 def instanced(*objects):
@@ -20,63 +22,53 @@ def instanced(*objects):
 
 
 @pytest.fixture
-def instance(quarter, empty_scene):
-    """Give an empty that instances the room, which stands at z = 5; the collection is offset."""
-    quarter.location.z = 5.0
-    bpy.context.view_layer.update()
-    empty_scene.collection.objects.unlink(quarter)
-    empty = instanced(quarter)
-    empty.instance_collection.instance_offset = (1.0, 0.0, 0.0)
-    return empty
-
-
-@pytest.fixture
 def places(addon):
-    return lambda *objects: list(addon.viewport.content.placings(objects))
+    """Give a function that lists the placings that an object shows."""
+
+    found, graph = addon.objects.instances.placings, bpy.context.evaluated_depsgraph_get
+    return lambda obj: [place for place in found(graph()) if place.shown_by == obj]
 
 
-def test_an_instance_stands_where_its_empty_puts_it(addon, quarter, instance, places):
-    """Twice as large: the room's origin, at z = 5 less the offset of x = 1, is at (-2, 0, 10)."""
-    instance.scale = (2.0, 2.0, 2.0)
-    bpy.context.view_layer.update()
-    (place,) = places(instance)
-    assert place.obj == quarter
-    np.testing.assert_allclose(
-        place.matrix, [[2, 0, 0, -2], [0, 2, 0, 0], [0, 0, 2, 10], [0, 0, 0, 1]]
-    )
-    assert addon.viewport.content.instanced([instance]) == {quarter}
-
-
-def test_instances_are_followed_as_deep_as_blender_draws_them(quarter, instance, places):
-    """Eight in each other, not the ninth; two in a collection that two instance are four places."""
-    outer = [instanced(instance.copy(), instance.copy()), instanced()]
-    outer[1].instance_collection = outer[0].instance_collection
-    four = places(*outer)
-    assert len({place.key for place in four}) == 4
-    assert {place.key[1] for place in four} == {quarter.data.session_uid}
-
-    empties = [instance]
-    for _ in range(8):
-        empties.append(instanced(empties[-1]))
-    assert [len(places(empty)) for empty in empties] == [1] * 8 + [0]
+def test_an_instance_stands_where_its_empty_puts_it(quarter, empty_scene, places):
+    """Twice as large: the room's origin, at z = 5 less the offset of x = 1, is at (-2, 0, 10).
+    An empty that instances it twice has two placings of the same data."""
+    quarter.location.z = 5.0
+    empty_scene.collection.objects.unlink(quarter)
+    instance = instanced(quarter)
+    instance.instance_collection.instance_offset, instance.scale = (1.0, 0.0, 0.0), (2.0, 2.0, 2.0)
+    outer = instanced(instance.copy(), instance.copy())
+    ((_, obj, matrix, _),) = places(instance)
+    assert obj == quarter
+    expected = [[2, 0, 0, -2], [0, 2, 0, 0], [0, 0, 2, 10], [0, 0, 0, 1]]
+    np.testing.assert_allclose(matrix, expected)
+    keys = {place.key for place in places(outer)}
+    assert [mesh for _, mesh in keys] == [quarter.data.session_uid] * 2
 
 
 @pytest.mark.usefixtures("room_cameras")
-def test_an_instance_is_made_real_and_scored(quarter, instance, places):
-    """A copy with data of its own stands where the instance stood, which is shown no more."""
-    instance.location = (1.0, 0.0, -5.0)
-    with pytest.raises(RuntimeError, match="poll"):
-        bpy.ops.refine.score()
+@pytest.mark.parametrize("kind", ["OBJECT", "GEOMETRY", "VERTS", "FACES"])
+def test_splats_on_points_and_faces_are_made_real_and_scored(quarter, places, kind):
+    """A triangle of three points, 3 m along x, has three instances, or one on its face.
+    They become objects where they stood, also of a hidden one, and are instanced no more."""
+    corners = [(3.0, 0.0, 0.0), (6.0, 0.0, 0.0), (6.0, 3.0, 0.0)]
+    ground = bpy.data.objects.new("ground", bpy.data.meshes.new("triangle"))
+    ground.data.from_pydata(corners, [], [(0, 1, 2)])
+    bpy.context.scene.collection.objects.link(ground)
+    bpy.context.view_layer.objects.active = ground
+    quarter.select_set(False)
+    if kind in {"VERTS", "FACES"}:
+        quarter.parent, ground.instance_type = ground, kind
+    else:
+        scatter(ground, quarter, as_instance=kind == "OBJECT")
+        quarter.hide_viewport = quarter.hide_render = True
     bpy.ops.refine.make_real()
-    real = bpy.context.object
+    real = bpy.context.selected_objects
     bpy.ops.refine.score()
-    assert real != quarter
-    assert real.data != quarter.data
-    np.testing.assert_allclose(np.array(real.matrix_world), np.eye(4))
-    assert "refine_score" in real.data.attributes
+    where = sorted(tuple(obj.matrix_world.translation) for obj in real)
+    np.testing.assert_allclose(where, [(5.0, 1.0, 0.0)] if kind == "FACES" else corners)
+    assert all("refine_score" in obj.data.attributes for obj in real)
     assert "refine_score" not in quarter.data.attributes
-    assert places(instance) == []
-    assert not bpy.ops.refine.make_real.poll()
+    assert places(ground) == []
 
 
 def test_a_linked_collection_is_made_real(quarter, tmp_path):

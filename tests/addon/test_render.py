@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mathutils import Matrix, Vector
 
-from tests.e2e.inside.clouds import as_cloud
+from tests.e2e.inside.clouds import as_cloud, scatter
 
 from .conftest import splats_of
 
@@ -146,8 +146,9 @@ def test_meshes_hide_splats_by_depth_and_alpha(addon, shot, quarter):
 
 
 def test_instances_are_drawn_and_what_renders_hide_is_not(addon, shot, quarter):
-    """An empty that stands for the collection of the hidden object shows it elsewhere.
-    Splats that are scaled to nothing, as where an animation ends one object, do not show."""
+    """An empty that stands for the collection of the hidden object shows it elsewhere, and so does
+    a point on which nodes instance its geometry. Splats scaled to nothing, as where an animation
+    ends one object, do not show."""
     whole = drawn(addon, shot, quarter)
     collection = bpy.data.collections.new("splats")
     collection.objects.link(quarter)
@@ -162,6 +163,12 @@ def test_instances_are_drawn_and_what_renders_hide_is_not(addon, shot, quarter):
         gone.matrix_world = Matrix.Diagonal((*flat, 1.0))
         shown.append(rendered())
     empty.hide_render = True
+    point = bpy.data.objects.new("point", bpy.data.meshes.new("point"))
+    point.data.vertices.add(1)
+    shot.collection.objects.link(point)
+    scatter(point, quarter, as_instance=False)
+    shown.append(rendered())
+    point.hide_render = True
 
     seen = whole[..., 3] > 0.1
     assert np.abs(np.array(shown) - whole)[:, seen].max() < 3.0 / 255.0

@@ -33,8 +33,9 @@ def test_splats_are_drawn_as_they_are_packed(addon, few, monkeypatch):
 
     def drawn():
         content.has_changed()
-        key = (few.session_uid, few.data.session_uid)
-        found = content.update(addon.viewport.content.placings([few]), lambda: {key})
+        key = ((few.session_uid,), few.data.session_uid)
+        places = addon.objects.instances.placings(bpy.context.evaluated_depsgraph_get())
+        found = content.update(places, lambda: {key})
         return content.atlas.slots[key] if found else None
 
     bpy.ops.refine.score()

@@ -132,7 +132,7 @@ def test_splats_stand_among_other_objects(binary: Binary, cloud: Path):
     """A green ball that one sees through is mixed over all splats, also where it lies behind them.
 
     X-ray has an opacity of .5 by default. The edges of a volume are drawn over splats; the grid
-    lies behind them in every version. An instance looks as the splats themselves, and is made real.
+    lies behind them in every version. Instances look as the splats themselves; one is made real.
     """
     found = binary.window_step(
         "among", size=(800, 500), cloud=fewer(cloud, binary.work), pictures=binary.work
@@ -152,8 +152,8 @@ def test_splats_stand_among_other_objects(binary: Binary, cloud: Path):
     assert np.abs(grid).max() < 0.01  # splats are not quite opaque
     edges = np.abs(shown("crop") - (0.0, 0.9, 0.8)).max(axis=2) < 0.1
     assert edges.sum() > 100
-    assert psnr(shown("instance"), plain) > 46.0
-    assert found["real"] == 9_939
+    assert min(psnr(shown(name), plain) for name in ("scatter", "instance")) > 46.0
+    assert (found["real"], found["undone"]) == (9_939, "instance")
 
 
 def test_blender_lives_on_where_an_operator_that_waits_refuses(binary: Binary, blend: Path):

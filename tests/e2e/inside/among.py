@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bpy
+from clouds import scatter
 from hand import begin
 from mathutils import Quaternion, Vector
 
@@ -20,8 +21,11 @@ def main(cloud, pictures):
     yield from grid(hand)
     yield from glass(hand)
     yield from instances(hand, splats)
-    hand.call(bpy.ops.refine.make_real)
+    hand.do(bpy.ops.refine.make_real)
     found["real"] = len(bpy.context.object.data.vertices)
+    yield from hand.undo()
+    found["undone"] = bpy.context.object.name
+    yield from hand.undo(redo=True)
     hand.call(bpy.ops.refine.add_volume, role="PROTECT", shape="BOX")
     yield 1.0
     hand.space.overlay.show_overlays = True
@@ -69,13 +73,21 @@ def glass(hand):
 
 
 def instances(hand, splats):
-    """Show an instance of a collection in the place of the splats."""
+    """Show instances in the place of the splats: by nodes, of their geometry; of a collection."""
+    splats.hide_set(True)
+    point = bpy.data.objects.new("point", bpy.data.meshes.new("point"))
+    point.data.vertices.add(1)
+    bpy.context.scene.collection.objects.link(point)
+    scatter(point, splats, as_instance=False)
+    yield 0.5
+    yield from hand.shown("among-scatter")
+    bpy.data.objects.remove(point)
     collection = bpy.data.collections.new("set")
     collection.objects.link(splats)
-    splats.hide_set(True)
     empty = bpy.data.objects.new("instance", None)
     empty.instance_type, empty.instance_collection = "COLLECTION", collection
     bpy.context.scene.collection.objects.link(empty)
     yield 0.5
     yield from hand.shown("among-instance")
     bpy.context.view_layer.objects.active = empty
+    hand.call(bpy.ops.ed.undo_push)

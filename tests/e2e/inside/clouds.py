@@ -1,4 +1,4 @@
-"""Point clouds of Blender's own splats, as Blender 5.3 imports them, made without the add-on."""
+"""Point clouds of splats, as Blender 5.3 imports them, made without the add-on; instances."""
 
 from __future__ import annotations
 
@@ -80,3 +80,18 @@ def as_cloud(addon, obj):
     bpy.context.view_layer.objects.active = cloud
     bpy.context.view_layer.update()
     return cloud
+
+
+def scatter(obj, source, *, as_instance):
+    """Let geometry nodes instance an object, or its geometry alone, on the points of another."""
+    tree = bpy.data.node_groups.new("scatter", "GeometryNodeTree")
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Mesh", in_out=direction, socket_type="NodeSocketGeometry")
+    kinds = ("GeometryNodeObjectInfo", "GeometryNodeInstanceOnPoints")
+    info, on_points, start, end = map(tree.nodes.new, (*kinds, "NodeGroupInput", "NodeGroupOutput"))
+    info.inputs["Object"].default_value = source
+    info.inputs["As Instance"].default_value = as_instance
+    tree.links.new(start.outputs[0], on_points.inputs["Points"])
+    tree.links.new(info.outputs["Geometry"], on_points.inputs["Instance"])
+    tree.links.new(on_points.outputs[0], end.inputs[0])
+    obj.modifiers.new("scatter", "NODES").node_group = tree
