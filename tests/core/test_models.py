@@ -142,9 +142,9 @@ def test_tiles_of_discs_may_state_them_in_either_way(tmp_path):
     assert stats["splats"]["kept"] == 20
 
 
-def footprints_of(splats):
+def footprints_of(splats, view=VIEW):
     gaussians, scene, _ = projection.prepare(splats, ViewSet((VIEW,)))
-    return projection.project(gaussians, scene, VIEW), gaussians
+    return projection.project(gaussians, scene, view), gaussians
 
 
 def before_the_camera(count, size, model):
@@ -194,6 +194,14 @@ def test_a_ray_hits_a_disc_where_it_meets_its_plane():
             assert got == pytest.approx(expected, rel=2e-3)
             found += 1
     assert found > 50
+
+
+def test_a_disc_seen_from_far_away_is_its_low_pass():
+    """``o exp(-d^2)`` is 1 / 255 at d = 2.34 px: 19 pixels. Its axes differ by rounding alone."""
+    far = replace(VIEW, center=np.array([0.0, 0.0, -1e17]), near=0.0)
+    footprints, _ = footprints_of(before_the_camera(60, -2.0, "2dgs"), far)
+    ((_, pixel, _),) = hits(footprints, np.arange(VIEW.width), np.arange(VIEW.height), 1 << 16)
+    assert np.unique(pixel, return_counts=True)[1].tolist() == [60] * 19
 
 
 def two(means, sizes, model):

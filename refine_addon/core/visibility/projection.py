@@ -433,8 +433,8 @@ def _principal(across, down, z, shape, view):
     c, s = np.where(wide, half + root, np.abs(xy)), np.where(wide, xy, root - half)
     s = np.where(wide | (xy >= 0.0), s, -s)
     length = np.hypot(c, s)
-    c = np.where(length > 0.0, c / np.maximum(length, 1e-30), 1.0)
-    s = np.where(length > 0.0, s / np.maximum(length, 1e-30), 0.0)
+    c = np.where(length > 1e-30, c / np.maximum(length, 1e-30), 1.0)
+    s = np.where(length > 1e-30, s / np.maximum(length, 1e-30), 0.0)
     return np.stack([first, second]), np.stack([c, s])
 
 
