@@ -11,7 +11,8 @@ from pathlib import Path
 from ..core import RefineError
 from ..core.errors import reason_of
 from ..core.formats.registry import SUFFIXES, format_named, names_file, without_suffix
-from ..core.lod import is_streamed, level_paths
+from ..core.formats.streamed_sog import INDEX
+from ..core.lod import level_paths
 from ..core.whole_file import Url, refuse_existing, refuse_url
 from .options import BLENDER, ROLES
 
@@ -102,7 +103,7 @@ def _rules(options: argparse.Namespace) -> dict[str, object]:
 
 def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
     output = options.output
-    if output is None or (options.command == "lod" and is_streamed(output)):
+    if output is None or (options.command == "lod" and output.name == INDEX):
         return []
     if options.command == "lod":
         format_named(output)  # refuses endings that are not written

@@ -258,11 +258,6 @@ def level_paths(source: Path, target: Path, count: int) -> list[Path]:
     return [folder / f"{name}.lod{number}{suffix}" for number in range(1, count + 1)]
 
 
-def is_streamed(target: Path) -> bool:
-    """Whether levels that go to `target` become a streamed SOG, by its name."""
-    return target.name == INDEX
-
-
 @contextlib.contextmanager
 def _into_folder(source, target, count, overwrite):
     """Write a file for each level but 0. New files are deleted if the block fails.
@@ -380,7 +375,7 @@ def lod_file(
     clock, path, file = Clock(), whole_file.expanded(target), whole_file.expanded(source)
     output = (
         _streamed(path, views, overwrite)
-        if is_streamed(path)
+        if path.name == INDEX
         else _into_folder(file, path, len(levels), overwrite)
     )
     with output as (add, finish):

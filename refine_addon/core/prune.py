@@ -459,12 +459,14 @@ class _Prune:
         psnr = estimated(merged.splats, comparing)
         if not isinstance(self.method, Refit):
             return Outcome(merged, "merge", {"merge": psnr})
-        deleted = _as_deleted(self.splats, keep, self.threads)
+        rest = copied(self.splats, np.flatnonzero(keep), self.threads)
+        gone = len(keep) - len(rest)
+        deleted = Merged(rest, keep, np.zeros(len(rest), np.bool_), 0, gone)  # changes none
         plain = estimated(deleted.splats)
         outcome = Outcome(merged, "merge", {"delete": plain, "merge": psnr})
         if plain is not None and psnr is not None and plain > psnr:
             outcome = replace(outcome, merged=deleted, done="delete")
-        del merged, deleted  # one of them is not needed while splats are refitted
+        del merged, deleted, rest  # one of them is not needed while splats are refitted
         outcome = self._refitted(outcome, scores.deciding or used, refitting)
         if outcome.refitted is None or outcome.stopped is not None:
             return outcome
@@ -538,12 +540,6 @@ class _Prune:
         if rays is None or outcome.stopped is not None:
             return None
         return psnr_against(rays, outcome.final.splats, self.used, threads=self.threads)
-
-
-def _as_deleted(splats: Splats, keep: NDArray[np.bool_], threads: int | None) -> Merged:
-    """Splats that deletion keeps, in the form of a merge that changed none."""
-    left = copied(splats, np.flatnonzero(keep), threads)
-    return Merged(left, keep, np.zeros(len(left), np.bool_), 0, len(keep) - len(left))
 
 
 def _share_between(tried: Sequence[_Try], goal: float, total: int) -> float | None:

@@ -78,7 +78,7 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 
 
 class REFINE_OT_render(Needing, bpy.types.Operator):
-    """Render splats as the 3D view draws them, among what the scene's engine renders"""
+    """Render splats among what the scene's engine renders; animations go where Output says"""
 
     bl_idname = "refine.render"
     bl_label = "Render with Splats"
@@ -93,13 +93,6 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     )
     _steps: Any = None
     _running: Running | None = None
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: REFINE_OT_render) -> str:
-        """A button's tooltip."""
-        if properties.animation:
-            return "Render all frames with splats, and write them where the scene's Output says"
-        return str(cls.__doc__)
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Render at once."""

@@ -167,9 +167,9 @@ def _score(splats, views, rounds, settled, sampling, few_views, most_between, pr
             f"no camera sees the splats: none of {count} reaches into the image of any of "
             f"{len(ordered)} views; check that cameras and splats share their frame and unit"
         )
-    weights, left_out = _floor_weights(
-        measured.take(sample), of_groups, errors, prior[index[sample]], part(weighing, 0.0, 0.5)
-    )
+    some, worth = measured.take(sample), prior[index[sample]]
+    folds = _folds(some, of_groups, errors, worth, part(weighing, 0.0, 0.5))
+    weights, left_out = coverage.floor_weights(folds, _with_floors(some, worth))
     more = []
     if left_out > LEFT_OUT:
         more = with_views_between(views, most_between, gaussians, scene, threads)
@@ -210,19 +210,17 @@ def _score(splats, views, rounds, settled, sampling, few_views, most_between, pr
     return result if job is None else note(job, stage, result)
 
 
-def _floor_weights(whole, of_groups, errors, prior, progress):
-    """`coverage.floor_weights` of a sample, with each group of views left out once."""
-    folds = _folds(whole, of_groups, errors, prior, progress)
-    return coverage.floor_weights(folds, _with_floors(whole, prior))
-
-
 def _with_floors(measured, prior):
-    """Scores and floors of splats."""
+    """Scores ``error contribution^p`` and floors of splats, (n,) each.
+
+    The error alone is that of removing one splat by itself.
+    """
     floors = coverage.floor(prior.astype(np.float64), measured.seen, 1.0 + EXPONENT)
-    return _combined(measured), floors
+    return measured.error * measured.contribution**EXPONENT, floors
 
 
 def _folds(whole, of_groups, errors, prior, progress):
+    """Yield what `coverage.floor_weights` takes, with each group of views left out once."""
     for without, of_views in zip(of_groups, errors, strict=True) if len(errors) > 1 else ():
         report(progress, 0.0, "scoring")
         others = Measured(
@@ -333,8 +331,3 @@ def _kept_after_rounds(count, rounds, settled):
     rest = 0 if settled is None else max(count - settled, 0)
     stays = (round(count * LEAST ** (number / (rounds - 1))) for number in range(1, rounds))
     return [*itertools.takewhile(lambda stay: stay > rest, stays), 0]
-
-
-def _combined(measured):
-    """``error contribution^p``, (M,): the error alone is that of removing one splat by itself."""
-    return measured.error * measured.contribution**EXPONENT
