@@ -8,7 +8,6 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.formats.ply_columns import THIRD_SCALE, Columns
 from ..core.formats.registry import scene_name
 from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
-from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
+from .layout import KINDS, Column, SplatObject, add_attributes, rest_count, splat_count
 
 _GROUP = 16  # Columns transposed together: float32 numbers in a cache line of 64 bytes
 _ROWS = 4096  # Rows transposed at a time: 256 kB, which fits a cache
@@ -91,39 +90,28 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
     return with_model(splats, checked.layout.model)
 
 
-def file_from_object(checked: SplatObject) -> SplatFile:
-    """A splat object as a PLY file in memory."""
-    groups = _groups_of(checked, frozenset())
-    return _file(checked.obj.name, checked.layout, len(checked), groups, dict)
-
-
 def read_for_file(
     checked: SplatObject,
     replaced: Collection[str] = (),
     columns: Callable[[], Mapping[str, NDArray[Any]]] = dict,
 ) -> Callable[[], SplatFile]:
-    """Read the object now; the thread-safe callable builds its PLY file.
+    """Read the object now; the thread-safe callable builds its PLY file, once.
     Properties in `replaced` take the values that `columns` gives then, (N,) each."""
     groups = deque(_groups_of(checked, frozenset(replaced)))
-    one_by_one = (groups.popleft() for _ in range(len(groups)))  # freed once written
-    return partial(_file, checked.obj.name, checked.layout, len(checked), one_by_one, columns)
+    name, layout, count = checked.obj.name, checked.layout, len(checked)
 
+    def file() -> SplatFile:
+        rows, values = np.empty(count, layout.row_dtype), columns()
+        while groups:
+            names, planes = groups.popleft()  # freed once written
+            if values.keys() & set(names):
+                pairs = zip(names, planes, strict=True)
+                planes = [values.get(name, plane) for name, plane in pairs]
+            _interleave(rows, names, planes)
+        no_elements = np.empty(0, np.uint8)
+        return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
 
-def _file(
-    name: str,
-    layout: Layout,
-    count: int,
-    groups: Iterable[tuple[list[str], Sequence[Any]]],
-    columns: Callable[[], Mapping[str, NDArray[Any]]],
-) -> SplatFile:
-    rows, replaced = np.empty(count, layout.row_dtype), columns()
-    for names, planes in groups:
-        if replaced.keys() & set(names):
-            pairs = zip(names, planes, strict=True)
-            planes = [replaced.get(name, plane) for name, plane in pairs]
-        _interleave(rows, names, planes)
-    no_elements = np.empty(0, np.uint8)
-    return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
+    return file
 
 
 def _groups_of(

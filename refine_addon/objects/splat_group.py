@@ -514,7 +514,7 @@ def _scene(
         row * len(checked) + fixed,
         gather([checked], whole=harmonics),
         demands.forced(checked),
-        lambda: replace(mesh_attributes.file_from_object(checked), axes=axes),
+        lambda: replace(mesh_attributes.read_for_file(checked)(), axes=axes),
         (row, fixed),
         form,
         _matrix(checked),

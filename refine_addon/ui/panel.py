@@ -88,13 +88,6 @@ def _draw_instances(layout: bpy.types.UILayout, context: bpy.types.Context) -> b
     return True
 
 
-def _named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
-    column = layout.column()
-    column.use_property_split = True
-    column.use_property_decorate = False
-    return column
-
-
 class REFINE_PT_splats(InSidebar, bpy.types.Panel):
     """Splats to prune, and their display."""
 
@@ -121,7 +114,7 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the choice of cameras, and what each sees."""
-        layout, settings = _named_column(self.layout), context.scene.refine
+        layout, settings = wrapped.named_column(self.layout), context.scene.refine
         row = layout.row(align=True)
         row.operator("refine.import_cameras", icon="IMPORT")
         row.operator("refine.add_ring", text="Add a Ring", icon="OUTLINER_OB_CAMERA")
@@ -171,7 +164,7 @@ class REFINE_PT_prune(InSidebar, bpy.types.Panel):
         for name, text, _ in METHODS:
             price = plans.price(plan, name) or HINTS[name]
             column.prop_enum(settings, "method", name, text=f"{text} · {price}")
-        column = _named_column(layout)
+        column = wrapped.named_column(layout)
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
         if settings.budget == "max_mb":
@@ -253,7 +246,7 @@ class REFINE_PT_deliver(InSidebar, bpy.types.Panel):
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.operator("refine.export_ply", icon="EXPORT")
         render_operators.draw_buttons(layout.column(align=True))
-        column = _named_column(layout)
+        column = wrapped.named_column(layout)
         column.prop(settings, "levels")
         column.operator("refine.levels", icon="MOD_DECIM")
         if splat_group.has_levels(obj):
@@ -288,7 +281,7 @@ def _draw_objects(layout: bpy.types.UILayout, objects: Sequence[bpy.types.Object
     if stored and (
         mesh_layout.MODEL in obj.data or not stated_model(stored.header, stored.row_dtype)
     ):  # chosen, or not named by the file
-        _named_column(layout).prop(bpy.context.scene.refine, "model")
+        wrapped.named_column(layout).prop(bpy.context.scene.refine, "model")
 
 
 def _draw_plan(layout: bpy.types.UILayout, obj: Any, record: Any, plan: Any) -> None:

@@ -237,7 +237,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     form, uids = settings.to_form(), [member.mesh.session_uid for member in group]
     if form is not None:
         if (form, uids, count) != (_rows or [None])[0]:
-            files = [mesh_attributes.file_from_object(member) for member in group]
+            files = [mesh_attributes.read_for_file(member)() for member in group]
             _rows[:] = [(form, uids, count), row_in(form, files)]
         arguments["sizes"] = (_rows[1], 0)
     predicted = budget.psnr is not None and way != "delete"

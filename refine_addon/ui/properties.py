@@ -30,7 +30,7 @@ from ..core.selection import Budget
 from ..core.splats import MODELS
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING
-from . import plans
+from . import plans, wrapped
 from .marks import RefineVolume
 from .select_operators import SelectSettings
 
@@ -292,9 +292,7 @@ class RefinePreferences(_Preferred, bpy.types.AddonPreferences):
 
     def draw(self, _context: bpy.types.Context) -> None:
         """Draw them."""
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = wrapped.named_column(self.layout)
         layout.label(text="Defaults for scenes into which splats are imported")
         for name in (*DEFAULTS, "upright"):
             layout.prop(self, name)

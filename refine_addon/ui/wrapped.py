@@ -20,6 +20,14 @@ class InSidebar:
     bl_category = "REFINE"
 
 
+def named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+    """A column with the names of settings before them."""
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    return column
+
+
 def label(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
     """Draw a sentence in as many lines as it takes, with the icon at the first."""
     preferences, region = bpy.context.preferences, bpy.context.region

@@ -215,7 +215,7 @@ def test_what_a_plan_keeps_is_what_is_marked_and_what_apply_leaves(addon, few, m
     bpy.ops.refine.apply()
 
     assert len(few.data.vertices) == plan["kept"]
-    file = addon.mesh.attributes.file_from_object(addon.mesh.layout.check(few))
+    file = addon.mesh.attributes.read_for_file(addon.mesh.layout.check(few))()
     assert plan["bytes_after"] == file.size()
     said = capfd.readouterr().out
     assert "Info: Kept 994 splats" in said

@@ -64,7 +64,7 @@ def as_blender_imports(rows, name="cloud"):
 def as_cloud(addon, obj):
     """Put a point cloud of the same splats, attributes and properties in the place of a mesh."""
     attributes, checked = addon.mesh.attributes, addon.mesh.layout.check(obj)
-    rows, name = attributes.file_from_object(checked).rows, obj.name
+    rows, name = attributes.read_for_file(checked)().rows, obj.name
     cloud = as_blender_imports(rows, "cloud")
     taken = (*"xyz", "position", "opacity", "f_", "scale_", "rot_", ".", "refine_home")
     taken += ("refine_shape",)  # a checksum of other numbers
