@@ -86,21 +86,6 @@ def test_every_degree_and_extra_property_comes_back(addon, make_splats, through)
     assert got.rows["fine"][0] == np.float32(1 / 3)
 
 
-def test_a_text_file_comes_out_binary_with_the_same_values(make_splats, through):
-    """Same header but for the format line; other elements are left behind with a note."""
-    columns = make_splats(count=3)
-    names = "".join(f"property float {name}\n" for name in columns)
-    rows = "".join(" ".join(f"{v[i]:.9g}" for v in columns.values()) + "\n" for i in range(3))
-    head = "ply\nformat ascii 1.0\ncomment kept\nelement vertex 3\n"
-    more = "element extra 1\nproperty int a\nend_header\n"
-    _, _, (note,), got = through(f"{head}{names}{more}{rows}7\n".encode())
-    assert b"format binary_little_endian 1.0\ncomment kept\n" in got.header
-    assert b"extra" not in got.header
-    assert all(np.array_equal(got.rows[name], values) for name, values in columns.items())
-    assert "in.ply is text" in note
-    assert "(extra)" in note
-
-
 def test_meshes_of_blenders_own_importer_and_of_kiri_are_read(addon, make_splats, tmp_path):
     """It folds nx ny nz into one vector and keeps the rest; KIRI 3DGS Render marks its objects."""
     source, target, layout = tmp_path / "in.ply", tmp_path / "out.ply", addon.mesh.layout

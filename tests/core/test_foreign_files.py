@@ -37,11 +37,9 @@ FOREIGN = [
     ("in.splat", bytes(64), f"a .splat file: {READ}"),
     ("in.splat", b"\x1f\x8b" + bytes(62), "a .splat file"),  # as gzip begins
     ("in.ksplat", bytes(4096), f"a .ksplat file: {READ}"),
-    ("in.spz", gzip.compress(SPZ), f"an SPZ file: {READ}"),
     ("in.ply", gzip.compress(SPZ), f"an SPZ file: {READ}"),
     ("in.spz", SPZ, f"an SPZ file: {READ}"),
     ("in.sog", zipped("means_l.webp", "meta.json"), SOG),
-    ("in.ply", zipped("meta.json", "sh0.webp"), SOG),
     ("in.ply", LONG, SOG),  # more than is looked into
     ("in.ply", zipped("a/meta.json", "a/b.webp"), SOG),
     ("in.zip", zipped("meta.json", "in.ply"), "a ZIP archive: unpack"),
@@ -63,11 +61,6 @@ def test_a_known_format_is_named_and_so_is_what_to_do(tmp_path, case):
 def test_a_gltf_is_named(tmp_path):
     words = ": a glTF file: 'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
     refused(tmp_path / "in.gltf", words, b' {"asset": {}}', read=read_ply)
-
-
-def test_a_ply_is_one_whatever_it_is_called(tmp_path):
-    (tmp_path / "in.splat").write_bytes(plain_ply(3))
-    assert len(read_ply(tmp_path / "in.splat")) == 3
 
 
 @pytest.mark.parametrize(

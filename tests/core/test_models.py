@@ -1,4 +1,4 @@
-"""How splats are drawn: what files say of it, and that it survives them."""
+"""What writers of files say of how splats are drawn, and that it survives."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from refine_addon.core.splats import (
 )
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import hits
-from tests.strategies import ply_of
+from tests.strategies import ply_of, splat_names
 
 from .test_numerics import cloud as random_splats
 
@@ -50,23 +50,40 @@ def write(path, splats, comments=()):
     return path
 
 
-@pytest.mark.parametrize(
-    ("comments", "model"),
-    [
-        ([], "default"),
-        (["splatrendermode:  MIP "], "antialiased"),
-        (["SplatRenderMode: 2dgs"], "2dgs"),
-        (["antialiased 1"], "antialiased"),
-        (["antialiased 0"], "default"),
-        (["antialiased 1", "SplatRenderMode: default"], "default"),
-        (["SplatRenderMode: something new", "of antialiased 1"], "default"),
-    ],
-)
-def test_comments_of_a_ply_say_how_it_is_drawn(tmp_path, comments, model):
-    """Brush's and Postshot's; of several the last counts, and what nobody knows does not."""
-    file = read_splats(write(tmp_path / "in.ply", cloud(5), comments))
-    assert file.model == file.splats().model == model
-    assert file.splats().take(slice(2)).model == model
+SIZES, TURNS = "scale_0 scale_1 scale_2", "rot_0 rot_1 rot_2 rot_3"
+COLOR, USUAL = "f_dc_0 f_dc_1 f_dc_2 REST", f"opacity {SIZES} {TURNS}"
+BRUSH = "by Brush", "Vertical axis: 0 -0.97 0.2", "SH degree: 2", "SplatRenderMode: mip"
+WRITERS = {
+    "Brush": (2, "antialiased", f"x y z {SIZES} opacity {TURNS} {COLOR}", *BRUSH),
+    "Postshot": (3, "antialiased", f"x y z {COLOR} {USUAL}", "antialiased 1"),
+    "SuperSplat": (3, "default", f"x y z {TURNS} {SIZES} opacity {COLOR}"),
+    "SuperSplat, discs": (1, "2dgs", f"x y z {TURNS} {SIZES[:15]} opacity {COLOR}"),
+    "LichtFeld Studio": (3, "default", f"red green blue x y z nx ny nz {COLOR} {USUAL}"),
+    "KIRI": (1, "default", f"x y z red green blue alpha {COLOR} {USUAL} Paint~Mask", "by Blender"),
+    "gsplat": (0, "default", f"x y z {COLOR} {USUAL}"),
+    "odd": (0, "antialiased", f"x y z {COLOR} {USUAL}", "splatrendermode:  MIP ", "antialiased 2"),
+    "two": (0, "default", f"x y z {COLOR} {USUAL}", "SplatRenderMode: 2dgs", "antialiased 0"),
+    "nerfstudio": (4, "default", f"x y z nx ny nz {COLOR} {USUAL}", "Vertical Axis: z"),
+}
+"""Writer, by its sources of August 2026: degree, model, properties (``~`` is a space), comments."""
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_a_file_is_read_as_its_writer_meant_and_written_as_it_was(tmp_path, writer):
+    """Each value is that of its name, of several words by Blender. The last comment counts."""
+    degree, model, names, *comments = WRITERS[writer]
+    random, columns = np.random.default_rng(len(names)), {}
+    for name in names.replace("REST", " ".join(splat_names(degree)[6:-8])).split():
+        kind = np.uint8 if name in ("red", "green", "blue", "alpha") else np.float32
+        columns[name.replace("~", " ")] = random.uniform(0.0, 9.0, 7).astype(kind)
+    path, same = tmp_path / "in.ply", tmp_path / "same.ply"
+    path.write_bytes(ply_of(columns, comments))
+    convert_files([path], same)
+    file = read_splats(path)
+    assert (file.splats().sh_degree, file.model, file.splats().model) == (degree, model, model)
+    for name, values in values_by_name(file.splats()).items():
+        np.testing.assert_array_equal(values, columns[name])
+    assert same.read_bytes() == path.read_bytes()
 
 
 def test_splats_without_a_third_scale_are_discs_and_stay_so(tmp_path):
@@ -75,16 +92,11 @@ def test_splats_without_a_third_scale_are_discs_and_stay_so(tmp_path):
     splats = replace(cloud(5), model="2dgs")
     path = write(tmp_path / "in.ply", splats, ["antialiased 1"])
     other = write(tmp_path / "other.ply", cloud(3), ["SplatRenderMode: 2dgs"])
-    assert b"scale_2" not in path.read_bytes()
-
-    convert_files([path], tmp_path / "out.ply")
     convert_files([other, path], tmp_path / "both.ply")
-
-    read, both = (read_splats(tmp_path / name) for name in ("out.ply", "both.ply"))
+    read, both = read_splats(path), read_splats(tmp_path / "both.ply")
     assert read.model == "2dgs"
     np.testing.assert_array_equal(read.splats().log_scales[:, 2], np.float32(LOG_ZERO))
     np.testing.assert_array_equal(read.splats().log_scales[:, :2], splats.log_scales[:, :2])
-    assert (tmp_path / "out.ply").read_bytes() == path.read_bytes()
     assert b"scale_2" not in both.header
     expected = joined([read_splats(other).splats(), read.splats()])
     np.testing.assert_array_equal(both.splats().log_scales, expected.log_scales)

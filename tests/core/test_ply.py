@@ -133,8 +133,7 @@ def test_text_is_written_as_the_binary_file_of_its_splats(folder, case, data):
 
 def test_odd_headers_are_read_and_kept(tmp_path):
     """NumPy hands out no buffer of rows with a colon in a name.
-    Lines end as the first does; 0x0a may be the first byte of x then. A byte-sized first property
-    does not turn the byte order: 1.0 is 3f 80 00 00. The count is the third word of its line."""
+    Lines end as the first does; 0x0a may be the first byte of x then."""
     tag = np.arange(3, dtype=np.float32)
     file = opened(tmp_path, ply_of(dict.fromkeys([*NAMES, "t:ag"], tag), ["made here"]))
     assert b"\ncomment made here\n" in rewritten(tmp_path, file, columns={"more": 2 * tag})
@@ -142,11 +141,6 @@ def test_odd_headers_are_read_and_kept(tmp_path):
     assert (again["t:ag"].tolist(), again["more"].tolist()) == ([0, 1, 2], [0, 2, 4])
     header, row = plain_header(1, NAMES).replace(b"\n", b"\r"), b"\n" + bytes(range(1, 56))
     assert row == opened(tmp_path, header + row).rows.tobytes()
-    header = plain_header(1, ["first", *NAMES], "binary_big_endian")
-    header = header.replace(b"float first", b"uchar first")
-    file = opened(tmp_path, header + b"\x07" + bytes(56))
-    written = rewritten(tmp_path, file, columns={"s": np.ones(1, "f4")})
-    assert written.endswith(b"\x07" + bytes(56) + b"\x3f\x80\x00\x00")
     odd = b"  element \t vertex   0002  "
     header, rows = plain_header(2, NAMES).replace(b"element vertex 2", odd), bytes(range(112))
     written = rewritten(tmp_path, opened(tmp_path, header + rows), np.array([False, True]))
@@ -211,14 +205,12 @@ LONG_ROW = TEXT_ROW.replace(b"\n", b" " * 40 + b"\n")
 
 REFUSED = [
     (b"", "the file is empty, expected a PLY"),
-    (b"\x89PNG\r\n\x1a\n....", r"not a PLY: it starts with b'\x89PNG\r\n\x1a\n'"),
     (b"\xef\xbb\xbf" + PLAIN, "not a PLY: it starts with b'\\xef\\xbb\\xbfply"),
     (declared(b"ply\n", b"ply\r\n"), f"no 'end_header' line in the first {len(PLAIN) + 1} bytes"),
     (declared(b"little_endian 1", b"middle 1"), "line 2: don't understand format"),
     (more(b"end_header now"), "unexpected data after 'end_header'"),
     (declared(b"float y", b"float\x1cy"), r"line 5: expected ASCII text, got b'property float\x1c"),
     (declared(b"float y", b"float x"), "line 5: 'x' is declared twice, expected once"),
-    (more(VERTEX[:-1]), "header line 18: 'vertex' is declared twice, expected once"),
     (MESH, "a mesh, not splats: vertex lacks f_dc_0"),
     (declared(VERTEX, b"element point 3\n"), "expected an element 'vertex', got point"),
     (PACKED, "a compressed splat PLY: 'refine convert IN OUT.ply' makes a plain one of it"),
@@ -227,19 +219,15 @@ REFUSED = [
     (plain_header(0, [*NAMES, *GAP]), "found 9 f_rest properties, expected f_rest_0 onward"),
     (more(b"property list uchar int links"), "property 'links' is a list, expected one number a"),
     (declared(b"float y", b"int y"), "'y' is of type i4, expected float or double"),
-    (counted(-1), f"header line 3: {ROWS} '-1'"),
     (counted("9" * 5000), f"header line 3: {ROWS} '999"),
     (counted(2**63), "9223372036854775808 rows of 'vertex', at least 516508834063867445248 bytes"),
-    (ahead(b"element a %d\nproperty uchar b\n" % 2**63), "9223372036854775808 rows of 'a'"),
     (more(b"element f %d\nproperty list uchar int a" % 2**63), "9223372036854775808 rows of 'f'"),
-    (ahead(b"element other %d\n" % 10**12), "'other' has 1000000000000 rows and no property"),
     (more(b"element a 1\nproperty double a"), "1 rows of 'a', at least 176 bytes so far, but on"),
     (ahead(LIST % b"uchar"), "'face' has a list and stands before the splats, expected it behind"),
     # Two rows are announced and one is there, long enough to be two by its bytes.
     (TEXT_HEADER + LONG_ROW, "truncated: the file ends in row 1 of 2 of 'vertex'"),
     # Names that do not end do not flood the message: forty characters of each are shown.
     (declared(b"float rot_3", b"float " + LONG), ""),
-    (ahead(LIST.replace(b"face", LONG) % b"uchar"), ""),
     (declared(b"property float x", b"property float x%s\nproperty float x%s" % (LONG, LONG)), ""),
     (declared(b"binary_little_endian", LONG), ""),
 ]
@@ -255,7 +243,6 @@ WRONG_ROWS = [
     (b"1", b"one", "property 'rot_0': expected a number of type float32"),
     (b"7", b"300", "expected a number of type uint8, got '300'"),
     (b" 7", b"", "expected 15 numbers, got 14"),
-    (b"7", b"7 # 7", "expected 15 numbers, got 17"),
     (b"7", b"\xff", r"of type uint8, got '\\xff'"),
     (TEXT_ROW, b"\n" + TEXT_ROW, "expected 15 numbers, got 0"),
     (b"1", b"1\x1d5", r"of type float32, got '1\x1d5'"),

@@ -73,7 +73,7 @@ def _read(path, data):
     if len(ranges) < needed:
         place.fail(f"{len(ranges)} chunks, expected {needed} for {count} splats")
     rest = np.empty((count, 0), np.uint8)
-    if "sh" in elements:
+    if "sh" in elements and elements["sh"].dtype.names:  # gsplat's may be without properties
         held = elements["sh"]
         names = [f"f_rest_{index}" for index in range(len(held.dtype.names or ()))]
         if len(held) != count or len(names) not in REST_COUNTS:

@@ -324,6 +324,8 @@ def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
         elif not re.fullmatch(rb"[\t -~]*\r?", line):
             raise RefineError(f"{where}: expected ASCII text, got {line[:80]!r}")
         elif keyword == b"property" or (keyword == b"element" and len(words) == 3):
+            if words[1:2] != [b"list"]:
+                words[2:] = [b"_".join(words[2:])]  # Blender writes names with spaces
             taken, name = (names, words[-1]) if keyword == b"property" else (elements, words[1])
             if taken is elements:
                 if not re.fullmatch(rb"[0-9]{1,30}", words[2]):
@@ -351,8 +353,6 @@ def row_ranges(header: Header, available: int) -> list[slice]:
         row = sum(2 if text else np.dtype(kind).itemsize for kind in kinds)
         ranges.append(slice(least, least + row * count))
         least, name = least + row * count, shown(element.name)
-        if not row and count:
-            raise RefineError(f"{header.path}: element {name} has {count} rows and no property")
         if least > available + text:  # plus 1 for text, whose last line may lack its line end
             what = f"truncated: the header announces {count} rows of {name}, at least {least} bytes"
             raise RefineError(f"{header.path}: {what} so far, but only {available} bytes follow it")
