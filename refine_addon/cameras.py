@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import bpy
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from .core.affine import QUARTER, QUARTERS, UNKNOWN_AXES, quaternion
 from .core.errors import RefineError
+from .core.formats.ply import HEADER_LIMIT, raw_header
 from .core.views import View, ViewSet
-from .mesh.layout import AXES, LAYOUT, is_native
+from .mesh.layout import AXES, LAYOUT, VERTICAL_AXIS, is_native
 
 WEIGHT = "refine_weight"  # Custom property of a camera object: the weight of its view, 1 without it
 SOURCE = "refine_view"  # Custom property of an imported camera: its view in the file, exact, JSON
@@ -361,6 +362,20 @@ def _turn(
     turns = [t for camera, view in pairs if (t := quarter_turn(camera, view, axes)) is not None]
     alike = len(set(turns)) == 1 and 2 * len(turns) >= len(cameras)
     return turns[0] if alike else None
+
+
+def y_down(path: Path) -> bool | None:
+    """Whether a PLY names y as its vertical axis, pointing down; None if it names none.
+    Brush writes ``y`` for that, or the direction upward, its z negated; nerfstudio ``z``."""
+    letters = {"x": "1 0 0", "y": "0 -1 0", "z": "0 0 1"}
+    try:
+        with path.open("rb") as stream:
+            header = raw_header(stream.read(HEADER_LIMIT)) or b""
+        *_, axis = VERTICAL_AXIS.findall(header.decode("latin-1"))
+        x, y, z = map(float, letters.get(axis.strip().lower(), axis).split())
+    except (OSError, ValueError):
+        return None
+    return -y > max(abs(x), abs(z))
 
 
 def active_camera(scene: bpy.types.Scene) -> bpy.types.Object:

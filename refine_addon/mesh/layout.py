@@ -90,6 +90,9 @@ _MOST_NAMES = 8  # Attribute names in an error message, at most
 _TAKEN = {"position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"}
 """Attribute names that mean something to Blender."""
 
+VERTICAL_AXIS = re.compile(r"comment[ \t]+vertical axis:([^\r\n\\]*)(?:\r?\n|(?:\\r)?\\n)", re.I)
+"""A comment that names a PLY's vertical axis, in a header or in JSON."""
+
 _TYPES = ("MESH", "POINTCLOUD")
 
 
@@ -400,6 +403,12 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
     text = vertex_header(header).decode("latin-1")
     mesh[LAYOUT] = json.dumps({"header": text, "columns": record})
     return tuple(columns)
+
+
+def forget_axis(mesh: bpy.types.ID) -> None:
+    """Drop the vertical axis that the file named: the splats were moved."""
+    if isinstance(text := mesh.get(LAYOUT), str):
+        mesh[LAYOUT] = VERTICAL_AXIS.sub("", text)
 
 
 def _row(columns: Sequence[Column]) -> np.dtype[Any]:

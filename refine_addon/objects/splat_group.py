@@ -360,6 +360,10 @@ def read_for_export(
     if not apply_transform:
         return mesh_attributes.read_for_file(checked)
     names, move = read_to_move(checked, _matrix(checked))
+    if names:
+        header = mesh_layout.VERTICAL_AXIS.sub("", checked.layout.header.decode("latin-1"))
+        layout = replace(checked.layout, header=header.encode("latin-1"))
+        checked = replace(checked, layout=layout)
     return mesh_attributes.read_for_file(checked, names, lambda: move()[0])
 
 

@@ -138,6 +138,8 @@ def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) ->
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
             mesh_attributes.write_columns(checked, columns)
             mesh_drift.stamp(checked.mesh)
+            if columns:
+                mesh_layout.forget_axis(checked.mesh)
 
 
 def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:

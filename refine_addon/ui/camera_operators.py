@@ -37,10 +37,8 @@ class Camera(NamedTuple):
 def cameras(record: dict[str, Any], psnr: Mapping[str, float]) -> list[Camera]:
     """Cameras of a record: useless ones first, then by change; `psnr`: known dB by view."""
     far = set((record.get("alignment") or {}).get("far", ()))
-    each = (
-        Camera(name, seen, psnr.get(name), name in far)
-        for name, seen in record.get("cameras") or ()
-    )
+    seen_by = record.get("cameras") or ()
+    each = (Camera(name, seen, psnr.get(name), name in far) for name, seen in seen_by)
     return sorted(
         each, key=lambda c: (c.seen > 0, not c.far, math.inf if c.psnr is None else c.psnr, c.seen)
     )

@@ -13,7 +13,7 @@ from bpy.props import BoolProperty, CollectionProperty, IntProperty, StringPrope
 from bpy.types import Context
 from bpy_extras.io_utils import ImportHelper
 
-from ..cameras import SHEAR, SOURCE, UPRIGHT, create_cameras, known_turn
+from ..cameras import SHEAR, SOURCE, UPRIGHT, create_cameras, known_turn, y_down
 from ..core.affine import AXES
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError, described
@@ -62,12 +62,10 @@ class _Importing(Job, Needing, ImportHelper):
         scene, collection = context.scene, bpy.data.collections.new("Cameras")
         operator_bases.target_collection(context).children.link(collection)
         cameras = create_cameras(views, collection, upright=self.upright)
-        scene.refine.collection = collection
-        scene.refine.source = "COLLECTION"
+        scene.refine.collection, scene.refine.source = collection, "COLLECTION"
         if self.set_resolution:
-            scene.render.resolution_x = views[0].width
-            scene.render.resolution_y = views[0].height
-            scene.render.resolution_percentage = 100
+            render, size = scene.render, (views[0].width, views[0].height)
+            (render.resolution_x, render.resolution_y), render.resolution_percentage = size, 100
         if self.set_resolution or scene.camera is None:
             scene.camera = cameras[0]
         if views.note:
@@ -203,15 +201,24 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         min=0,
         options={"SKIP_SAVE"},
     )
+    chosen: Path | None = None  # File at the last `check`
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Ask for files, or only for options where files were dropped."""
         self.by_hand = True
         properties.fill(self.properties, context, "upright")
+        self.check(context)
         if not self.properties.is_property_set("cameras"):
             self.cameras = not any(SOURCE in obj for obj in context.scene.objects)
         suggest_resolution(self, context)
         return self.invoke_popup(context)
+
+    def check(self, _context: Context) -> bool:
+        """Set *Upright* if a newly chosen file names its vertical axis; whether it does."""
+        before, self.chosen = self.chosen, self._paths()[0]
+        down = y_down(self.chosen) if self.chosen != before else None
+        self.upright = self.upright if down is None else down
+        return down is not None
 
     def draw(self, context: Context) -> None:
         """Draw the options, and name the cameras that would come along."""
@@ -269,10 +276,8 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         if not imported:
             raise RefineError("; ".join(map(described, errors)))
         self.warn(map(described, errors))
-        for obj in context.selected_objects:
-            obj.select_set(False)
-        for obj in imported:
-            obj.select_set(True)
+        for obj in (*context.selected_objects, *imported):
+            obj.select_set(obj in imported)
         context.view_layer.objects.active = imported[-1]
         if not bpy.app.background:  # scripts set what they want
             properties.fill(context.scene.refine, context, *properties.DEFAULTS)

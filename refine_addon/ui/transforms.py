@@ -70,9 +70,8 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, mended: Any) -> None:
         """Mend the objects."""
-        transforms.write_moved(
-            [(one, columns) for one, (columns, _) in zip(group, mended, strict=True)]
-        )
+        parts = [(one, columns) for one, (columns, _) in zip(group, mended, strict=True)]
+        transforms.write_moved(parts)
         plans.refresh(context)
         self.report({"INFO"}, f"Mended {counted(sum(count for _, count in mended), 'splat')}")
 

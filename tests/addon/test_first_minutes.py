@@ -9,6 +9,8 @@ from types import SimpleNamespace
 import bpy
 import pytest
 
+from tests.strategies import ply_of
+
 from .conftest import ROOM
 
 
@@ -78,6 +80,31 @@ def test_what_lies_beside_the_splats_is_found_by_its_name(addon, tmp_path):
     model = tmp_path / "sparse" / "0"
     assert found == [None, model, tmp_path / "transforms_train.json", tmp_path / "cameras.json"]
     assert find(place / "d") is None
+
+
+AXES = {"y": True, "0.04 -0.97 0.23": True, "0 -0.2 -0.98": False, "Z ": False, "up": None}
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_upright_is_as_the_chosen_file_says(addon, make_splats, tmp_path, axis):
+    """Brush negates z of the direction upward. The user may change it for the same file.
+    Once splats were moved, the file that is written no longer says it."""
+    path, upright = tmp_path / "in.ply", AXES[axis]
+    check, comment = addon.ui.import_operators.REFINE_OT_import_ply.check, f"vertical Axis: {axis}"
+    path.write_bytes(ply_of(make_splats(count=5), [comment]))
+    operator = SimpleNamespace(upright=not upright, chosen=None, _paths=lambda: [path])
+    assert check(operator, bpy.context) == (upright is not None)
+    assert operator.upright == (upright is None or upright)
+    assert not check(operator, bpy.context)
+
+    bpy.ops.refine.import_ply(filepath=str(path), upright=True)
+    out, said = tmp_path / "out.ply", []
+    for move in (False, True, False):  # the last time baked
+        bpy.ops.refine.export_ply(filepath=str(out), apply_transform=move, overwrite=True)
+        said.append(comment.encode() in out.read_bytes())
+        if move:
+            bpy.ops.refine.bake_transform()
+    assert said == [True, False, False]
 
 
 def test_the_render_size_is_set_where_nobody_chose_one(addon):
