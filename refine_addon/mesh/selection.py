@@ -27,7 +27,12 @@ def name_of(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> str:
 
 def selected(obj: bpy.types.Object) -> NDArray[np.bool_]:
     """Selected splats of an object, (N,) bool."""
-    return _in_edit(obj, "select") if _in_edit_mode(obj) else _chosen(obj)
+    if _in_edit_mode(obj):
+        return _in_edit(obj, "select")
+    name = name_of(obj.data)
+    if obj.mode == "EDIT" and name not in obj.data.attributes:
+        return np.ones(splat_count(obj.data), np.bool_)  # without it Blender selects all
+    return _flags(obj.data, name)
 
 
 def hidden(obj: bpy.types.Object) -> NDArray[np.bool_]:
@@ -55,7 +60,7 @@ def count(obj: bpy.types.Object) -> int:
     """Number of selected splats; cheap enough to draw."""
     if _in_edit_mode(obj):
         return int(obj.data.total_vert_sel)
-    return int(np.count_nonzero(_chosen(obj)))
+    return int(np.count_nonzero(selected(obj)))
 
 
 @contextmanager
@@ -94,13 +99,6 @@ def _store(
 
 def _in_edit_mode(obj: bpy.types.Object) -> bool:
     return obj.type == "MESH" and obj.mode == "EDIT"
-
-
-def _chosen(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    name = name_of(obj.data)
-    if obj.mode == "EDIT" and name not in obj.data.attributes:
-        return np.ones(splat_count(obj.data), np.bool_)  # without it Blender selects all
-    return _flags(obj.data, name)
 
 
 def _flags(mesh: bpy.types.Mesh | bpy.types.PointCloud, name: str) -> NDArray[np.bool_]:

@@ -94,15 +94,14 @@ class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
 
 def taken(context: Context, checked: SplatObject, what: str) -> NDArray[np.bool_]:
     """Splats of one of `SETS`, or of `marks.WHAT`, (N,)."""
-    settings, columns = context.scene.refine, mesh_attributes.stored_columns(checked)
+    settings = context.scene.refine
     if what == "SELECTED":
         return selection.selected(checked.obj)
-    if what == "FAINT":
-        return opacity(columns["opacity"]) < settings.select_opacity
-    if what == "LARGE":
-        names = (column.name for column in checked.layout.columns)
-        scales = [columns[name] for name in names if name.startswith("scale_")]
-        return np.max(scales, axis=0) > np.log(settings.select_size)
+    if what in {"FAINT", "LARGE"}:
+        splats = mesh_attributes.splats_from_object(checked, sh_rest=False)
+        if what == "FAINT":
+            return opacity(splats.opacity_logits) < settings.select_opacity
+        return splats.log_scales.max(axis=1) > np.log(settings.select_size)
     if what == "FLOATERS":
         return mesh_scores.floater_mask(checked, settings.to_reasons())
     if what == "GOING":
