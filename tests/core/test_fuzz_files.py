@@ -14,7 +14,6 @@ from refine_addon.core import (
     Budget,
     ClosedForm,
     Levels,
-    Move,
     RefineError,
     Refit,
     convert_files,
@@ -60,7 +59,9 @@ def test_splats_of_no_number_are_moved_kept_and_in_levels_without_a_warning(
     data = np.frombuffer(plain_ply(20, 1), np.uint8).copy()
     data[-20 * 4 * len(names) :].view("<u4")[: 12 * len(names)] = bits
     source.write_bytes(data)
-    convert_files([source], tmp_path / "turned.ply", moves=[Move(rotate=(10.0, 0.0, 0.0))])
+    turn = np.eye(4)
+    turn[1:3, 1:3] = [[0.8, -0.6], [0.6, 0.8]]
+    convert_files([source], tmp_path / "turned.ply", matrices=[turn])
     lod_file(source, tmp_path / "lod-meta.json", cameras, Levels((0.7,)), ClosedForm())
     result = prune_file(source, tmp_path / "out.ply", cameras, Budget(keep=10), Refit(rounds=1))
     assert np.count_nonzero(result.keep) == 10
