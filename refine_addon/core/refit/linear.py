@@ -38,6 +38,10 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matri
 LEAST_WEIGHT = ALPHA_CUT
 """Hits of less weight T a are left out: a quarter less work than 1e-3, equal results to 0.01 dB."""
 
+EVENLY = 0.2
+"""Least chance of a ray to be learned from: others weigh little, as half of the squared error lies
+in a hundredth of the pixels (drawn by error as by arXiv 2504.12905)."""
+
 HUBER = 1.0  # root mean squares of a view above which errors count linearly, see `_trust`
 _LEAST_ERROR = 1e-10  # squared; keeps a division finite
 
@@ -84,18 +88,18 @@ class Shapes:
         return result
 
     def by_parameter(self, sums: Singles) -> Singles:
-        """The transpose of `in_scene`, (22, M), applied to sums as of `LinearView.backward`."""
-        result = np.zeros((COUNT, len(self)), np.float32)
-        result[COLOR] = np.float32(SH_C0) * sums[COLOR]
-        result[DEGREE_1] = sums[DEGREE_1]
-        result[OPACITY] = (np.float32(1.0) - self.gaussians.alphas) * sums[OPACITY]
-        np.einsum("kin,in->kn", self.axes, sums[MEAN], out=result[MEAN])
-        result[MEAN] *= self.scales.max(axis=0)
+        """Apply the transpose of `in_scene` to sums of `LinearView.backward`, (22, M), in place."""
+        sums[COLOR] *= np.float32(SH_C0)
+        sums[OPACITY] *= np.float32(1.0) - self.gaussians.alphas
+        sums[MEAN] = np.einsum("kin,in->kn", self.axes, sums[MEAN]) * self.scales.max(axis=0)
+        result = np.zeros((COUNT - SCALE.start, len(self)), np.float32)
         for parameter, strength, one, other in self._quadratic():
-            for row, (i, k) in enumerate(PAIRS, SCALE.start):
-                result[parameter] += sums[row] * (one[i] * other[k] + one[k] * other[i])
-            result[parameter] *= strength
-        return result
+            row = result[parameter - SCALE.start]
+            for of_pair, (i, k) in zip(sums[SCALE.start :], PAIRS, strict=True):
+                row += of_pair * (one[i] * other[k] + one[k] * other[i])
+            row *= strength
+        sums[SCALE.start :] = result
+        return sums
 
     def _quadratic(self) -> Iterator[tuple[int, Any, Any, Any]]:
         """Yield row, half factor (M,) and two axes (3, M) of S for each scale and turn."""
@@ -293,26 +297,25 @@ def linear_view(
     of `shapes`, which can change, are the first of all that can be hit.
     """
     rays, transmittance = visible
+    errors = truth - rays.composited(transmittance * rays.alpha, colors)
+    trust = _trust(errors)
+    drawn = np.flatnonzero(trust.take(rays.ray))
+    every, rays, transmittance = rays.hit, rays.of_hits(drawn), transmittance.take(drawn)
+    colors = colors.take(np.searchsorted(every, rays.hit), axis=1)
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit
     weight, counts = transmittance * rays.alpha, rays.counts()
     kept = np.flatnonzero((weight > LEAST_WEIGHT) & (rays.owner < movable))
-    owner = rays.owner.take(kept)
+    owner, ray = rays.owner.take(kept), rays.ray.take(kept)
     left = np.maximum((transmittance - weight)[kept], np.float32(LEAST_LEFT))
-    ends = np.cumsum(counts)
-    last = np.repeat(ends, counts)[kept]  # behind the last hit of the same ray
-    hitting = rays.ray.take(ends - 1)
-    alpha = rays.alpha[kept]
-    changing = np.where(alpha < ALPHA_MAX, alpha, np.float32(0.0)) * transmittance[kept]
-    seen, by_log_alpha = np.zeros((3, rays.count)), np.empty((3, len(kept)), np.float32)
+    last = np.repeat(np.cumsum(counts), counts)[kept]  # behind the last hit of the same ray
+    alpha, of_hits = rays.alpha[kept], trust.take(ray)
+    changing = np.where(alpha < ALPHA_MAX, alpha, np.float32(0.0)) * transmittance[kept] * of_hits
+    by_log_alpha = np.empty((3, len(kept)), np.float32)
     for channel, of_splats in enumerate(colors):
         sums = np.zeros(len(weight) + 1)  # running sums of what hits add to the colours of rays
         np.cumsum(weight * of_splats.take(rays.owner), dtype=np.float64, out=sums[1:])
-        seen[channel, hitting] = sums.take(ends) - sums.take(ends - counts)
         background = (sums.take(last) - sums.take(kept + 1)).astype(np.float32) / left
         by_log_alpha[channel] = changing * (of_splats.take(owner) - background)
-    errors, ray = (truth - seen.clip(0.0, 1.0)).astype(np.float32), rays.ray.take(kept)
-    trust = _trust(errors)
-    of_hits = trust.take(ray)
     hit, shapes = rays.hit[:movable], shapes.take(rays.hit[:movable])
     first = np.flatnonzero(np.diff(ray, prepend=-1))
     steepness = _steepness(replace(rays, hit=hit), kept, footprints)
@@ -321,7 +324,7 @@ def linear_view(
     linear = LinearView(
         hit, trust * errors, ray.take(first).astype(np.int64), np.diff(first, append=len(ray)),
         owner.astype(np.uint16 if movable < 1 << 16 else np.int32),
-        _halves(of_hits * weight[kept]), _halves(of_hits * by_log_alpha), _halves(steepness),
+        _halves(of_hits * weight[kept]), _halves(by_log_alpha), _halves(steepness),
         ((colors > 0.0) & (colors < projection.BRIGHTEST))[:, :movable], jacobian,
         _basis(shapes, view),
     )  # fmt: skip
@@ -329,11 +332,17 @@ def linear_view(
 
 
 def _trust(errors: Singles) -> Singles:
-    """Roots of the weights of rays, (P,), from errors (3, P): Huber's loss, reweighted once."""
-    squared = np.mean(np.square(errors), axis=0)
-    mean = max(float(squared.mean(dtype=np.float64)), _LEAST_ERROR)
-    most = np.float32(HUBER * np.sqrt(mean))
-    return np.asarray(np.sqrt(most / np.maximum(np.sqrt(squared), most)), np.float32)
+    """Roots of the weights of rays, (P,), from errors (3, P): Huber's loss, reweighted once.
+
+    Rays of small error are drawn by it, and weigh the more the less likely that was, or nothing.
+    """
+    squared = np.mean(np.square(errors), axis=0, dtype=np.float64)
+    size = np.sqrt(squared + _LEAST_ERROR)
+    most = HUBER * np.sqrt(squared.mean() + _LEAST_ERROR)
+    chance = np.minimum(EVENLY + (1.0 - EVENLY) * size / size.mean(), 1.0)
+    drawn = np.diff(np.floor(np.cumsum(chance)), prepend=0.0) > 0.0
+    weight = np.divide(most, np.maximum(size, most) * chance, out=np.zeros_like(size), where=drawn)
+    return np.sqrt(weight).astype(np.float32)
 
 
 def _halves(values: Singles) -> NDArray[np.uint16]:

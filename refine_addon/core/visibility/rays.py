@@ -60,12 +60,15 @@ class Rays:
     def visible(self) -> tuple[Rays, NDArray[np.float32]]:
         """The rays without hidden hits, which show the same; transmittance in front, (h,)."""
         kept, log_front = self._seen()
+        return self.of_hits(kept), np.exp(log_front)
+
+    def of_hits(self, kept: NDArray[np.int64]) -> Rays:
+        """The rays with some hits, and the splats of these."""
         owner = self.owner.take(kept)
         used = np.zeros(len(self.hit), np.bool_)
         used[owner] = True
         place = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        seen = replace(self._with_hits(kept), owner=place.take(owner), hit=self.hit[used])
-        return seen, np.exp(log_front)
+        return replace(self._with_hits(kept), owner=place.take(owner), hit=self.hit[used])
 
     def composited(
         self, weight: NDArray[np.float32], colors: NDArray[np.float32]
