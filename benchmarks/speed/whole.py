@@ -2,13 +2,14 @@
 
     python -m benchmarks.speed.whole [--quick] [--write]
 
-160,000, 1 million and 2.2 million splats of degree 3 (`capture`); with ``--quick`` the first alone,
-a minute of the processor. Each command is a process of its own and runs once, from file to file,
-one after the other: every method, merging to half and a tenth, and splat-transform to the same
-numbers; refitting where it takes minutes, not tens of them. Told are seconds of the processor and
-the most memory (RssAnon) of the whole tree of processes, both over splat-transform's, and by how
-much they differ from the committed figures, `figures.json`, which ``--write`` replaces. Seconds of
-another machine are compared by what copying and decimating take there, so look at ratios first.
+160,000, 1 million and 2.2 million splats of degree 3, 160,000 and 2.2 million of degree 0
+(`capture`); with ``--quick`` 160,000 alone, minutes of the processor. Each command is a process of
+its own and runs once, from file to file, one after the other: every method, merging to half and a
+tenth, and splat-transform to the same numbers; refitting where it takes minutes, not tens of them.
+Told are seconds of the processor and the most memory (RssAnon) of the whole tree of processes, both
+over splat-transform's, and by how much they differ from the committed figures, `figures.json`,
+which ``--write`` replaces. Seconds of another machine are compared by what copying and decimating
+take there, so look at ratios first.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ from ..baselines import splat_transform
 from ..tables.million import write_cameras, write_ply
 from . import capture
 
-SIZES = (160_000, 1_000_000, 2_200_000)
+QUICK = 160_000
+SCENES = ((QUICK, 3), (QUICK, 0), (1_000_000, 3), (2_200_000, 3), (2_200_000, 0))
+"""Numbers of splats, and degrees of their harmonics: splat-transform takes longer with more."""
+
 FIGURES = Path(__file__).parent / "figures.json"
 REFITTED = 200_000
 """Scenes of at most so many splats are refitted, too."""
@@ -62,17 +66,20 @@ def commands(folder: Path, count: int) -> Mapping[str, Sequence[str | Path]]:
     return found
 
 
-def measured(count: int) -> dict[str, Figure]:
+def measured(count: int, degree: int) -> dict[str, Figure]:
     """Return the figures of all commands on a scene of so many splats, by name."""
     figures = {}
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        write_ply(folder / "in.ply", capture.make(count))
+        write_ply(folder / "in.ply", capture.make(count, degree))
         write_cameras(folder / "cameras.json", capture.cameras())
         for name, command in commands(folder, count).items():
             _, busy, megabytes = splat_transform.measured(command)
             figures[name] = Figure(round(busy, 2), round(megabytes))
-            print(f"{count:,}, {name}: {busy:.1f} s, {megabytes:.0f} MB", flush=True)
+            print(
+                f"{count:,} of degree {degree}, {name}: {busy:.1f} s, {megabytes:.0f} MB",
+                flush=True,
+            )
             (folder / "out.ply").unlink()
     return figures
 
@@ -100,19 +107,19 @@ def table(figures: Mapping[str, Figure], before: Mapping[str, Sequence[float]]) 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print tables, and write the figures if asked."""
     parser = argparse.ArgumentParser(description="Time every method beside splat-transform.")
-    parser.add_argument("--quick", action="store_true", help=f"{SIZES[0]:,} splats alone")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK:,} splats alone")
     parser.add_argument("--write", action="store_true", help="keep the figures as those to compare")
     options = parser.parse_args(arguments)
     known = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
     if splat_transform.find() is None:
         print(splat_transform.MISSING)
-    for count in SIZES[:1] if options.quick else SIZES:
-        figures = measured(count)
-        lines = table(figures, known.get(str(count), {}))
-        print(f"\n{count:,} splats\n", *lines, sep="\n", flush=True)
-        known[str(count)] = figures
+    for count, degree in SCENES[:2] if options.quick else SCENES:
+        figures, scene = measured(count, degree), f"{count} of degree {degree}"
+        lines = table(figures, known.get(scene, {}))
+        print(f"\n{scene}\n", *lines, sep="\n", flush=True)
+        known[scene] = figures
     if options.write:
-        rows = (f'"{count}": {json.dumps(figures)}' for count, figures in known.items())
+        rows = (f'"{scene}": {json.dumps(figures)}' for scene, figures in known.items())
         FIGURES.write_text("{\n" + ",\n".join(rows) + "\n}\n")
 
 
