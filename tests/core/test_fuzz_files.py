@@ -58,9 +58,10 @@ def test_splats_of_no_number_are_moved_kept_and_in_levels(cameras, tmp_path, bit
     data[-20 * 4 * len(names) :].view("<u4")[: 12 * len(names)] = bits
     source.write_bytes(data)
     convert_files([source], tmp_path / "turned.ply", matrices=[np.eye(4)[[0, 2, 1, 3]]])
-    lod_file(source, tmp_path / "lod-meta.json", cameras, Levels((0.7,)), ClosedForm())
     result = prune_file(source, tmp_path / "out.ply", cameras, Budget(keep=10), Refit(rounds=1))
     assert np.count_nonzero(result.keep) == 10
+    pytest.importorskip("PIL", reason="needs Pillow, which SOG does outside of Blender")
+    lod_file(source, tmp_path / "lod-meta.json", cameras, Levels((0.7,)), ClosedForm())
 
 
 ANY_BITS = st.tuples(st.sampled_from(splat_names(1)), st.integers(0, 19), st.integers(0, 2**32 - 1))
