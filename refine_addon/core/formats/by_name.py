@@ -178,9 +178,7 @@ def _buckets(section, data):
 
 
 def _named(suffix):
-    return lambda path, head: (
-        path.suffix.lower() == suffix and bool(head) and not head.startswith(b"ply")
-    )
+    return lambda path, head: path.suffix.lower() == suffix and head[:3] not in (b"", b"ply")
 
 
 _LOSS = "holds colour, opacity and rotation in 8 bits each"

@@ -175,6 +175,18 @@ def _places(values, ranges):
     return (values - low) / np.where(extent > 0.0, extent, 1.0)
 
 
+def moved_by(means: np.ndarray) -> float:
+    """How far writing moves the one of N positions, (N, 3), that it moves farthest."""
+    order, largest, farthest = nearby_order(means), [k for _, k in _PLACES], 0.0
+    for piece in pieces(len(means)):
+        ends = np.empty((-(-len(order[piece]) // SPLATS), 6))
+        codes = _places(means[order[piece]], ends) * largest
+        steps = np.repeat((ends[:, 3:] - ends[:, :3]) / largest, SPLATS, axis=0)[: len(codes)]
+        moves = (codes - np.rint(codes)) * steps
+        farthest = max(farthest, float(np.linalg.norm(moves, axis=1).max()))
+    return farthest
+
+
 def _header(count, rest):
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-count // SPLATS)}"]
     lines += [f"property float {name}" for name in (*_POSITION, *_SCALE, *_COLOR)]

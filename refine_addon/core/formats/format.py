@@ -69,8 +69,7 @@ def set_colors(splats: Splats, shares: NDArray[Any]) -> None:
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
     """Raise `RefineError` if `what` needs more bytes than the `available` ones of the file."""
     if needed > available:
-        problem = f"{what} need {needed} bytes, the file has {available}"
-        raise RefineError(f"{path}: truncated: {problem}")
+        raise RefineError(f"{path}: truncated: {what} need {needed} bytes, got {available}")
 
 
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

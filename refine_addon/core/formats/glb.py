@@ -47,8 +47,7 @@ def _write(stream, splats):
         text, body = _json(attributes, len(splats), *ends)
         total = gltf.HEADER.size + 2 * gltf.CHUNK.size + len(text) + body
         if total > _LONGEST:
-            what = f"{len(splats)} splats are {total} bytes as {NAME}"
-            raise RefineError(f"{what}, which holds {_LONGEST}")
+            raise RefineError(f"{len(splats)} splats are {total} bytes, a {NAME} holds {_LONGEST}")
         stream.write(gltf.HEADER.pack(gltf.MAGIC, gltf.VERSION, total))
         stream.write(gltf.CHUNK.pack(len(text), gltf.JSON) + text)
         stream.write(gltf.CHUNK.pack(body, gltf.BINARY))

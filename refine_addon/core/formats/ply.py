@@ -255,8 +255,7 @@ def splat_header(path: Path | Url, head: bytes) -> tuple[Header, int]:
     missing = [name for name in REQUIRED if name not in kinds]
     rest = [name for name in kinds if name.startswith("f_rest_")]
     if "packed_position" in kinds:
-        what = "'refine convert IN OUT.ply' makes a plain one of it"
-        _refuse(path, f"a compressed splat PLY: {what}")
+        _refuse(path, "a compressed splat PLY: 'refine convert IN OUT.ply' makes a plain one of it")
     if missing and missing != [THIRD_SCALE]:
         mesh = any(name in INDEXING for name in names)
         guess = f"a {'mesh' if mesh else 'point cloud'}, not splats"
@@ -292,8 +291,7 @@ def read_header(path: Path | Url, head: bytes) -> Header:
         got = f"not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
         _refuse(path, foreign_kind(path, head) or got)
     if raw is None:
-        what = f"no 'end_header' line in the first {len(head)} bytes"
-        _refuse(path, f"header without end: {what}")
+        _refuse(path, f"header without end: no 'end_header' line in the first {len(head)} bytes")
     plain, counts = _plain(path, raw)
     try:
         data = plyfile.PlyData.read(io.BytesIO(plain))

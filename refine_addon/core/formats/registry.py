@@ -204,19 +204,22 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
         kept = "beside the splats is kept as it is; its indices may point past the end"
         indexing = () if keep.all() else file.indexing
         return [*file.remarks, *(f"element '{name}' {kept}" for name in indexing)]
-    suffix, degree, model = form.suffix, file.splats().sh_degree, file.model
+    splats, suffix, model = file.splats(), form.suffix, file.model
+    good, degree = keep & drawable(splats), splats.sh_degree
+    lost = int(np.count_nonzero(keep)) - int(np.count_nonzero(good))
     extra = other_properties(file.rows.dtype.names or ())
-    lost = left_out(file, form, keep)
+    chunked = form is compressed_ply.FORMAT and good.any()
+    moved = compressed_ply.moved_by(splats.means[good]) if chunked else 0.0
     held = f"{suffix} holds harmonics of degree {form.degree}, the file has degree {degree}"
     stated = f"{suffix} does not say that splats are {model}: say so when it is read (model)"
-    undrawn = f"{lost} of the kept splats cannot be drawn and {suffix} cannot hold them: left out"
     up, is_spz = file.axes == AXES[0], form is spz.FORMAT
     said = {
         f"{suffix} {form.loss} (docs/conventions.md, Formats)": True,
+        f"{suffix} moves splats by up to {moved:.3g}, those beside an outlier farthest": moved,
         f"{held}: the others are left out": degree > form.degree,
         stated: model not in form.models,
         f"{suffix} does not hold {', '.join(extra)}: left out": extra,
-        undrawn: lost,
+        f"{lost} of the kept splats cannot be drawn and {suffix} cannot hold them: left out": lost,
         f"coordinates go to {suffix} turned to y up and z back": is_spz and up,
         f"coordinates go to {suffix} as they stand, y up is documented": is_spz and not up,
     }

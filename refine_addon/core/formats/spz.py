@@ -147,8 +147,7 @@ def _unpacked(path, data):
                 body += engine.decompress(data[at : at + _STEP].data)
                 del body[needed + _MOST_EXTENSIONS :]
     except zlib.error as error:
-        where = f"its gzip stream breaks behind byte {at} ({error})"
-        Place(path).fail(f"a damaged SPZ file: {where}")
+        Place(path).fail(f"a damaged SPZ file: its gzip stream breaks behind byte {at} ({error})")
     if len(body) >= needed and not engine.eof:
         Place(path).fail("truncated: the gzip stream has no end")
     return header, np.frombuffer(body, np.uint8)[_HEADER.size :]
