@@ -66,10 +66,10 @@ def set_colors(splats: Splats, shares: NDArray[Any]) -> None:
     splats.opacity_logits[:] = opacity_logits(shares[:, 3])
 
 
-def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
-    """Raise `RefineError` if `what` needs more bytes than the `available` ones of the file."""
-    if needed > available:
-        raise RefineError(f"{path}: truncated: {what} need {needed} bytes, got {available}")
+def refuse_short(path: Path, needed: int, held: int, what: str) -> None:
+    """Raise `RefineError` if `what` needs more bytes than the `held` ones of the file."""
+    if needed > held:
+        raise RefineError(f"{path}: truncated: {what} need {needed} bytes, the file has {held}")
 
 
 def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
