@@ -54,8 +54,11 @@ class REFINE_OT_view(bpy.types.Operator):
 
 def _count(context: bpy.types.Context) -> int:
     """Number of splats that the active object instances."""
-    counts = (mesh_layout.splat_count(place.obj.data) for place in instances.shown_by(context))
-    return cached("instanced", lambda: sum(counts))
+
+    def count() -> int:
+        return sum(mesh_layout.splat_count(p.obj.data) for p in instances.shown_by(context))
+
+    return cached("instanced", count)
 
 
 def _instances(context: bpy.types.Context) -> str:

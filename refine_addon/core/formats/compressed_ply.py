@@ -175,7 +175,7 @@ def _places(values, ranges):
     return (values - low) / np.where(extent > 0.0, extent, 1.0)
 
 
-def moved_by(means: np.ndarray) -> float:
+def _moves(means):
     """How far writing moves the one of N positions, (N, 3), that it moves farthest."""
     order, largest, farthest = nearby_order(means), [k for _, k in _PLACES], 0.0
     for piece in pieces(len(means)):
@@ -197,4 +197,4 @@ def _header(count, rest):
 
 
 _LOSS = "holds every value in 8 to 11 bits, and sorts the splats"
-FORMAT = Format(NAME, ".compressed.ply", _matches, _read, _write, 3, _LOSS, MODELS)
+FORMAT = Format(NAME, ".compressed.ply", _matches, _read, _write, 3, _LOSS, MODELS, _moves)

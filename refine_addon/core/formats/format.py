@@ -33,6 +33,8 @@ class Format:
     degree: int = 0  # highest of the harmonics
     loss: str = ""  # what is lost, as a sentence whose subject is the suffix
     models: tuple[Model, ...] = MODELS[:1]  # those that a file can name
+    # Positions, (N, 3) -> how far writing moves the one it moves farthest; None if always little.
+    moves: Callable[[NDArray[Any]], float] | None = None
 
 
 def new_file(

@@ -206,10 +206,9 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
         return [*file.remarks, *(f"element '{name}' {kept}" for name in indexing)]
     splats, suffix, model = file.splats(), form.suffix, file.model
     good, degree = keep & drawable(splats), splats.sh_degree
-    lost = int(np.count_nonzero(keep)) - int(np.count_nonzero(good))
+    lost = int(np.count_nonzero(keep & ~good))
     extra = other_properties(file.rows.dtype.names or ())
-    chunked = form is compressed_ply.FORMAT and good.any()
-    moved = compressed_ply.moved_by(splats.means[good]) if chunked else 0.0
+    moved = form.moves(splats.means[good]) if form.moves and good.any() else 0.0
     held = f"{suffix} holds harmonics of degree {form.degree}, the file has degree {degree}"
     stated = f"{suffix} does not say that splats are {model}: say so when it is read (model)"
     up, is_spz = file.axes == AXES[0], form is spz.FORMAT
