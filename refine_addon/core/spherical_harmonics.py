@@ -93,11 +93,14 @@ def colors(
     return np.asarray(color)
 
 
-def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
-    """`colors` in float32, (3, N), in a tenth of the time; harmonics are (N, 3, (degree + 1)^2)."""
-    degree = math.isqrt(harmonics.shape[2]) - 1
-    values = np.stack(_values(np.asarray(directions, np.float32), degree), axis=1)  # (N, K)
-    result = np.einsum("nk,nck->cn", values, harmonics)
+def single_colors(
+    directions: NDArray[Any], sh_dc: NDArray[np.float32], sh_rest: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """`colors` in float32, (3, N), in a tenth of the time; directions are (3, N)."""
+    values = _values(np.asarray(directions, np.float32), math.isqrt(sh_rest.shape[1] + 1) - 1)
+    result = values[0] * sh_dc.T
+    if sh_rest.shape[1]:
+        result += np.einsum("nk,nkc->cn", np.stack(values[1:], axis=1), sh_rest)
     result += np.float32(0.5)
     return np.asarray(result, np.float32)
 

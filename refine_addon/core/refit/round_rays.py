@@ -47,11 +47,13 @@ MANY_HITS, FEWER_HITS = 1 << 24, 64
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """Move of a view in a round, about: in distances to the next view; at most in scene sizes."""
 
+VALIDATION_VIEWS = 12  # about the most that validation rays go from
+
 HELD = 1 << 23  # bytes that stay in memory; small scenes need no file
 LARGEST = np.float32(1e36)  # coefficient of the harmonics: 25 of them add up to a float32
 FARTHEST = 1e18  # step from a camera, world units; its square fits into a float32
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
-_CHUNK = 1 << 14
+_CHUNK = 1 << 12  # what stays in the second-level cache
 _EVERY = 2  # validation rays go through every second row of a round's rays
 _NOTHING = 1e-30  # hits of a ray; keeps a division finite
 
@@ -132,15 +134,16 @@ def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> Singles:
     result = np.empty((3, len(rows)), np.float32)
     for piece in chunks(len(rows), _CHUNK):
         chosen = rows[piece]
-        harmonics = np.empty((len(chosen), 3, 1 + splats.sh_rest.shape[1]), np.float32)
-        harmonics[:, :, 0] = splats.sh_dc[chosen].clip(-LARGEST, LARGEST)
-        harmonics[:, :, 1:] = splats.sh_rest[chosen].clip(-LARGEST, LARGEST).transpose(0, 2, 1)
-        from_view = splats.means[chosen].astype(np.float64) - view.center
-        from_view /= np.maximum(np.abs(from_view).max(axis=1, keepdims=True) / FARTHEST, 1.0)
-        direction = np.ascontiguousarray(from_view.T, np.float32)
+        harmonics = (
+            every[chosen].clip(-LARGEST, LARGEST).astype(np.float32, copy=False)
+            for every in (splats.sh_dc, splats.sh_rest)
+        )
+        from_view = (splats.means[chosen].astype(np.float64) - view.center).T.copy()
+        from_view /= np.maximum(np.abs(from_view).max(axis=0) / FARTHEST, 1.0)
+        direction = from_view.astype(np.float32)
         length = np.sqrt(np.square(direction).sum(axis=0))
         direction /= np.maximum(length, np.finfo(np.float32).tiny)
-        result[:, piece] = single_colors(direction, harmonics)
+        result[:, piece] = single_colors(direction, *harmonics)
     return result.clip(0.0, projection.BRIGHTEST)
 
 
@@ -164,7 +167,7 @@ class RoundRays:
         kind: Callable[..., Target] = Target,
     ) -> None:
         self.windows, self.original, self._threads, self._kind = windows, original, threads, kind
-        step = -(-len(windows) // cast.VALIDATION_VIEWS)
+        step = -(-len(windows) // VALIDATION_VIEWS)
         self._validating = [window.moved(0) for window in windows[::step]] if step else []
         self._validation: list[Truth] = []
 

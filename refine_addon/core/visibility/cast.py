@@ -19,7 +19,7 @@ from ..splats import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS, Splats
 from ..views import View, ViewSet
 from . import projection
 from .projection import Footprints, Gaussians
-from .rays import LOG_OPAQUE, Rays
+from .rays import Rays
 from .scene import Scene
 
 VALIDATION_RAYS = 1 << 14
@@ -48,6 +48,9 @@ MIN_RAYS_OF_VIEW = 16
 
 BEHIND = 1e-4
 """Rays miss a disc's plane behind the camera, and beyond 1 / this times the centre's depth."""
+
+LOG_DIM = -6.9
+"""Logarithm of the transmittance, 1e-3, where `cast_visible` ends rays (72 dB to all hits)."""
 
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
 _MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
@@ -232,7 +235,7 @@ def cast(
 def cast_visible(
     footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]
 ) -> tuple[Rays, NDArray[np.float32]]:
-    """`Rays.visible` of what `cast` gives, in less time: rays end behind opaque hits."""
+    """`Rays.visible` of what `cast` gives, up to `LOG_DIM`, in less time."""
     log_left = np.zeros(len(columns) * len(rows))
 
     def visible_hits():
@@ -241,9 +244,9 @@ def cast_visible(
             log_left[:] += np.bincount(piece[1], np.log1p(-piece[2]), len(log_left))
 
     def wanted(_footprint, ray):
-        return (log_left > LOG_OPAQUE - _MARGIN).take(ray)
+        return (log_left > LOG_DIM - _MARGIN).take(ray)
 
-    return _front_to_back(footprints, columns, rows, None, visible_hits()).visible()
+    return _front_to_back(footprints, columns, rows, None, visible_hits()).visible(LOG_DIM)
 
 
 def _front_to_back(footprints, columns, rows, aims, of_hits):

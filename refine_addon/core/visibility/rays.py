@@ -57,9 +57,9 @@ class Rays:
         """The rays with only their hits on the splats `keep`, (u,) bool."""
         return self._with_hits(np.flatnonzero(keep.take(self.owner)))
 
-    def visible(self) -> tuple[Rays, NDArray[np.float32]]:
+    def visible(self, opaque: float = LOG_OPAQUE) -> tuple[Rays, NDArray[np.float32]]:
         """The rays without hidden hits, which show the same; transmittance in front, (h,)."""
-        kept, log_front = self._seen()
+        kept, log_front = self._seen(opaque)
         return self.of_hits(kept), np.exp(log_front)
 
     def of_hits(self, kept: NDArray[np.int64]) -> Rays:
@@ -148,10 +148,10 @@ class Rays:
         np.not_equal(self.ray[1:], self.ray[:-1], out=new[1:])
         return np.flatnonzero(new)
 
-    def _seen(self):
+    def _seen(self, opaque=LOG_OPAQUE):
         """Visible hits, (r,), and the logarithms of the transmittance in front of them."""
         log_front = in_front(self.log_passed.astype(np.float64), self.counts())
-        seen = np.flatnonzero(log_front > LOG_OPAQUE)
+        seen = np.flatnonzero(log_front > opaque)
         return seen, log_front.take(seen).astype(np.float32)
 
     def _with_hits(self, kept):
