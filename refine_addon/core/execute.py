@@ -21,10 +21,12 @@ import sys
 import tempfile
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -65,6 +67,7 @@ for which ready ones are used."""
 _HEAPS = -8  # M_ARENA_MAX of glibc's malloc.h
 _HELD = 30_000_000  # bytes, see `run`; freeing a block above 32 MB raises no threshold of glibc
 _INTERVAL = 0.1  # seconds between two reports while a piece of work takes long
+_SMALL = 1 << 21  # bytes of arrays that stay in memory
 _ALIGNED = 64  # bytes, of arrays in a file
 _SENT = 1 << 24  # most bytes of work sent to a cluster; arrays in files are sent as names
 _AHEAD = 4  # pieces of work for each thread whose results may wait for those before them
@@ -94,6 +97,7 @@ class _Own(threading.local):
 _own = _Own()
 _idle: list[_Process] = []
 _lock = threading.Lock()
+_maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
 
 class Cancelled(Exception):
@@ -207,11 +211,37 @@ def default_threads() -> int:
     return _own.cores or min(there or 1, 8)
 
 
-def return_freed() -> None:
-    """Return freed memory to the system, which only glibc does not do by itself."""
+def mapped(stream: Any) -> mmap.mmap:
+    """Map a file, read-only."""
+    pages = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    with _lock:
+        _maps.add(pages)
+    return pages
+
+
+def in_file(item: Any) -> Any:
+    """Map a copy of an array, or of a dataclass's, from a temporary file, if large and it fits."""
+    if not isinstance(item, np.ndarray):
+        held = {k: in_file(v) for k, v in vars(item).items() if isinstance(v, np.ndarray)}
+        return replace(item, **held)
+    if item.nbytes < _SMALL:
+        return item
+    with suppress(OSError), tempfile.TemporaryFile(prefix="refine-") as stream:
+        stream.write(np.ascontiguousarray(item).data)
+        stream.flush()
+        return np.frombuffer(mapped(stream), item.dtype).reshape(item.shape)
+    return item
+
+
+def return_freed(*, mapped_only: bool = False) -> None:
+    """Return memory of mapped files, and freed memory, which only glibc does not do by itself."""
     if sys.platform == "linux":
+        with _lock:
+            for pages in _maps:  # what is read is mapped again
+                pages.madvise(mmap.MADV_DONTNEED)
         with suppress(OSError, AttributeError):  # another C library
-            ctypes.CDLL(None).malloc_trim(0)
+            if not mapped_only:
+                ctypes.CDLL(None).malloc_trim(0)
 
 
 def share_heap() -> None:
@@ -490,8 +520,8 @@ def _stored(work, path):
 def _unpacked(pickled, path, places):
     """The work that `_stored` has written."""
     with Path(path).open("rb") as stream:
-        mapped = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY))
-    return pickle.loads(pickled, buffers=[mapped[begin:end] for begin, end in places])
+        pages = memoryview(mapped(stream))
+    return pickle.loads(pickled, buffers=[pages[begin:end] for begin, end in places])
 
 
 def serve() -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import mmap
 import os
 import pickle
 import secrets
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError
-from .execute import checkpoint, chunks
+from .execute import checkpoint, chunks, mapped
 from .splats import ARRAYS, Splats
 from .whole_file import explained
 
@@ -232,4 +231,4 @@ def file_bytes(path: Path) -> NDArray[np.uint8]:
         with path.open("rb") as stream:
             if not state.st_size:
                 return np.empty(0, np.uint8)
-            return np.frombuffer(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
+            return np.frombuffer(mapped(stream), np.uint8)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from . import report as reports
 from .errors import RefineError
-from .execute import Cancelled, Progress, part, report, return_freed, seconds, silent, stages
+from .execute import Cancelled, Progress, in_file, part, report, seconds, silent, stages
 from .formats.ply import SplatFile
 from .merging.merge import Merged, copied, merge, stage_counts, stage_seconds
 from .methods import DEFAULT, ClosedForm, Method, Refit
@@ -466,6 +466,8 @@ class _Prune:
         outcome = Outcome(merged, "merge", {"delete": plain, "merge": psnr})
         if plain is not None and psnr is not None and plain > psnr:
             outcome = replace(outcome, merged=deleted, done="delete")
+        kept = replace(outcome.merged, splats=in_file(outcome.merged.splats))
+        outcome = replace(outcome, merged=kept)
         del merged, deleted, rest  # one of them is not needed while splats are refitted
         outcome = self._refitted(outcome, scores.deciding or used, refitting)
         if outcome.refitted is None or outcome.stopped is not None:
@@ -512,7 +514,6 @@ class _Prune:
         if merged.keep.all() and self.origin is None:
             return outcome
         done, stopped = None, None
-        return_freed()
         try:
             for reached in refit_rounds(
                 merged.splats, self.splats if self.origin is None else self.origin.splats,

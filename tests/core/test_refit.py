@@ -96,14 +96,12 @@ def test_kept_splats_come_nearer_to_what_the_views_see_but_the_protected_and_uns
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["1 thread", "3 threads", "file", "full disk", "processes"])
+@pytest.mark.parametrize("how", ["1 thread", "3 threads", "full disk", "processes"])
 def test_threads_files_and_processes_change_no_bit(monkeypatch, how):
     """Derivatives of views lie in a file, as far as it has room; in processes views are cast."""
     splats, here = cloud(300), []
     kept = splats.take(np.arange(100))
     expected = refit.refit(kept, splats, ring(), 2, threads=2)
-    if how in ("file", "full disk"):
-        monkeypatch.setattr(round_rays, "HELD", 0)
     if how == "processes":
         for name in ("WORTH", "WORTH_READY"):
             monkeypatch.setattr(execute, name, 0.0)

@@ -7,6 +7,8 @@ scenes that finds 87 to 89 % of the 8 nearest, and 97 to 98 % of the very neares
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,6 +103,7 @@ class MergeGraph:
         near = nearest(
             place, NEIGHBOURS, progress=part(progress, 0.0, 0.5), threads=self.threads
         )  # (R, k)
+        del place
 
         def pairs(piece: slice) -> tuple[Rows, Rows]:
             of_piece, others = np.arange(piece.start, piece.stop)[:, None], near[piece]  # (n, 1)
@@ -115,6 +118,7 @@ class MergeGraph:
         )  # fmt: skip
         # int32 takes half the memory of int64, and no file holds two billion splats.
         self.first, self.second = map(np.concatenate, zip(*edges, strict=True))
+        del edges
         self.cost = np.empty(len(self.first), np.float32)
         self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.6, 1.0))
         self.connected = int(np.count_nonzero(self.alive))
@@ -144,7 +148,8 @@ class MergeGraph:
         costs = np.concatenate([error, self.cost])
         possible = np.count_nonzero(self.alive) + np.count_nonzero(np.isfinite(self.cost))
         rank = min(2 * max(quota, least), possible) - 1
-        limit = np.partition(costs, rank)[rank]
+        costs.partition(rank)
+        limit = costs[rank]
         edges = np.flatnonzero(self.cost <= limit)  # (e,)
         first, second, cost = self.first[edges], self.second[edges], self.cost[edges]
         best = _least_costs(error, first, second, cost)
@@ -211,12 +216,13 @@ class MergeGraph:
         valid = np.ones(len(self.first), np.bool_)
         valid[concerned[~remain]] = False
 
-        def left(piece: slice) -> tuple[Rows, Rows, Costs]:
-            stays = valid[piece]
-            return self.first[piece][stays], self.second[piece][stays], self.cost[piece][stays]
+        def left(values: NDArray[Any]) -> NDArray[Any]:
+            some = run_all(lambda piece: values[piece][valid[piece]], pieces, threads=self.threads)
+            return np.concatenate(some)
 
-        rest = run_all(left, pieces, threads=self.threads)
-        self.first, self.second, self.cost = map(np.concatenate, zip(*rest, strict=True))
+        self.first = left(self.first)  # one at a time, to save memory
+        self.second = left(self.second)
+        self.cost = left(self.cost)
 
 
 def _least_costs(error: Costs, first: Rows, second: Rows, cost: Costs) -> Costs:

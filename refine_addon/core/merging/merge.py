@@ -179,6 +179,7 @@ class _Stage:
         rows, measured = self.measured(part(progress, 0.0, 0.3))
         graph = self.graph(measured, measured.seen_and_whole())
         del measured
+        return_freed()
         return self.reduced(rows, graph, keep_count, part(progress, 0.3, 1.0))
 
     def measured(self, progress):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,7 @@ EVENLY = 0.2
 in a hundredth of the pixels (drawn by error as by arXiv 2504.12905)."""
 
 HUBER = 1.0  # root mean squares of a view above which errors count linearly, see `_trust`
+BAND = 1 << 18  # hits
 _LEAST_ERROR = 1e-10  # squared; keeps a division finite
 
 
@@ -77,7 +79,8 @@ class Shapes:
         """Changed parameters, (22, M), as colour, degree 1, log opacity, m, S (`PAIRS`)."""
         result = np.zeros((COUNT, len(self)), np.float32)
         result[COLOR] = np.float32(SH_C0) * change[COLOR]
-        result[DEGREE_1] = change[DEGREE_1]
+        if change[DEGREE_1].any():  # else no memory is touched
+            result[DEGREE_1] = change[DEGREE_1]
         result[OPACITY] = (np.float32(1.0) - self.gaussians.alphas) * change[OPACITY]
         moved = self.scales.max(axis=0) * change[MEAN]
         np.einsum("kin,kn->in", self.axes, moved, out=result[MEAN])
@@ -196,6 +199,24 @@ class LinearView:
         hits = self.hits()
         return self.backward(self.forward(change, hits), hits)
 
+    def bands(self) -> Iterator[LinearView]:
+        """Yield parts of about `BAND` hits, which take less memory and hit splats that are near."""
+        ends, every = np.cumsum(self.counts), len(self.owner)
+        cuts = np.unique(np.searchsorted(ends, [*range(0, every, BAND), every], side="right"))
+        for start, end in pairwise(cuts.tolist()):
+            rays, hits = slice(start, end), slice(ends[start] - self.counts[start], ends[end - 1])
+            used = np.zeros(len(self.hit), np.bool_)
+            used[self.owner[hits]] = True
+            place = np.cumsum(used) - 1
+            owner = place.take(self.owner[hits]).astype(np.min_scalar_type(place[-1]))
+            first, last = self.hitting[start], self.hitting[end - 1]
+            yield LinearView(
+                self.hit[used], self.errors[:, first : last + 1], self.hitting[rays] - first,
+                self.counts[rays], owner, self.weight[hits], self.by_log_alpha[:, hits],
+                self.steepness[:, hits], self.unclipped[:, used], self.jacobian[:, :, used],
+                self.basis[:, used],
+            )  # fmt: skip
+
     def hits(self) -> tuple[Any, ...]:
         """Owner, weight, derivatives and steepness of the hits as numbers, (h,) each."""
         halves = ([_floats(row) for row in rows] for rows in (self.by_log_alpha, self.steepness))
@@ -223,7 +244,8 @@ class LinearView:
         result[COLOR] *= self.unclipped
         for channel, squared in enumerate(result[COLOR]):
             # Squared harmonics of a degree are on average those of the constant (Unsoeld 1927).
-            result[_of_channel(channel)] = squared
+            if self.basis.any():
+                result[_of_channel(channel)] = squared
         value = np.square(by_log_alpha[0])
         for slope in by_log_alpha[1:]:
             value += np.square(slope)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, part, run_all, seconds, silent, stages
+from ..execute import Progress, chunks, in_file, part, run_all, seconds, silent, stages
 from ..mapped import divided, folder_of, in_one, in_regions, look, new_folder, note, noted, on_disk
 from ..splats import Splats, rotation_matrices, unit_quaternions
 from ..views import View, ViewSet
@@ -60,6 +60,7 @@ _FIRST = 0.1  # share of progress until the first round
 _CASTING, _SOLVED = 0.35, 0.9  # share of a round's progress when its rays are cast, and solved
 _SAMPLE = 1 << 12  # splats of a region that tell where it is in each view
 _EDGE = 0.005  # share of them that may lie outside on each side
+_CHUNK = 1 << 14  # splats changed at a time
 _NOTHING = 1e-30  # least of D from which a parameter changes; 1 over it is a float32
 
 
@@ -124,7 +125,7 @@ def refit_rounds(
     """Yield kept splats as they are, and after each round that gains on validation rays.
 
     `rounds` are the most (RefineError if out of range); by default they also end after
-    `ENOUGH_RAYS`. `protected` splats do not change. Memory: about 900 bytes a kept splat; a
+    `ENOUGH_RAYS`. `protected` splats do not change. Memory: about 600 bytes a kept splat; a
     temporary file takes 14 bytes for each hit of a round, see `round_rays.limits`.
     """
     check_rounds(rounds)
@@ -176,8 +177,8 @@ def refit_on(
         del linear  # the hits, before those of the next round
         if not change.any():
             return
-        change = _worthwhile(change)
-        trial = _moved(best.splats, change)
+        _worthwhile(change)
+        trial = in_file(_moved(best.splats, change))
         psnr = rays.psnr(trial, part(share, _SOLVED, 1.0))
         gain = psnr - best.psnr
         if gain > 0.0:
@@ -186,10 +187,12 @@ def refit_on(
             yield best
             if gain < LEAST_GAIN or cast >= enough:
                 return
-            before[1] *= np.float32(CARRIED)
+            before = before * np.array([[[1.0]], [[CARRIED]]], np.float32)
             for k in np.flatnonzero(moving):
                 for total, of_round in zip(before, learned, strict=True):
                     total[k, index] += of_round[k]
+            before = in_file(before)
+            del learned, change
         elif undone:
             return
         else:
@@ -203,18 +206,22 @@ def _solve(linear, movable, damping, before, *, progress, threads):
     by one: all at a time take 88 bytes a splat.
     """
     index, diagonal, residual = linear.shapes.gaussians.index, linear.diagonal, linear.residual
-    rows, moving, medians = np.flatnonzero(movable.any(axis=1)), movable[:, index], {}
-    curvature, change, direction = np.zeros((3, *diagonal.shape), np.float32)
+    rows, moving = np.flatnonzero(movable.any(axis=1)), movable[:, index]
+    medians = np.ones(COUNT, np.float32)
+    change, direction = np.zeros((2, *diagonal.shape), np.float32)
     size = 0.0
+
+    def curvature(k):
+        damped = diagonal[k] + np.float32(damping) * (diagonal[k] + medians[k])
+        return damped + before[0][k, index]
+
     for k in rows:
         moving[k] &= diagonal[k] > _NOTHING
         residual[k] += np.float32(CARRIED) * before[1][k, index]
         residual[k] *= moving[k]
-        # Of the splats that rays hit, 1 where they hit none.
-        medians[k] = np.median(diagonal[k, moving[k]]) if moving[k].any() else np.float32(1.0)
-        curvature[k] = diagonal[k] + np.float32(damping) * (diagonal[k] + medians[k])
-        curvature[k] += before[0][k, index]
-        direction[k] = residual[k] / curvature[k]
+        if moving[k].any():  # splats that rays hit
+            medians[k] = np.median(diagonal[k, moving[k]])
+        direction[k] = residual[k] / curvature(k)
         size += _dot(residual[k], direction[k])
     for step in range(STEPS):
         if size <= 0.0:
@@ -223,16 +230,18 @@ def _solve(linear, movable, damping, before, *, progress, threads):
         along, later = 0.0, 0.0
         for k in rows:
             image[k] *= moving[k]
-            image[k] += (curvature[k] - diagonal[k]) * direction[k]
+            image[k] += (curvature(k) - diagonal[k]) * direction[k]
             along += _dot(direction[k], image[k])
         for k in rows:
             change[k] += np.float32(size / along) * direction[k]
             residual[k] -= np.float32(size / along) * image[k]
-            later += _dot(residual[k], residual[k] / curvature[k])
+            later += _dot(residual[k], residual[k] / curvature(k))
         for k in rows:
             direction[k] *= np.float32(later / size)
-            direction[k] += residual[k] / curvature[k]
+            direction[k] += residual[k] / curvature(k)
         size = later
+        del image
+    del direction
     result = np.zeros(movable.shape, np.float32)
     for k in rows:
         result[k, index] = change[k]
@@ -244,22 +253,27 @@ def _dot(one: Singles, other: Singles) -> float:
     return float(np.sum(one * other, dtype=np.float64))
 
 
-def _worthwhile(change: Singles) -> Singles:
-    """Change, (22, N), with moves of means shortened (Breiman's garrote).
+def _worthwhile(change: Singles) -> None:
+    """Shorten the moves of means in a change, (22, N) (Breiman's garrote).
 
     A move can swap splats in depth, which no derivative shows: the squared error grows with the
     move, the gain with its square.
     """
     means = change[MEAN]
     squared = np.maximum(np.square(means).sum(axis=0), np.float32(_NOTHING))
-    kept = np.maximum(np.float32(1.0) - np.float32(LEAST_MOVE**2) / squared, np.float32(0.0))
-    result = change.copy()
-    result[MEAN] = means * kept
-    return result
+    means *= np.maximum(np.float32(1.0) - np.float32(LEAST_MOVE**2) / squared, np.float32(0.0))
 
 
 def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
     """Splats with changed parameters; those that do not change keep their bits."""
+    result = splats.take(np.arange(len(splats)))
+    for piece in chunks(len(splats), _CHUNK):
+        _move(result.take(piece), change[:, piece])
+    return result
+
+
+def _move(splats, change):
+    """Change parameters in place."""
     rows = np.flatnonzero(change.any(axis=0))
     some, change = splats.take(rows), change[:, rows].astype(np.float64)
     quaternions = unit_quaternions(some.quaternions)
@@ -283,11 +297,8 @@ def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
         # In float32, since that is what blended harmonics are in memory, but not in tiles.
         learned = some.sh_rest[:, :3].clip(-LARGEST, LARGEST).astype(np.float32)
         values["sh_rest"][:, :3] = (learned + np.stack(steps, axis=2)).astype(np.float32)
-    arrays = {}
     for name, new in values.items():
-        arrays[name] = getattr(splats, name).copy()
-        arrays[name][rows] = new
-    return replace(splats, **arrays)
+        getattr(splats, name)[rows] = new
 
 
 def _limited(vectors: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
@@ -347,7 +358,7 @@ def _refit_region(folder, views, rounds, original, kept, threads, number):
     done = Refitted(splats, np.zeros(len(rows), np.bool_), 0, 0.0, 0.0)
     windows = _windows(splats, len(others), original.scene, views.by_distance())
     if windows:
-        amid = partial(_Amid, every=kept, others=others[kept.gaussians.index[...]])
+        amid = partial(_Amid.of, every=kept, others=others[kept.gaussians.index[...]])
         rays = RoundRays(windows, original, threads, amid)
         how: Any = {"protected": protected, "progress": look, "threads": threads}
         *_, done = refit_on(rays, splats, rounds, **how)
@@ -360,9 +371,6 @@ class _Amid(Target):
 
     every: Target  # of all regions
     others: NDArray[np.bool_]  # (M,), which of the Gaussians of all are not of the region
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "every": self.every, "others": self.others}
 
     def footprints(self, window: Window) -> Footprints:
         """Footprints in a window; those of the region have the first numbers."""

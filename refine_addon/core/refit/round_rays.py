@@ -20,11 +20,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, part, return_freed, run, seconds
+from ..execute import Progress, chunks, in_file, part, return_freed, run, seconds
 from ..mapped import folder_of
 from ..quality.psnr import psnr_of
 from ..spherical_harmonics import single_colors
-from ..splats import ARRAYS, Splats
+from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import cast, projection
 from ..visibility.projection import Footprints, Gaussians
@@ -49,7 +49,6 @@ SHIFT, MAX_SHIFT = 0.7, 0.1
 
 VALIDATION_VIEWS = 12  # about the most that validation rays go from
 
-HELD = 1 << 23  # bytes that stay in memory; small scenes need no file
 LARGEST = np.float32(1e36)  # coefficient of the harmonics: 25 of them add up to a float32
 FARTHEST = 1e18  # step from a camera, world units; its square fits into a float32
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
@@ -102,31 +101,29 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Splats that rays are cast into; pickled for other processes, copied only then."""
+    """Splats that rays are cast into, in files."""
 
-    splats: Splats
+    splats: Splats  # as the Gaussians are ordered, if they were in memory
     gaussians: Gaussians
     scene: Scene
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Contiguous rows, which processes map instead of copying, or names of files."""
-        if folder_of(self.splats) is not None:
-            return vars(self)
-        arrays: dict[str, Any] = {
-            name: np.ascontiguousarray(getattr(self.splats, name)[self.gaussians.index])
-            for name in ARRAYS
-        }
-        gaussians = replace(self.gaussians, index=np.arange(len(self.gaussians)))
-        splats = replace(self.splats, **arrays)
-        return {"splats": splats, "gaussians": gaussians, "scene": self.scene}
+    @classmethod
+    def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene, **more: Any) -> Target:
+        """Splats that were in memory or in files, and the Gaussians made of them."""
+        if folder_of(splats) is None:
+            splats = in_file(splats.take(gaussians.index))
+        return cls(splats, gaussians, scene, **more)
 
     def footprints(self, window: Window) -> Footprints:
         """Footprints in a view that may reach into a window, with the rows of the Gaussians."""
-        return projection.project(self.gaussians, self.scene, window.view, window.part)
+        footprints = projection.project(self.gaussians, self.scene, window.view, window.part)
+        return_freed(mapped_only=True)
+        return footprints
 
     def colors(self, hit: NDArray[np.int64], view: View) -> Singles:
         """Colours in which a view sees the Gaussians `hit`, (3, u)."""
-        return colors_of(self.splats, self.gaussians.index[hit], view)
+        rows = hit if folder_of(self.splats) is None else self.gaussians.index[hit]
+        return colors_of(self.splats, rows, view)
 
 
 def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> Singles:
@@ -164,7 +161,7 @@ class RoundRays:
         windows: Sequence[Window],
         original: Target,
         threads: int | None,
-        kind: Callable[..., Target] = Target,
+        kind: Callable[..., Target] = Target.of,
     ) -> None:
         self.windows, self.original, self._threads, self._kind = windows, original, threads, kind
         step = -(-len(windows) // VALIDATION_VIEWS)
@@ -186,8 +183,7 @@ class RoundRays:
             Window(view, number, weight, rays, hits, step=steps[number])
             for number, (view, weight) in enumerate(chosen)
         ]
-        return_freed()
-        return cls(windows, Target(original, gaussians, scene), threads)
+        return cls(windows, Target.of(original, gaussians, scene), threads)
 
     def linear(self, splats: Splats, number: int, progress: Progress) -> LinearRays:
         """The rays of a round, from 1, linearized at the kept splats; call `psnr` before."""
@@ -199,9 +195,7 @@ class RoundRays:
         truth = partial(cast_truth, self.original, windows, number, shown)
         work = partial(_linearized, truth, windows, target, shapes)
         seen = self._each(work, windows, splats, part(progress, 0.05, 1.0))
-        result = LinearRays(shapes, seen)
-        return_freed()
-        return result
+        return LinearRays(shapes, seen)
 
     def psnr(self, splats: Splats, progress: Progress) -> float:
         """Mean PSNR of kept splats on validation rays, weighted as the views are, dB."""
@@ -212,7 +206,6 @@ class RoundRays:
         target = self.target(splats, part(progress, 0.5, 0.6))
         work = partial(_psnr, target, windows, self._validation)
         psnr = [*self._each(work, windows, splats, part(progress, 0.6, 1.0))]
-        return_freed()
         return float(np.average(psnr, weights=[window.weight for window in windows]))
 
     def target(self, splats: Splats, progress: Progress) -> Target:
@@ -289,6 +282,7 @@ def _linearized(truth_of, windows, target, shapes, place):
         colors = target.colors(seen[0].hit, window.view)
         view, mine = linear_view(seen, footprints, truth.colors, colors, shapes, window.view)
         del seen, footprints  # which take more memory than the view
+        view.basis[:] *= target.splats.sh_rest.shape[1] > 0
         return view, view.backward(view.errors), view.diagonal(mine)
 
 
@@ -302,14 +296,17 @@ class LinearRays:
         self.shapes, self.views, self.count = shapes, Stored(), 0  # count of rays
         residual, self.diagonal = np.zeros((2, COUNT, len(shapes)), np.float32)
         for view, of_residual, of_diagonal in seen:  # each as soon as it is there
-            self.views.append(view)
+            for band in view.bands():
+                self.views.append(band)
             self.count += view.errors.shape[1]
             _add(residual, view.hit, of_residual)
             _add(self.diagonal, view.hit, of_diagonal)
+            return_freed()
         self.residual = shapes.by_parameter(residual)
 
     def normal(self, change: Singles, progress: Progress, threads: int | None) -> Singles:
         """G'G times a change of the parameters, (22, M)."""
+        return_freed()
         in_scene = self.shapes.in_scene(change)
         total = np.zeros_like(in_scene)
 
@@ -327,16 +324,17 @@ class LinearRays:
 def _add(total, hit, values):
     """Add the values of the u Gaussians of a view, (k, u), to a sum over views, (k, M)."""
     for row, of_row in zip(total, values, strict=True):  # four times as fast as all at once
-        row[hit] += of_row
+        if of_row.any():  # else no memory is touched
+            row[hit] += of_row
 
 
 class Stored:
-    """A list of objects, in a temporary file after the first `HELD` bytes, if the disk has room."""
+    """A list of objects, in a temporary file as far as the disk has room."""
 
     def __init__(self) -> None:
-        self._held, self._lock = 0, threading.Lock()
         self._places: list[Any] = []  # what is pickled, or its start and end in the file
         self._file: Any = None
+        self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._places)
@@ -344,17 +342,14 @@ class Stored:
     def append(self, item: Any) -> None:
         """Add an object, which may be changed afterwards."""
         place: Any = (data := pickle.dumps(item, 5))
-        if self._held + len(data) > HELD:
-            with suppress(OSError):
-                if self._file is None:
-                    # Without a buffer, so that nothing is left to be written when it closes.
-                    self._file = tempfile.TemporaryFile("w+b", 0, prefix="refine-")  # noqa: SIM115
-                    weakref.finalize(self, self._file.close)
-                start = self._file.seek(0, os.SEEK_END)
-                if self._file.write(data) == len(data):
-                    place = start, start + len(data)
-        if place is data:
-            self._held += len(data)
+        with suppress(OSError):
+            if self._file is None:
+                # Without a buffer, so that nothing is left to be written when it closes.
+                self._file = tempfile.TemporaryFile("w+b", 0, prefix="refine-")  # noqa: SIM115
+                weakref.finalize(self, self._file.close)
+            start = self._file.seek(0, os.SEEK_END)
+            if self._file.write(data) == len(data):
+                place = start, start + len(data)
         self._places.append(place)
 
     def __getitem__(self, number: int) -> Any:

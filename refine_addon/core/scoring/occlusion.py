@@ -200,7 +200,7 @@ def _score(splats, views, rounds, settled, sampling, few_views, most_between, pr
     values = np.empty(count, np.float32)
     values[np.concatenate([first, order])] = shares_gone(np.arange(1, count + 1), count)
     values[~good] = 0.0
-    everything = measured.for_all(index, count)
+    everything = Measured(*map(execute.in_file, measured.for_all(index, count)))
     scores = Scores(
         values, everything.seen, len(ordered), int(np.count_nonzero(~good)),
         {"floor": weights}, method="occlusion", ray_sample=samples[0], between=between,

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, checkpoint, chunks, run, run_all, silent
+from ..execute import Progress, checkpoint, chunks, return_freed, run, silent
 from ..splats import ALPHA_CUT, ALPHA_MAX
 from ..views import View
 from . import projection
@@ -45,7 +45,7 @@ _MAX_DEPTH = 60.0
 _LEAST_LEFT = 1e-4
 """Least transmittance behind a point, by which the colour behind is divided; less shows nothing."""
 
-_ADDED = 1 << 16  # splats of a view that are added to the sums at a time
+_SUMMED = 1 << 20  # points summed at a time
 
 
 @dataclass(frozen=True)
@@ -89,18 +89,13 @@ class Measured(NamedTuple):
         for name in self._fields:
             getattr(self, name)[:] += getattr(other, name)
 
-    def _add_view(self, measured, weight, threads=1):
+    def _add_view(self, measured, weight):
         """Add what one view sees (`_measure_view`), times its weight."""
         rows, inside, contribution, error = measured
-
-        def add(piece):
-            some = rows[piece]  # no row is there twice
-            self.seen[some[inside[piece]]] += 1
-            with np.errstate(under="ignore"):
-                self.contribution[some] += weight * contribution[piece]
-                self.error[some] += weight * error[piece]
-
-        run_all(add, chunks(len(rows), _ADDED), threads=threads)
+        self.seen[rows[inside]] += 1  # no row is there twice
+        with np.errstate(under="ignore"):
+            self.contribution[rows] += weight * contribution
+            self.error[rows] += weight * error
 
 
 def view_groups(count: int) -> list[range]:
@@ -141,7 +136,7 @@ def measure(
         sums, of_views = Measured.zero(len(gaussians)), []
         for number, ((measurement, cast), some) in zip(group, each, strict=False):
             before = sums.error[rows]  # (m,)
-            sums._add_view(measurement, views[number][1], threads)
+            sums._add_view(measurement, views[number][1])
             of_views.append(sums.error[rows] - before)
             for ray_sample, rays in zip(some, cast, strict=True):
                 ray_sample.rays[number] = rays
@@ -166,6 +161,7 @@ def _measure_view(gaussians, scene, view, sampling):
     """Footprints in a view; rows, whether centres are inside, contributions, errors, (n,) each."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
+        return_freed(mapped_only=True)
         integrals = np.empty(0), np.empty(0)
         if len(footprints.index):
             side = cell_size(footprints, view, sampling.cell, sampling.density)
@@ -195,7 +191,7 @@ def _integrals(footprints, colors, points):
     traits[:, 3] = mass / np.float32(points.area)
     np.minimum(alphas, np.float32(ALPHA_MAX), out=traits[:, 4])
     traits[:, 5] = _evenness(footprints, points.area)
-    visible, errors = np.empty((2, len(points.owners)))  # (m,) each
+    seen = np.empty((2, len(points.owners)), np.float32)  # of visible contributions, of errors
     for cells, members in runs(points.counts):
         shares, counts = points.shares[members], points.counts[cells]
         of_points = traits.take(points.owners[members], axis=0)
@@ -206,16 +202,20 @@ def _integrals(footprints, colors, points):
         front, even = sums.real.astype(np.float32), sums.imag.astype(np.float32)
         weight = _transmittance(front, even)
         weight *= shares
-        visible[members] = weight
+        seen[0, members] = weight
         weight *= weight
-        errors[members] = weight * _squared_contrast(front, covered, of_points[:, :3], counts)
+        seen[1, members] = weight * _squared_contrast(front, covered, of_points[:, :3], counts)
     checkpoint()
-    owners = points.owners.astype(np.int64)
-    error = np.bincount(owners, errors, count).astype(float)
+    del traits
+    visible, error = np.zeros((2, count))
+    for piece in chunks(len(points.owners), _SUMMED):
+        owners = points.owners[piece].astype(np.int64)
+        for total, of_points in zip((visible, error), seen[:, piece], strict=True):
+            total += np.bincount(owners, of_points, count)
     # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
     # footprint that lies in the image.
     error *= points.share_inside / np.maximum(points.squares, 1e-30)
-    return mass * np.bincount(owners, visible, count), mass_squared * error
+    return mass * visible, mass_squared * error
 
 
 def _evenness(footprints, area):

@@ -133,6 +133,7 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     inside, squares = (np.bincount(rows, sum_, len(kinds)).astype(float) for sum_ in sums)  # (n,)
     filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
     counts = filled[filled > 0]  # (C,)
+    del axes, rows, patches, whole, sizes  # before memory is highest
     # A stable sort keeps the points of a cell front to back; those `_OUTSIDE` come last.
     order = np.argsort(cells, kind="stable")[: counts.sum()]
     checkpoint()

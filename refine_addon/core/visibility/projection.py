@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, checkpoint, chunks, part, report, run, run_all, silent
+from ..execute import Progress, checkpoint, chunks, in_file, part, report, run, run_all, silent
 from ..mapped import folder_of, write
 from ..splats import (
     ALPHA_CUT,
@@ -230,7 +230,7 @@ def _activate(splats, index, positions, scene, progress, threads):
 
     with np.errstate(under="ignore"):
         run_all(fill, chunks(count, _CHUNK), progress=progress, what="reading", threads=threads)
-    return result
+    return in_file(result)
 
 
 def project(

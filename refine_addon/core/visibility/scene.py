@@ -159,8 +159,7 @@ def spatial_order(
 
     run_all(fill, chunks(len(positions), _CHUNK), threads=threads)
     order = np.argsort(code, kind="stable")
-    same = np.diff(code[order]) == 0  # (N - 1,)
-    if ties is not None and same.any():
+    if ties is not None and (same := np.diff(code[order]) == 0).any():  # (N - 1,)
         tied = np.flatnonzero(np.append(same, False) | np.append(False, same))
         rows = order[tied]
         order[tied] = rows[np.lexsort((ties(rows), code[rows]))]
