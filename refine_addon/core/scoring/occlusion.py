@@ -35,7 +35,7 @@ EXPONENT = 0.25
 """Exponent of the contribution."""
 
 BETWEEN = 12
-"""Most views in between that are estimated."""
+"""Most views halfway between that are estimated."""
 
 BETWEEN_RAYS = 0.375
 """Rays of views in between over `VALIDATION_RAYS`."""
@@ -187,7 +187,7 @@ def _score(splats, views, rounds, settled, sampling, few_views, most_between, pr
             total *= share
             total += sums
     between = None
-    told = views_beside(views, BETWEEN, gaussians, scene) if more else views_between(views, BETWEEN)
+    told = views_beside(views, gaussians, scene) if more else views_between(views, BETWEEN)
     if told:
         between = RaySample(ViewSet(tuple(told)).by_distance(), gaussians, splats)
         between.share = BETWEEN_RAYS

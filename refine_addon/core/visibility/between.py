@@ -67,13 +67,14 @@ def with_views_between(
     return found
 
 
-def views_beside(views: ViewSet, most: int, gaussians: Gaussians, scene: Scene) -> list[View]:
-    """At most `most` views moved and turned from `views`, in the free space in front of these.
+def views_beside(views: ViewSet, gaussians: Gaussians, scene: Scene, most: int = 48) -> list[View]:
+    """At most `most` views moved and turned from `views`, several each if need be, in free space.
 
-    They move about as far as the third view from there, see `BESIDE`, and turn by about `TURNED`.
+    They move about as far as the third view, see `BESIDE`, turn by `TURNED`, and face no wall near.
     """
     centers, found = views.centers, []
-    for number, (view, _) in enumerate(views.spread(most).by_distance()):
+    starts = [view for view, _ in views.spread(most).by_distance()]
+    for number, view in enumerate((starts * most)[:most]):
         away = np.sort(np.linalg.norm(centers - view.center, axis=1))[1:4]
         random = np.random.default_rng(number)
         for _ in range(_TRIES):
@@ -85,7 +86,9 @@ def views_beside(views: ViewSet, most: int, gaussians: Gaussians, scene: Scene) 
                 view, center=view.center + step @ view.rotation, name=f"beside {view.name}",
                 rotation=turned @ view.rotation,
             )  # fmt: skip
-            if transmittance(gaussians, scene, view.center, moved.center) > CLEAR:
+            ahead = moved.center + np.linalg.norm(step) * moved.rotation[2]
+            paths = (view.center, moved.center), (moved.center, ahead)
+            if all(transmittance(gaussians, scene, *path) > CLEAR for path in paths):
                 found.append(moved)
                 break
     return found

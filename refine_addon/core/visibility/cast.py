@@ -119,9 +119,9 @@ class RaySample:
         return [k for k, rays in enumerate(self.rays) if rays is not None and len(rays.ray)]
 
     def validating(self) -> list[int]:
-        """Numbers of the validation views, at most `VALIDATION_VIEWS` of those that see splats."""
+        """Numbers of at most `VALIDATION_VIEWS` views that see splats, or more with a low share."""
         seeing = self.seeing()
-        return seeing[:: max(math.ceil(len(seeing) / VALIDATION_VIEWS), 1)]
+        return seeing[:: max(math.ceil(self.share * len(seeing) / VALIDATION_VIEWS), 1)]
 
     def hits_of_ray(self) -> float:
         """Mean number of splats that a ray hits, hidden ones included."""
