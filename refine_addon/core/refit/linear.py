@@ -305,7 +305,7 @@ def _squared(polynomial: Singles, sums: Sequence[Singles]) -> Singles:
 
 
 def linear_view(
-    visible: tuple[Rays, Singles],
+    visible: list[Any],
     footprints: Footprints,
     truth: Singles,
     colors: Singles,
@@ -319,6 +319,7 @@ def linear_view(
     of `shapes`, which can change, are the first of all that can be hit.
     """
     rays, transmittance = visible
+    visible.clear()  # all its hits take more memory than those that are drawn
     errors = truth - rays.composited(transmittance * rays.alpha, colors)
     trust = _trust(errors)
     drawn = np.flatnonzero(trust.take(rays.ray))

@@ -278,10 +278,10 @@ def _linearized(truth_of, windows, target, shapes, place):
     window, truth = windows[place], truth_of(place)
     with np.errstate(under="ignore"):
         footprints = target.footprints(window)
-        seen = cast.cast_visible(footprints, truth.columns, truth.rows)
+        seen: list[Any] = [*cast.cast_visible(footprints, truth.columns, truth.rows)]
         colors = target.colors(seen[0].hit, window.view)
         view, mine = linear_view(seen, footprints, truth.colors, colors, shapes, window.view)
-        del seen, footprints  # which take more memory than the view
+        del footprints
         view.basis[:] *= target.splats.sh_rest.shape[1] > 0
         return view, view.backward(view.errors), view.diagonal(mine)
 

@@ -257,6 +257,7 @@ def _front_to_back(footprints, columns, rows, aims, of_hits):
     pieces = [[np.empty(0, kind) for kind in types]]
     pieces += [[*map(np.ndarray.astype, piece, types)] for piece in of_hits]
     footprint, ray, alpha = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
+    del pieces
     order = np.argsort(ray, kind="stable")  # footprints are front to back, and so stay hits
     used = np.zeros(len(footprints.index), np.bool_)
     used[footprint] = True

@@ -64,11 +64,10 @@ class Rays:
 
     def of_hits(self, kept: NDArray[np.int64]) -> Rays:
         """The rays with some hits, and the splats of these."""
-        owner = self.owner.take(kept)
-        used = np.zeros(len(self.hit), np.bool_)
-        used[owner] = True
+        rays, used = self._with_hits(kept), np.zeros(len(self.hit), np.bool_)
+        used[rays.owner] = True
         place = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        return replace(self._with_hits(kept), owner=place.take(owner), hit=self.hit[used])
+        return replace(rays, owner=place.take(rays.owner), hit=self.hit[used])
 
     def composited(
         self, weight: NDArray[np.float32], colors: NDArray[np.float32]
