@@ -37,9 +37,9 @@ the parameters only near by."""
 CARRIED = 0.5  # part of the gradient G'd left by a round that counts in the next
 MORE_DAMPING = 8.0  # factor of k after a round that lost
 
-MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
-"""Default rounds, fewer after this many rays for each kept splat and in all: for large scenes a
-round takes as long as merging."""
+MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000, 1_500_000)
+"""Default rounds, fewer after so many rays for each kept splat, but at least and at most the others
+in all: of millions of splats a round takes as long as merging."""
 
 MOST_ROUNDS = 100  # limit of the option; after some ten none gains
 LEAST_GAIN = 0.05  # dB on validation rays; rounds end below
@@ -102,8 +102,11 @@ def check_rounds(rounds: int | None) -> None:
 
 def expected_rounds(count: int, rounds: int | None = None) -> int:
     """Rounds that refitting `count` splats takes if all of them gain."""
-    enough = max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
-    return rounds or min(math.ceil(enough / limits(count)[0]), MAX_ROUNDS)
+    return rounds or min(math.ceil(_enough(count) / limits(count)[0]), MAX_ROUNDS)
+
+
+def _enough(count):
+    return float(np.clip(ENOUGH_RAYS[0] * count, *ENOUGH_RAYS[1:]))
 
 
 def refit(*arguments: Any, **options: Any) -> Refitted:
@@ -154,7 +157,7 @@ def refit_on(
     fixed = np.zeros(count, np.bool_) if protected is None else protected
     movable = moving[:, None] & ~fixed
     ahead, cast, done = expected_rounds(count, rounds), 0, _FIRST
-    enough = np.inf if rounds else max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
+    enough = np.inf if rounds else _enough(count)
     psnr = rays.psnr(splats, part(progress, 0.0, done))
     best = Refitted(splats, np.zeros(count, np.bool_), 0, psnr, psnr)
     if not any(window.step for window in rays.windows):

@@ -40,8 +40,7 @@ MAX_HITS_OF_VIEW = 1 << 21
 MAX_RAYS_OF_VIEW = 60_000
 """Most rays of a view: their numbers fit into 16 bits."""
 
-VALIDATION_VIEWS = 24
-"""About the most views in which merged splats and written files are compared, which is slow."""
+VALIDATION_VIEWS = 24  # about the most that merged splats and written files are compared in
 
 MIN_RAYS_OF_VIEW = 16
 """Fewest rays of a view that has as many pixels."""
@@ -49,8 +48,7 @@ MIN_RAYS_OF_VIEW = 16
 BEHIND = 1e-4
 """Rays miss a disc's plane behind the camera, and beyond 1 / this times the centre's depth."""
 
-LOG_DIM = -6.9
-"""Logarithm of the transmittance, 1e-3, where `cast_visible` ends rays (72 dB to all hits)."""
+LOG_DIM = -6.9  # of the transmittance, 1e-3, where `cast_visible` ends rays
 
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
 _MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
