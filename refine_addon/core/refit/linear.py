@@ -242,9 +242,9 @@ class LinearView:
         result = np.zeros((COUNT, len(self.hit)), np.float32)
         result[COLOR] = np.float32(SH_C0**2) * self._sum(np.square(weight), owner, np.float64)
         result[COLOR] *= self.unclipped
-        for channel, squared in enumerate(result[COLOR]):
+        if self.basis.any():
             # Squared harmonics of a degree are on average those of the constant (Unsoeld 1927).
-            if self.basis.any():
+            for channel, squared in enumerate(result[COLOR]):
                 result[_of_channel(channel)] = squared
         value = np.square(by_log_alpha[0])
         for slope in by_log_alpha[1:]:
@@ -314,9 +314,9 @@ def linear_view(
 ) -> tuple[LinearView, Shapes]:
     """The colours of a view's rays, linear in the splats that they hit, and these splats' shapes.
 
-    The rays, at most 2^16, come with the transmittance in front of each hit; `truth` are their
-    colours with the unpruned splats, `colors`, (3, u), those of the splats that are hit. The splats
-    of `shapes`, which can change, are the first of all that can be hit.
+    `visible`, which is emptied, holds at most 2^16 rays and the transmittance in front of each hit;
+    `truth` are their colours with the unpruned splats, `colors`, (3, u), those of the splats hit.
+    The splats of `shapes`, which can change, are the first of all that can be hit.
     """
     rays, transmittance = visible
     visible.clear()  # all its hits take more memory than those that are drawn
