@@ -30,7 +30,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from ..viewport import draw
 from . import operator_bases, properties
-from .operator_bases import FAILURES, Answer, Job, Needing, idle, in_object_mode
+from .operator_bases import FAILURES, Answer, Job, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
@@ -39,7 +39,7 @@ _DEFAULT_SIZE = (1920, 1080, 100)  # of Blender's factory settings, with the per
 _OF_MODELS = {".bin", ".txt"}  # several files of one folder are a COLMAP model
 
 
-class _Importing(Job, Needing, ImportHelper):
+class _Importing(Job, ImportHelper):
     """An operator that imports cameras, alone or with splats."""
 
     bl_options = {"REGISTER", "UNDO", "PRESET"}

@@ -38,9 +38,9 @@ def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
 class Worker:
     """A thread that runs ``work(progress)``. `fraction`: share done, 0 to 1; `what`: its step."""
 
-    def __init__(self, work: Callable[[Progress], Any]) -> None:
-        self.fraction, self.what = 0.0, ""
-        self._cancelled: float | None = None  # time of `cancel`
+    def __init__(self, work: Callable[[Progress], Any], partial_step: str | None = None) -> None:
+        self.fraction, self.what, self._partial_step = 0.0, "", partial_step
+        self.cancelled: float | None = None  # time of `cancel`
         self._outcome: Future[Any] = Future()
         self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
         self._thread.start()
@@ -48,18 +48,12 @@ class Worker:
     def running(self) -> bool:
         """Whether to wait for it: until it ends, or `PATIENCE` after it was cancelled.
         Work that goes on after that ends at its next check; its result is dropped."""
-        late = self.cancelled and time.monotonic() - self._cancelled > PATIENCE
+        late = self.cancelled and time.monotonic() - self.cancelled > PATIENCE
         return not late and self._thread.is_alive()
 
-    @property
-    def cancelled(self) -> bool:
-        """Whether it was asked to stop."""
-        return self._cancelled is not None
-
     def cancel(self) -> None:
-        """Ask it to stop; `result` raises `Cancelled` then, unless the work has a partial one."""
-        if not self.cancelled:
-            self._cancelled = time.monotonic()
+        """Ask it to stop; `result` raises `Cancelled` then, unless the step has a partial one."""
+        self.cancelled = self.cancelled or time.monotonic()
 
     def end(self) -> None:
         """Ask it to stop, and wait until it has or `PATIENCE` is over."""
@@ -78,7 +72,7 @@ class Worker:
         try:
             with checked_by(self._check):
                 result = work(self._progress)
-            if getattr(result, "stopped", None) is None:  # see `Result.stopped`
+            if self.what != self._partial_step:
                 self._check()  # it may have been cancelled since its last check
             self._outcome.set_result(result)
         except BaseException as error:
@@ -125,9 +119,10 @@ class Running:
     ) -> None:
         self.operator, self.doing = type(operator).bl_idname, operator.doing
         self.job, self.waits = job, ""
-        self._partial, self._targets = operator.partial_step, [Target.of(each) for each in group]
+        self._partial_step = operator.partial_step
+        self._targets = [Target.of(each) for each in group]
         self._left, self._shown = TimeLeft(), ""
-        self.worker = worker or Worker(partial(operator.compute, job))
+        self.worker = worker or Worker(partial(operator.compute, job), self._partial_step)
         self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
         _now[:] = [self]
         self.tell(context)
@@ -168,7 +163,7 @@ class Running:
     @property
     def at_escape(self) -> str:
         """What Esc does now."""
-        keeps = self._partial and self.worker.what == self._partial and not self.waits
+        keeps = self.worker.what == self._partial_step and not self.waits
         return "keeps the result so far" if keeps else "cancels"
 
     @property
@@ -302,18 +297,17 @@ class OnSplats(Needing):
 
 
 class AtOnce(Needing):
-    """An operator without a thread: ``act(context)`` does it; `FAILURES` are reported as errors."""
+    """An operator that ``act(context)`` does, at once; `FAILURES` are reported as errors."""
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do it, or report why not."""
         try:
-            self.act(context)
+            return self.act(context) or {"FINISHED"}
         except FAILURES as error:
             return fail(self, error)
-        return {"FINISHED"}
 
 
-class Job:
+class Job(AtOnce):
     """An operator on a thread, with progress bar and Esc. The window stays usable; the result is
     refused if objects changed. A class defines `doing`, its name while it runs, and
 
@@ -321,9 +315,9 @@ class Job:
       `compute`; raises one of `FAILURES`,
     - ``put(context, group, job, result)``: write the result to the unchanged objects, all or none.
 
-    `partial_step`: the step whose partial result is kept on cancel (`Result.stopped`)."""
+    `partial_step`: the step whose partial result is kept on cancel."""
 
-    doing = partial_step = ""
+    doing, partial_step = "", None
     by_hand = False  # Whether a user started it; `invoke` sets it, also before a file browser
     _running: Running | None = None
 
@@ -337,24 +331,18 @@ class Job:
         self.by_hand = True
         return self.execute(context)
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer | None:
         """Start a thread for a user; for scripts and *Adjust Last Operation* do all at once."""
         watched, self.by_hand = self.by_hand and not bpy.app.background, False
         if watched and context.window is not None:
             return self.launch(context)
-        try:
-            group, job = self.gather(context)
-            self.put(context, group, job, self.compute(job, silent))
-        except FAILURES as error:
-            return fail(self, error)
-        return {"FINISHED"}
+        group, job = self.gather(context)
+        self.put(context, group, job, self.compute(job, silent))
+        return None
 
     def launch(self, context: bpy.types.Context) -> Answer:
         """Read the scene, start the thread, and have Blender call `modal`."""
-        try:
-            self._running = Running(self, context, *self.gather(context))
-        except FAILURES as error:
-            return fail(self, error)
+        self._running = Running(self, context, *self.gather(context))
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 import numpy as np
@@ -115,18 +115,6 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         self.warn((*scoring_notes(scores), *modifiers, *drifts))
 
 
-class _Applied(NamedTuple):
-    """The result, and the change of each object."""
-
-    result: Result
-    changes: list[Change]
-
-    @property
-    def stopped(self) -> BaseException | None:
-        """See `Result.stopped`, which `Worker` reads."""
-        return self.result.stopped
-
-
 class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
     """Delete the splats that the budget does not keep; Merge and Refit adapt the kept ones"""
 
@@ -153,22 +141,22 @@ class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
         return group, (apply_arguments(context, group, forced), forced, frames, form, reads)
 
     @staticmethod
-    def compute(job: Any, progress: Progress) -> _Applied:
-        """The kept splats and their new values."""
+    def compute(job: Any, progress: Progress) -> tuple[Result, list[Change]]:
+        """The result, and the change of each object."""
         arguments, _, frames, form, reads = job
         arguments = splat_group.sized(arguments, form, reads) if form else arguments
         result = prune(**arguments, partial=True, progress=progress)
-        return _Applied(result, splat_group.changes(frames, result))
+        return result, splat_group.changes(frames, result)
 
-    def put(self, context: Context, group: Members, job: Any, applied: Any) -> None:
+    def put(self, context: Context, group: Members, job: Any, result: Any) -> None:
         """Delete removed splats, and change kept ones."""
-        (arguments, forced, *_), result = job, applied.result
+        (arguments, forced, *_), (result, changes) = job, result
         context.view_layer.update()
         if arguments["method"].changes:  # volumes may have moved meanwhile
             splat_group.check_forced(context.scene, group, forced)
         changed = [] if result.merged else plans.stale(*(each.obj for each in group))
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
-        outcome = splat_group.apply(group, applied.changes)
+        outcome = splat_group.apply(group, changes)
         plans.refresh(context)
         psnr = result.report["estimated_psnr"]
         reported = scoring_notes(result.scores)  # *Score* showed them

@@ -84,7 +84,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     bl_label = "Render with Splats"
     bl_options = {"REGISTER"}
     needs = (idle, no_render)
-    doing, partial_step = "Rendering", ""
+    doing, partial_step = "Rendering", None
 
     animation: BoolProperty(
         name="Animation",
