@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 import mathutils
@@ -25,23 +25,15 @@ from .wrapped import counted
 _MOST = 8  # Cameras shown
 
 
-class Camera(NamedTuple):
-    """View's name, splats in it, estimated dB or None, whether it is far away."""
-
-    name: str
-    seen: int
-    psnr: float | None
-    far: bool
-
-
-def cameras(record: dict[str, Any], psnr: Mapping[str, float]) -> list[Camera]:
-    """Cameras of a record: useless ones first, then by change; `psnr`: known dB by view."""
+def cameras(record: dict[str, Any], psnr: Mapping[str, float]) -> list[tuple[Any, ...]]:
+    """Cameras of a record, by: whether it sees splats, whether it is near, its dB (of `psnr`, by
+    view; infinite if unknown), how many splats it sees; and its name."""
     far = set((record.get("alignment") or {}).get("far", ()))
-    seen_by = record.get("cameras") or ()
-    each = (Camera(name, seen, psnr.get(name), name in far) for name, seen in seen_by)
-    return sorted(
-        each, key=lambda c: (c.seen > 0, not c.far, math.inf if c.psnr is None else c.psnr, c.seen)
-    )
+    each = [
+        (seen > 0, name not in far, psnr.get(name, math.inf), seen, name)
+        for name, seen in record.get("cameras") or ()
+    ]
+    return sorted(each, key=lambda camera: camera[:-1])
 
 
 def draw(layout: bpy.types.UILayout, record: dict[str, Any], psnr: Mapping[str, float]) -> None:
@@ -52,12 +44,11 @@ def draw(layout: bpy.types.UILayout, record: dict[str, Any], psnr: Mapping[str, 
         return
     column = body.column(align=True)
     every = cameras(record, psnr)
-    for camera in every[:_MOST]:
-        text = "far away" if camera.far else f"{camera.seen:,}" if camera.seen else "nothing"
-        if camera.psnr is not None:
-            text += f", {in_words(camera.psnr)}"
-        useless = camera.far or not camera.seen
-        column.label(text=f"{camera.name}: {text}", icon="ERROR" if useless else "CAMERA_DATA")
+    for sees, near, level, seen, name in every[:_MOST]:
+        text = "far away" if not near else f"{seen:,}" if sees else "nothing"
+        if level < math.inf:
+            text += f", {in_words(level)}"
+        column.label(text=f"{name}: {text}", icon="CAMERA_DATA" if near and sees else "ERROR")
     if len(every) > _MOST:
         column.label(text=f"and {len(every) - _MOST} that change less")
 
