@@ -275,24 +275,18 @@ def _show(context: Context, images: list[bpy.types.Image]) -> None:
     before = set(manager.windows)
     bpy.ops.wm.window_new()
     (window,) = set(manager.windows) - before
-    for area, image in zip(_split(context, window, len(images)), images, strict=True):
+    (rest,) = window.screen.areas
+    for left in range(len(images), 1, -1):  # several areas of one width, left to right
+        with context.temp_override(window=window, screen=window.screen, area=rest):
+            bpy.ops.screen.area_split(direction="VERTICAL", factor=1.0 / left)
+    _, *before_rest = window.screen.areas  # Blender adds areas at the end
+    for area, image in zip([*before_rest, rest], images, strict=True):
         area.type = "IMAGE_EDITOR"
         space = area.spaces.active
         space.image = image
         space.show_region_toolbar = space.show_region_ui = False
     # Until Blender has drawn them, areas have the size from before they were split.
     bpy.app.timers.register(partial(_fit, [image.name for image in images]), first_interval=0.2)
-
-
-def _split(context: Context, window: bpy.types.Window, count: int) -> list[bpy.types.Area]:
-    """Split a window's only area into several of one width, left to right."""
-    (rest,) = window.screen.areas
-    areas: list[bpy.types.Area] = []
-    for left in range(count, 1, -1):
-        with context.temp_override(window=window, screen=window.screen, area=rest):
-            bpy.ops.screen.area_split(direction="VERTICAL", factor=1.0 / left)
-        areas += [area for area in window.screen.areas if area != rest and area not in areas]
-    return [*areas, rest]
 
 
 def _fit(names: list[str]) -> None:
