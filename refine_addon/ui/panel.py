@@ -81,16 +81,6 @@ class REFINE_OT_make_real(AtOnce, bpy.types.Operator):
         instances.make_real(context)
 
 
-def _draw_instances(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
-    """Draw the active object's instances and the button; whether it instances splats."""
-    if _instances(context):
-        return False
-    text = f"{_count(context):,} instanced splats"
-    wrapped.label(layout, text, icon="OUTLINER_OB_GROUP_INSTANCE")
-    layout.operator("refine.make_real")
-    return True
-
-
 class REFINE_PT_splats(InSidebar, bpy.types.Panel):
     """Splats to prune, and their display."""
 
@@ -104,8 +94,12 @@ class REFINE_PT_splats(InSidebar, bpy.types.Panel):
             _draw_objects(layout, splat_group.chosen(obj))
         elif obj is not None and mesh_layout.lost_base(obj):
             wrapped.label(layout, "Colours were lost: open it in Blender 5.2", icon="ERROR")
-        elif not _draw_instances(layout, context):
+        elif _instances(context):
             wrapped.label(layout, "Select an object that holds splats", icon="INFO")
+        else:
+            text = f"{_count(context):,} instanced splats"
+            wrapped.label(layout, text, icon="OUTLINER_OB_GROUP_INSTANCE")
+            layout.operator("refine.make_real")
         _draw_modes(layout, obj if mesh_layout.looks_like_splats(obj) else None)
         _draw_progress(layout, "refine.import_ply")
 
@@ -136,7 +130,7 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
             return
-        record = _record(obj)
+        record = mesh_scores.record(obj.data)
         if record is None:
             turn = cached("turn", lambda: known_turn(context, obj))
             alignment = Alignment(turn, known=True)
@@ -147,7 +141,7 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
             button = self.layout.operator("refine.turn_cameras")
             button.quarters = alignment.turn
         if record:
-            plan = plans.shown(obj, settings) or {}
+            plan = plans.shown(context) or {}
             camera_operators.draw(self.layout, record, plan.get("views", {}))
 
 
@@ -159,13 +153,11 @@ class REFINE_PT_prune(InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the methods with their price, the budget, and the buttons."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
-        record, plan = _record(obj), None
-        if record:
-            plans.ask(context)
-            plan = plans.shown(obj, settings)
+        record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        plan = plans.shown(context) if record else None
         column = layout.column(align=True)
-        for name, text, _ in METHODS:
-            price = plans.price(plan, name) or HINTS[name]
+        for (name, text, _), hint in zip(METHODS, HINTS, strict=True):
+            price = plans.price(plan, name) or hint
             column.prop_enum(settings, "method", name, text=f"{text} · {price}")
         column = wrapped.named_column(layout)
         column.prop(settings, "budget")
@@ -324,10 +316,6 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
         button.mode = "OFF" if mode == now else mode
     if viewport_draw.failure():
         layout.label(text=viewport_draw.failure(), icon="ERROR")
-
-
-def _record(obj: bpy.types.Object | None) -> dict[str, Any] | None:
-    return mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
 
 
 CLASSES = (

@@ -62,10 +62,8 @@ _WORDS = {
 def changed(_settings: Any, context: bpy.types.Context) -> None:
     """Plan anew once the slider rests, in scripts at once. Settings call this."""
     obj = getattr(context, "object", None)  # not in every editor
-    if bpy.app.background:
-        refresh(context)
-    elif obj is not None and _can_have(obj):
-        _wait(context.scene, [obj], REST)
+    if obj is not None and (bpy.app.background or _can_have(obj)):
+        _soon(context.scene, [obj], REST)
 
 
 def refresh(context: bpy.types.Context) -> None:
@@ -83,17 +81,7 @@ def mark_again(_settings: Any, context: bpy.types.Context) -> None:
     first = [active] if active in objects else [obj for obj in objects if obj.visible_get()][:1]
     noted = {demands.RECORD, mesh_scores.RECORD, mesh_scores.FLOATERS}
     others = [obj for obj in objects if obj.select_get() or noted & set(obj.data.keys())]
-    if bpy.app.background:
-        _refresh(context.scene, [*first, *others])
-    elif first or others:
-        _wait(context.scene, [*first, *others], REST)
-
-
-def ask(context: bpy.types.Context) -> None:
-    """Plan soon for the active object if no plan exists; called when drawn."""
-    obj, settings = context.object, context.scene.refine
-    if not bpy.app.background and not _waiting and stored(obj, settings) is None and _can_have(obj):
-        _wait(context.scene, [obj], 0.0)
+    _soon(context.scene, [*first, *others], REST)
 
 
 def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
@@ -101,10 +89,15 @@ def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
     return _last[0][1] if _last and _last[0][0] == _key(obj, settings) else None
 
 
-def shown(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:
-    """The plan to draw: while a new one is made, the last of the same scores."""
+def shown(context: bpy.types.Context) -> dict[str, Any] | None:
+    """The plan to draw; if there is none, one is made soon, and the last of the same scores is
+    drawn meanwhile."""
+    obj, settings = context.object, context.scene.refine
+    plan = stored(obj, settings)
+    if plan is None and not bpy.app.background and not _waiting and _can_have(obj):
+        _soon(context.scene, [obj], 0.0)
     same = _waiting and _last and _last[0][0][0] == _key(obj, settings)[0]
-    return _last[0][1] if same else stored(obj, settings)
+    return _last[0][1] if same else plan
 
 
 def sentence(plan: dict[str, Any]) -> str:
@@ -184,8 +177,11 @@ def _key(obj: bpy.types.Object, settings: Any) -> Any:
     return scorings, budget, settings.protect, volumes, images.look(bpy.context.preferences)
 
 
-def _wait(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: float) -> None:
-    """Schedule `_refresh` of these objects and of those that wait already."""
+def _soon(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: float) -> None:
+    """Schedule `_refresh` of these objects and of those that wait already; in scripts do it."""
+    if bpy.app.background:
+        _refresh(scene, objects)
+        return
     pairs = [(scene.name, obj.name) for obj in objects]
     _waiting[:] = [*pairs, *(pair for pair in _waiting if pair not in pairs)]
     if bpy.app.timers.is_registered(_rested):
@@ -205,14 +201,11 @@ def _rested() -> None:
 def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> None:
     """Plan for each object, or mark its demands if it has no scores.
     One plan does for all objects of a scene. The first object's comes last, and so is kept."""
-    done: set[bpy.types.Object] = set()
-    leading = []  # an object of each scene
+    leading: dict[tuple[bpy.types.Object, ...], bpy.types.Object] = {}  # an object of each scene
     for obj in objects:
-        if obj not in done:
-            leading.append(obj)
-            done.update(splat_group.chosen(obj) if _can_have(obj) else [])
+        leading.setdefault(tuple(splat_group.chosen(obj)) if _can_have(obj) else (obj,), obj)
     bpy.context.view_layer.update()  # or volumes that a script moved are still elsewhere
-    for obj in reversed(dict.fromkeys(leading)):
+    for obj in reversed(leading.values()):
         if _can_have(obj):
             try:
                 plan = _plan(scene, obj)

@@ -42,12 +42,7 @@ METHODS = (
 )
 """The dial, from instant to best, by core's names."""
 
-HINTS = {
-    "closed-form": "only deletes",
-    "occlusion": "only deletes",
-    "merge": "what goes is merged",
-    "refit": "merged, then fitted",
-}
+HINTS = ("only deletes", "only deletes", "what goes is merged", "merged, then fitted")
 """The panel's text on each method before there are scores."""
 
 BUDGETS = (
