@@ -21,7 +21,7 @@ from ..objects import demands, splat_group
 from . import operator_bases, plans
 from .operator_bases import Answer, AtOnce, Job, OnSplats, idle, on_splats, tooltips
 from .operators import chosen_views
-from .select_operators import taken
+from .select_operators import some, taken
 
 ROLES = (
     ("PROTECT", "Protect Inside", "Splats inside stay, even where they must go", "LOCKED", 0),
@@ -73,15 +73,32 @@ class REFINE_OT_add_volume(AtOnce, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         """Add it, and select it to be moved; the splats stay active."""
-        checked = mesh_layout.check(context.object)
-        if self.shape == "SELECTED":
-            objects = _selected_volumes(context)
-        else:
-            objects = [_new_empty(context, checked, self.shape, self.role)]
-        for obj in objects:
+        checked, new = mesh_layout.check(context.object), self.shape != "SELECTED"
+        for obj in [self._new_empty(context, checked)] if new else _selected_volumes(context):
             item = context.scene.refine.volumes.add()
             item.role = self.role
             item.object = obj
+
+    def _new_empty(self, context: Context, checked: SplatObject) -> bpy.types.Object:
+        """A new empty around the middle half of the splats, or nearly all if they are kept."""
+        means = demands.finite_means(checked)
+        share = _OUTSIDE_KEPT if self.role == "KEEP" else _OUTSIDE
+        low, high = np.quantile(means, (share, 1.0 - share), axis=0)
+        half = np.maximum((high - low) / 2.0, _LEAST_HALF)
+        obj = bpy.data.objects.new(f"{checked.obj.name} {self.role.lower()}", None)
+        obj.empty_display_type = "CUBE" if self.shape == "BOX" else "SPHERE"
+        obj.location = (low + high) / 2.0
+        obj.scale = half
+        if self.shape == "SPHERE":
+            away = np.linalg.norm(means - (low + high) / 2.0, axis=1)
+            obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), _LEAST_HALF),) * 3
+        obj.show_in_front = True
+        operator_bases.target_collection(context).objects.link(obj)
+        for other in context.selected_objects:
+            other.select_set(False)
+        obj.select_set(True)
+        context.view_layer.update()
+        return obj
 
 
 def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -94,30 +111,6 @@ def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
     for obj in objects:
         demands.zone("remove", obj)
     return objects
-
-
-def _new_empty(
-    context: bpy.types.Context, checked: mesh_layout.SplatObject, shape: str, role: str
-) -> bpy.types.Object:
-    """A new empty around the middle half of the splats, or nearly all if they are kept."""
-    means = demands.finite_means(checked)
-    share = _OUTSIDE_KEPT if role == "KEEP" else _OUTSIDE
-    low, high = np.quantile(means, (share, 1.0 - share), axis=0)
-    half = np.maximum((high - low) / 2.0, _LEAST_HALF)
-    obj = bpy.data.objects.new(f"{checked.obj.name} {role.lower()}", None)
-    obj.empty_display_type = "CUBE" if shape == "BOX" else "SPHERE"
-    obj.location = (low + high) / 2.0
-    obj.scale = half
-    if shape == "SPHERE":
-        away = np.linalg.norm(means - (low + high) / 2.0, axis=1)
-        obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), _LEAST_HALF),) * 3
-    obj.show_in_front = True
-    operator_bases.target_collection(context).objects.link(obj)
-    for other in context.selected_objects:
-        other.select_set(False)
-    obj.select_set(True)
-    context.view_layer.update()
-    return obj
 
 
 class REFINE_OT_drop_volume(AtOnce, bpy.types.Operator):
@@ -156,9 +149,7 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
         """Write the marks; a splat has one of the two."""
         obj = context.object
         mesh_edit.check_writable(obj)
-        chosen = selection.selected(obj)
-        if not chosen.any():
-            raise RefineError(f"object '{obj.name}': no splat is selected; select some first")
+        chosen = some(obj, selection.selected(obj))
         for mark, name in _MARKS.items():
             before = mesh_edit.marks(obj, name)
             others = False if before is None else before

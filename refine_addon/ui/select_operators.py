@@ -62,9 +62,9 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
         mesh_edit.check_writable(obj)
         chosen, hidden = selection.selected(obj), selection.hidden(obj)
         if self.action == "HIDE":
-            selection.hide(obj, hidden | _some(obj, chosen))
+            selection.hide(obj, hidden | some(obj, chosen))
         elif self.action == "ISOLATE":
-            selection.hide(obj, ~_some(obj, chosen))
+            selection.hide(obj, ~some(obj, chosen))
         elif self.action == "REVEAL":
             selection.hide(obj, np.zeros_like(hidden))
             selection.select(obj, chosen | hidden)
@@ -128,7 +128,7 @@ class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
         """Positions, and the selection."""
         checked = mesh_layout.check(context.object)
         mesh_edit.check_writable(checked.obj)
-        chosen = _some(checked.obj, selection.selected(checked.obj))
+        chosen = some(checked.obj, selection.selected(checked.obj))
         means = mesh_attributes.read_attribute(checked.mesh, "position")
         return [checked], (means, chosen, self.shrink)
 
@@ -153,7 +153,7 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: Context) -> None:
         """Copy the object, and delete from each the other's splats."""
         checked = mesh_layout.check(context.object)
-        chosen = _some(checked.obj, selection.selected(checked.obj))
+        chosen = some(checked.obj, selection.selected(checked.obj))
         mesh_edit.check_deletable(checked.obj)
         if chosen.all():
             raise RefineError(
@@ -207,10 +207,10 @@ class REFINE_OT_grade(AtOnce, OnSplats, bpy.types.Operator):
         viewport_draw.untint()
 
 
-def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The chosen splats, (N,); `RefineError` if there are none."""
     if not chosen.any():
-        raise RefineError(f"object '{obj.name}': no splat is selected")
+        raise RefineError(f"object '{obj.name}': no splat is selected; select some first")
     return chosen
 
 
