@@ -160,9 +160,7 @@ def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> lis
 
 
 def _root(obj: bpy.types.Object) -> bpy.types.Object:
-    while obj.parent:
-        obj = obj.parent
-    return obj
+    return _root(obj.parent) if obj.parent else obj
 
 
 def _join(context: bpy.types.Context, ring: bpy.types.Collection) -> None:

@@ -138,8 +138,7 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
             alignment = Alignment.from_facts(record.get("alignment"))
         if text := alignment.turned():
             wrapped.label(self.layout, text[:1].upper() + text[1:], icon="ERROR")
-            button = self.layout.operator("refine.turn_cameras")
-            button.quarters = alignment.turn
+            self.layout.operator("refine.turn_cameras").quarters = alignment.turn
         if record:
             plan = plans.shown(context) or {}
             camera_operators.draw(self.layout, record, plan.get("views", {}))

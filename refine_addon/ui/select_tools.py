@@ -112,11 +112,6 @@ class Stroke:
         viewport_draw.select(self.obj.data.session_uid, self.selected)
         return True
 
-    def sentence(self) -> str:
-        """How many splats will be selected."""
-        chosen = self.before if self.selected is None else self.selected
-        return f"{int(np.count_nonzero(chosen)):,} of {len(chosen):,} splats selected"
-
     def outline(self) -> list[tuple[float, float]]:
         """Closed outline over the view; columns and rows."""
         (x, y), (u, v) = self.path[0], self.path[-1]
@@ -230,7 +225,8 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
             computed = stroke.follow()
             context.area.tag_redraw()
             if computed:
-                context.area.header_text_set(stroke.sentence())
+                count, total = np.count_nonzero(stroke.selected), len(stroke.selected)
+                context.area.header_text_set(f"{count:,} of {total:,} splats selected")
             if computed and stroke.released:
                 return self._over(context, kept=True)
         except FAILURES as error:
