@@ -59,7 +59,7 @@ class Exporting(Job, OnSplats, ExportHelper):
 
     def put(self, _context: Context, _group: list[SplatObject], job: Any, told: Any) -> None:
         """Report what was written, with notes."""
-        self.warn(job[-1])
+        self.tell(job[-1])
         for text in told:
             self.report({"INFO"}, text)
 

@@ -275,7 +275,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
                 errors.append(error)
         if not imported:
             raise RefineError("; ".join(map(described, errors)))
-        self.warn(map(described, errors))
+        self.tell(map(described, errors))
         for obj in (*context.selected_objects, *imported):
             obj.select_set(obj in imported)
         context.view_layer.objects.active = imported[-1]
@@ -306,7 +306,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         if self.upright:
             obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
         operator_bases.target_collection(context).objects.link(obj)
-        self.warn(mesh_attributes.import_notes(file))
+        self.tell(mesh_attributes.import_notes(file))
         return obj
 
 

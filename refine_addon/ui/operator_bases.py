@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import bpy
 from bpy.app.handlers import persistent
+from bpy.types import Context
 
 from .. import main_thread
 from ..core.errors import RefineError, described
@@ -25,7 +26,7 @@ from ..viewport import draw as viewport_draw
 _STEP = 0.05  # Seconds between two looks at the thread
 PATIENCE = 0.7  # Seconds that a cancelled thread has to end before it is left alone
 Answer = set[str]  # FINISHED, CANCELLED, RUNNING_MODAL or PASS_THROUGH
-Need = Callable[[bpy.types.Context], str]  # Gives what an operator lacks to run, "" if nothing
+Need = Callable[[Context], str]  # Gives what an operator lacks to run, "" if nothing
 FAILURES = (RefineError, MemoryError)  # Exceptions reported as errors; all others are bugs
 
 
@@ -36,10 +37,11 @@ def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
 
 
 class Worker:
-    """A thread that runs ``work(progress)``. `fraction`: share done, 0 to 1; `what`: its step."""
+    """A thread that runs ``work(progress)``. `fraction`: share done, 0 to 1; `what`: its step;
+    `partial_step`: the one that has a partial result on cancel."""
 
     def __init__(self, work: Callable[[Progress], Any], partial_step: str | None = None) -> None:
-        self.fraction, self.what, self._partial_step = 0.0, "", partial_step
+        self.fraction, self.what, self.partial_step = 0.0, "", partial_step
         self.cancelled: float | None = None  # time of `cancel`
         self._outcome: Future[Any] = Future()
         self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
@@ -72,7 +74,7 @@ class Worker:
         try:
             with checked_by(self._check):
                 result = work(self._progress)
-            if self.what != self._partial_step:
+            if self.what != self.partial_step:
                 self._check()  # it may have been cancelled since its last check
             self._outcome.set_result(result)
         except BaseException as error:
@@ -106,32 +108,24 @@ class Target(NamedTuple):
 
 class Running:
     """A running operation. Holds the splats, as Blender's history would keep them in the operator.
-    `operator`: its `bl_idname`; `job`: see `Job.gather`; `worker`: a `Worker`, or a render's
+    `operator`: its `bl_idname`; `gathered`: of `Job.gather`; `worker`: a `Worker`, or a render's
     stand-in; `waits`: what the user must do before the result is written, "" if nothing."""
 
-    def __init__(
-        self,
-        operator: Any,
-        context: bpy.types.Context,
-        group: list[SplatObject],
-        job: Any,
-        worker: Any = None,
-    ) -> None:
+    def __init__(self, operator: Any, context: Context, gathered: Any, worker: Any = None) -> None:
         self.operator, self.doing = type(operator).bl_idname, operator.doing
-        self.job, self.waits = job, ""
-        self._partial_step = operator.partial_step
+        group, self.job = gathered
         self._targets = [Target.of(each) for each in group]
-        self._left, self._shown = TimeLeft(), ""
-        self.worker = worker or Worker(partial(operator.compute, job), self._partial_step)
+        self._left, self._shown, self.waits = TimeLeft(), "", ""
+        self.worker = worker or Worker(partial(operator.compute, self.job), operator.partial_step)
         self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
         _now[:] = [self]
         self.tell(context)
 
-    def objects(self) -> list[bpy.types.Object]:
-        """Objects to write to; raises `RefineError` if one was deleted."""
+    def objects(self) -> list[tuple[bpy.types.Object, Target]]:
+        """Objects to write to, as they were; raises `RefineError` if one was deleted."""
         there = {obj.session_uid: obj for obj in bpy.data.objects}
-        objects = [there.get(target.uid) for target in self._targets]
-        for obj, target in zip(objects, self._targets, strict=True):
+        objects = [(there.get(target.uid), target) for target in self._targets]
+        for obj, target in objects:
             if obj is None or not obj.users_scene:
                 raise RefineError(
                     f"object '{target.name}': was deleted; {self.doing.lower()} has ended"
@@ -140,10 +134,10 @@ class Running:
 
     def done(self) -> bool:
         """Whether the thread ended and its result can be written; see `waits`."""
-        pairs = zip(self.objects(), self._targets, strict=True)
+        objects = self.objects()
         if self.worker.running():
             return False
-        modes = (target.mode for obj, target in pairs if obj.mode != target.mode)
+        modes = (target.mode for obj, target in objects if obj.mode != target.mode)
         mode = next(modes, "").replace("_", " ").lower()
         self.waits = f"go back to {mode} mode for the result" if mode else ""
         if self.waits and self.worker.cancelled:
@@ -152,9 +146,10 @@ class Running:
 
     def unchanged(self) -> list[SplatObject]:
         """The objects; `RefineError` if their splats changed since."""
-        group = [mesh_layout.check(obj) for obj in self.objects()]
-        for checked, target in zip(group, self._targets, strict=True):
-            if Target.of(checked).splats != target.splats:
+        group = []
+        for obj, target in self.objects():
+            group.append(mesh_layout.check(obj))
+            if Target.of(group[-1]).splats != target.splats:
                 raise RefineError(
                     f"object '{target.name}': its splats were changed meanwhile; start again"
                 )
@@ -163,7 +158,7 @@ class Running:
     @property
     def at_escape(self) -> str:
         """What Esc does now."""
-        keeps = self.worker.what == self._partial_step and not self.waits
+        keeps = self.worker.what == self.worker.partial_step and not self.waits
         return "keeps the result so far" if keeps else "cancels"
 
     @property
@@ -183,7 +178,7 @@ class Running:
         what = f" ({self.worker.what})" if self.worker.what else ""
         return f"{self.doing}{what}; Esc {self.at_escape}"
 
-    def tell(self, context: bpy.types.Context) -> None:
+    def tell(self, context: Context) -> None:
         """Show the progress in status bar and panels, if it changed."""
         text = f"{self.sentence}: {self.share}"
         if text != self._shown:
@@ -191,7 +186,7 @@ class Running:
             context.workspace.status_text_set(text)
             redraw_panels(context)
 
-    def over(self, context: bpy.types.Context) -> None:
+    def over(self, context: Context) -> None:
         """Stop workers and clear the bars."""
         self.worker.cancel()
         if self in _now:
@@ -211,7 +206,7 @@ def now() -> Running | None:
     return _now[0] if _now else None
 
 
-def idle(_context: bpy.types.Context) -> str:
+def idle(_context: Context) -> str:
     """A need: no other operation may run on a thread."""
     if (running := now()) is None:
         return ""
@@ -225,7 +220,7 @@ def _clear_bars() -> None:
                 workspace.status_text_set(None)
 
 
-def redraw_panels(context: bpy.types.Context) -> None:
+def redraw_panels(context: Context) -> None:
     """Redraw the sidebars of the 3D views, and not the views themselves."""
     for area in viewport_draw.areas(context):
         for region in area.regions:
@@ -233,29 +228,29 @@ def redraw_panels(context: bpy.types.Context) -> None:
                 region.tag_redraw()
 
 
-def in_object_mode(context: bpy.types.Context) -> str:
+def in_object_mode(context: Context) -> str:
     """A need: object mode."""
     return "" if context.mode == "OBJECT" else "Go to object mode first"
 
 
-def on_splats(context: bpy.types.Context) -> str:
+def on_splats(context: Context) -> str:
     """A need: the active object holds splats."""
     if mesh_layout.looks_like_splats(context.object):
         return ""
     return "Select an object that holds splats, or import a file of splats"
 
 
-def out_of_edit_mode(context: bpy.types.Context) -> str:
+def out_of_edit_mode(context: Context) -> str:
     """A need: the active object is not in edit mode."""
     return "Leave edit mode first" if context.object.mode == "EDIT" else ""
 
 
-def scored(context: bpy.types.Context) -> str:
+def scored(context: Context) -> str:
     """A need: the active object has scores."""
     return "" if mesh_scores.record(context.object.data) else "Score the splats first"
 
 
-def target_collection(context: bpy.types.Context) -> bpy.types.Collection:
+def target_collection(context: Context) -> bpy.types.Collection:
     """Active collection, or the scene's where that is a library's."""
     active = context.collection
     return context.scene.collection if active is None or active.library else active
@@ -264,7 +259,7 @@ def target_collection(context: bpy.types.Context) -> bpy.types.Collection:
 def tooltips(name: str, items: Sequence[Sequence[Any]]) -> Any:
     """A `description` for an operator: the tooltip of the enum item that its button sets."""
 
-    def described(_cls: type, _context: bpy.types.Context, properties: Any) -> str:
+    def described(_cls: type, _context: Context, properties: Any) -> str:
         return next(text for value, _, text, *_ in items if value == getattr(properties, name))
 
     return classmethod(described)
@@ -277,17 +272,17 @@ class Needing:
     needs: tuple[Need, ...] = (idle,)
 
     @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
+    def poll(cls, context: Context) -> bool:
         """Whether the operator can run."""
         missing = next(filter(None, (need(context) for need in cls.needs)), "")
         if missing:
             cls.poll_message_set(missing)
         return not missing
 
-    def warn(self, notes: Iterable[str]) -> None:
-        """Report each note as a warning."""
+    def tell(self, notes: Iterable[str], kind: str = "WARNING") -> None:
+        """Report each note."""
         for note in notes:
-            self.report({"WARNING"}, note)
+            self.report({kind}, note)
 
 
 class OnSplats(Needing):
@@ -299,7 +294,7 @@ class OnSplats(Needing):
 class AtOnce(Needing):
     """An operator that ``act(context)`` does, at once; `FAILURES` are reported as errors."""
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def execute(self, context: Context) -> Answer:
         """Do it, or report why not."""
         try:
             return self.act(context) or {"FINISHED"}
@@ -326,12 +321,12 @@ class Job(AtOnce):
         """The result; on any thread, with arrays only. By default it calls the job."""
         return job(progress=progress)
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+    def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Start the work on a thread."""
         self.by_hand = True
         return self.execute(context)
 
-    def act(self, context: bpy.types.Context) -> Answer | None:
+    def act(self, context: Context) -> Answer | None:
         """Start a thread for a user; for scripts and *Adjust Last Operation* do all at once."""
         watched, self.by_hand = self.by_hand and not bpy.app.background, False
         if watched and context.window is not None:
@@ -340,16 +335,15 @@ class Job(AtOnce):
         self.put(context, group, job, self.compute(job, silent))
         return None
 
-    def launch(self, context: bpy.types.Context) -> Answer:
+    def launch(self, context: Context) -> Answer:
         """Read the scene, start the thread, and have Blender call `modal`."""
-        self._running = Running(self, context, *self.gather(context))
+        self._running = Running(self, context, self.gather(context))
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+    def modal(self, context: Context, event: bpy.types.Event) -> Answer:
         """Wait for the thread, then put its result."""
-        running = self._running
-        if running is None:
+        if (running := self._running) is None:
             return {"CANCELLED"}
         if event.type == "TIMER":
             return self._check(context, running)
@@ -358,13 +352,13 @@ class Job(AtOnce):
         running.worker.cancel()
         return {"RUNNING_MODAL"}
 
-    def cancel(self, context: bpy.types.Context) -> None:
+    def cancel(self, context: Context) -> None:
         """End the thread when Blender ends the operator, closing its window or file."""
         if (running := self._running) is not None:
             self._over(context, running)
             running.worker.end()
 
-    def _check(self, context: bpy.types.Context, running: Running) -> Answer:
+    def _check(self, context: Context, running: Running) -> Answer:
         """Put the result if the thread is done; Blender prints errors that are no `FAILURES`."""
         try:
             main_thread.serve()
@@ -384,7 +378,7 @@ class Job(AtOnce):
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def _over(self, context: bpy.types.Context, running: Running) -> None:
+    def _over(self, context: Context, running: Running) -> None:
         if self._running is not None:
             self._running = None
             running.over(context)
@@ -392,8 +386,7 @@ class Job(AtOnce):
 
 def unregister() -> None:
     """End the work: Blender drops the operator silently."""
-    running = now()
-    if running is not None:
+    if (running := now()) is not None:
         _end()
         running.over(bpy.context)
 

@@ -112,7 +112,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         )
         modifiers = [note for each in group for note in splat_group.modifier_notes(each.obj)]
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
-        self.warn((*scoring_notes(scores), *modifiers, *drifts))
+        self.tell((*scoring_notes(scores), *modifiers, *drifts))
 
 
 class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
@@ -169,7 +169,7 @@ class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
             + sizes_in_words(outcome.bytes_before, "->", outcome.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
-        self.warn(drifts)
+        self.tell(drifts)
         if changed:
             self.report(
                 {"WARNING"},
@@ -212,7 +212,7 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         ]
         text = f"Made '{collection.name}', hidden: {', '.join(counts)} splats"
         self.report({"INFO"}, f"{text}; show one by its eye in the Outliner")
-        self.warn(wanted.notes({level.goal: level.remark for level in levels}))
+        self.tell(wanted.notes({level.goal: level.remark for level in levels}))
 
 
 class REFINE_OT_compare(Job, OnSplats, bpy.types.Operator):

@@ -84,7 +84,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     bl_label = "Render with Splats"
     bl_options = {"REGISTER"}
     needs = (idle, no_render)
-    doing, partial_step = "Rendering", None
+    doing = "Rendering"
 
     animation: BoolProperty(
         name="Animation",
@@ -112,8 +112,10 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         answer = self._go_on(context)
         if "RUNNING_MODAL" in answer:  # Blender frees a finished operator, not its handler
             stop = partial(setattr, self._shared, "stopped", True)
-            worker = SimpleNamespace(fraction=0.0, what="", cancel=stop, end=stop)
-            self._running = Running(self, context, [], None, worker)
+            worker = SimpleNamespace(
+                fraction=0.0, what="", partial_step=None, cancel=stop, end=stop
+            )
+            self._running = Running(self, context, ([], None), worker)
             context.window_manager.modal_handler_add(self)
             _watch_anew(self._shared)
         return answer
@@ -138,7 +140,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             chosen = [*range(scene.frame_start, scene.frame_end + 1, scene.frame_step)]
         self._shared, self._frames = engine.Shared(card=card.available()), chosen
         self._steps = engine.steps(scene, chosen, self._shared, write=self.animation)
-        self._started, self._opened, self._done = time.monotonic(), False, 0
+        self._started, self._done = time.monotonic(), 0
         self._next: meshes.Step | None = None
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
@@ -173,7 +175,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         self._running.tell(context)
         view = context.preferences.view
         display = view.render_display_type
-        if self._opened:
+        if self._done > 1:
             view.render_display_type = "NONE"
         shows = _NEEDS_WINDOW and step.what == "meshes"
         if shows:
@@ -182,9 +184,8 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             bpy.ops.render.render("INVOKE_DEFAULT", scene=step.scene, animation=step.animation)
         finally:
             view.render_display_type = display
-        if shows and not self._opened:
+        if shows and self._done == 1:
             _draw_whole()
-        self._opened = True
         _watch_anew(self._shared)
 
     def _show(self) -> None:
@@ -206,7 +207,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         what = counted(len(shared.frames), "frame") if self.animation else "Rendered"
         among = f" among what {shared.engine} rendered" if shared.engine else ""
         self.report({"INFO"}, f"{what}: {shared.splats:,} splats{among}, {seconds:.1f} s")
-        self.warn(engine.left_out(context.scene))
+        self.tell(engine.left_out(context.scene))
         return {"FINISHED"}
 
     def _stopped(self, context: bpy.types.Context, error: BaseException) -> Answer:

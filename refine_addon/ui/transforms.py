@@ -45,7 +45,7 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: Context) -> None:
         """Bake the transforms of the selected objects."""
         group = splat_group.members(context.object)
-        self.warn(transforms.bake(group, location=self.location))
+        self.tell(transforms.bake(group, location=self.location))
         plans.refresh(context)
         self.report({"INFO"}, f"Baked the transform of {counted(len(group), 'object')}")
 
