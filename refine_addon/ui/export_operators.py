@@ -57,11 +57,17 @@ class Exporting(Job, OnSplats, ExportHelper):
             self.filepath = self.new_name(context.object)
         return ExportHelper.invoke(self, context, event)
 
+    def read(self, *objects: bpy.types.Object) -> tuple[list[Any], list[str]]:
+        """For each object a call that builds its file, and notes."""
+        group, moved = [mesh_layout.check(obj) for obj in objects], self.apply_transform
+        files = [splat_group.read_for_export(each, apply_transform=moved) for each in group]
+        notes = [splat_group.export_notes(each, apply_transform=moved) for each in group]
+        return files, list(dict.fromkeys(itertools.chain(*notes)))
+
     def put(self, _context: Context, _group: list[SplatObject], job: Any, told: Any) -> None:
         """Report what was written, with notes."""
         self.tell(job[-1])
-        for text in told:
-            self.report({"INFO"}, text)
+        self.tell(told, "INFO")
 
 
 class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
@@ -105,12 +111,10 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
         """Object, path and notes; raises for what cannot be written."""
-        checked, moved = mesh_layout.check(context.object), self.apply_transform
         target = expanded(bpy.path.abspath(self.filepath))
         refuse_existing(target, overwrite=self.overwrite)
-        read = splat_group.read_for_export(checked, apply_transform=moved)
-        notes = splat_group.export_notes(checked, apply_transform=moved)
-        axes = AXES[0] if self.spz_y_up else checked.mesh.get(mesh_layout.AXES, "")
+        (read,), notes = self.read(context.object)
+        axes = AXES[0] if self.spz_y_up else context.object.data.get(mesh_layout.AXES, "")
         return [], (lambda: replace(read(), axes=axes), target, self.overwrite, notes)
 
     @staticmethod
@@ -143,31 +147,25 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
         """Levels, finest first, path and notes."""
         objects = splat_group.levels_of(mesh_layout.check(context.object).obj)
-        moved = self.apply_transform
-        each = [mesh_layout.check(obj) for obj in objects]
-        files = [splat_group.read_for_export(one, apply_transform=moved) for one in each]
-        notes = [
-            note for one in each for note in splat_group.export_notes(one, apply_transform=moved)
-        ]
+        files, notes = self.read(*objects)
         width = objects[1][splat_group.LEVEL_STATS].get("distance", np.inf)
-        if not moved:  # in the object's own unit
+        if not self.apply_transform:  # in the object's own unit
             width /= np.cbrt(abs(objects[0].matrix_world.to_3x3().determinant())) or 1.0
         path = expanded(bpy.path.abspath(self.filepath))
         target = path if path.name == INDEX else path / INDEX
-        return [], (files, float(width), target, self.overwrite, list(dict.fromkeys(notes)))
+        return [], (files, float(width), target, self.overwrite, notes)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> list[str]:
         """Write the levels."""
         files, width, target, overwrite, _ = job
         with folder_for(target, overwrite=overwrite) as folder:
-            scene = None
+            scene: Any = None
             for number, file in enumerate(files):
                 report(progress, number / len(files), f"level {number}")
                 splats = registry.held_splats(target, sog.FORMAT, file(), None, {})
                 scene = scene or StreamedSog(splats.means, width, folder)
                 scene.add(splats)
-            assert scene is not None
             scene.publish(target, overwrite=overwrite)
         return [f"Wrote {len(files)} levels, the finest as it is, to {target}"]
 
