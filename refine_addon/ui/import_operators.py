@@ -72,10 +72,11 @@ class _Importing(Job, ImportHelper):
             self.report({"WARNING"}, views.note)
         return collection
 
-    def warn_of_turn(self, context: Context, splats: bpy.types.Object) -> None:
+    def warn_of_turn(self, context: Context) -> None:
         """Report if only one of splats and deciding cameras was imported upright."""
         context.view_layer.update()  # or what was just made stands at the origin
-        if turn := known_turn(context, splats):
+        splats = _splats_in(context)
+        if splats is not None and (turn := known_turn(context, splats)):
             self.report({"WARNING"}, Alignment(turn, known=True).turned())
 
 
@@ -129,8 +130,7 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
     def put(self, context: Context, _group: list[SplatObject], _job: Any, views: ViewSet) -> None:
         """Make camera objects."""
         collection = self.add_cameras(context, views)
-        if (splats := _splats_in(context)) is not None:
-            self.warn_of_turn(context, splats)
+        self.warn_of_turn(context)
         self.report({"INFO"}, f"Imported {counted(len(views), 'camera')} into '{collection.name}'")
 
 
@@ -144,9 +144,15 @@ class REFINE_FH_cameras(_Dropped, bpy.types.FileHandler):
 
 
 def suggest_resolution(operator: Any, context: Context) -> None:
-    """Default of ``set_resolution``: true where nobody has chosen size or camera."""
-    if not operator.properties.is_property_set("set_resolution"):
-        operator.set_resolution = _is_untouched(context.scene)
+    """Default of ``set_resolution``: true where nobody has chosen size or camera, and the scene
+    has at most the camera that Blender starts with."""
+    if operator.properties.is_property_set("set_resolution"):
+        return
+    render = context.scene.render
+    size = (render.resolution_x, render.resolution_y, render.resolution_percentage)
+    cameras = [obj for obj in context.scene.objects if obj.type == "CAMERA"]
+    chosen = any(obj.animation_data or SOURCE in obj for obj in cameras)
+    operator.set_resolution = size == _DEFAULT_SIZE and len(cameras) <= 1 and not chosen
 
 
 def cameras_beside(folder: Path) -> Path | None:
@@ -165,15 +171,6 @@ def _splats_in(context: Context) -> bpy.types.Object | None:
 def _is_upright(obj: bpy.types.Object) -> bool:
     """Whether an object stands as *Upright* turns it; float32 leaves 7.5e-8 of the zeros."""
     return np.allclose(np.array(obj.matrix_world)[:3, :3], UPRIGHT[:3, :3], atol=SHEAR)
-
-
-def _is_untouched(scene: bpy.types.Scene) -> bool:
-    """Whether a scene has the size and at most the camera that Blender starts with."""
-    render = scene.render
-    size = (render.resolution_x, render.resolution_y, render.resolution_percentage)
-    cameras = [obj for obj in scene.objects if obj.type == "CAMERA"]
-    chosen = any(obj.animation_data or SOURCE in obj for obj in cameras)
-    return size == _DEFAULT_SIZE and len(cameras) <= 1 and not chosen
 
 
 _ROWS = 1 << 16  # Rows read between two checks for cancelling
@@ -288,7 +285,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
             self.add_cameras(context, views)
             beside = os.path.relpath(cameras, paths[0].parent)
             text += f", and {counted(len(views), 'camera')} from {beside}"
-        self.warn_of_turn(context, imported[-1])
+        self.warn_of_turn(context)
         self.report({"INFO"}, text)
 
     def _paths(self) -> list[Path]:
