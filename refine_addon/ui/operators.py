@@ -63,7 +63,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
     doing = "Scoring splats"
 
     def gather(self, context: Context) -> tuple[Members, Any]:
-        """The arguments of `score`, and `plans.origin` of each object."""
+        """A call of `score`, and `plans.origin` of each object."""
         settings = context.scene.refine
         method, views = settings.to_method(), chosen_views(context)
         group = splat_group.members(context.object)
@@ -72,36 +72,31 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         quality = method.name != "closed-form" or settings.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
         forced = splat_group.refresh(context.scene, group)  # before `origin` reads the marks
-        arguments = {
-            "splats": splats,
-            "views": views,
-            "method": method,
-            "protected": forced.protected,
-            "removed": forced.removed,
-            "quality": quality,
-        }
-        return group, (arguments, [plans.origin(member.obj) for member in group])
+        masks = {"protected": forced.protected, "removed": forced.removed}
+        call = partial(score, splats, views, method, **masks, quality=quality)
+        return group, (call, [plans.origin(member.obj) for member in group])
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> tuple[Scores, NDArray[np.int64], float]:
         """Scores, splats in each view, (V,), and seconds of scoring."""
-        (arguments, _), start = job, time.perf_counter()
-        scores = score(**arguments, progress=part(progress, 0.0, _SCORED))
+        (call, _), start = job, time.perf_counter()
+        scores = call(progress=part(progress, 0.0, _SCORED))
         seconds = time.perf_counter() - start
-        means, removed = arguments["splats"].means, arguments["removed"]
-        means = means if removed is None else means[~removed]
+        (splats, views, _), removed = call.args, call.keywords["removed"]
+        means = splats.means if removed is None else splats.means[~removed]
         rest = part(progress, _SCORED, 1.0)
-        return scores, frustum.census(means, arguments["views"], progress=rest), seconds
+        return scores, frustum.census(means, views, progress=rest), seconds
 
     def put(self, context: Context, group: Members, job: Any, result: Any) -> None:
         """Store the scores on the meshes and report them."""
-        (arguments, origins), (scores, counts, seconds) = job, result
-        pairs = zip(arguments["views"], counts.tolist(), strict=True)
+        (call, origins), (scores, counts, seconds) = job, result
+        (_, views, method), masks = call.args, call.keywords
+        pairs = zip(views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
-        record = {"cameras": cameras, "protected": arguments["protected"], "seconds": seconds}
-        splat_group.store(group, scores, arguments["method"], origins, **record)
+        record = {"cameras": cameras, "protected": masks["protected"], "seconds": seconds}
+        splat_group.store(group, scores, method, origins, **record)
         plans.refresh(context)
-        removed = arguments["removed"]
+        removed = masks["removed"]
         out = 0 if removed is None else int(np.count_nonzero(removed))
         unseen = int((scores.seen == 0).sum()) - out
         self.report(
@@ -160,22 +155,19 @@ class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
         plans.refresh(context)
         psnr = result.report["estimated_psnr"]
         reported = scoring_notes(result.scores)  # *Score* showed them
-        for note in result.report["notes"]:
-            if note not in reported:
-                self.report({"INFO"}, note)
+        self.tell((note for note in result.report["notes"] if note not in reported), "INFO")
         self.report(
             {"INFO"},
             f"Kept {outcome.kept:,} splats{_of_objects(group)}, removed {outcome.removed:,}: "
             + sizes_in_words(outcome.bytes_before, "->", outcome.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
-        self.tell(drifts)
         if changed:
-            self.report(
-                {"WARNING"},
+            drifts.append(
                 f"The scores were from before a change ({', '.join(changed)}); to have it count, "
-                "undo and score again",
+                "undo and score again"
             )
+        self.tell(drifts)
 
 
 class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
@@ -188,23 +180,22 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
     needs = (*OnSplats.needs, in_object_mode)
 
     def gather(self, context: Context) -> tuple[Members, Any]:
-        """The arguments of `lod`."""
+        """A call of `lod`."""
         group, settings = [mesh_layout.check(context.object)], context.scene.refine
         method, levels = settings.to_method(), settings.to_levels()
         splats = splat_group.gather(group, whole=True if method.changes else None)
         forced = splat_group.forced(context.scene, group)
         masks = {"protected": forced.protected, "removed": forced.removed}
-        return group, ((splats, chosen_views(context), levels, method), masks)
+        return group, partial(lod, splats, chosen_views(context), levels, method, **masks)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> list[Level]:
         """The levels."""
-        arguments, masks = job
-        return list(lod(*arguments, **masks, progress=progress))
+        return list(job(progress=progress))
 
     def put(self, _context: Context, group: Members, job: Any, levels: Any) -> None:
         """Make the objects and report each level's cost."""
-        (splats, views, wanted, _), _ = job
+        splats, views, wanted, _ = job.args
         collection = splat_group.add_levels(group[0], levels, viewing_distance(splats, views))
         counts = [
             f"{level.facts()['splats']:,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
@@ -268,13 +259,11 @@ def measured(obj: bpy.types.Object, settings: Any) -> str:
 
 
 def _show(context: Context, images: list[bpy.types.Image]) -> None:
-    manager = context.window_manager
     shown = [area.spaces.active.image for area in viewport_draw.areas(context, "IMAGE_EDITOR")]
     if all(image in shown for image in images):
         return
-    before = set(manager.windows)
     bpy.ops.wm.window_new()
-    (window,) = set(manager.windows) - before
+    window = context.window_manager.windows[-1]
     (rest,) = window.screen.areas
     for left in range(len(images), 1, -1):  # several areas of one width, left to right
         with context.temp_override(window=window, screen=window.screen, area=rest):
