@@ -178,9 +178,7 @@ def prune(
     removed : (N,) bool, optional
         Removed first, unless protected; the budget counts them. The others are scored, merged and
         compared with pictures as if these had never been there.
-    scores : Scores, optional
-        Of an earlier `score`. A merging method measures anew: it uses them, if of occlusion, where
-        deletion is as good.
+    scores : Scores, optional; of an earlier `score`, to delete by: a merging method measures anew
     sizes : (float, int), optional; bytes of a splat and of the rest of the output, for `max_mb`
     origin : Origin, optional; the splats before an earlier merging prune, for comparing pictures
     reusable : bool, whether scores are to serve other budgets; else scoring ends at this one
@@ -203,8 +201,8 @@ def prune(
         refuse_other(views)
     gone = must_go(removed, protected)
     run = _Prune(
-        splats, views, budget, method, protected, scores, sizes or (0.0, 0), origin, reusable,
-        clock or Clock(), threads,
+        splats, views, budget, method, protected, None if method.changes else scores,
+        sizes or (0.0, 0), origin, reusable, clock or Clock(), threads,
     )  # fmt: skip
     if scores is not None and gone is None:
         scores.refuse_unscored()
@@ -217,6 +215,10 @@ def prune(
     if result.stopped is not None and not partial:
         raise result.stopped
     return replace(result, source=file or splats)
+
+
+_Chosen = tuple[NDArray[np.bool_], "float | None", "float | None"]
+"""Splats that deletion keeps, (N,), and the PSNR in views that decided and between, dB."""
 
 
 class _Try(NamedTuple):
@@ -292,13 +294,10 @@ class _Prune:
         """Decide by scores alone; `tried` is the outcome of merging, if it was tried."""
         scores = self._scores(part(progress, 0.0, 0.94))
         report(progress, 0.94, "selecting")
-        keep, psnr = self._select(scores)
-        self.clock.lap("select_s")
-        between = None
-        if scores.between is not None:
-            between = psnr_kept(scores.between, keep, threads=self.threads)
-        elif scores.quality is not None:
-            between = scores.quality.at_between(1.0 - float(np.mean(keep)))
+        return self._deleted(scores, self._select(scores), tried)
+
+    def _deleted(self, scores: Scores, chosen: _Chosen, tried: Outcome | None = None) -> Result:
+        keep, psnr, between = chosen
         summary = reports.of_prune(
             scores, keep, self.budget, self.method, self.sizes, self.clock,
             psnr=psnr, between=between, measured={"delete": psnr}, tried=tried,
@@ -311,13 +310,6 @@ class _Prune:
         views, goal = len(self.used), self.budget.psnr
         count = len(self.splats)
         refits = isinstance(self.method, Refit)
-        given = self.scores  # for deletion where that is as good, which they do not decide
-        if given is not None and (
-            given.method == ClosedForm.name
-            or given.settled is not None
-            or (goal and not given.quality)
-        ):
-            given = None  # they are of another method or budget
         gone = self.budget.removals(count, *self.sizes)
         left = count // 2 if gone is None else count - gone
         expected = sum(self._expected_seconds(left))
@@ -333,21 +325,17 @@ class _Prune:
         if goal is not None:
             scores = with_quality(scores, protected=self.protected, threads=self.threads)
         self.clock.lap("score_s")
-        keep, plain = np.ones(count, np.bool_), None
+        chosen: _Chosen = np.ones(count, np.bool_), None, None
         if not (refits and goal is not None):
             report(making, 0.0, "selecting")
-            keep, plain = self._select(scores)
-            self.clock.lap("select_s")
-        deletes = replace(self, method=self.method.deleting(), scores=given)
-        beside = None  # in views that did not decide
-        if goal is None and scores.between is not None:
-            beside = psnr_kept(scores.between, keep, threads=self.threads)
+            chosen = self._select(scores)
+        keep, plain, beside = chosen
         will_do = not refits and (  # so that merging need not be tried
             all(map(deletion_will_do, (plain, beside))) if goal is None
             else quality_of(scores).share(goal, "merge") <= PLAIN
         )  # fmt: skip
         if will_do:
-            return self._deleted(deletes.delete(making), None)
+            return self._deleted(scores, chosen)
         if goal is None:
             outcome = self._to_count(keep, scores, measurement, making)
         else:
@@ -358,7 +346,7 @@ class _Prune:
         if beside is not None and between is not None:
             pairs.append((beside, between))
         if not refits and self._deletion_is_as_good(keep, outcome, *pairs):
-            return self._deleted(deletes.delete(silent, outcome), outcome)
+            return self.delete(silent, outcome)  # by all rounds: up to 5 dB more
         # Where a PSNR is asked for, deletion keeps another number of splats.
         measured = outcome.psnr if goal is not None else {"delete": plain, **outcome.psnr}
         final = outcome.final
@@ -369,16 +357,6 @@ class _Prune:
         )  # fmt: skip
         merged = None if outcome.done == "delete" else final
         return Result(final.keep, summary, scores, merged, outcome.stopped)
-
-    def _deleted(self, result: Result, tried: Outcome | None) -> Result:
-        """Result of deletion where merging was asked for."""
-        summary = result.report
-        summary["method"]["asked"] = self.method.name
-        summary["settings"] = self.method.facts()
-        if summary["splats"]["removed"]:
-            reached = None if tried is None else tried.reached
-            summary["notes"].append(reports.deleted_note(summary["estimated_psnr"], reached))
-        return result
 
     def _scores(self, progress: Progress) -> Scores:
         scores = self.scores
@@ -404,17 +382,20 @@ class _Prune:
         # Protected splats are passed over, wherever in the order they are.
         return None if gone is None or gone + spared >= total else gone + spared
 
-    def _select(self, scores: Scores) -> tuple[NDArray[np.bool_], float | None]:
-        """Which splats deletion keeps, (N,), and the estimated PSNR, dB."""
+    def _select(self, scores: Scores) -> _Chosen:
         keep = select(
             scores, self.budget, protected=self.protected,
             row_bytes=self.sizes[0], fixed_bytes=self.sizes[1],
         )  # fmt: skip
+        gone, curve = 1.0 - float(np.mean(keep)), scores.quality
+        psnr = None if curve is None else curve.at(gone)
+        between = None if curve is None else curve.at_between(gone)
         if scores.ray_sample is not None:
-            return keep, psnr_kept(scores.ray_sample, keep, threads=self.threads)
-        if scores.quality is not None:
-            return keep, scores.quality.at(1.0 - float(np.mean(keep)))
-        return keep, None
+            psnr = psnr_kept(scores.ray_sample, keep, threads=self.threads)
+        if scores.between is not None:
+            between = psnr_kept(scores.between, keep, threads=self.threads)
+        self.clock.lap("select_s")
+        return keep, psnr, between
 
     def _deletion_is_as_good(self, keep, outcome: Outcome, *pairs: tuple[Any, Any]) -> bool:
         """Whether deletion, keeping (N,), is about as good.

@@ -154,10 +154,13 @@ def of_prune(
         plain = measured.get("delete")
         if outcome.done == "merge" and plain is not None and plain > (psnr or plain):
             notes.append(f"plain deletion reaches more: {in_words(plain)}")
+    if method.changes and outcome is None and removed:
+        notes.append(deleted_note(psnr, None if tried is None else tried.reached))
     deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
     seconds = None
     if timed and not isinstance(method, ClosedForm):
-        took = expected_seconds(clock.timings["score_s"], share, once=outcome is not None)
+        once = method.changes and tried is None
+        took = expected_seconds(clock.timings["score_s"], share, once=once)
         seconds = {way: round(value, 1) for way, value in took.items()}
     report |= {
         "budget": {budget.kind: getattr(budget, budget.kind)},
@@ -224,8 +227,7 @@ def predicted(scores: Scores, share: float, measured: Mapping[Way, float | None]
     rays, many = scores.ray_sample, len(scores.values) >= FEWEST
     hits = rays.hits_of_ray() if rays is not None and many else None
     psnr = expected(scores.quality, share, measured, hits)
-    some = any(value is not None for value in measured.values())
     return {
         "psnr": {way: None if value is None else round(value, 2) for way, value in psnr.items()},
-        "note": None if psnr["merge"] is not None or not some else NOT_PREDICTED,
+        "note": None if psnr["merge"] is not None or scores.quality is None else NOT_PREDICTED,
     }
