@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import checkpoint
+from ..execute import checkpoint, chunks
 from ..views import View
 from .projection import Footprints
 
@@ -52,6 +52,7 @@ _SLACK = 1.01  # on the side of a cell: a column of cells may lie partly outside
 _OUTSIDE = MAX_CELLS  # the cell number of points outside the image
 _MARGIN = 1e-2  # cells; far more than what rounding moves a point by
 _BLOCK = 1 << 15  # points processed at a time, which limits temporary memory
+_FOOTPRINTS = 1 << 18  # so many get points at a time, likewise
 _VAST = 8  # a lattice whose points lie an eighth of the image apart could miss the image
 _FAR = 15.0  # standard deviations; farther out a Gaussian is 0 in float32
 
@@ -115,31 +116,48 @@ def cell_size(footprints: Footprints, view: View, cell: float, density: float) -
 def scatter(footprints: Footprints, view: View, side: float, density: float) -> Points:
     """Points over footprints, front to back, in cells of `side` px; `density` is `Sampling`'s."""
     kinds = _kinds(footprints, view, density / side)  # (n,)
-    # Half axes, major, minor, and centre, each across and down, in cells, (6, n).
-    axes = np.concatenate([footprints.major, footprints.minor, footprints.centers])
-    axes *= np.float32(1.0 / side)
-    size = view.width / side, view.height / side
-    vast = kinds == len(COUNTS) ** 2  # (n,), the few footprints much larger than the image
-    axes[:, vast] = 0.0  # nothing is cut off; `_flat_points` replaces their points
-    rows, patches, whole = _patches(axes, size, kinds)  # (q,) each
-    sizes = _lattices().sizes.take(patches)  # (q,)
-    owners = np.repeat(rows.astype(np.int32), sizes)  # (p,)
-    cells, shares, sums = _lay_out(axes, size, rows, patches, whole)  # (p,), (p,), (2, q)
-    replaced = np.flatnonzero(vast.take(rows))
-    if len(replaced):
-        at = np.cumsum(sizes)[replaced][:, None] - np.arange(FLAT**2, 0, -1)
-        cells[at], shares[at] = _flat_points(footprints, rows[replaced], view, side)
-        sums[:, replaced] = shares[at].sum(axis=1), (shares[at] ** 2).sum(axis=1)
-    inside, squares = (np.bincount(rows, sum_, len(kinds)).astype(float) for sum_ in sums)  # (n,)
+    pieces = [
+        _points_of(footprints, view, side, kinds, piece)
+        for piece in chunks(len(kinds), _FOOTPRINTS)
+    ]
+    owners, cells, shares, sums = (
+        np.concatenate(each, axis=-1) for each in zip(*pieces, strict=True)
+    )
+    del pieces  # before memory is highest
+    inside, squares = sums  # (n,)
     filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
     counts = filled[filled > 0]  # (C,)
-    del axes, rows, patches, whole, sizes  # before memory is highest
     # A stable sort keeps the points of a cell front to back; those `_OUTSIDE` come last.
     order = np.argsort(cells, kind="stable")[: counts.sum()]
     checkpoint()
     owners, shares = owners.take(order), shares.take(order)
     _merge(owners, shares, squares, counts)
     return Points(owners, shares, counts, inside, squares, side * side)
+
+
+def _points_of(footprints, view, side, kinds, piece):
+    """Owners, cells and shares of the points, (p,) each, of a piece of n footprints, and sums of
+    these shares and of their squares, (2, n).
+    """
+    # Half axes, major, minor, and centre, each across and down, in cells, (6, n).
+    axes = (footprints.major, footprints.minor, footprints.centers)
+    axes = np.concatenate([each[:, piece] for each in axes])
+    axes *= np.float32(1.0 / side)
+    size = view.width / side, view.height / side
+    vast = kinds[piece] == len(COUNTS) ** 2  # (n,), the few footprints much larger than the image
+    axes[:, vast] = 0.0  # nothing is cut off; `_flat_points` replaces their points
+    rows, patches, whole = _patches(axes, size, kinds[piece])  # (q,) each
+    sizes = _lattices().sizes.take(patches)  # (q,)
+    owners = np.repeat((rows + piece.start).astype(np.int32), sizes)
+    cells, shares, sums = _lay_out(axes, size, rows, patches, whole)
+    replaced = np.flatnonzero(vast.take(rows))
+    if len(replaced):
+        at = np.cumsum(sizes)[replaced][:, None] - np.arange(FLAT**2, 0, -1)
+        of_all = rows[replaced] + piece.start
+        cells[at], shares[at] = _flat_points(footprints, of_all, view, side)
+        sums[:, replaced] = shares[at].sum(axis=1), (shares[at] ** 2).sum(axis=1)
+    sums = np.stack([np.bincount(rows, sum_, len(vast)) for sum_ in sums])
+    return owners, cells, shares, sums.astype(float, copy=False)
 
 
 def _kinds(footprints, view, scale):

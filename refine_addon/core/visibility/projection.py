@@ -275,12 +275,15 @@ def project(
                     alphas *= kept
             inside = frustum.contains(view, local, planes)
             pieces.append((local[2], rows + first, centers, *axes, inside, alphas, *hit))
-    depth, *arrays = (np.concatenate(each, axis=-1) for each in zip(*pieces, strict=True))
+    depth, *columns = zip(*pieces, strict=True)
+    del pieces
     checkpoint()
-    order, footprints = _by_depth(depth), Footprints(*arrays)
+    order = _by_depth(np.concatenate(depth))
     if gaussians.model == "antialiased":  # some are now too faint to be drawn
-        order = order[footprints.alphas[order] > ALPHA_CUT]
-    return footprints.take(order)
+        order = order[np.concatenate(columns[6])[order] > ALPHA_CUT]
+    # One by one: all in both orders would be the most memory that a view takes.
+    arrays = (np.concatenate(columns.pop(0), axis=-1) for _ in range(len(columns)))
+    return Footprints(*(array.take(order, axis=-1) for array in arrays))
 
 
 def in_camera(
