@@ -269,10 +269,10 @@ def nearest(
         return np.empty((total, 0), np.int32)
     window = max((count + 1) // 2, WINDOW)
     candidates = _candidates(points, window, part(progress, 0.0, 0.2), threads)
-    near = np.empty((total, count), np.int32)
+    columns, near = np.ascontiguousarray(points.T), np.empty((total, count), np.int32)
 
     def search(piece: slice) -> None:
-        near[piece] = _nearest_of(points, piece, candidates(piece), count)
+        near[piece] = _nearest_of(columns, piece, candidates(piece), count)
 
     run_all(
         search, chunks(total, _CHUNK),
@@ -307,12 +307,11 @@ def _candidates(points, window, progress, threads):
     return around
 
 
-def _nearest_of(points, piece, candidates, count):
+def _nearest_of(columns, piece, candidates, count):
     """The `count` nearest of the candidates of n points, (n, count)."""
     squared = np.zeros(candidates.shape)  # (n, C)
     with np.errstate(under="ignore"):
-        for axis in range(3):
-            along = np.ascontiguousarray(points[:, axis])
+        for along in columns:
             step = along.take(candidates) - along[piece, None]
             squared += np.multiply(step, step, out=step)
         distance = np.minimum(squared, np.finfo(np.float32).max).astype(np.float32)
