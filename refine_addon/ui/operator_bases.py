@@ -48,10 +48,11 @@ class Worker:
         self._thread.start()
 
     def running(self) -> bool:
-        """Whether to wait for it: until it ends, or `PATIENCE` after it was cancelled.
-        Work that goes on after that ends at its next check; its result is dropped."""
+        """Whether to wait for it: until it ends, or, without a partial result, `PATIENCE` after it
+        was cancelled. Work that goes on after that ends at its next check; its result is dropped.
+        """
         late = self.cancelled and time.monotonic() - self.cancelled > PATIENCE
-        return not late and self._thread.is_alive()
+        return self._thread.is_alive() and (not late or self.what == self.partial_step)
 
     def cancel(self) -> None:
         """Ask it to stop; `result` raises `Cancelled` then, unless the step has a partial one."""

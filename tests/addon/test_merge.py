@@ -101,7 +101,8 @@ def test_nothing_is_saved_over_where_refitting_was_stopped(
 @pytest.mark.parametrize("rounds", [0, 1])
 def test_esc_while_refitting_keeps_what_that_has_reached(addon, obj, monkeypatch, rounds):
     """Merged, or refitted in a round: as many splats as asked for, and the sentence says which.
-    The bar says so beforehand; what ends the work is told by core, at once."""
+    The bar says so beforehand, and waits for it; what ends the work is told by core, at once."""
+    monkeypatch.setattr(addon.ui.operator_bases, "PATIENCE", 0.0)
     bpy.context.scene.refine.method = "refit"
     bpy.ops.refine.score()
     done, measured = [], addon.core.refit.round_rays.RoundRays.psnr
