@@ -220,7 +220,7 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         description="Vertex group, or boolean or float point attribute, whose splats stay",
         search=_protectable,
         search_options={"SORT", "SUGGESTION"},
-        update=plans.changed,
+        update=plans.mark_again,
     )
     volumes: CollectionProperty(
         name="Volumes", description="Objects that mark what must stay and go", type=RefineVolume
