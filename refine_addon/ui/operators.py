@@ -149,7 +149,8 @@ class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
         context.view_layer.update()
         if arguments["method"].changes:  # volumes may have moved meanwhile
             splat_group.check_forced(context.scene, group, forced)
-        changed = [] if result.merged else plans.stale(*(each.obj for each in group))
+        stored = [] if arguments["method"].changes else group  # who is not measured anew
+        changed = plans.stale(*(each.obj for each in stored))
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
         outcome = splat_group.apply(group, changes)
         plans.refresh(context)

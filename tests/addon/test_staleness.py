@@ -108,13 +108,17 @@ def test_scores_without_a_whole_note_say_nothing(addon, quarter, room_views, sco
 
 
 @pytest.mark.usefixtures("room_cameras")
-@pytest.mark.parametrize("moved", [False, True])
-def test_apply_goes_by_the_old_scores_and_says_so(addon, quarter, capfd, moved):
-    """Blender prints what an operator reports when a script calls it."""
+@pytest.mark.parametrize(("moved", "merging"), [(False, False), (True, False), (True, True)])
+def test_apply_goes_by_the_old_scores_and_says_so(addon, quarter, capfd, moved, merging):
+    """Blender prints what an operator reports when a script calls it. Merging scores anew."""
+    if merging:  # deletes, too, of so few
+        bpy.context.scene.refine.method, bpy.context.scene.refine.percent = "merge", 4.0
     bpy.ops.refine.score()
     keep = keep_mask(addon, quarter, addon.core.Budget(ratio=0.5))
     quarter.location.x = float(moved)
     capfd.readouterr()
     bpy.ops.refine.apply()
-    assert len(quarter.data.vertices) == keep.sum()
-    assert ("from before a change (object moved)" in capfd.readouterr().out) == moved
+    said = capfd.readouterr().out
+    words = ("from before a change (object moved)", "rows stay as they were")
+    assert [each in said for each in words] == [moved and not merging, merging]
+    assert merging or len(quarter.data.vertices) == keep.sum()
