@@ -387,13 +387,15 @@ class _Prune:
             scores, self.budget, protected=self.protected,
             row_bytes=self.sizes[0], fixed_bytes=self.sizes[1],
         )  # fmt: skip
-        gone, curve = 1.0 - float(np.mean(keep)), scores.quality
-        psnr = None if curve is None else curve.at(gone)
-        between = None if curve is None else curve.at_between(gone)
+        gone, curve, psnr, between = 1.0 - float(np.mean(keep)), scores.quality, None, None
         if scores.ray_sample is not None:
             psnr = psnr_kept(scores.ray_sample, keep, threads=self.threads)
+        elif curve is not None:
+            psnr = curve.at(gone)
         if scores.between is not None:
             between = psnr_kept(scores.between, keep, threads=self.threads)
+        elif curve is not None:
+            between = curve.at_between(gone)
         self.clock.lap("select_s")
         return keep, psnr, between
 

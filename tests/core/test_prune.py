@@ -144,14 +144,21 @@ def test_kept_splats_of_doubles_are_doubles(small, views, tmp_path):
 @pytest.mark.parametrize("budget", [Budget(ratio=0.04), Budget(psnr=80.0)])
 def test_known_scores_do_not_decide_where_merging_deletes(splats, views, budget):
     """Apply in the panel, which has scores, keeps what the command keeps."""
-    scores = score(splats, views, Occlusion(3))
-    at_once, later = (
-        prune(splats, views, budget, Merge(12), scores=each) for each in (None, scores)
-    )
+    scene, scores = (splats, views, budget, Merge(12)), score(splats, views, Occlusion(3))
+    at_once, later = prune(*scene), prune(*scene, scores=scores)
     method = later.report["method"]
     assert (method["asked"], method["done"], later.merged) == ("merge", "occlusion", None)
     np.testing.assert_array_equal(later.keep, at_once.keep)
     assert method["seconds"] is not None
+
+
+@pytest.mark.slow
+def test_known_scores_do_not_decide_whether_merging_deletes(file):
+    """At 27 dB both are about as good: deleting by all rounds of scoring, by one it is not."""
+    quarter = file.splats().take(np.arange(0, len(file), 4))
+    scene = quarter, read_cameras(ROOM / "cameras.json"), Budget(ratio=0.7), Merge(4)
+    at_once, later = prune(*scene), prune(*scene, scores=score(*scene[:2], Merge(4)))
+    np.testing.assert_array_equal(at_once.keep, later.keep)
 
 
 @pytest.mark.slow

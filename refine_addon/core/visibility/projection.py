@@ -279,11 +279,12 @@ def project(
     del pieces
     checkpoint()
     order = _by_depth(np.concatenate(depth))
-    if gaussians.model == "antialiased":  # some are now too faint to be drawn
-        order = order[np.concatenate(columns[6])[order] > ALPHA_CUT]
     # One by one: all in both orders would be the most memory that a view takes.
     arrays = (np.concatenate(columns.pop(0), axis=-1) for _ in range(len(columns)))
-    return Footprints(*(array.take(order, axis=-1) for array in arrays))
+    footprints = Footprints(*(array.take(order, axis=-1) for array in arrays))
+    if gaussians.model == "antialiased":  # some are now too faint to be drawn
+        return footprints.take(np.flatnonzero(footprints.alphas > ALPHA_CUT))
+    return footprints
 
 
 def in_camera(
