@@ -152,7 +152,7 @@ def test_a_curve_is_read_between_its_points_and_back():
 def test_on_a_ray_the_nearest_kept_hit_stands_in():
     """Red, green, blue, one behind the other, alpha .5; as near as another, the one behind."""
     line, half, three = np.zeros(3, np.int32), np.full(3, 0.5), np.arange(3)
-    rays = Rays(np.arange(1), np.arange(1), line, three, half, np.log1p(-half), three)
+    rays = Rays(np.arange(1), np.arange(1), line, three, half, three)
     for keep, expected in (
         ([True, False, True], [0.5, 0.0, 0.375]),
         ([False, False, True], [0.0, 0.0, 0.875]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +33,7 @@ def some_rays(count: int = 40, splats: int = 30) -> tuple[Rays, np.ndarray]:
     alpha = RANDOM.uniform(0.01, 0.9, len(ray)).astype(np.float32)
     rays = Rays(
         np.arange(count), np.zeros(1, np.int64), np.array(ray, np.int32),
-        np.array(owner, np.int32), alpha, np.log1p(-alpha), np.arange(splats),
+        np.array(owner, np.int32), alpha, np.arange(splats),
     )  # fmt: skip
     return rays, RANDOM.uniform(0.0, 1.0, (3, splats)).astype(np.float32)
 
@@ -58,9 +59,7 @@ def test_a_removal_error_is_the_squared_change_of_the_rays_without_a_splat(monke
         (drawn(rays, white) - drawn(rays, white * (np.arange(30) != k)))[:, 0].sum()
         for k in range(30)
     ]
-
     error, contribution = rays.removal_errors(colors)
-
     # What lies behind less than 1e-4 of the light is left out.
     np.testing.assert_allclose(error, expected, rtol=1e-2, atol=1e-6)
     np.testing.assert_allclose(contribution, parts, rtol=1e-4, atol=1e-3)
@@ -114,12 +113,12 @@ def test_what_is_left_grows_as_rays_tell_and_unhit_splats_as_all_do(scene, threa
         prior = KNOWN / np.maximum(hits, 1) * own
         expected.append(own * (later + prior * later.sum() / then.sum()) / (then + prior))
     expected[0] = (hits * now[0][left] + KNOWN * expected[0]) / (hits + KNOWN)
-    at_once, halves = (_RemovalRounds(sample, measured, silent, threads) for _ in range(2))
-
+    at_once, halves = (  # which take the rays away from their sample
+        _RemovalRounds(deepcopy(sample), measured, silent, threads) for _ in range(2)
+    )
     found = at_once.remove_and_measure(left, silent)
     halves.remove_and_measure(np.flatnonzero(keep | (np.arange(count) < count // 2)), silent)
     again = halves.remove_and_measure(left, silent)
-
     assert now[0][left].sum() > 1.05 * before[0][left].sum()
     for name, values in zip(("error", "contribution"), expected, strict=True):
         np.testing.assert_allclose(getattr(found, name), values, rtol=1e-9)
@@ -145,7 +144,6 @@ def test_equally_many_scoring_and_validation_rays_lie_apart(count, monkeypatch):
     monkeypatch.setattr(cast, "SCORING_RAYS", cast.VALIDATION_RAYS)
     view = replace(WIDE, width=480, height=320, fx=450.0, fy=450.0, cx=240.0, cy=160.0)
     views, footprints = [(view, 1.0 / count)] * count, footprints_in(view)
-
     for number in (0, count // 2, count - 1):
         some, others = (
             cast.cast_view(views, number, footprints, scoring=scoring) for scoring in (False, True)
@@ -175,10 +173,8 @@ def test_large_pictures_full_of_vast_splats_take_bounded_memory(monkeypatch):
         log_scales=np.full((500, 3), np.log(4.0), np.float32),
         opacity_logits=np.full(500, -3.0, np.float32),
     )
-
     tracemalloc.start()
     occlusion.score(splats, views, threads=2)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-
     assert peak < 60e6

@@ -32,7 +32,7 @@ SCORING_RAYS = 1 << 16
 """Scoring rays, of all views together."""
 
 MAX_SCORING_HITS = 3 << 24
-"""About the most hits of scoring rays, 16 bytes each."""
+"""About the most hits of scoring rays, 12 bytes each."""
 
 MAX_HITS_OF_VIEW = 1 << 21
 """About the most hits of one view, which take 60 bytes each while views are cast side by side."""
@@ -263,10 +263,9 @@ def _front_to_back(footprints, columns, rows, aims, of_hits):
     members = members[np.argsort(footprints.index[members])]  # (u,)
     place = np.empty(len(used), np.int32)  # of each footprint among those that are hit
     place[members] = np.arange(len(members))
-    alpha = alpha.take(order)
     return Rays(
-        columns, rows, ray.take(order).astype(np.int32), place.take(footprint.take(order)), alpha,
-        np.log1p(-alpha), footprints.index[members], aims,
+        columns, rows, ray.take(order).astype(np.int32), place.take(footprint.take(order)),
+        alpha.take(order), footprints.index[members], aims,
     )  # fmt: skip
 
 

@@ -36,7 +36,6 @@ class Rays:
     ray: NDArray[np.int32]  # (h,), ascending; the hits of a ray are front to back
     owner: NDArray[np.int32]  # (h,), the Gaussian that is hit, as a place in `hit`
     alpha: NDArray[np.float32]  # (h,)
-    log_passed: NDArray[np.float32]  # (h,), log(1 - alpha)
     hit: NDArray[np.int64]  # (u,), rows of Gaussians, ascending
     aims: NDArray[np.int64] | None = None  # (2, P), pixels instead, see `cast.aimed`
 
@@ -44,6 +43,11 @@ class Rays:
     def count(self) -> int:
         """Number of rays."""
         return len(self.columns) * len(self.rows)
+
+    @property
+    def log_passed(self) -> NDArray[np.float32]:
+        """Logarithms of the light that each hit lets through, (h,)."""
+        return np.log1p(-self.alpha)
 
     def pixels_of(
         self, ray: NDArray[np.integer[Any]]
@@ -109,7 +113,7 @@ class Rays:
             checkpoint()
             piece = slice(int(ends[first]), int(ends[last]))
             error[piece], weight[piece] = _removal_errors(
-                self.alpha[piece], self.log_passed[piece], colors.take(owner[piece], axis=1),
+                self.alpha[piece], colors.take(owner[piece], axis=1),
                 np.diff(ends[first : last + 1]),
             )  # fmt: skip
         errors, weights = (np.bincount(owner, each, len(self.hit)) for each in (error, weight))
@@ -154,13 +158,13 @@ class Rays:
         return seen, log_front.take(seen).astype(np.float32)
 
     def _with_hits(self, kept):
-        names = ("ray", "owner", "alpha", "log_passed")
+        names = ("ray", "owner", "alpha")
         return replace(self, **{name: getattr(self, name).take(kept) for name in names})
 
 
-def _removal_errors(alpha, log_passed, colors, counts):
+def _removal_errors(alpha, colors, counts):
     """Errors and contributions of hits, (h,), 0 where hidden; `counts`, >= 1, are hits of rays."""
-    log_front = in_front(log_passed.astype(np.float64), counts)
+    log_front = in_front(np.log1p(-alpha).astype(np.float64), counts)
     transmittance = np.exp(log_front.astype(np.float32))
     transmittance[log_front < LOG_OPAQUE] = 0.0
     weight = transmittance * alpha
