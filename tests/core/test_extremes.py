@@ -62,9 +62,7 @@ SCENES = {
 def test_kept_splats_of_a_scene_at_an_edge_are_as_many_as_asked_for_and_numbers(name, method):
     """Half stay; none is NaN that was a number; refitting ends no lower than it began."""
     splats, views = SCENES[name](cloud(COUNT), with_lens(around(3, 6.0), **SMALL))
-
     result = prune(splats, views, Budget(keep=max(len(splats) // 2, 1)), method())
-
     left, told = result.splats, result.report
     assert len(left) == max(len(splats) // 2, 1)
     for array in ("means", "log_scales", "quaternions", "sh_dc", "sh_rest"):

@@ -25,9 +25,7 @@ def test_places_and_their_order_do_not_depend_on_chunks_and_threads(monkeypatch)
     places = (means - whole.origin) @ (whole.axes.T / whole.size)
     order = scene.spatial_order(places)
     monkeypatch.setattr(scene, "_CHUNK", 64)
-
     one, three = (scene_of(means, drawn, VIEWS, threads=threads) for threads in (1, 3))
-
     assert one.size == three.size == whole.size
     np.testing.assert_array_equal(three.axes, one.axes)
     np.testing.assert_array_equal(whole.positions(means, threads=3), places)

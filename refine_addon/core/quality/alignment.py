@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..affine import QUARTERS
-from ..execute import Progress, part, report, run_all, silent
+from ..execute import run_all
 from ..splats import Splats
 from ..views import ViewSet
 from ..visibility import frustum, projection
@@ -124,8 +124,6 @@ def alignment(
     splats: Splats,
     views: ViewSet,
     used: ViewSet | None = None,
-    *,
-    progress: Progress = silent,
     threads: int | None = None,
 ) -> Alignment:
     """Whether views are to be turned, by some of `used`, and which are far (docs/method.md, 10)."""
@@ -133,7 +131,6 @@ def alignment(
     with np.errstate(under="ignore", invalid="ignore"):  # signalling NaN
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
         for view in views:
-            report(progress, 0.0, "checking")
             if view.weight:
                 points = _in_picture(means, view)
                 in_pictures, count = in_pictures + points.shape[1], count + len(means)
@@ -144,7 +141,7 @@ def alignment(
         one_way = np.linalg.norm(views.rotations[:, 2].mean(axis=0)) >= ONE_WAY
         if used is None or one_way or in_pictures >= WHOLE * count:
             return unturned
-        fineness = _fineness(splats, used.spread(VIEWS), progress, threads)
+        fineness = _fineness(splats, used.spread(VIEWS), threads)
     best = list(QUARTERS)[int(np.argmax(fineness))]
     turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
     return replace(unturned, turn=turn, fineness=fineness)
@@ -173,16 +170,14 @@ def _is_far(points, view):
     return (widths * (view.fx / view.width, view.fy / view.height)).max() < SMALL
 
 
-def _fineness(splats, views, progress, threads):
+def _fineness(splats, views, threads):
     """Fineness of the pictures of views, turned by each of `QUARTERS`."""
     rows = _spread_rows(splats, SAMPLE)
     stand_for = len(splats) / len(rows)
     sample = splats.take(rows)
     larger = np.asarray(sample.log_scales, np.float64) + 0.5 * np.log(stand_for)
     sample = replace(sample, log_scales=larger, sh_rest=sample.sh_rest[:, :0])
-    gaussians, scene, _ = projection.prepare(
-        sample, views, progress=part(progress, 0.0, 0.2), threads=threads
-    )
+    gaussians, scene, _ = projection.prepare(sample, views, threads=threads)
     ordered = [view for view, _ in views.by_distance()]
     near = NEAR * views.middle()[1] ** 0.5 / scene.size
 
@@ -201,8 +196,6 @@ def _fineness(splats, views, progress, threads):
             _, owner, weight = rays.contributions()
             return float((weight / (1.0 + square[rays.hit[owner]])).sum()) / rays.count
 
-    fineness = run_all(
-        of_turned, itertools.product(QUARTERS.values(), enumerate(ordered)),
-        progress=part(progress, 0.2, 1.0), what="checking", threads=threads,
-    )  # fmt: skip
+    turned = itertools.product(QUARTERS.values(), enumerate(ordered))
+    fineness = run_all(of_turned, turned, threads=threads)
     return tuple(np.reshape(fineness, (len(QUARTERS), -1)).mean(axis=1).tolist())
