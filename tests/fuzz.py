@@ -42,7 +42,6 @@ from refine_addon.core.formats.registry import FORMATS, SUFFIXES
 from refine_addon.core.methods import ClosedForm
 from refine_addon.core.prune import score
 from refine_addon.core.scoring import occlusion
-from refine_addon.core.visibility.measuring import Sampling
 from tests.core.test_camera_files import FRAME, INRIA, MATRIX, TRANSFORMS
 from tests.core.test_colmap import HALVES, TWO, WRITERS
 from tests.strategies import LINE_ENDS, ORDERS, ply_case, splat_names
@@ -251,10 +250,9 @@ def use_cameras(folder: Path) -> None:
     values = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32)
     values[:, :3] += (-3.0, 2.0, 3.0)  # what the good cameras look at
     splats = splats_from_columns(dict(zip(splat_names(0), values.T, strict=True)))
-    coarse = Sampling(16.0, 1.0)
     try:  # in this thread: NumPy's flags are raised in it alone
         first = score(splats, views, ClosedForm(), threads=1).values
-        second = occlusion.score_once(splats, views, sampling=coarse, threads=1)[0].values
+        second = occlusion.score(splats, views, rounds=1, threads=1)[0].values
     except RefineError as error:
         if "no camera sees the splats" not in str(error):
             raise

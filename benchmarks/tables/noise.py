@@ -80,7 +80,7 @@ def measure(folder: Path, ratios: Sequence[float], turns: int) -> None:
     found = np.zeros((turns, len(ratios)))
     for turn in range(turns):
         with other_pixels(turn), other_cells(turn):
-            known = occlusion.score_once(scene.splats, used, threads=1)
+            known = occlusion.score(scene.splats, used, rounds=1, threads=1)
             for place, ratio in enumerate(ratios):
                 left = len(scene.splats) - int(ratio * len(scene.splats))
                 made = merge_down(scene.splats, used, left, scored=known, threads=1).splats

@@ -113,7 +113,7 @@ def score(
                 rays = validation_rays(splats, used, progress=casting, threads=threads)
                 scores = replace(scores, ray_sample=rays)
         else:
-            scores = occlusion.score(
+            scores, _ = occlusion.score(
                 splats, used, settled=settled, most_between=method.between(used),
                 progress=scoring, threads=threads,
             )  # fmt: skip
@@ -217,6 +217,9 @@ def prune(
     return replace(result, source=file or splats)
 
 
+Estimates = dict[Way, "float | None"]
+"""Estimated PSNR by what was done, dB; None if too little is seen."""
+
 _Chosen = tuple[NDArray[np.bool_], "float | None", "float | None"]
 """Splats that deletion keeps, (N,), and the PSNR in views that decided and between, dB."""
 
@@ -238,7 +241,7 @@ class Outcome:
 
     merged: Merged  # before refitting; by deletion where that is better to begin with
     done: Way
-    psnr: dict[Way, float | None]  # estimates, dB; None if too little is seen
+    psnr: Estimates
     refitted: Refitted | None = None
     seconds: float = 0.0  # of refitting
     stopped: Cancelled | KeyboardInterrupt | None = None  # what ended refitting early
@@ -290,13 +293,24 @@ class _Prune:
             scores=None if self.scores is None else self.scores.of(rest),
         )
 
-    def delete(self, progress: Progress, tried: Outcome | None = None) -> Result:
-        """Decide by scores alone; `tried` is the outcome of merging, if it was tried."""
-        scores = self._scores(part(progress, 0.0, 0.94))
+    def delete(self, progress: Progress) -> Result:
+        """Decide by scores alone."""
+        scores = self.scores
+        if scores is None:
+            scores = score(
+                self.splats, self.views or self.used, self.method,
+                protected=self.protected, quality=self.budget.psnr is not None,
+                settled=self._settled(), progress=part(progress, 0.0, 0.94), threads=self.threads,
+            )  # fmt: skip
+        elif self.budget.psnr is not None and self.protected is not None:
+            # Other splats may have been protected when these scores were made.
+            scores = with_quality(scores, protected=self.protected, threads=self.threads)
+        self.clock.lap("score_s")
         report(progress, 0.94, "selecting")
-        return self._deleted(scores, self._select(scores), tried)
+        return self._deleted(scores, self._select(scores))
 
-    def _deleted(self, scores: Scores, chosen: _Chosen, tried: Outcome | None = None) -> Result:
+    def _deleted(self, scores: Scores, chosen: _Chosen, tried: Estimates | None = None) -> Result:
+        """Result of deletion; `tried` are estimates of merging, if it was tried."""
         keep, psnr, between = chosen
         summary = reports.of_prune(
             scores, keep, self.budget, self.method, self.sizes, self.clock,
@@ -316,8 +330,8 @@ class _Prune:
         scoring, making = stages(
             progress, seconds("measure", count, views), expected * (2.2 if goal else 1.0)
         )
-        scores, measurement = occlusion.score_once(
-            self.splats, self.used, few_views=goal is None,
+        scores, measurement = occlusion.score(
+            self.splats, self.used, rounds=1, few_views=goal is None,
             most_between=self.method.between(self.used),
             progress=scoring, threads=self.threads,
         )  # fmt: skip
@@ -346,7 +360,15 @@ class _Prune:
         if beside is not None and between is not None:
             pairs.append((beside, between))
         if not refits and self._deletion_is_as_good(keep, outcome, *pairs):
-            return self.delete(silent, outcome)  # by all rounds: up to 5 dB more
+            tried = outcome.psnr
+            del outcome  # not needed where memory is highest
+            scores = occlusion.in_rounds(  # up to 5 dB more than one round
+                self.splats, scores, measurement, settled=self._settled(),
+                progress=lambda *_: progress(1.0, "selecting"), threads=self.threads,
+            )  # fmt: skip
+            if goal is not None:
+                scores = with_quality(scores, protected=self.protected, threads=self.threads)
+            return self._deleted(scores, self._select(scores), tried)
         # Where a PSNR is asked for, deletion keeps another number of splats.
         measured = outcome.psnr if goal is not None else {"delete": plain, **outcome.psnr}
         final = outcome.final
@@ -357,20 +379,6 @@ class _Prune:
         )  # fmt: skip
         merged = None if outcome.done == "delete" else final
         return Result(final.keep, summary, scores, merged, outcome.stopped)
-
-    def _scores(self, progress: Progress) -> Scores:
-        scores = self.scores
-        if scores is None:
-            scores = score(
-                self.splats, self.views or self.used, self.method,
-                protected=self.protected, quality=self.budget.psnr is not None,
-                settled=self._settled(), progress=progress, threads=self.threads,
-            )  # fmt: skip
-        elif self.budget.psnr is not None and self.protected is not None:
-            # Other splats may have been protected when these scores were made.
-            scores = with_quality(scores, protected=self.protected, threads=self.threads)
-        self.clock.lap("score_s")
-        return scores
 
     def _settled(self) -> int | None:
         """How many splats are needed in their final order; None for all."""
@@ -551,12 +559,12 @@ def merge_down(
 ) -> Merged:
     """Merge splats until `count` are left, by `views` and those between; errors as by `score`.
 
-    `scored` comes from `occlusion.score_once`. `began` is the number before earlier merges:
+    `scored` comes from `occlusion.score`. `began` is the number before earlier merges:
     deletion before merging, and the merge penalty, depend on the share removed since then.
     """
     total = len(splats)
     if scored is None:
-        scored = occlusion.score_once(splats, views, few_views=True, threads=threads)
+        scored = occlusion.score(splats, views, rounds=1, few_views=True, threads=threads)
     scores, measured = scored
     views = scores.deciding or views
     began = total if began is None else began

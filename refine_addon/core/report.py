@@ -109,13 +109,13 @@ def of_prune(
     measured: Mapping[Way, float | None],
     timed: bool,
     outcome: Any = None,
-    tried: Any = None,
+    tried: Mapping[Way, float | None] | None = None,
 ) -> dict[str, Any]:
     """Report of a prune as plain JSON values; it shares the clock's times, later laps too.
 
     PSNR, dB, is `psnr` in the views that decided, `between` in views in between, `measured` on rays
     by method. `timed` says whether the clock timed the scoring, from which other methods' times are
-    predicted. `outcome` is that of merging, `tried` if deletion was as good.
+    predicted. `outcome` is that of merging, `tried` its PSNR if deletion was as good.
     """
     count, curve = len(keep), scores.quality
     report: dict[str, Any] = {**scored(scores)}
@@ -142,7 +142,7 @@ def of_prune(
         )
     estimates = dict(measured)
     if tried is not None and budget.psnr is None:  # of as many kept splats
-        estimates = {**tried.psnr, **estimates}
+        estimates = {**tried, **estimates}
     if outcome is not None:
         if outcome.refitted is not None:
             notes.append(outcome.refitted.note(outcome.seconds))
@@ -155,12 +155,11 @@ def of_prune(
         if outcome.done == "merge" and plain is not None and plain > (psnr or plain):
             notes.append(f"plain deletion reaches more: {in_words(plain)}")
     if method.changes and outcome is None and removed:
-        notes.append(deleted_note(psnr, None if tried is None else tried.reached))
+        notes.append(deleted_note(psnr, None if tried is None else tried["merge"]))
     deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
     seconds = None
     if timed and not isinstance(method, ClosedForm):
-        once = method.changes and tried is None
-        took = expected_seconds(clock.timings["score_s"], share, once=once)
+        took = expected_seconds(clock.timings["score_s"], share, once=method.changes)
         seconds = {way: round(value, 1) for way, value in took.items()}
     report |= {
         "budget": {budget.kind: getattr(budget, budget.kind)},

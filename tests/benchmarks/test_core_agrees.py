@@ -21,8 +21,8 @@ from benchmarks.renderer.footprints import (
 from refine_addon.core import Splats, View, ViewSet, read_cameras, read_splats
 from refine_addon.core.pictures import CAMERAS, compare, draw
 from refine_addon.core.splats import MODELS, rotation_matrices, scales, with_model
-from refine_addon.core.visibility import measuring, projection
-from refine_addon.core.visibility.measuring import Measured, Sampling
+from refine_addon.core.visibility import measuring, points, projection
+from refine_addon.core.visibility.measuring import Measured
 from refine_addon.viewport import arrays
 from refine_addon.viewport.arrays import Eye
 from tests.benchmarks.scenes import ROOM, round_scene
@@ -36,7 +36,7 @@ def room():
     return read_splats(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
 
 
-def test_cells_converge_to_the_rendered_contributions_and_removal_errors():
+def test_cells_converge_to_the_rendered_contributions_and_removal_errors(monkeypatch):
     """Halving the cells takes off a constant share of the error; 12 and 15 % are left at 1.5 px.
 
     Splats a few pixels large, several deep everywhere, half of them nearly opaque; errors are sums
@@ -58,8 +58,9 @@ def test_cells_converge_to_the_rendered_contributions_and_removal_errors():
     errors = []
     for side in SIDES:
         total = Measured.zero(len(gaussians))
-        settings = Sampling(cell=side, density=8.0)
-        total._add_view(measuring._measure_view(gaussians, frame, view, settings)[1], 1.0)
+        for name, value in (("CELL", side), ("DENSITY", 8.0)):
+            monkeypatch.setattr(points, name, value)
+        total._add_view(measuring._measure_view(gaussians, frame, view)[1], 1.0)
         back = np.argsort(gaussians.index)
         pairs = ((total.contribution, exact.weight_sum), (total.error, exact.removal_error))
         errors.append([

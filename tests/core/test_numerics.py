@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import mpmath
 import numpy as np
@@ -88,10 +89,9 @@ def test_one_extreme_splat_spoils_neither_itself_nor_the_others(name, settings):
     If the first cannot be drawn, the others keep their order; by occlusion in one round:
     how many go in each depends on their number.
     """
-    fixed = {"rounds": 1, "threads": 1}
-    once = occlusion.score if isinstance(settings, Occlusion) else None
-    alone = cloud().take(slice(1, None))
-    expected = (once(alone, TWO, **fixed) if once else scored(alone, settings=settings)).values
+    once, alone = isinstance(settings, Occlusion), cloud().take(slice(1, None))
+    one_round = partial(occlusion.score, views=TWO, rounds=1, threads=1)
+    expected = (one_round(alone)[0] if once else scored(alone, settings=settings)).values
     cases = [(value, np.float32) for value in EXTREME] + [(value, np.float64) for value in DOUBLES]
     for number, (value, kind) in enumerate(cases):
         values = getattr(cloud(), name).astype(kind)
@@ -101,7 +101,7 @@ def test_one_extreme_splat_spoils_neither_itself_nor_the_others(name, settings):
         scores = scored(splats, settings=settings)
         check(splats, scores)
         if not drawable(splats)[0]:
-            rest = (once(splats, TWO, **fixed) if once else scores).values[1:]
+            rest = (one_round(splats)[0] if once else scores).values[1:]
             assert np.argsort(rest).tolist() == np.argsort(expected).tolist()
             if not once:
                 np.testing.assert_allclose(rest / rest[0], expected / expected[0], rtol=1e-6)

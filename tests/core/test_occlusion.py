@@ -14,10 +14,9 @@ from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.splats import SH_C0
 from refine_addon.core.visibility import measuring, projection
 from refine_addon.core.visibility import points as points_module
-from refine_addon.core.visibility.measuring import Measured, Sampling
+from refine_addon.core.visibility.measuring import Measured
 
 CUT = 1.0 / 255.0
-SAMPLING = Sampling()
 
 
 def look_along_z(center=(0.0, 0.0, 0.0), **changes) -> View:
@@ -42,11 +41,11 @@ def splats_of(means, alphas=0.5, scales=0.05, color=0.5) -> Splats:
     )
 
 
-def measured(splats: Splats, *views: View, sampling: Sampling = SAMPLING) -> Measured:
+def measured(splats: Splats, *views: View) -> Measured:
     """Sums over views, in the order of the splats."""
     gaussians, frame, _ = projection.prepare(splats, ViewSet(views), threads=1)
     pairs, every = [(view, 1.0) for view in views], [range(len(views))]
-    total = measuring.measure(gaussians, frame, pairs, every, sampling, threads=1)[0]
+    total = measuring.measure(gaussians, frame, pairs, every, threads=1)[0]
     return total.take(np.argsort(gaussians.index))
 
 
@@ -165,16 +164,16 @@ def test_a_splat_contributes_what_lies_over_pixels_of_the_image(x, y, sigma, nea
     assert found.seen.tolist() == [max(abs(x), abs(y)) <= 32]
 
 
-def test_a_splat_covers_no_more_of_a_cell_than_its_opacity():
+def test_a_splat_covers_no_more_of_a_cell_than_its_opacity(monkeypatch):
     """Sigma 2 px in a cell of 4: 2 pi 2^2 .5 / 16 is .78 of it, and yet half goes through.
 
     Of its thickness log 2 the share 4.3 / (4.3 + 16) is even, the rest gamma distributed.
     """
-    sampling = Sampling(cell=4.0, density=1.0)  # one point for each
+    monkeypatch.setattr(points_module, "DENSITY", 1.0)  # one point for each
     middle = np.array([0.02, 0.02])  # 2 px off the middle of the image: that of a cell
     front = splats_of([[*middle, 1.0], [*middle * 2, 2.0]], scales=[[0.02] * 3, [0.04] * 3])
-    found = measured(front, square(), sampling=sampling)
-    alone = measured(front.take(slice(1, 2)), square(), sampling=sampling)
+    found = measured(front, square())
+    alone = measured(front.take(slice(1, 2)), square())
     even = (2.0**2 + 0.3) / (2.0**2 + 0.3 + 16.0)
     k = measuring.GAMMA_SHAPE
     passed = 2.0**-even * (1.0 + (1.0 - even) * math.log(2.0) / k) ** -k
@@ -203,7 +202,7 @@ def test_what_no_renderer_draws_goes_first_the_least_first():
     splats.log_scales[faint] = -3.0
     splats.sh_dc[faint] = 0.0
     splats.opacity_logits[faint] = np.random.default_rng(6).permutation(20) * 0.1 - 9.0
-    order = np.argsort(occlusion.score(splats, ring(), rounds=3).values)
+    order = np.argsort(occlusion.score(splats, ring())[0].values)
     assert order[:20].tolist() == faint[np.argsort(splats.opacity_logits[faint])].tolist()
 
 
@@ -242,7 +241,7 @@ def test_what_lies_behind_all_cameras_does_not_all_go():
     splats, behind = cloud(600), np.arange(600) >= 300
     splats.means[:, 2] += np.where(behind, -6.0, 6.0)
     views = ViewSet(tuple(look_along_z((x, 0.0, 0.0)) for x in np.linspace(-0.2, 0.2, 9)))
-    values = occlusion.score(splats, views).values
+    values = occlusion.score(splats, views)[0].values
     kept = values > np.median(values)
     assert 0.2 < np.mean(kept[behind]) < np.mean(kept[~behind])
 
@@ -250,7 +249,7 @@ def test_what_lies_behind_all_cameras_does_not_all_go():
 @pytest.mark.slow
 def test_threads_change_nothing_at_all():
     alone, several = (
-        occlusion.score(cloud(), ring(11), rounds=4, threads=threads).values for threads in (1, 3)
+        occlusion.score(cloud(), ring(11), threads=threads)[0].values for threads in (1, 3)
     )
     np.testing.assert_array_equal(alone, several)
 
@@ -263,7 +262,7 @@ def test_scoring_is_cancelled_by_any_report_and_none_follows_it(monkeypatch):
         told = []
         with contextlib.suppress(Cancelled):
             occlusion.score(
-                cloud(60), ring(3), rounds=2, threads=1,
+                cloud(60), ring(3), threads=1,
                 progress=lambda *_: told.append(1) or len(told) < last,
             )  # fmt: skip
         return len(told)
@@ -279,9 +278,10 @@ def test_scoring_is_cancelled_by_any_report_and_none_follows_it(monkeypatch):
 def test_cells_grow_until_the_points_of_a_view_fit_the_memory(monkeypatch, limit, most):
     """Of 1,370; each of 283 footprints has one however large the cells."""
     monkeypatch.setattr(points_module, "MAX_POINTS", limit)
+    monkeypatch.setattr(points_module, "DENSITY", 3.2)
     view, footprints = ring()[0], footprints_of(cloud(), ring()[0])
-    side = points_module.cell_size(footprints, view, 4.0, 3.2)
-    assert len(points_module.scatter(footprints, view, side, 3.2).owners) <= most
+    side = points_module.cell_size(footprints, view)
+    assert len(points_module.scatter(footprints, view, side).owners) <= most
 
 
 @pytest.mark.parametrize(("width", "height"), [(8000, 6000), (200_000, 1), (1, 1)])
@@ -290,6 +290,6 @@ def test_an_image_of_any_shape_has_few_enough_cells(width, height):
     splats = cloud(50)
     splats.means[6], splats.opacity_logits[6] = 0.0, 1.0  # seen by all
     view = replace(ring()[0], width=width, height=height, cx=width / 2, cy=height / 2)
-    side = points_module.cell_size(footprints_of(splats, view), view, 4.0, 3.2)
+    side = points_module.cell_size(footprints_of(splats, view), view)
     assert math.ceil(width / side) * math.ceil(height / side) <= points_module.MAX_CELLS
-    assert np.isfinite(occlusion.score(splats, ViewSet((view,)), rounds=1).values).all()
+    assert np.isfinite(occlusion.score(splats, ViewSet((view,)))[0].values).all()

@@ -10,6 +10,7 @@ import pytest
 from refine_addon.core import Budget, Merge, Occlusion, ViewSet, prune, select
 from refine_addon.core.quality.curve import Quality
 from refine_addon.core.quality.psnr import psnr_against, psnr_kept
+from refine_addon.core.scoring import occlusion
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.between import (
     transmittance,
@@ -46,7 +47,6 @@ def test_only_neighbours_have_a_view_between_them():
     views = line(0.0, 8.0)
     walls = [splats_of([(x, 0.0, 0.0)], 0.99, [(0.01, 9.0, 9.0)]) for x in (99.0, 2.0)]
     free, shut = (projection.prepare(wall, views)[:2] for wall in walls)
-
     five = {view.center[0] for view in with_views_between(views, 5, *free)}
     beside = views_beside(views, *shut, 40)
     assert sorted(view.center[0] for view in views_between(line(0.0, 1.0, 3.0), 9)) == [0.5, 2.0]
@@ -114,9 +114,7 @@ def test_what_only_views_between_see_is_told_and_warned_of(merges, method):
     and more where a part of it stays. The estimate is that of rays cast there.
     """
     splats, views, patch = hidden_from_the_sides()
-
     result = prune(splats, views, Budget(ratio=0.25), replace(method, exact=True))
-
     told = result.report["estimated_psnr_between"]
     assert np.mean(result.keep[patch]) < 0.1
     assert result.report["estimated_psnr"] > 80.0
@@ -147,6 +145,19 @@ def test_views_between_few_cameras_decide_and_keep_what_they_see(merges, method)
     assert "few cameras: 4 views between them decide, too" in " ".join(result.report["notes"])
     assert result.scores.seen.max() == 2
     assert exact.report["views"]["between"] == one.report["views"]["between"] == 0
+
+
+@pytest.mark.parametrize("between", [0, 4])
+def test_rounds_after_one_give_the_scores_of_all_rounds(between):
+    """To the bit, whether views between decide or not, though no view is measured again."""
+    given = hidden_from_the_sides()[:2]
+    how = {"few_views": True, "most_between": between}
+    once, measured = occlusion.score(*given, rounds=1, **how)
+    scores, _ = occlusion.score(*given, **how)
+    found = occlusion.in_rounds(given[0], once, measured).values
+    assert scores.views_between == between
+    np.testing.assert_array_equal(found, scores.values)
+    assert (found != once.values).any()
 
 
 def test_what_is_stored_of_the_curve_is_read_again():

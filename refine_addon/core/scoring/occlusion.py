@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import execute
 from ..errors import RefineError
-from ..execute import Progress, part, report, run_all, seconds, silent, stages
+from ..execute import Progress, part, report, run, run_all, seconds, silent, stages
 from ..mapped import folder_of, note, noted
 from ..scores import Scores, shares_gone
 from ..splats import Splats, refuse_undrawable
@@ -25,8 +25,11 @@ from ..views import ViewSet
 from ..visibility import projection
 from ..visibility.between import views_beside, views_between, with_views_between
 from ..visibility.cast import RaySample
-from ..visibility.measuring import SECONDS, Measured, Sampling, measure, view_groups
+from ..visibility.measuring import SECONDS, Measured, measure, view_groups
 from . import closed_form, coverage
+
+ROUNDS = 8
+"""How often scores are computed."""
 
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
@@ -48,118 +51,68 @@ KNOWN = 10.0
 """Weight of a measured error, in rays."""
 
 _LOADING = 0.3  # share of the progress of `_RemovalRounds.__init__` that colours take
-_SAMPLING = Sampling()
 
 
+@np.errstate(under="ignore")  # numbers that underflow to 0 are negligible in all sums
 def score(
     splats: Splats,
     views: ViewSet,
     *,
-    rounds: int = 8,
-    sampling: Sampling = _SAMPLING,
+    rounds: int = ROUNDS,
     settled: int | None = None,
-    most_between: int = 0,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Scores:
-    """Score splats, in memory or files, by how much the views change without them, with occlusion.
-
-    A splat's value is the share of splats removed up to it, in (0, 1]; 0 if undrawable. Memory: 300
-    bytes a splat, 100 more for each further thread, and 100 for each point
-    (`points.MAX_POINTS`) of a view in each thread.
-
-    Parameters
-    ----------
-    splats : Splats, in the frame of the views
-    rounds : int, at least 1, how often scores are computed
-    settled : int, optional, how many splats, the first to go, need their final order; else all
-    most_between : int, most views between these that decide, too, where there are few
-    progress, threads : see `prune`
-
-    Raises
-    ------
-    RefineError : no splats, none that can be drawn or that a view sees, or no rounds
-    Cancelled
-    """
-    if rounds < 1:
-        raise RefineError(f"rounds is {rounds}, expected 1 or more")
-    how = rounds, settled, sampling, False, most_between
-    return _score(splats, views, *how, progress, threads)[0]
-
-
-def score_once(
-    splats: Splats,
-    views: ViewSet,
-    *,
-    sampling: Sampling = _SAMPLING,
     few_views: bool = False,
     most_between: int = 0,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Scores, Measured]:
-    """Scores of one round, and what was measured of all N splats; else as `score`."""
-    with np.errstate(under="ignore"):  # numbers that underflow to 0 are negligible in all sums
-        return _score(splats, views, 1, None, sampling, few_views, most_between, progress, threads)
+    """Score splats, in memory or files, by how much the views change without them, with occlusion.
 
+    A splat's value is the share of splats removed up to it, in (0, 1]; 0 if undrawable. Memory: 300
+    bytes a splat, 100 more for each further thread, and 100 for each point
+    (`points.MAX_POINTS`) of a view in each thread. A stage of the job if splats lie in files.
 
-def measure_part(
-    splats: Splats,
-    views: ViewSet,
-    turn: int,
-    parts: int,
-    *,
-    sampling: Sampling = _SAMPLING,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> tuple[Measured, float]:
-    """What one of at most `parts` parts of the views sees of N splats, and its share of weights."""
-    gaussians, scene, _ = projection.prepare(
-        splats, views, progress=part(progress, 0.0, 0.05), threads=threads
-    )
-    ordered = views.by_distance()
-    groups = view_groups(len(ordered))
-    parts = min(parts, len(groups))
-    groups = groups[turn % parts :: parts]
-    measured, *_ = measure(
-        gaussians, scene, ordered, groups, sampling,
-        progress=part(progress, 0.05, 1.0), threads=threads,
-    )  # fmt: skip
-    measured = measured.for_all(np.asarray(gaussians.index), len(splats))
-    weight = math.fsum(ordered[number][1] for group in groups for number in group)
-    return measured, weight / math.fsum(weight for _, weight in ordered)
+    Parameters
+    ----------
+    splats : Splats, in the frame of the views
+    rounds : int, how often scores are computed
+    settled : int, optional, how many splats, the first to go, need their final order; else all
+    few_views : bool, whether the PSNR is to be estimated in few views, see `RaySample`
+    most_between : int, most views between these that decide, too, where there are few
+    progress, threads : see `prune`
 
+    Returns
+    -------
+    Scores, and what was measured of all N splats before any removal
 
-def _score(splats, views, rounds, settled, sampling, few_views, most_between, progress, threads):
-    """Scores, and what was measured of all N; a stage of the job if splats lie in files."""
+    Raises
+    ------
+    RefineError : no splats, or none that can be drawn or that a view sees
+    Cancelled
+    """
     job, stage = folder_of(splats), f"scores-{rounds}-{settled}-{few_views}-{most_between}"
-    done, result = (False, None) if job is None else noted(job, stage)
-    if done:
-        return result
+    if job is not None and (done := noted(job, stage))[0]:
+        return done[1]
     count = len(splats)
     if not count:
         raise RefineError("there are no splats to score")
     execute.start(SECONDS * count * len(views), threads)
     kept = _kept_after_rounds(count, rounds, settled)
-    preparing, closed, looking, weighing, casting, loading, *ranking = stages(
+    preparing, closed, looking, weighing, casting, ranking = stages(
         progress, seconds("read", count), seconds("closed form", count, len(views)),
         seconds("measure", count, len(views)), 5e-6 * min(count, coverage.SAMPLE),
         seconds("cast", count, min(BETWEEN, len(views))),
-        *(seconds("order", left, len(views)) for left in (count, *kept)),
+        sum(seconds("order", left, len(views)) for left in (count, *kept)),
     )  # fmt: skip
     gaussians, scene, good = projection.prepare(splats, views, progress=preparing, threads=threads)
     refuse_undrawable(int(np.count_nonzero(good)), count)
-    # Splats that no view shows need a floor too: without frustum test.
-    prior = closed_form.score(
-        splats, views, depth="distance", frustum=False, local=False,
-        progress=closed, threads=threads,
-    ).values  # fmt: skip
+    prior = _prior(splats, views, closed, threads)
     ordered = views.by_distance()
     samples = [RaySample(ordered, gaussians, splats, few_views=few_views)]
     if rounds > 1:
         samples.append(RaySample(ordered, gaussians, splats, scoring=True))
     sample, index = coverage.sample(gaussians), np.asarray(gaussians.index)
     measured, of_groups, errors = measure(
-        gaussians, scene, ordered, view_groups(len(ordered)), sampling,
+        gaussians, scene, ordered, view_groups(len(ordered)),
         sample=sample, ray_samples=samples, progress=looking, threads=threads,
     )  # fmt: skip
     if not measured.contribution.any():
@@ -174,13 +127,11 @@ def _score(splats, views, rounds, settled, sampling, few_views, most_between, pr
     if left_out > LEFT_OUT:
         more = with_views_between(views, most_between, gaussians, scene, threads)
     if more:
-        share = len(ordered) / (len(ordered) + len(more))
-        every = [(view, share * weight) for view, weight in ordered]
-        every += [(v, (1.0 - share) * weight) for v, weight in ViewSet(tuple(more)).by_distance()]
+        share, every = _with_between(views, more)
         for scoring in samples[1:]:
             scoring.extend(every)
         of_more, *_ = measure(
-            gaussians, scene, every, [range(len(ordered), len(every))], sampling,
+            gaussians, scene, every, [range(len(ordered), len(every))],
             ray_samples=samples[1:], progress=part(weighing, 0.5, 1.0), threads=threads,
         )  # fmt: skip
         for total, sums in zip(measured[:2], of_more[:2], strict=True):
@@ -193,13 +144,8 @@ def _score(splats, views, rounds, settled, sampling, few_views, most_between, pr
         between.share = BETWEEN_RAYS
         between.cast_all(gaussians, scene, casting, threads)
     del gaussians, of_groups, errors  # not needed any more where memory is highest
-    rays = _RemovalRounds(samples.pop(), measured, loading, threads) if rounds > 1 else None
-    undrawn = np.setdiff1d(np.arange(count), index)
-    first = undrawn[np.argsort(prior[undrawn], kind="stable")]
-    order = _order(index, prior, measured, rays, weights, kept, ranking)
-    values = np.empty(count, np.float32)
-    values[np.concatenate([first, order])] = shares_gone(np.arange(1, count + 1), count)
-    values[~good] = 0.0
+    rays = samples.pop() if rounds > 1 else None
+    values = _values(index, good, prior, measured, rays, weights, kept, ranking, threads)
     everything = Measured(*map(execute.in_file, measured.for_all(index, count)))
     scores = Scores(
         values, everything.seen, len(ordered), int(np.count_nonzero(~good)),
@@ -208,6 +154,76 @@ def _score(splats, views, rounds, settled, sampling, few_views, most_between, pr
     )  # fmt: skip
     result = scores, everything
     return result if job is None else note(job, stage, result)
+
+
+@np.errstate(under="ignore")
+def in_rounds(
+    splats: Splats,
+    scores: Scores,
+    measured: Measured,
+    *,
+    settled: int | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """`score` by what one round of it gave, not measuring again; each step reports 0 to 1."""
+    deciding = scores.deciding
+    assert deciding is not None
+    own = len(deciding) - scores.views_between
+    views, more = replace(deciding, views=deciding.views[:own]), deciding.views[own:]
+    gaussians, scene, good = projection.prepare(splats, views, progress=progress, threads=threads)
+    rays = RaySample((), gaussians, splats, scoring=True)
+    for some in (views.by_distance(), _with_between(views, more)[1]):  # own views get more rays
+        rays.extend(some)
+        rays.cast_all(gaussians, scene, progress, threads)
+    index, kept = np.asarray(gaussians.index), _kept_after_rounds(len(splats), ROUNDS, settled)
+    del gaussians
+    prior, weights = _prior(splats, views, progress, threads), scores.facts["floor"]
+    some = measured.take(index)
+    values = _values(index, good, prior, some, rays, weights, kept, progress, threads)
+    return replace(scores, values=values, settled=settled)
+
+
+def measure_part(
+    splats: Splats,
+    views: ViewSet,
+    turn: int,
+    parts: int,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> tuple[Measured, float]:
+    """What one of at most `parts` parts of the views sees of N splats, and its share of weights."""
+    gaussians, scene, _ = projection.prepare(
+        splats, views, progress=part(progress, 0.0, 0.05), threads=threads
+    )
+    ordered = views.by_distance()
+    groups = view_groups(len(ordered))
+    parts = min(parts, len(groups))
+    groups = groups[turn % parts :: parts]
+    measured, *_ = measure(
+        gaussians, scene, ordered, groups,
+        progress=part(progress, 0.05, 1.0), threads=threads,
+    )  # fmt: skip
+    measured = measured.for_all(np.asarray(gaussians.index), len(splats))
+    weight = math.fsum(ordered[number][1] for group in groups for number in group)
+    return measured, weight / math.fsum(weight for _, weight in ordered)
+
+
+def _prior(splats, views, progress, threads):
+    """The closed form's scores, which splats that no view shows have, too: no frustum test."""
+    return closed_form.score(
+        splats, views, depth="distance", frustum=False, local=False,
+        progress=progress, threads=threads,
+    ).values  # fmt: skip
+
+
+def _with_between(views, more):
+    """Share of `views` in all weights, and the views that decide, with weights: `more` are last."""
+    share = len(views) / (len(views) + len(more))
+    every = [(view, share * weight) for view, weight in views.by_distance()]
+    others = ViewSet(tuple(more)).by_distance() if more else ()
+    return share, every + [(view, (1.0 - share) * weight) for view, weight in others]
 
 
 def _with_floors(measured, prior):
@@ -232,6 +248,19 @@ def _folds(whole, of_groups, errors, prior, progress):
         yield *_with_floors(others, prior), of_views
 
 
+def _values(index, good, prior, measured, rays, weights, kept, progress, threads):
+    """Scores of N splats, `good` ones drawable; removal is in rounds if there are scoring rays."""
+    loading, *of_rounds = stages(progress, len(good), *kept)
+    now = None if rays is None else _RemovalRounds(rays, measured, loading, threads)
+    undrawn = np.setdiff1d(np.arange(len(good)), index)
+    first = undrawn[np.argsort(prior[undrawn], kind="stable")]
+    order = np.concatenate([first, _order(index, prior, measured, now, weights, kept, of_rounds)])
+    values = np.empty(len(good), np.float32)
+    values[order] = shares_gone(np.arange(1, len(good) + 1), len(good))
+    values[~good] = 0.0
+    return values
+
+
 def _order(index, prior, measured, rays, weights, kept, progress):
     """Rows of the Gaussians in the order of removal, (M,); `kept` are left after each round."""
     count, left, removed = len(prior), np.arange(len(index)), []
@@ -251,13 +280,17 @@ def _order(index, prior, measured, rays, weights, kept, progress):
 
 
 class _RemovalRounds:
-    """Errors and contributions of M Gaussians as ever more go, by rays cast before any removal."""
+    """Errors and contributions of M Gaussians as ever more go, by rays cast before any removal.
+
+    The rays leave their sample, so that the hits of what has gone are not kept there.
+    """
 
     def __init__(self, scoring_rays, measured, progress, threads):
         self._measured, self._threads = measured, threads
 
         def colored(number):
             rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
+            scoring_rays.rays[number] = None
             with np.errstate(under="ignore"):
                 colors = scoring_rays.colors(number, rays).astype(np.float32)
             return rays, colors, weight * view.width * view.height / rays.count
@@ -298,16 +331,16 @@ class _RemovalRounds:
             self._views[number] = rays, colors, area
             with np.errstate(under="ignore"):
                 error, contribution = rays.removal_errors(colors)
-                return area * error, area * contribution
+                return rays.hit, area * error, area * contribution
 
-        of_views = run_all(
+        error, contribution = np.zeros(len(keep)), np.zeros(len(keep))
+        for hit, errors, contributions in run(
             removal_errors, range(len(self._views)),
             progress=progress, what="scoring", threads=self._threads,
-        )  # fmt: skip
-        error, contribution = np.zeros(len(keep)), np.zeros(len(keep))
-        for (rays, _, _), (errors, contributions) in zip(self._views, of_views, strict=True):
-            error[rays.hit] += errors
-            contribution[rays.hit] += contributions
+        ):  # fmt: skip
+            error[hit] += errors
+            contribution[hit] += contributions
+        execute.return_freed()
         return error[left], contribution[left]
 
 

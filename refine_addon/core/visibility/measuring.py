@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RefineError
 from ..execute import Progress, checkpoint, chunks, return_freed, run, silent
 from ..splats import ALPHA_CUT, ALPHA_MAX
 from ..views import View
@@ -46,19 +44,6 @@ _LEAST_LEFT = 1e-4
 """Least transmittance behind a point, by which the colour behind is divided; less shows nothing."""
 
 _SUMMED = 1 << 20  # points summed at a time
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """How finely images are divided and splats sampled."""
-
-    cell: float = 4.0  # least side of a cell, px; see `points.cell_size`
-    density: float = 3.7  # points per standard deviation that is as long as a cell
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0.0 < value < np.inf:
-                raise RefineError(f"{name} is {value}, expected a positive number")
 
 
 class Measured(NamedTuple):
@@ -109,7 +94,6 @@ def measure(
     scene: Scene,
     views: Sequence[tuple[View, float]],
     groups: Sequence[range],
-    sampling: Sampling,
     *,
     sample: Sequence[int] | NDArray[np.int64] = (),
     ray_samples: Sequence[RaySample] = (),
@@ -125,7 +109,7 @@ def measure(
     rows, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
     lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]
     measured = run(
-        partial(_measure_and_cast, gaussians, scene, views, sampling),
+        partial(_measure_and_cast, gaussians, scene, views),
         [(n, [rays.scoring for rays in some]) for n, some in zip(numbers, lacking, strict=True)],
         cost=SECONDS * len(gaussians) * len(numbers),
         progress=progress, what="scoring", threads=threads,
@@ -147,25 +131,24 @@ def measure(
     return total, of_groups, errors
 
 
-def _measure_and_cast(gaussians, scene, views, sampling, number_and_kinds):
+def _measure_and_cast(gaussians, scene, views, number_and_kinds):
     """What a view sees of the splats, and its scoring or validation rays, in any process."""
     number, kinds = number_and_kinds
-    footprints, measurement = _measure_view(gaussians, scene, views[number][0], sampling)
+    footprints, measurement = _measure_view(gaussians, scene, views[number][0])
     with np.errstate(under="ignore"):
         return measurement, [
             cast_view(views, number, footprints, scoring=scoring) for scoring in kinds
         ]
 
 
-def _measure_view(gaussians, scene, view, sampling):
+def _measure_view(gaussians, scene, view):
     """Footprints in a view; rows, whether centres are inside, contributions, errors, (n,) each."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         return_freed(mapped_only=True)
         integrals = np.empty(0), np.empty(0)
         if len(footprints.index):
-            side = cell_size(footprints, view, sampling.cell, sampling.density)
-            points = scatter(footprints, view, side, sampling.density)
+            points = scatter(footprints, view, cell_size(footprints, view))
             integrals = _integrals(gaussians, footprints, points)
     return footprints, (footprints.index, footprints.inside, *integrals)
 

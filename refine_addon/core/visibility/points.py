@@ -37,6 +37,12 @@ FOOTPRINTS = 4.0
 MAX_CELLS = 65535
 """Most cells of an image: NumPy sorts numbers of 16 bits by radix, in linear time."""
 
+CELL = 4.0
+"""Least side of a cell, px."""
+
+DENSITY = 3.7
+"""Points per standard deviation that is as long as a cell."""
+
 MAX_POINTS = 1 << 22
 """Most points of a view, as estimated, about 100 bytes each: cells grow until there are fewer."""
 
@@ -98,24 +104,24 @@ def runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
             start, member = cut, int(ends[cut - 1])
 
 
-def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
-    """Side of a view's cells, px: `cell`, or more for `FOOTPRINTS`, `MAX_CELLS`, `MAX_POINTS`."""
+def cell_size(footprints: Footprints, view: View) -> float:
+    """Side of a view's cells, px: `CELL`, or more for `FOOTPRINTS`, `MAX_CELLS`, `MAX_POINTS`."""
     needed = max(FEW_CELLS, len(footprints.index) / FOOTPRINTS)
-    side = max(cell, math.sqrt(view.width * view.height / min(needed, MAX_CELLS)) * _SLACK)
+    side = max(CELL, math.sqrt(view.width * view.height / min(needed, MAX_CELLS)) * _SLACK)
     while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:
         side *= _GROWTH  # happens for images that are only a few pixels wide or high
     # As cells grow, the points needed fall to one a footprint, which is below this limit.
     limit = max(MAX_POINTS, LEAST_POINTS * len(footprints.index))
     while True:
-        along = (footprints.sigmas * np.float32(density / side)).clip(1.0, COUNTS[-1])
+        along = (footprints.sigmas * np.float32(DENSITY / side)).clip(1.0, COUNTS[-1])
         if not float(np.dot(along[0], along[1])) > limit:  # about how many points
             return side
         side *= _GROWTH
 
 
-def scatter(footprints: Footprints, view: View, side: float, density: float) -> Points:
-    """Points over footprints, front to back, in cells of `side` px; `density` is `Sampling`'s."""
-    kinds = _kinds(footprints, view, density / side)  # (n,)
+def scatter(footprints: Footprints, view: View, side: float) -> Points:
+    """Points over footprints, front to back, in cells of `side` px."""
+    kinds = _kinds(footprints, view, DENSITY / side)  # (n,)
     pieces = [
         _points_of(footprints, view, side, kinds, piece)
         for piece in chunks(len(kinds), _FOOTPRINTS)
