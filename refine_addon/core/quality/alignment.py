@@ -124,6 +124,7 @@ def alignment(
     splats: Splats,
     views: ViewSet,
     used: ViewSet | None = None,
+    *,
     threads: int | None = None,
 ) -> Alignment:
     """Whether views are to be turned, by some of `used`, and which are far (docs/method.md, 10)."""
