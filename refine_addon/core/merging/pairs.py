@@ -151,8 +151,7 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
         whole = _mixture(ends.one.covariances, ends.two.covariances, ends.step, position)
         mean, deviation = (np.asarray(each.T, np.float64, order="C") for each in ends[6:8])
         disc = footprint(flat_as_viewed(whole.T, mean, deviation), plane, np.zeros(len(blur)))
-        area = base = _area(_disc_as_drawn(disc, blur))
-        growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
+        growth = np.maximum(mass / (_area(_disc_as_drawn(disc, blur)) * ALPHA_MAX), 1.0)
         mixed = _disc_as_drawn((disc[0] * growth, disc[1] * growth, disc[2] * growth), blur)
         area = base = _area(mixed)
     else:
@@ -283,12 +282,10 @@ def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[A
             if merged.model == "2dgs":
                 vectors = vectors[:, :, [1, 2, 0]]
                 logs = np.stack([logs[:, 1], logs[:, 2], np.full(len(logs), LOG_ZERO)], axis=1)
-                sides = vectors[:, :, :2] * np.exp(logs[:, None, :2])
-                thin = packed(sides @ np.swapaxes(sides, 1, 2))
                 plane, none = across(some.direction), np.zeros(len(logs))
                 before, after = (
                     _area(_disc_as_drawn(footprint(each, plane, none), some.blur))
-                    for each in (some.covariances, thin)
+                    for each in (some.covariances, flat(some.covariances))
                 )
                 opacity = np.minimum(opacity * before / after, ALPHA_MAX)
             stored[0][piece], stored[1][piece] = logs, quaternion(vectors)
@@ -341,40 +338,10 @@ def _full(covariances: Array) -> Array:
 
 
 def flat(covariances: Array) -> Array:
-    """Covariances, (M, 6), without their shortest axis n: ``P C P``, ``P = I - n n'``.
-
-    The least eigenvalue is ``t / 3 + 2 p cos((acos(det(B / p) / 2) + 2 pi) / 3)``, t the trace,
-    ``B = C - t / 3 I``, ``p^2 = tr(B^2) / 6`` (Smith 1961).
-    """
-    total = np.maximum(covariances[:, [0, 3, 5]].sum(axis=1), _TINY)
-    full = _full(covariances) / total[:, None, None]
-    centered = full - np.eye(3) / 3.0
-    p = np.sqrt(np.maximum(np.einsum("nij,nij->n", centered, centered) / 6.0, FLATTEST))
-    first, second, third = np.moveaxis(centered, 1, 0)
-    determinant = np.einsum("ni,ni->n", first, np.cross(second, third))
-    angle = np.arccos(np.clip(determinant / (2.0 * p**3), -1.0, 1.0)) / 3.0
-    least = 1.0 / 3.0 + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
-    normal = _null(full - least[:, None, None] * np.eye(3))
-    along = np.einsum("nij,nj->ni", full, normal)
-    own = np.einsum("ni,ni->n", along, normal)
-    outer = normal[:, :, None] * along[:, None, :]
-    left = full - outer - np.swapaxes(outer, 1, 2)
-    left += own[:, None, None] * normal[:, :, None] * normal[:, None, :]
-    return packed(left) * total[:, None]
-
-
-def _null(matrices: Array) -> Array:
-    """Unit vectors, (M, 3), that symmetric matrices of rank 2 or less map to 0."""
-    rows = np.moveaxis(matrices, 1, 0)  # (3, M, 3)
-    crossed = np.stack([np.cross(rows[k], rows[(k + 1) % 3]) for k in range(3)], axis=1)
-    best = np.argmax(np.einsum("nki,nki->nk", crossed, crossed), axis=1)
-    normal = crossed[np.arange(len(best)), best]
-    # Of rank 1, a needle: any vector at right angles to its axis. Of rank 0: any vector.
-    lengths = np.einsum("nki,nki->nk", matrices, matrices)
-    axis = matrices[np.arange(len(best)), np.argmax(lengths, axis=1)]
-    beside = across(normalized(axis))[0].T
-    lost = np.einsum("ni,ni->n", normal, normal) <= FLATTEST * lengths.max(axis=1) ** 2
-    return normalized(np.where(lost[:, None], beside, normal))
+    """Covariances, (M, 6), without their shortest axis."""
+    values, vectors = np.linalg.eigh(_full(covariances))
+    sides = vectors[:, :, 1:] * np.sqrt(np.maximum(values[:, None, 1:], 0.0))
+    return packed(sides @ np.swapaxes(sides, 1, 2))
 
 
 def _dot(one: Real, other: Real) -> Real:
