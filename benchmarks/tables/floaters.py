@@ -54,7 +54,7 @@ class Places:
                 continue
             local, _ = projection.in_camera(gaussians.take(rays.hit), scene, view)
             depth = local[2][rays.owner] * scene.size
-            dark = rays.log_passed.astype(np.float64)
+            dark = np.log1p(-rays.alpha).astype(np.float64)
             first = np.flatnonzero(np.diff(rays.ray, prepend=-1))
             total = np.cumsum(dark)
             before = np.repeat(total[first] - dark[first], np.diff(np.append(first, len(dark))))

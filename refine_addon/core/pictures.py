@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import spherical_harmonics
 from .errors import RefineError
 from .execute import Progress, chunks, part, run_all, silent
 from .images import png
@@ -103,11 +102,8 @@ def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
     if not splats.sh_degree:
         return splats
     with np.errstate(all="ignore"):  # of splats that cannot be drawn
-        direction = splats.means.astype(np.float64) - center
-        length = np.linalg.norm(direction, axis=1, keepdims=True)
-        direction /= np.maximum(length, np.finfo(np.float64).tiny)
-        colors = spherical_harmonics.colors(direction, splats.sh_dc, splats.sh_rest)
-    return replace(splats.up_to_degree(0), sh_dc=(colors - 0.5) / SH_C0)
+        colors = colors_from(splats, np.arange(len(splats)), center)
+    return replace(splats.up_to_degree(0), sh_dc=(colors.T - 0.5) / SH_C0)
 
 
 def drawn(
@@ -123,7 +119,7 @@ def drawn(
     """`draw` for splats prepared by `projection.prepare`."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
-        colors = colors_from(splats, gaussians.index[footprints.index], view)
+        colors = colors_from(splats, gaussians.index[footprints.index], view.center)
         places = projection.coordinates(gaussians.means, scene, view)
         depths = scene.size * places[2, footprints.index]
 

@@ -13,6 +13,8 @@ from .execute import chunks
 from .images import srgb_of
 from .splats import SH_C0
 
+LARGEST = np.float32(1e36)  # coefficient that counts: 25 of them add up to a float32
+
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 _LUMA = (0.2126, 0.7152, 0.0722)  # shares of red, green and blue in a grey (ITU-R BT.709)
 _GAMMA = 2.2  # of the power that the curve of sRGB is near
@@ -79,30 +81,22 @@ def _values(directions, degree):
 
 def colors(
     directions: NDArray[Any], sh_dc: NDArray[Any], sh_rest: NDArray[Any]
-) -> NDArray[np.float64]:
-    """Colour of each splat along a direction as in `basis`, (N, 3) float64, not clipped.
+) -> NDArray[np.float32]:
+    """Colour of each splat along a direction as in `basis`, (N, 3) float32, not clipped.
 
     ``0.5 + sum of harmonics times coefficients`` (Kerbl et al. 2023), display-referred;
-    `directions` and `sh_dc` are (N, 3), `sh_rest` is (N, K, 3).
+    `directions` and `sh_dc` are (N, 3), `sh_rest` is (N, K, 3), each at most `LARGEST`.
     """
-    values = basis(directions, math.isqrt(sh_rest.shape[1] + 1) - 1)  # (N, K + 1)
-    color = 0.5 + values[:, :1] * np.asarray(sh_dc, np.float64)
-    if sh_rest.shape[1]:
-        # In one memory layout, since einsum sums in an order that depends on it.
-        color += np.einsum("nk,nkc->nc", values[:, 1:], np.ascontiguousarray(sh_rest, np.float64))
-    return np.asarray(color)
-
-
-def single_colors(
-    directions: NDArray[Any], sh_dc: NDArray[np.float32], sh_rest: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """`colors` in float32, (3, N), in a tenth of the time; directions are (3, N)."""
-    values = _values(np.asarray(directions, np.float32), math.isqrt(sh_rest.shape[1] + 1) - 1)
-    result = values[0] * sh_dc.T
-    if sh_rest.shape[1]:
-        result += np.einsum("nk,nkc->cn", np.stack(values[1:], axis=1), sh_rest)
-    result += np.float32(0.5)
-    return np.asarray(result, np.float32)
+    columns = np.ascontiguousarray(directions.T, np.float32)
+    values = _values(columns, math.isqrt(sh_rest.shape[1] + 1) - 1)
+    # In one memory layout, since einsum sums in an order that depends on it.
+    dc, rest = (
+        np.ascontiguousarray(each.clip(-LARGEST, LARGEST), np.float32) for each in (sh_dc, sh_rest)
+    )
+    result = values[0] * dc.T
+    if rest.shape[1]:
+        result += np.einsum("nk,nkc->cn", np.stack(values[1:], axis=1), rest)
+    return np.asarray(result.T + np.float32(0.5))
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]:

@@ -14,7 +14,7 @@ import numba
 from numpy.typing import NDArray
 
 from benchmarks.renderer import rasterizer
-from refine_addon.core.spherical_harmonics import colors
+from refine_addon.core.spherical_harmonics import basis
 from refine_addon.core.splats import Splats, opacity, opacity_logits, rotation_matrices
 from refine_addon.core.views import View
 from tests.benchmarks.scenes import BACKGROUND, round_scene
@@ -55,7 +55,9 @@ def dense_render(
     finished = np.zeros((camera.height, camera.width), bool)
     toward = scene.means - camera.center
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    shown = np.maximum(0.0, colors(toward, scene.sh_dc, scene.sh_rest))
+    harmonics = np.concatenate([scene.sh_dc[:, None], scene.sh_rest], axis=1)
+    values = basis(toward, scene.sh_degree)
+    shown = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", values, harmonics))
     opacities, count = opacity(scene.opacity_logits), len(scene)
     stats = {n: np.zeros(count) for n in ("weight_sum", "weight_max", "opacity_sum", "hits")}
     for _, i, u, v, inverse in dense_geometry(scene, camera):

@@ -194,8 +194,8 @@ def _fineness(splats, views, threads):
             if near:
                 depths = projection.coordinates(gaussians.means, scene, view)[2]
                 square *= np.clip(depths / near, 1.0, _FARTHEST) ** 2
-            _, owner, weight = rays.contributions()
-            return float((weight / (1.0 + square[rays.hit[owner]])).sum()) / rays.count
+            fine = rays.weights() / (1.0 + square[rays.hit[rays.owner]])
+            return float(fine.sum()) / rays.count
 
     turned = itertools.product(QUARTERS.values(), enumerate(ordered))
     fineness = run_all(of_turned, turned, threads=threads)

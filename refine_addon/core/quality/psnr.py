@@ -131,7 +131,7 @@ def psnr_against(
         view = sample.views[number][0]
         footprints = projection.project(gaussians, scene, view)
         other = cast(footprints, rays.columns, rays.rows)
-        colors = colors_from(splats, gaussians.index[other.hit], view)
+        colors = colors_from(splats, gaussians.index[other.hit], view.center)
         truth = rays.colors(sample.colors(number, rays))
         return [psnr_of(other.colors(colors), truth, view)]
 

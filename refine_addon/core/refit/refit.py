@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from ..errors import RefineError
 from ..execute import Progress, chunks, in_file, part, run_all, seconds, silent, stages
 from ..mapped import divided, folder_of, in_one, in_regions, look, new_folder, note, noted, on_disk
+from ..spherical_harmonics import LARGEST
 from ..splats import Splats, rotation_matrices, unit_quaternions
 from ..views import View, ViewSet
 from ..visibility import projection
 from ..visibility.projection import Footprints, Gaussians
 from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, Singles
-from .round_rays import LARGEST, RoundRays, Target, Window, limits, steps_of
+from .round_rays import RoundRays, Target, Window, limits, steps_of
 
 STEPS = 8  # of conjugate gradients in a round
 

@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, in_file, part, return_freed, run, seconds
+from ..execute import Progress, in_file, part, return_freed, run, seconds
 from ..mapped import folder_of
 from ..quality.psnr import psnr_of
-from ..spherical_harmonics import single_colors
 from ..splats import Splats
 from ..views import View, ViewSet
 from ..visibility import cast, projection
@@ -49,8 +48,6 @@ SHIFT, MAX_SHIFT = 0.7, 0.1
 
 VALIDATION_VIEWS = 12  # about the most that validation rays go from
 
-LARGEST = np.float32(1e36)  # coefficient of the harmonics: 25 of them add up to a float32
-FARTHEST = 1e18  # step from a camera, world units; its square fits into a float32
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
 _CHUNK = 1 << 12  # what stays in the second-level cache
 _EVERY = 2  # validation rays go through every second row of a round's rays
@@ -123,25 +120,7 @@ class Target:
     def colors(self, hit: NDArray[np.int64], view: View) -> Singles:
         """Colours in which a view sees the Gaussians `hit`, (3, u)."""
         rows = hit if folder_of(self.splats) is None else self.gaussians.index[hit]
-        return colors_of(self.splats, rows, view)
-
-
-def colors_of(splats: Splats, rows: NDArray[np.int64], view: View) -> Singles:
-    """Colours in which a view sees splats by their rows, (3, u) float32, 0 to `BRIGHTEST`."""
-    result = np.empty((3, len(rows)), np.float32)
-    for piece in chunks(len(rows), _CHUNK):
-        chosen = rows[piece]
-        harmonics = (
-            every[chosen].clip(-LARGEST, LARGEST).astype(np.float32, copy=False)
-            for every in (splats.sh_dc, splats.sh_rest)
-        )
-        from_view = (splats.means[chosen].astype(np.float64) - view.center).T.copy()
-        from_view /= np.maximum(np.abs(from_view).max(axis=0) / FARTHEST, 1.0)
-        direction = from_view.astype(np.float32)
-        length = np.sqrt(np.square(direction).sum(axis=0))
-        direction /= np.maximum(length, np.finfo(np.float32).tiny)
-        result[:, piece] = single_colors(direction, *harmonics)
-    return result.clip(0.0, projection.BRIGHTEST)
+        return cast.colors_from(self.splats, rows, view.center)
 
 
 class Truth(NamedTuple):

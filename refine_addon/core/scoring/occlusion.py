@@ -292,7 +292,7 @@ class _RemovalRounds:
             rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
             scoring_rays.rays[number] = None
             with np.errstate(under="ignore"):
-                colors = scoring_rays.colors(number, rays).astype(np.float32)
+                colors = scoring_rays.colors(number, rays)
             return rays, colors, weight * view.width * view.height / rays.count
 
         # Of each view: rays, (3, u) colours of what they hit, and the area of the image for each

@@ -108,7 +108,7 @@ def transmittance(
     ray = View(rotation, start, _FOCAL, _FOCAL, 0.5, 0.5, 1, 1, far=length)
     with np.errstate(under="ignore"):
         hits = cast(projection.project(gaussians, scene, ray), pixel, pixel)
-        return float(np.exp(hits.log_passed.sum(dtype=np.float64)))
+        return float(np.exp(np.log1p(-hits.alpha).sum(dtype=np.float64)))
 
 
 def _neighbours(place):

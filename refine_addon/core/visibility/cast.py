@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import spherical_harmonics
-from ..execute import Progress, checkpoint, part, run_all, silent
+from ..execute import Progress, checkpoint, chunks, part, run_all, silent
 from ..splats import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS, Splats
 from ..views import View, ViewSet
 from . import projection
@@ -51,6 +51,7 @@ BEHIND = 1e-4
 LOG_DIM = -6.9  # of the transmittance, 1e-3, where `cast_visible` ends rays
 
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
+_SPLATS = 1 << 12  # whose colours are computed at a time, likewise
 _MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
 _CROSSING = 1e-3  # least s of `_disc_extent`; with less, a disc is partly behind the camera
@@ -87,9 +88,9 @@ class RaySample:
         self.rays += [None] * (len(views) - len(self.views))
         self.views = views
 
-    def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:
-        """Colours in which view `number` sees the splats that its rays hit, (3, u) float64."""
-        return colors_from(self.splats, self.splat_rows[rays.hit], self.views[number][0])
+    def colors(self, number: int, rays: Rays) -> NDArray[np.float32]:
+        """Colours in which view `number` sees the splats that its rays hit, (3, u)."""
+        return colors_from(self.splats, self.splat_rows[rays.hit], self.views[number][0].center)
 
     def wants(self, number: int) -> bool:
         """Whether the rays of a view are wanted and not cast yet."""
@@ -159,16 +160,22 @@ def cast_view(
     return cast(footprints, *pixels(view, number + 0.5 * scoring, count))
 
 
-def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
-    """Colours in which a view sees n splats by their rows, (3, n), 0 to `BRIGHTEST`.
+def colors_from(
+    splats: Splats, rows: NDArray[np.int64], center: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Colours in which a place, (3,), sees splats by their rows, (3, n), 0 to `BRIGHTEST`.
 
     All harmonics count: by the constant alone the estimated PSNR was 1.2 dB too high outdoors.
     """
-    direction = splats.means[rows].astype(np.float64) - view.center
-    length = np.linalg.norm(direction, axis=1)
-    direction /= np.maximum(length, np.finfo(np.float64).tiny)[:, None]
-    colors = spherical_harmonics.colors(direction, splats.sh_dc[rows], splats.sh_rest[rows])
-    return np.ascontiguousarray(colors.T.clip(0.0, projection.BRIGHTEST))
+    result = np.empty((3, len(rows)), np.float32)
+    for piece in chunks(len(rows), _SPLATS):
+        some = rows[piece]
+        direction = splats.means[some].astype(np.float64) - center
+        length = np.linalg.norm(direction, axis=1)
+        direction /= np.maximum(length, np.finfo(np.float64).tiny)[:, None]
+        harmonics = splats.sh_dc[some], splats.sh_rest[some]
+        result[:, piece] = spherical_harmonics.colors(direction, *harmonics).T
+    return result.clip(0.0, projection.BRIGHTEST)
 
 
 def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

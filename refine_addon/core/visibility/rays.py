@@ -44,11 +44,6 @@ class Rays:
         """Number of rays."""
         return len(self.columns) * len(self.rows)
 
-    @property
-    def log_passed(self) -> NDArray[np.float32]:
-        """Logarithms of the light that each hit lets through, (h,)."""
-        return np.log1p(-self.alpha)
-
     def pixels_of(
         self, ray: NDArray[np.integer[Any]]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -61,10 +56,11 @@ class Rays:
         """The rays with only their hits on the splats `keep`, (u,) bool."""
         return self._with_hits(np.flatnonzero(keep.take(self.owner)))
 
-    def visible(self, opaque: float = LOG_OPAQUE) -> tuple[Rays, NDArray[np.float32]]:
+    def visible(self, opaque: float) -> tuple[Rays, NDArray[np.float32]]:
         """The rays without hidden hits, which show the same; transmittance in front, (h,)."""
-        kept, log_front = self._seen(opaque)
-        return self.of_hits(kept), np.exp(log_front)
+        transmittance = _transmittance(self.alpha, self.counts(), opaque)
+        kept = np.flatnonzero(transmittance)
+        return self.of_hits(kept), transmittance.take(kept)
 
     def of_hits(self, kept: NDArray[np.int64]) -> Rays:
         """The rays with some hits, and the splats of these."""
@@ -84,18 +80,13 @@ class Rays:
                 row[hitting] = np.add.reduceat(weight * channel.take(self.owner), first)
         return result.clip(0.0, 1.0)
 
-    def contributions(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-        """Ray, owner and T alpha, the share of the pixel, of visible hits, (r,) each."""
-        seen, log_front = self._seen()
-        return self.ray.take(seen), self.owner.take(seen), self.alpha.take(seen) * np.exp(log_front)
+    def weights(self) -> NDArray[np.float32]:
+        """T alpha, the share of the pixel, of each hit, (h,); 0 where it is hidden."""
+        return self.alpha * _transmittance(self.alpha, self.counts())
 
-    def colors(self, colors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def colors(self, colors: NDArray[np.float32]) -> NDArray[np.float32]:
         """Colour of each ray over black, (3, P), 0..1, from those of the splats, (3, u)."""
-        ray, owner, weight = self.contributions()
-        channels = [
-            np.bincount(ray, weight * channel.take(owner), self.count) for channel in colors
-        ]
-        return np.stack(channels).clip(0.0, 1.0)
+        return self.composited(self.weights(), colors)
 
     def removal_errors(
         self, colors: NDArray[np.float32]
@@ -120,8 +111,8 @@ class Rays:
         return errors.astype(float), weights.astype(float)
 
     def colors_by_nearest_kept(
-        self, colors: NDArray[np.float64], keep: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
+        self, colors: NDArray[np.float32], keep: NDArray[np.bool_]
+    ) -> NDArray[np.float32]:
         """Colour of each ray, (3, P), 0..1, if kept splats, (u,) bool, stand in for removed ones.
 
         A removed splat keeps its alpha and takes the colour of the ray's nearest kept hit, counted
@@ -140,7 +131,7 @@ class Rays:
         alone = np.minimum(steps_front, steps_back) == none
         owner = self.owner.take(np.where(alone, here, nearest))
         owner[alone] = colors.shape[1]  # the column of black
-        return replace(self, owner=owner).colors(np.append(colors, np.zeros((3, 1)), axis=1))
+        return replace(self, owner=owner).colors(np.pad(colors, ((0, 0), (0, 1))))
 
     def counts(self) -> NDArray[np.int64]:
         """Number of hits of each ray that has any."""
@@ -151,22 +142,22 @@ class Rays:
         np.not_equal(self.ray[1:], self.ray[:-1], out=new[1:])
         return np.flatnonzero(new)
 
-    def _seen(self, opaque=LOG_OPAQUE):
-        """Visible hits, (r,), and the logarithms of the transmittance in front of them."""
-        log_front = in_front(self.log_passed.astype(np.float64), self.counts())
-        seen = np.flatnonzero(log_front > opaque)
-        return seen, log_front.take(seen).astype(np.float32)
-
     def _with_hits(self, kept):
         names = ("ray", "owner", "alpha")
         return replace(self, **{name: getattr(self, name).take(kept) for name in names})
 
 
-def _removal_errors(alpha, colors, counts):
-    """Errors and contributions of hits, (h,), 0 where hidden; `counts`, >= 1, are hits of rays."""
+def _transmittance(alpha, counts, opaque=LOG_OPAQUE):
+    """Transmittance in front of hits, (h,), 0 where hidden; `counts`, >= 1, are hits of rays."""
     log_front = in_front(np.log1p(-alpha).astype(np.float64), counts)
-    transmittance = np.exp(log_front.astype(np.float32))
-    transmittance[log_front < LOG_OPAQUE] = 0.0
+    result = np.exp(log_front.astype(np.float32))
+    result[log_front < opaque] = 0.0
+    return result
+
+
+def _removal_errors(alpha, colors, counts):
+    """Errors and contributions of hits, (h,), 0 where hidden; see `_transmittance`."""
+    transmittance = _transmittance(alpha, counts)
     weight = transmittance * alpha
     left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))  # transmittance behind it
     error = np.zeros(len(alpha), np.float32)
