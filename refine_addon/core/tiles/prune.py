@@ -123,7 +123,7 @@ def prune_tiles(
     names = ("input", "output", "before", "kept", "unseen", "input_bytes", "output_bytes")
     targets = [str(each) for each in outputs.targets] if outputs else [None] * len(tiles)
     report["tiles"] = [
-        dict(zip(names, (t.path, to, t.splats, kept, unseen, t.size, after), strict=True))
+        dict(zip(names, (str(t.path), to, t.splats, kept, unseen, t.size, after), strict=True))
         for t, to, (kept, unseen), after in zip(tiles, targets, counts, sizes, strict=True)
     ]
     report["timings"] = clock.timings

@@ -26,7 +26,7 @@ _PIECE = 1 << 24  # bytes beside the rows that are copied at a time
 class Tile(NamedTuple):
     """A file of splats, as it was when the job began."""
 
-    path: str  # absolute, or a URL
+    path: Path | Url  # a path is absolute
     splats: int  # how many it holds
     dtype: np.dtype[Any]  # of a row
     model: Model  # how they are drawn
@@ -34,16 +34,6 @@ class Tile(NamedTuple):
     begin: int  # bytes before the first row
     size: int  # bytes of the file
     changed: int | str  # see `storage.state`
-
-    @property
-    def place(self) -> Path | Url:
-        """Path or URL."""
-        return storage.located(self.path)
-
-    @property
-    def name(self) -> str:
-        """File name."""
-        return self.place.name
 
     @property
     def end(self) -> int:
@@ -62,7 +52,7 @@ def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Ti
     given: dict[str, Tile] = {}
     for path in paths:
         tile = tile_at(path, model)
-        first = given.setdefault(storage.identity(tile.place), tile)
+        first = given.setdefault(storage.identity(tile.path), tile)
         if first is not tile:
             also = "" if first.path == tile.path else f", also as {first.path}"
             raise RefineError(f"{tile.path}: is given twice{also}")
@@ -98,7 +88,7 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
     if model not in (None, stated) and THIRD_SCALE not in (dtype.names or ()):
         raise RefineError(f"{place}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}")
     return Tile(
-        str(place if isinstance(place, Url) else place.absolute()), header.counts[vertex], dtype,
+        place if isinstance(place, Url) else place.absolute(), header.counts[vertex], dtype,
         model or stated, len(header.raw), len(header.raw) + begin, size, changed,
     )  # fmt: skip
 
@@ -115,8 +105,8 @@ def bytes_of(tile: Tile, start: int, stop: int) -> Iterator[NDArray[np.uint8]]:
 
 
 def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
-    sent = storage.array(tile.place, dtype, count, begin)
-    if storage.state(tile.place) != (tile.size, tile.changed):
+    sent = storage.array(tile.path, dtype, count, begin)
+    if storage.state(tile.path) != (tile.size, tile.changed):
         raise RefineError(f"{tile.path}: was changed while it was worked on; nothing was written")
     if len(sent) != count:
         raise RefineError(

@@ -69,10 +69,10 @@ class Outputs:
     def __post_init__(self) -> None:
         first: dict[str, Tile] = {}
         for tile in self.tiles:
-            if first.setdefault(tile.name, tile) is not tile:
-                raise RefineError(f"{tile.path}: another tile is called {tile.name} too")
+            if first.setdefault(tile.path.name, tile) is not tile:
+                raise RefineError(f"{tile.path}: another tile is called {tile.path.name} too")
         refuse_one_file(target for target in self.targets if isinstance(target, Path))
-        read = {storage.identity(tile.place) for tile in self.tiles}
+        read = {storage.identity(tile.path) for tile in self.tiles}
         for target in self.targets:
             if storage.identity(target) in read:
                 raise RefineError(
@@ -83,7 +83,7 @@ class Outputs:
     @property
     def targets(self) -> list[Path | Url]:
         """Final names of the tiles."""
-        return [self.folder / tile.name for tile in self.tiles]
+        return [self.folder / tile.path.name for tile in self.tiles]
 
     @property
     def waiting(self) -> list[Path | Url]:
@@ -91,7 +91,7 @@ class Outputs:
         if isinstance(self.folder, Url):
             name = self.job.name
             return [self.folder / f"{name}-{number:06d}" for number in range(len(self.tiles))]
-        return [waiting_in(self.job) / tile.name for tile in self.tiles]
+        return [waiting_in(self.job) / tile.path.name for tile in self.tiles]
 
     def in_place(self) -> dict[int, int]:
         """Bytes of the tiles, by number, that an interrupted run has renamed."""
@@ -156,7 +156,7 @@ class Outputs:
 
 def _write_tile(job, tiles, kept, places, number):
     """Write a tile's kept rows, unless an earlier run has, and upload it; returns its bytes."""
-    waiting = waiting_in(job) / tiles[number].name
+    waiting = waiting_in(job) / tiles[number].path.name
     if not waiting.exists():
         unfinished = waiting_in(job) / f"{number:06d}-{secrets.token_hex(8)}.tmp"
         try:
