@@ -505,12 +505,12 @@ def write_rows(
     at: Any = {"names": ["stored"], "formats": [plain.dtype], "itemsize": row.itemsize}
 
     def bytes_of(piece: slice) -> NDArray[Any]:
-        kept = slice(None) if keep is None else keep[piece]
-        chunk = plain[piece][kept]
+        stored = plain[piece]
         if changed is not None:
-            chunk = np.array(chunk)
-            changed.put(chunk, rows.dtype, piece, None if keep is None else keep[piece])
-        elif columns:
+            stored = changed.put(stored, rows.dtype, piece)
+        kept = slice(None) if keep is None else keep[piece]
+        chunk = stored[kept]
+        if columns and changed is None:
             read, chunk = chunk, np.empty(len(chunk), row)
             chunk.view(np.dtype(at))["stored"] = read
             # A double may be too large or too small for a float; a signalling NaN becomes quiet.

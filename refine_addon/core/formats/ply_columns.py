@@ -110,19 +110,17 @@ class ChangedColumns(Mapping[str, "NDArray[Any]"]):
     def __len__(self) -> int:
         return len(self._values)
 
-    def put(self, chunk: NDArray[Any], dtype: np.dtype[Any], piece: slice, kept: Keep) -> None:
-        """Set new values in `chunk`, (n,) void: the kept rows of a piece, each of type `dtype`."""
+    def put(self, stored: NDArray[Any], dtype: np.dtype[Any], piece: slice) -> NDArray[Any]:
+        """Copy of the rows of a piece, (n,) void, each of type `dtype`, with the new values."""
         low, high = np.searchsorted(self._rows, (piece.start, piece.stop))
-        rows, taken = self._rows[low:high] - piece.start, np.arange(low, high)
-        if kept is not None:
-            stays = kept[rows]
-            rows, taken = (np.cumsum(kept) - 1)[rows[stays]], taken[stays]
-        changed = chunk[rows]
+        rows, copy = self._rows[low:high] - piece.start, stored.copy()
+        changed = stored[rows]
         fields = changed.view(dtype)
         with np.errstate(over="ignore", under="ignore"):
             for name, values in self._values.items():
-                fields[name] = values[taken]
-        chunk[rows] = changed
+                fields[name] = values[low:high]
+        copy[rows] = changed
+        return copy
 
 
 def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:
