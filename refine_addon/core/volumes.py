@@ -104,16 +104,12 @@ class Solid:
             raise RefineError("has no faces, expected a closed mesh")
         if not np.isfinite(vertices).all():
             raise RefineError("has a vertex that is not finite, expected a closed mesh")
-        order = np.lexsort(vertices.T)
-        new = np.ones(len(order), np.bool_)
-        new[1:] = (vertices[order[1:]] != vertices[order[:-1]]).any(axis=1)
-        joined = np.empty(len(order), np.int64)
-        joined[order] = np.cumsum(new) - 1
-        triangles = joined[triangles]
+        vertices, joined = np.unique(vertices, axis=0, return_inverse=True)
+        triangles = joined.reshape(-1)[triangles]
         a, b, c = triangles.T
         triangles = triangles[(a != b) & (b != c) & (c != a)]
         start, end = triangles.reshape(-1), np.roll(triangles, -1, axis=1).reshape(-1)
-        names = np.minimum(start, end) * len(order) + np.maximum(start, end)
+        names = np.minimum(start, end) * len(vertices) + np.maximum(start, end)
         edge = np.unique(names, return_inverse=True)[1].reshape(-1)
         open_edges = np.count_nonzero(np.bincount(edge) % 2)
         if open_edges or not len(triangles):
@@ -121,7 +117,7 @@ class Solid:
                 f"is not closed: {open_edges} of its edges belong to an odd number of faces; fill "
                 "the holes, or add a Remesh modifier"
             )
-        self.vertices, self.triangles = vertices[order[new]], triangles
+        self.vertices, self.triangles = vertices, triangles
         self.turned = not np.bincount(edge, np.where(start < end, 1.0, -1.0)).any()
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
