@@ -244,7 +244,7 @@ def compare(
             splats, views, progress=part(progress, start, start + 0.1), threads=threads
         )
         if not pictures:
-            views = ViewSet(tuple(_fitted(view, scene) for view in views))
+            views = ViewSet(tuple(fitted(view, scene.size) for view in views))
         rest, share = part(progress, start + 0.1, start + 0.5), 1.0 / len(views)
         pictures.append([
             drawn(
@@ -259,22 +259,19 @@ def compare(
     ]
 
 
-def fitted(view: View) -> View:
-    """View of the same field of view, at most `LONGEST` pixels along its longer side."""
-    scale = LONGEST / max(view.width, view.height)
-    if scale >= 1.0:
-        return view
+def fitted(view: View, scene_size: float) -> View:
+    """View of the same field of view, at most `LONGEST` pixels along its longer side.
+
+    It has the near plane of scoring in a scene of this size: fewer splats would move it.
+    """
+    scale = min(LONGEST / max(view.width, view.height), 1.0)
     width, height = (max(round(size * scale), 1) for size in (view.width, view.height))
     across, down = width / view.width, height / view.height
     fx, cx = view.fx * across, view.cx * across
     fy, cy = view.fy * down, view.cy * down
-    return replace(view, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
-
-
-def _fitted(view, scene):
-    """View in picture size, with the near plane of scoring: fewer splats would move it."""
-    near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
-    return replace(fitted(view), near=near if near < far else view.near)
+    near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene_size)
+    near = near if near < far else view.near
+    return replace(view, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, near=near)
 
 
 def _rounded(picture):

@@ -74,10 +74,10 @@ def test_pictures_do_not_depend_on_threads_or_on_how_many_pairs_are_drawn_at_a_t
 
 def test_a_view_of_many_pixels_is_drawn_smaller_and_sees_the_same():
     """4000 x 3000 px becomes 960 x 720; a point stays at the same share of the image."""
-    small = fitted(replace(view_of(4000, 3000, 2000.0), cx=1500.0))
-    assert (small.width, small.height) == (960, 720)
+    small = fitted(replace(view_of(4000, 3000, 2000.0), cx=1500.0), 10.0)
+    assert (small.width, small.height, small.near) == (960, 720, 0.1)
     assert [small.fx / 960, small.cx / 960] == pytest.approx([2000.0 / 4000, 1500.0 / 4000])
-    assert fitted(small) is small
+    assert repr(fitted(small, 10.0)) == repr(small)
 
 
 def test_what_cannot_be_drawn_or_is_too_near_is_not_and_drawing_can_be_cancelled():
