@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -93,17 +93,14 @@ class Outputs:
             return [self.folder / f"{name}-{number:06d}" for number in range(len(self.tiles))]
         return [waiting_in(self.job) / tile.path.name for tile in self.tiles]
 
-    def in_place(self) -> dict[int, int]:
-        """Bytes of the tiles, by number, that an interrupted run has renamed."""
-        return {
-            number: size
-            for number, (size, changed) in enumerate(noted(self.job, RENAMED)[1] or ())
-            if self._is_renamed(number, size, changed)
-        }
+    def in_place(self) -> dict[int, tuple[int, int | str]]:
+        """`_state` of the tiles, by number, that an interrupted run has renamed."""
+        states = enumerate(noted(self.job, RENAMED)[1] or ())
+        return {number: state for number, state in states if self._is_renamed(number, *state)}
 
     def write(self, kept: Kept, progress: Progress, threads: int | None) -> list[int]:
         """Write each tile to its waiting file, unless it is in place; returns bytes of each."""
-        sizes = self.in_place()
+        sizes = {number: size for number, (size, _) in self.in_place().items()}
         numbers = [number for number in range(len(self.tiles)) if number not in sizes]
         work = partial(_write_tile, self.job, self.tiles, kept, self.waiting)
         cost = seconds("write", sum(self.tiles[number].splats for number in numbers))
@@ -113,11 +110,11 @@ class Outputs:
 
     def publish(self) -> None:
         """Rename all tiles not yet in place; none, and `Interrupted`, if a file is in the way."""
-        there, before = self.in_place(), noted(self.job, RENAMED)[1]
+        there = self.in_place()
         try:
             self._refuse_existing(there)
             states = [
-                before[number] if number in there else _state(waiting)
+                there[number] if number in there else _state(waiting)
                 for number, waiting in enumerate(self.waiting)
             ]
             note(self.job, RENAMED, states)
@@ -133,7 +130,7 @@ class Outputs:
             if isinstance(place, Url):
                 storage.discard(place)
 
-    def _refuse_existing(self, there: Mapping[int, int]) -> None:
+    def _refuse_existing(self, there: Collection[int]) -> None:
         """Raise `RefineError` if a tile that is not in place could not be renamed to its target."""
         for number, target in enumerate(self.targets):
             if number in there:
@@ -146,7 +143,7 @@ class Outputs:
                         f"{target}: is a link to another disk, {behind}; remove the link"
                     )
 
-    def _is_renamed(self, number: int, size: int, changed: int) -> bool:
+    def _is_renamed(self, number: int, size: int, changed: int | str) -> bool:
         """Whether a tile is in place; behind URLs by its size, as renaming changes times there."""
         target, waiting = self.targets[number], self.waiting[number]
         if isinstance(target, Path):
@@ -187,9 +184,6 @@ def _write_rows(tiles, kept, number, path):
             stream.write(beside.data)
 
 
-def _state(path: Path | Url) -> tuple[int, int]:
+def _state(path: Path | Url) -> tuple[int, int | str]:
     """Bytes of a file, and on a disk the time of its last change, ns."""
-    if isinstance(path, Path):
-        status = path.stat()
-        return status.st_size, status.st_mtime_ns
-    return storage.size_of(path) or 0, 0
+    return storage.state(path) if isinstance(path, Path) else (storage.size_of(path) or 0, 0)
