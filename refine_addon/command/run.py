@@ -37,31 +37,13 @@ def flush() -> bool:
     return _write("stdout", "")
 
 
-class Terminal:
-    """Output of a run; `quiet`: errors only. `failed`: some of it could not be written."""
-
-    def __init__(self, *, quiet: bool) -> None:
-        self.failed = False
-        self._quiet = quiet
-        self._draws = not quiet and _is_terminal(sys.stderr)
-
-    def say(self, *lines: str) -> None:
-        """Print lines, unless quiet."""
-        if not self._quiet:
-            self.failed |= _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
-
-    def draw(self, text: str) -> None:
-        """Show a line that the next one replaces; on terminals only."""
-        if self._draws:
-            _write("stderr", f"{_CLEAR}{printable(text)}")
-
-
 class Run:
-    """One call of the command: its options, its terminal, and a report entry for each input."""
+    """One call of the command: its options, its output, and a report entry for each input."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
-        self.terminal = Terminal(quiet=options.quiet)
+        self._failed = False  # some output could not be written
+        self._draws = not options.quiet and _is_terminal(sys.stderr)
         self.entries: list[dict[str, Any]] = []
         self._started = time.perf_counter()
         files = options.inputs or [""]
@@ -82,6 +64,16 @@ class Run:
             self._views, self._cameras = scene.views(self.options)
         return self._views
 
+    def print(self, *lines: str) -> None:
+        """Print lines, unless quiet."""
+        if not self.options.quiet:
+            self._failed |= _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
+
+    def _draw(self, text: str) -> None:
+        """Show a line that the next one replaces; on terminals only."""
+        if self._draws:
+            _write("stderr", f"{_CLEAR}{printable(text)}")
+
     def progress(self, name: str) -> Progress:
         """Progress callback that draws the share done of an input, and the time left."""
         done, sizes = len(self.entries), self._sizes
@@ -90,7 +82,7 @@ class Run:
         def draw(fraction: float, what: str) -> None:
             seconds = self._left.seconds((before + fraction * sizes[done]) / total)
             left = "" if seconds is None else f", about {in_time(seconds)} left{several}"
-            self.terminal.draw(f"{self._named(name)}: {what} {fraction:4.0%}{left}")
+            self._draw(f"{self._named(name)}: {what} {fraction:4.0%}{left}")
 
         return draw
 
@@ -107,10 +99,10 @@ class Run:
             lines.append(f"{unseen:,} of {scored:,} splats lie in no view")
             if (gone := splats.get("unseen_removed")) and unseen >= MANY_UNSEEN * scored:
                 lines.append(f"{gone / unseen:.0%} of these go: add views if others can see them")
-        self.terminal.draw("")
+        self._draw("")
         first = f"{self._named(label)}: {line}{f' -> {output}' if output else ''}"
         rest = filter(None, [*lines, *more, *(f"note: {note}" for note in report["notes"])])
-        self.terminal.say(first, *(f"  {text}" for text in rest))
+        self.print(first, *(f"  {text}" for text in rest))
         return report
 
     def each(self, work: Callable[..., dict[str, Any]]) -> None:
@@ -148,7 +140,7 @@ class Run:
             wrote = any(options.save or entry.get("files", {}).get("output") for entry in done)
             wrote = wrote and not options.dry_run
             _write_report(options.report, self.entries, seconds, options.overwrite, wrote)
-        return len(done) < len(self.entries) or self.terminal.failed
+        return len(done) < len(self.entries) or self._failed
 
     def _named(self, name: str) -> str:
         count = len(self._sizes)

@@ -62,7 +62,7 @@ def _run(run: Run) -> None:
     if options.command == "render":
         from .scene import render
 
-        render(options, run.terminal.say)
+        render(options, run.print)
     elif options.command == "convert":
         run.attempt(_convert, str(options.inputs[0]))
     elif options.together:
@@ -202,7 +202,7 @@ def _convert(run: Run, _first: str) -> dict[str, Any]:
 def _info(run: Run, source: Path, _output: None) -> dict[str, Any]:
     entry = describe(core.read_splats(source))
     lines = [f"  {name.replace('_', ' '):18} {value}" for name, value in entry.items()]
-    run.terminal.say(str(source), *lines)
+    run.print(str(source), *lines)
     return {"input": str(source), **entry}
 
 

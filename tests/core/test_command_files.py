@@ -53,7 +53,7 @@ def test_a_report_made_meanwhile_is_left_and_what_was_written_is_told(
     folder, monkeypatch, capsys, arguments
 ):
     theirs = lambda *_: (folder / "report.json").write_text("theirs")  # noqa: E731
-    monkeypatch.setattr("refine_addon.command.run.Terminal.say", theirs)
+    monkeypatch.setattr("refine_addon.command.run.Run.print", theirs)
 
     assert main([*arguments, "--report", "report.json"]) == 1
 
