@@ -223,12 +223,18 @@ def in_one(
 
 def file_bytes(path: Path) -> NDArray[np.uint8]:
     """Bytes of a file, memory-mapped, (n,); `RefineError` if it is no file or cannot be read."""
+    if not status_of(path).st_size:
+        return np.empty(0, np.uint8)
+    reading = explained(path, "cannot be read", errors=(OSError, ValueError))
+    with reading, path.open("rb") as stream:
+        return np.frombuffer(mapped(stream), np.uint8)
+
+
+def status_of(path: Path) -> os.stat_result:
+    """Status of a file that may be read; `RefineError` if it is no file or cannot be found."""
     with explained(path, "cannot be read", errors=(OSError, ValueError)):
-        state = path.stat()
-        if not stat.S_ISREG(state.st_mode):  # opening a pipe would wait for a writer
-            kind = "folder" if path.is_dir() else "device"
-            raise RefineError(f"{path}: is a {kind}, expected a PLY file")
-        with path.open("rb") as stream:
-            if not state.st_size:
-                return np.empty(0, np.uint8)
-            return np.frombuffer(mapped(stream), np.uint8)
+        status = path.stat()
+    if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for a writer
+        kind = "folder" if stat.S_ISDIR(status.st_mode) else "device"
+        raise RefineError(f"{path}: is a {kind}, expected a PLY file")
+    return status

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,14 +17,13 @@ from numpy.typing import NDArray
 
 from .. import whole_file
 from ..errors import RefineError, reason_of
-from ..mapped import Interrupted
-from ..whole_file import Url, expanded, is_url
+from ..mapped import Interrupted, status_of
+from ..whole_file import Url, expanded, explained, is_url
 
 _FLEETING = ("url", "access")
 """Parts of names of entries that change though the file does not, such as times of access."""
 
 _LOCAL = "file://"
-_NO_SUCH = "there is no such file"
 
 
 def located(path: Path | str) -> Path | Url:
@@ -47,11 +45,7 @@ def identity(path: Path | Url) -> str:
 def state(path: Path | Url) -> tuple[int, int | str]:
     """Bytes of a file, and what changes with its content: a time in ns, or a storage's entries."""
     if not isinstance(path, Url):
-        with _explained(path, "cannot be read"):
-            status = path.stat()
-        if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for a writer
-            kind = "folder" if stat.S_ISDIR(status.st_mode) else "device"
-            raise RefineError(f"{path}: is a {kind}, expected a PLY file")
+        status = status_of(path)
         return status.st_size, status.st_mtime_ns
     with _opened(path, "cannot be read") as (system, inner):
         info = system.info(inner)
@@ -73,7 +67,7 @@ def beginning(path: Path | Url, size: int, whole: int) -> bytes:
     The last byte behind a URL is read, too, which fails where `array` would download the file.
     """
     if not isinstance(path, Url):
-        with _explained(path, "cannot be read"), path.open("rb") as stream:
+        with explained(path, "cannot be read"), path.open("rb") as stream:
             return stream.read(size)
     with (
         _opened(path, "cannot be read") as (system, inner),
@@ -88,7 +82,7 @@ def beginning(path: Path | Url, size: int, whole: int) -> bytes:
 def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
     """`count` elements from byte `begin` on, fewer if the file ends; nothing else is read."""
     if not isinstance(path, Url):
-        with _explained(path, "cannot be read"):
+        with explained(path, "cannot be read"):
             return np.fromfile(path, dtype, count, offset=begin)
     if not count:
         return np.empty(0, dtype)
@@ -164,11 +158,20 @@ def discard(url: Url) -> None:
 
 @contextlib.contextmanager
 def _opened(url: Url, problem: str) -> Iterator[tuple[Any, str]]:
-    """Yield the file system of a URL, without cached listings, and the path there."""
-    with _explained(url, problem):
+    """Yield the file system of a URL, without cached listings, and the path there.
+
+    `Interrupted` takes the place of any error of the storage.
+    """
+    try:
         system, inner = _split(url)
         system.invalidate_cache()
         yield system, inner
+    except (RefineError, MemoryError):
+        raise
+    except Exception as error:  # each storage has errors of its own
+        missing = isinstance(error, FileNotFoundError) and not error.strerror
+        why = "there is no such file" if missing else reason_of(error)
+        raise Interrupted(f"{url}: {problem} ({why})") from error
 
 
 def _split(url: Url) -> tuple[Any, str]:
@@ -180,16 +183,3 @@ def _split(url: Url) -> tuple[Any, str]:
         ) from error
     system, inner = url_to_fs(url)
     return system, inner
-
-
-@contextlib.contextmanager
-def _explained(path: Path | Url, problem: str) -> Iterator[None]:
-    """Raise `RefineError`, or `Interrupted` for a URL, in place of any error of the storage."""
-    try:
-        yield
-    except (RefineError, MemoryError):
-        raise
-    except Exception as error:  # each storage has errors of its own
-        missing = isinstance(error, FileNotFoundError) and not error.strerror
-        kind = Interrupted if isinstance(path, Url) else RefineError
-        raise kind(f"{path}: {problem} ({_NO_SUCH if missing else reason_of(error)})") from error
