@@ -97,6 +97,20 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
     }
 
 
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[BinaryIO]:
+    """Open a file that becomes `path` when the block ends, if it does; `Interrupted` on errors."""
+    unfinished = path.with_name(f"{secrets.token_hex(8)}.tmp")
+    try:
+        with explained(path, "cannot be written", Interrupted):
+            with unfinished.open("xb") as stream:
+                yield stream
+            unfinished.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
 def once(job: Path, stage: str, make: Callable[[], Result]) -> Result:
     """Result of a stage of a job: of an earlier run, or of ``make()``, which is then stored."""
     done, result = noted(job, stage)
@@ -105,16 +119,8 @@ def once(job: Path, stage: str, make: Callable[[], Result]) -> Result:
 
 def note(job: Path, stage: str, result: Result) -> Result:
     """Store the result of a stage, whole or not at all, and return it; see `once`."""
-    path = job / f"{stage}.done"
-    temporary = path.with_name(f"{secrets.token_hex(8)}.tmp")
-    try:
-        with explained(path, "cannot be written", Interrupted):
-            with temporary.open("xb") as stream:
-                pickle.dump(result, stream, protocol=5)
-            temporary.replace(path)
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+    with whole(job / f"{stage}.done") as stream:
+        pickle.dump(result, stream, protocol=5)
     return result
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 from bisect import bisect_left
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +17,9 @@ from ..errors import RefineError
 from ..execute import Progress, run, seconds
 from ..formats.ply import with_count, with_model, write_rows
 from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
-from ..mapped import Interrupted, Mapped, note, noted
+from ..mapped import Interrupted, Mapped, note, noted, whole
 from ..splats import Splats
-from ..whole_file import Url, explained, refuse_one_file
+from ..whole_file import Url, refuse_one_file
 from . import storage
 from .source import ROWS, Tile, bytes_of, rows_of
 
@@ -155,13 +154,8 @@ def _write_tile(job, tiles, kept, places, number):
     """Write a tile's kept rows, unless an earlier run has, and upload it; returns its bytes."""
     waiting = waiting_in(job) / tiles[number].path.name
     if not waiting.exists():
-        unfinished = waiting_in(job) / f"{number:06d}-{secrets.token_hex(8)}.tmp"
-        try:
-            with explained(waiting, "cannot be written", Interrupted):
-                _write_rows(tiles, kept, number, unfinished)
-                unfinished.replace(waiting)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with whole(waiting) as stream:
+            _write_rows(tiles, kept, number, stream)
     if isinstance(places[number], Url):
         storage.upload(waiting, places[number])
         if not waiting.exists():  # others have ended the job meanwhile: nobody will rename this
@@ -169,19 +163,18 @@ def _write_tile(job, tiles, kept, places, number):
     return waiting.stat().st_size
 
 
-def _write_rows(tiles, kept, number, path):
+def _write_rows(tiles, kept, number, stream):
     tile, begin = tiles[number], sum(tile.splats for tile in tiles[:number])
     header = header_of(tile, int(np.count_nonzero(kept.keep[begin : begin + tile.splats])))
-    with path.open("wb") as stream:
-        stream.write(header)
-        for beside in bytes_of(tile, tile.header, tile.begin):
-            stream.write(beside.data)
-        for start in range(0, tile.splats, ROWS):
-            rows, first = rows_of(tile, start, min(start + ROWS, tile.splats)), begin + start
-            stays = kept.keep[first : first + len(rows)]
-            write_rows(stream, rows, stays, kept.columns(rows, first))
-        for beside in bytes_of(tile, tile.end, tile.size):
-            stream.write(beside.data)
+    stream.write(header)
+    for beside in bytes_of(tile, tile.header, tile.begin):
+        stream.write(beside.data)
+    for start in range(0, tile.splats, ROWS):
+        rows, first = rows_of(tile, start, min(start + ROWS, tile.splats)), begin + start
+        stays = kept.keep[first : first + len(rows)]
+        write_rows(stream, rows, stays, kept.columns(rows, first))
+    for beside in bytes_of(tile, tile.end, tile.size):
+        stream.write(beside.data)
 
 
 def _state(path: Path | Url) -> tuple[int, int | str]:
