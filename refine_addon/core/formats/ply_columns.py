@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from ..splats import LOG_ZERO, Splats, above_constant
@@ -52,14 +53,10 @@ def other_properties(names: Iterable[str]) -> list[str]:
 
 def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
     """Rows, (count,), of a 3DGS PLY in float32, all 0, and their splats as views."""
-    rest = 3 * above_constant(degree)
-    names = [*REQUIRED[:6], *(f"f_rest_{index}" for index in range(rest)), *REQUIRED[6:]]
-    table = np.zeros((count, len(names)), "<f4")
-    ends = np.cumsum([3, 3, rest, 1, 3])
-    means, sh_dc, sh_rest, logits, scales, quaternions = np.split(table, ends, axis=1)
-    planes = sh_rest.reshape(count, 3, rest // 3)
-    splats = Splats(means, scales, quaternions, logits[:, 0], sh_dc, planes.transpose(0, 2, 1))
-    return table.view(np.dtype([(name, "<f4") for name in names]))[:, 0], splats
+    rest = [f"f_rest_{index}" for index in range(3 * above_constant(degree))]
+    names = [*REQUIRED[:6], *rest, *REQUIRED[6:]]
+    rows = np.zeros(count, [(name, "<f4") for name in names])
+    return rows, splats_from_columns(rows)
 
 
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
@@ -131,9 +128,8 @@ def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:
         step = kinds[0].itemsize
         beside = tuple(range(offsets[0], offsets[0] + step * len(names), step))
         if len(set(kinds)) == 1 and offsets == beside and len(columns):
-            return np.lib.stride_tricks.as_strided(
-                first, (len(first), len(names)), (first.strides[0], step), writeable=False
-            )
+            layout = (len(first), len(names)), (first.strides[0], step)
+            return as_strided(first, *layout, writeable=first.flags.writeable)
     kind = np.result_type(*(columns[name].dtype for name in names), np.float32)
     stacked = np.empty((len(first), len(names)), kind)
     with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
