@@ -210,23 +210,18 @@ def _results(splats, views, budgets, method, protected, progress, threads):
     if not method.changes:
         scores = score(splats, views, method, quality=True, progress=scoring, threads=threads)
     for budget, of_level in zip(budgets, of_levels, strict=True):
-        if scores is not None:
-            yield prune(
-                splats, views, budget, method, protected=protected, scores=scores,
-                progress=of_level, threads=threads,
-            )  # fmt: skip
-            continue
         spared = protected if protected is None or whole is None else protected[whole.keep]
         result = prune(
-            splats if whole is None else whole.splats, views, budget, method,
-            protected=spared, origin=origin, progress=of_level, threads=threads,
+            splats if whole is None else whole.splats, views, budget, method, protected=spared,
+            scores=scores, origin=origin, progress=of_level, threads=threads,
         )  # fmt: skip
-        whole = replace(result if whole is None else _both(whole, result), source=splats)
-        if origin is None:
-            assert result.scores is not None
-            origin = Origin(splats, result.scores.ray_sample, result.scores.between, None)
-        origin = replace(origin, psnr=result.report["estimated_psnr"])
-        yield whole
+        if method.changes:
+            result = replace(result if whole is None else _both(whole, result), source=splats)
+            if origin is None:
+                assert result.scores is not None
+                origin = Origin(splats, result.scores.ray_sample, result.scores.between, None)
+            origin, whole = replace(origin, psnr=result.report["estimated_psnr"]), result
+        yield result
 
 
 def _both(first, second):
