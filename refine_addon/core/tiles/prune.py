@@ -186,7 +186,6 @@ def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
                 yield
                 stays = False
             except Interrupted as error:
-                stays = outputs is not None
                 if outputs is None:
                     raise
                 advice = "the same command goes on where this one was"
