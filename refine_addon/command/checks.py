@@ -9,11 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..core import RefineError
-from ..core.errors import reason_of
 from ..core.formats.registry import SUFFIXES, format_named, names_file, without_suffix
 from ..core.formats.streamed_sog import INDEX
 from ..core.lod import level_paths
-from ..core.whole_file import Url, refuse_existing, refuse_url
+from ..core.whole_file import Url, explained, refuse_existing, refuse_url
 from .options import BLENDER, ROLES
 
 
@@ -43,14 +42,9 @@ def check(options: argparse.Namespace) -> None:
 def check_report(path: Path, *, overwrite: bool) -> None:
     """Refuse a report that could not be written, before the work."""
     refuse_existing(path, overwrite=overwrite)
-    try:
+    with explained(path, "cannot be written", end="; nothing was changed"):
         # A link stays one: what it points to is written.
-        with tempfile.TemporaryFile(dir=os.path.dirname(os.path.realpath(path))):
-            pass
-    except OSError as error:
-        raise RefineError(
-            f"{path}: cannot be written ({reason_of(error)}); nothing was changed"
-        ) from error
+        tempfile.TemporaryFile(dir=os.path.dirname(os.path.realpath(path))).close()
 
 
 def _rules(options: argparse.Namespace) -> dict[str, object]:

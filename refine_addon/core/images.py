@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import RefineError
+from .whole_file import explained
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TRUECOLOR = 2
@@ -64,14 +64,11 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
 
 def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
     """Channels by name, (H, W), top row first; `RefineError` if damaged, compressed or in parts."""
-    try:
-        return _channels(path.read_bytes())
-    except OSError as error:
-        raise RefineError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, KeyError, IndexError, struct.error) as error:
-        raise RefineError(
-            f"{path}: expected an OpenEXR image in one part, without compression; {error}"
-        ) from error
+    with explained(path, "cannot be read"):
+        data = path.read_bytes()
+    wanted = "expected an OpenEXR image in one part, without compression"
+    with explained(path, wanted, errors=(ValueError, KeyError, IndexError, struct.error)):
+        return _channels(data)
 
 
 def _channels(data):
@@ -205,8 +202,6 @@ def codec_for(path: Path) -> Codec:
     """Codec in use; `RefineError`, naming `path`, if there is none."""
     if _chosen:
         return _chosen[0]
-    try:
+    wanted = "run this in Blender, or 'pip install pillow'"
+    with explained(path, f"WebP images need a library: {wanted}", errors=ImportError):
         return _Pillow()
-    except ImportError as error:
-        wanted = "run this in Blender, or 'pip install pillow'"
-        raise RefineError(f"{path}: WebP images need a library: {wanted}") from error

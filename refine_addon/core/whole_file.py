@@ -61,10 +61,8 @@ def refuse_url(text: Path | str) -> None:
 def expanded(path: Path | str) -> Path:
     """Path with ``~`` replaced by the home folder; `RefineError` without one, or for a URL."""
     refuse_url(path)
-    try:
+    with explained(path, "cannot be found", errors=RuntimeError):
         return Path(path).expanduser()
-    except RuntimeError as error:
-        raise RefineError(f"{path}: cannot be found ({error})") from error
 
 
 def mode_of(path: Path) -> int:
@@ -111,7 +109,7 @@ def refuse_mapped(path: Path, source: Path) -> None:
 
 @contextlib.contextmanager
 def explained(
-    path: Path, problem: str, kind: Any = RefineError, *, errors: Any = OSError, end: str = ""
+    path: Path | str, problem: str, kind: Any = RefineError, *, errors: Any = OSError, end: str = ""
 ) -> Iterator[None]:
     """Raise an error of a `kind`, a `RefineError`, with the reason in place of the system's."""
     try:

@@ -175,11 +175,8 @@ def _opened(url: Url, problem: str) -> Iterator[tuple[Any, str]]:
 
 
 def _split(url: Url) -> tuple[Any, str]:
-    try:
+    needed = "URLs need fsspec: pip install 'refine-addon[distributed]'"
+    with explained(url, needed, errors=ImportError):
         from fsspec.core import url_to_fs
-    except ImportError as error:
-        raise RefineError(
-            f"{url}: URLs need fsspec: pip install 'refine-addon[distributed]'"
-        ) from error
     system, inner = url_to_fs(url)
     return system, inner
