@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -19,7 +19,7 @@ THIRD_SCALE = "scale_2"  # the only one that discs (2DGS) may lack
 REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}  # number of ``f_rest_*`` -> degree
 
 
-def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> Splats:
+def splats_from_columns(columns: Columns) -> Splats:
     """Splats of properties by name, (N,) each: all of `REQUIRED`, and any ``f_rest_*``.
 
     Harmonics are all of red, then green, then blue. Without ``scale_2`` the splats are discs. The
@@ -71,18 +71,14 @@ def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
     return dict(zip(names, values, strict=True))
 
 
+Columns: TypeAlias = "Mapping[str, NDArray[Any]] | NDArray[Any]"
+"""Properties of N splats by name, (N,) each; or a structured array."""
+
 Keep: TypeAlias = "NDArray[np.bool_] | None"
 """Kept rows among N, (N,); None stands for all."""
 
 Changes: TypeAlias = "Mapping[str, NDArray[Any]] | None"
 """Properties of N splats by name, (N,) each, to be set or appended."""
-
-
-class Columns(Protocol):
-    """Properties of N splats by name, such as a mapping or a structured array."""
-
-    def __getitem__(self, name: str, /) -> NDArray[Any]:
-        """A property, (N,)."""
 
 
 class ChangedColumns(Mapping[str, "NDArray[Any]"]):
