@@ -21,7 +21,7 @@ from .errors import RefineError
 from .execute import Cancelled, Progress, part, report, seconds, silent, stages
 from .formats import registry
 from .formats.format import Format
-from .formats.ply import SplatFile
+from .formats.ply import SplatFile, refuse_other_models
 from .formats.ply_columns import Changes, other_properties
 from .formats.registry import format_named, read_splats, write_splats
 from .formats.spz import turned_from
@@ -493,12 +493,7 @@ def convert_files(
             read_splats(path, model, level if has_levels or not any(streamed) else 0, axes)
             for path, has_levels in zip(paths, streamed, strict=True)
         ]
-        for file in files:
-            if file.model != files[0].model:
-                raise RefineError(
-                    f"{file.path}: its splats are {file.model}, those of {files[0].path} "
-                    f"{files[0].model}; expected one model, or say which (--model)"
-                )
+        refuse_other_models(files)
         parts = [file.splats() for file in files]
         splats = joined(list(map(transformed, parts, matrices)) if matrices else parts)
         if degree is not None:

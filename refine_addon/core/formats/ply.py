@@ -473,6 +473,16 @@ def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:
     return model_of(header) if THIRD_SCALE in (rows.names or ()) else "2dgs"
 
 
+def refuse_other_models(files: Sequence[Any]) -> None:
+    """Raise `RefineError` if files, each with `path` and `model`, have not one model."""
+    for file in files:
+        if file.model != files[0].model:
+            raise RefineError(
+                f"{file.path}: its splats are {file.model}, those of {files[0].path} "
+                f"{files[0].model}; expected one model, or say which (--model)"
+            )
+
+
 def with_model(raw: bytes, model: Model) -> bytes:
     """Header that states a model in a comment; unchanged if it has this model already."""
     if (model_of(raw) or "default") == model:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, chunks, run
-from ..formats.ply import HEADER_LIMIT, TEXT, format_of, row_ranges, splat_header, stated_model
+from ..formats import ply
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..mapped import on_disk
 from ..splats import Model, Splats, joined, with_model
@@ -57,11 +57,7 @@ def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Ti
             also = "" if first.path == tile.path else f", also as {first.path}"
             raise RefineError(f"{tile.path}: is given twice{also}")
         tiles.append(tile)
-        if tile.model != tiles[0].model:
-            raise RefineError(
-                f"{tile.path}: its splats are {tile.model}, those of {tiles[0].path} "
-                f"{tiles[0].model}; expected one model in all tiles"
-            )
+    ply.refuse_other_models(tiles)
     if not any(tile.splats for tile in tiles):
         raise RefineError(f"none of {len(tiles)} tiles has a splat: there is nothing to prune")
     return tiles
@@ -75,16 +71,16 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
         raise RefineError(f"{place}: names no file")
     head = storage.beginning(place, _HEADER, size)
     if b"end_header" not in head:
-        head = storage.beginning(place, HEADER_LIMIT, size)
-    header, vertex = splat_header(place, head)
-    if header.order == TEXT:
+        head = storage.beginning(place, ply.HEADER_LIMIT, size)
+    header, vertex = ply.splat_header(place, head)
+    if header.order == ply.TEXT:
         raise RefineError(
-            f"{place}: is {format_of(header.raw)}, expected a plain binary PLY as a tile, which "
-            "'refine convert IN OUT.ply' makes of other formats"
+            f"{place}: is {ply.format_of(header.raw)}, expected a plain binary PLY as a tile, "
+            "which 'refine convert IN OUT.ply' makes of other formats"
         )
-    begin = row_ranges(header, size - len(header.raw))[vertex].start
+    begin = ply.row_ranges(header, size - len(header.raw))[vertex].start
     dtype = header.elements[vertex].dtype(header.order)
-    stated = stated_model(header.raw, dtype) or "default"
+    stated = ply.stated_model(header.raw, dtype) or "default"
     if model not in (None, stated) and THIRD_SCALE not in (dtype.names or ()):
         raise RefineError(f"{place}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}")
     return Tile(
