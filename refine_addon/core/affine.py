@@ -16,9 +16,7 @@ from .splats import Splats, assign, rotation_matrices
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
 
-HALF = QUARTER @ QUARTER  # half a turn about x
-
-QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T, 2: HALF}
+QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T, 2: QUARTER @ QUARTER}
 """Turns about x by number of quarters."""
 
 AXES = ("rub", "rdf")

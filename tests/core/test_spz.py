@@ -14,7 +14,7 @@ import pytest
 
 from refine_addon import command, core
 from refine_addon.core import RefineError, read_splats, write_splats
-from refine_addon.core.affine import HALF
+from refine_addon.core.affine import QUARTERS
 from refine_addon.core.spherical_harmonics import rotate
 from tests.hostile import refused
 from tests.strategies import plain_ply
@@ -119,7 +119,7 @@ def test_splats_are_turned_as_asked_or_as_cameras_see_them_and_turned_back(tmp_p
     assert back.read_bytes() == (tmp_path / "again.spz").read_bytes()
     np.testing.assert_array_equal(plain.means, splats.means * [1, -1, -1])
     assert np.abs(splats.means - read_splats(room).splats().means).max() < 1e-3
-    np.testing.assert_array_equal(rotate(plain.sh_rest, HALF), splats.sh_rest)
+    np.testing.assert_array_equal(rotate(plain.sh_rest, QUARTERS[2]), splats.sh_rest)
     np.testing.assert_array_equal(result.keep, expected.keep)
     for note in ("a.spz: brought from axes RUB", "turned to y up and z back"):
         assert note in " ".join(result.report["notes"])
