@@ -31,11 +31,6 @@ from .source import Tile, copied, tiles_at
 from .storage import identity, located, new_folder
 from .writing import Kept, Outputs, header_of, waiting_in
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
 
 def prune_tiles(
     sources: Sequence[Path | str],
@@ -203,14 +198,14 @@ def _opened(job: Path, outputs: Outputs | None) -> Iterator[None]:
 
 
 def _lock(job: Path, lock: Any) -> None:
-    if fcntl is None:
-        return
     try:
+        import fcntl
+
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise RefineError(f"{job}: another run is at work on the same job") from error
-    except OSError:
-        pass  # this file system has no locks
+    except (ImportError, OSError):
+        pass  # Windows and some file systems have no such locks
 
 
 def _digest(output, tiles, views, budget, method):
