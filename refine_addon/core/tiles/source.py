@@ -115,8 +115,7 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
 def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
     """Copy tiles to files of a new folder, of their widest types and highest degree, else 0."""
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
-    empty = [with_model(splats_from_columns(np.empty(0, each)), tiles[0].model) for each in dtypes]
-    kinds = empty if len(dtypes) > 1 else []
+    kinds = [with_model(splats_from_columns(np.empty(0, each)), tiles[0].model) for each in dtypes]
     pieces = [(tile, part.start, part.stop) for tile in tiles for part in chunks(tile.splats, ROWS)]
 
     def read(piece: tuple[Tile, int, int]) -> Splats:
