@@ -80,8 +80,7 @@ def _read(path, data):
             got = f"element 'sh' has {len(held)} rows of {len(names)} properties"
             place.fail(f"{got}, expected {count} rows of 9, 24, 45 or 72")
         held = rows_of("sh", tuple(names), "u1")
-        order = [(held.dtype.names or ()).index(name) for name in names]
-        rest = held.view(np.uint8).reshape(count, len(names))[:, order]
+        rest = np.stack([held[name] for name in names], axis=1)
     model, degree = ply.model_of(header.raw) or "default", REST_COUNTS[rest.shape[1]]
     file, splats = new_file(path, (NAME, len(data)), count, degree, model)
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite
