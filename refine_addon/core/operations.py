@@ -171,8 +171,7 @@ def run(
                 result.report["written_psnr"] = None if psnr is None else round(psnr, 2)
             if pictures is not None and views is not None:
                 if after is None:
-                    merged = result.merged
-                    after = scene.splats.take(keep) if merged is None else merged.splats
+                    after = replace(result, source=scene.splats).splats
                 result.report["pictures"] = pictures.write(
                     scene.splats, after, views, progress=comparing, threads=threads
                 )
