@@ -29,12 +29,7 @@ _CLEAR = "\r\x1b[K"
 def complain(text: str) -> None:
     """Print an error in place of the progress line."""
     start = _CLEAR if _is_terminal(sys.stderr) else ""
-    _write("stderr", f"{start}refine: error: {printable(text)}\n")
-
-
-def flush() -> bool:
-    """Flush argparse's help; whether it could not be written."""
-    return _write("stdout", "")
+    write("stderr", f"{start}refine: error: {printable(text)}\n")
 
 
 class Run:
@@ -67,12 +62,12 @@ class Run:
     def print(self, *lines: str) -> None:
         """Print lines, unless quiet."""
         if not self.options.quiet:
-            self._failed |= _write("stdout", "".join(f"{printable(line)}\n" for line in lines))
+            self._failed |= write("stdout", "".join(f"{printable(line)}\n" for line in lines))
 
     def _draw(self, text: str) -> None:
         """Show a line that the next one replaces; on terminals only."""
         if self._draws:
-            _write("stderr", f"{_CLEAR}{printable(text)}")
+            write("stderr", f"{_CLEAR}{printable(text)}")
 
     def progress(self, name: str) -> Progress:
         """Progress callback that draws the share done of an input, and the time left."""
@@ -183,7 +178,7 @@ def _is_terminal(stream: TextIO | None) -> bool:
     return stream is not None and stream.isatty()
 
 
-def _write(name: Literal["stdout", "stderr"], text: str) -> bool:
+def write(name: Literal["stdout", "stderr"], text: str) -> bool:
     """Write text; whether standard output failed. A reader that has left is no failure."""
     stream: TextIO | None = getattr(sys, name)
     if stream is None:  # closed before Python began
@@ -192,7 +187,7 @@ def _write(name: Literal["stdout", "stderr"], text: str) -> bool:
         stream.write(text)
         stream.flush()
     except UnicodeEncodeError:  # a name that this terminal's encoding cannot show
-        return _write(name, text.encode("ascii", "backslashreplace").decode())
+        return write(name, text.encode("ascii", "backslashreplace").decode())
     except OSError as error:
         # The work goes on. Python would flush again at exit and set an exit code of its own.
         setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115

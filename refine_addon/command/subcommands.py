@@ -25,7 +25,7 @@ from ..core.tiles.storage import located
 from ..core.volumes import Role, Volume
 from .checks import check, check_report
 from .options import ROLES, complete, make_parser
-from .run import Run, complain, flush
+from .run import Run, complain, write
 
 
 def run(arguments: Sequence[str], *, scene: bool) -> int:
@@ -49,7 +49,7 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
         _run(work)
         return int(work.finish())
     except SystemExit as end:  # of argparse; Blender needs a number
-        return int(flush() or end.code or 0)
+        return int(write("stdout", "") or end.code or 0)  # flushes argparse's help
     except (RefineError, OSError, MemoryError) as error:
         complain(described(error))
     return 1
