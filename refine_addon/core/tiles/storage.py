@@ -136,17 +136,14 @@ def publish(finished: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
     if isinstance(finished, Path) and isinstance(path, Path):
         whole_file.publish(finished, path, overwrite=overwrite)
         return
-    assert isinstance(path, Url)
     refuse_existing(path, overwrite=overwrite)
-    with _opened(path, "cannot be written") as (system, inner):
+    with _opened(Url(path), "cannot be written") as (system, inner):
         system.mv(_split(Url(finished))[1], inner)
 
 
-def size_of(path: Path | Url) -> int | None:
+def size_of(url: Url) -> int | None:
     """Bytes of a file; None if there is none."""
-    if not isinstance(path, Url):
-        return path.stat().st_size if path.is_file() else None
-    with _opened(path, "cannot be looked for") as (system, inner):
+    with _opened(url, "cannot be looked for") as (system, inner):
         return int(system.size(inner)) if system.isfile(inner) else None
 
 

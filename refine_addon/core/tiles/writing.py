@@ -147,7 +147,7 @@ class Outputs:
         target, waiting = self.targets[number], self.waiting[number]
         if isinstance(target, Path):
             return target.is_file() and _state(target) == (size, changed)
-        return storage.size_of(waiting) is None and storage.size_of(target) == size
+        return storage.size_of(Url(waiting)) is None and storage.size_of(target) == size
 
 
 def _write_tile(job, tiles, kept, places, number):
