@@ -487,11 +487,8 @@ def convert_files(
         if alone:
             return read_scene(sources[0], model=model, form=form, axes=axes)
         paths = [expanded(path) for path in sources]
-        streamed = [path.name.lower().endswith(INDEX) for path in paths]
-        files = [
-            read_splats(path, model, level if has_levels or not any(streamed) else 0, axes)
-            for path, has_levels in zip(paths, streamed, strict=True)
-        ]
+        of_level = [path for path in paths if path.name.lower().endswith(INDEX)] or paths
+        files = [read_splats(path, model, level if path in of_level else 0, axes) for path in paths]
         refuse_other_models(files)
         parts = [file.splats() for file in files]
         splats = joined(list(map(transformed, parts, matrices)) if matrices else parts)
