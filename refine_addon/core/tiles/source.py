@@ -48,7 +48,6 @@ class Tile(NamedTuple):
 
 def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
     """Tiles of a scene (`tile_at`); `RefineError` also for a file twice, other models, no splat."""
-    tiles: list[Tile] = []
     given: dict[str, Tile] = {}
     for path in paths:
         tile = tile_at(path, model)
@@ -56,7 +55,7 @@ def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Ti
         if first is not tile:
             also = "" if first.path == tile.path else f", also as {first.path}"
             raise RefineError(f"{tile.path}: is given twice{also}")
-        tiles.append(tile)
+    tiles = list(given.values())
     ply.refuse_other_models(tiles)
     if not any(tile.splats for tile in tiles):
         raise RefineError(f"none of {len(tiles)} tiles has a splat: there is nothing to prune")
