@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import or_
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -307,7 +305,7 @@ def forced(
 def any_of(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
     """Splats in any mask, (N,) bool; None if all are None."""
     given = [mask for mask in masks if mask is not None]
-    return reduce(or_, given) if given else None
+    return np.asarray(np.any(given, axis=0)) if given else None
 
 
 def must_go(
