@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -249,7 +248,7 @@ def row_in(form: Format | None, files: Sequence[SplatFile]) -> float:
     """About how many bytes a splat of files takes in a format: mean of some, spread evenly."""
     step = max(sum(map(len, files)) // SAMPLE, 1)
     some = [np.arange(len(file)) % step == 0 for file in files]
-    size = sum(map(registry.written_size, files, itertools.repeat(form), some))
+    size = sum(map(registry.written_size, files, [form] * len(some), some))
     return size / sum(map(np.count_nonzero, some))
 
 

@@ -214,8 +214,6 @@ def _digest(output, tiles, views, budget, method):
     for argument in (VERSION, identity(output), [*tiles], budget, method):
         digest.update(repr(argument).encode("utf-8", "surrogateescape"))
     for view in views.spread(method.views):
-        for field in fields(view):
-            value = getattr(view, field.name)
-            is_array = isinstance(value, np.ndarray)
-            digest.update(value.tobytes() if is_array else repr(value).encode())
+        values = [np.asarray(getattr(view, field.name)).tolist() for field in fields(view)]
+        digest.update(repr(values).encode())
     return digest.hexdigest()
