@@ -131,46 +131,31 @@ def stored_columns(checked: SplatObject) -> Columns:
     return _Reader(checked)
 
 
-def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Store columns, (N,) each by PLY property, in the object's attributes."""
-    mesh = checked.mesh
-    places = {c.name: c.place for c in checked.layout.columns if c.name in columns}
-    vectors: dict[str, NDArray[Any]] = {}
-    for name, place in places.items():
-        values = columns[name]
-        values = place.coding.to_attribute(values) if place.coding else values
-        kind = mesh.attributes[place.attribute].data_type
-        if KINDS[kind].width == 1:
-            write_attribute(mesh, place.attribute, kind, values)
-            continue
-        if place.attribute not in vectors:
-            vectors[place.attribute] = read_attribute(mesh, place.attribute)
-        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # float64 to float32
-            vectors[place.attribute][:, place.component] = values
-    for attribute, values in vectors.items():
-        kind = mesh.attributes[attribute].data_type
-        unit = single_unit_quaternions(values) if kind == "QUATERNION" else values
-        write_attribute(mesh, attribute, kind, unit)
-    if columns:
-        updated(mesh)
-
-
-def write_rows(
-    checked: SplatObject, rows: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
+def write_columns(
+    checked: SplatObject,
+    columns: Mapping[str, NDArray[Any]],
+    rows: slice | NDArray[np.int64] = slice(None),
 ) -> None:
-    """Store columns, (M,) each, in M rows; other rows keep every bit.
+    """Store columns by PLY property, (M,) each, in M rows, by default all; others keep every bit.
     One attribute at a time, as allocating memory takes longest."""
-    attributes: dict[str, list[str]] = {}
+    mesh = checked.mesh
+    parts: dict[str, list[Column]] = {}
     for column in checked.layout.columns:
         if column.name in columns:
-            attributes.setdefault(column.attribute, []).append(column.name)
-    for names in attributes.values():
-        stored = stored_columns(checked)
-        whole = {name: stored[name].copy() for name in names}
-        with np.errstate(over="ignore", under="ignore"):  # a double may be too large for a float
-            for name, values in whole.items():
-                values[rows] = columns[name]
-        write_columns(checked, whole)
+            parts.setdefault(column.place.attribute, []).append(column)
+    for attribute, own in parts.items():
+        kind, values = mesh.attributes[attribute].data_type, read_attribute(mesh, attribute)
+        components = values.reshape(len(values), -1)
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # float64 to float32
+            for column in own:
+                new, coding = columns[column.name], column.place.coding
+                new = coding.to_attribute(new) if coding else new
+                components[rows, column.place.component] = new
+        if kind == "QUATERNION":
+            values[rows] = single_unit_quaternions(values[rows])
+        write_attribute(mesh, attribute, kind, values)
+    if columns:
+        updated(mesh)
 
 
 def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:

@@ -323,7 +323,7 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
 def reduce_object(checked: SplatObject, change: Change) -> None:
     """Delete removed splats, store changed ones, drop the scores' record."""
     mesh_edit.delete_vertices(checked.obj, ~change.keep)
-    mesh_attributes.write_rows(checked, change.rows, change.columns)
+    mesh_attributes.write_columns(checked, change.columns, change.rows)
     if change.columns:
         mesh_drift.renew(checked.mesh)
     mesh_scores.forget_floaters(checked.mesh)
@@ -339,7 +339,7 @@ def grade(checked: SplatObject, rows: NDArray[np.int64], matrix: NDArray[np.floa
     values = values_by_name(replace(splats, sh_dc=sh_dc, sh_rest=sh_rest))
     columns = {name: values[name] for name in values if name.startswith("f_")}
     with mesh_edit.all_or_nothing(checked.obj):
-        mesh_attributes.write_rows(checked, rows, columns)
+        mesh_attributes.write_columns(checked, columns, rows)
 
 
 def _check_counts(group: Sequence[SplatObject], count: int) -> None:
