@@ -48,6 +48,7 @@ from .transforms import read_to_move, uneven_notes
 LEVEL_STATS = "refine_lod"  # Custom property of a level object: its stats, as in files' reports
 LEVEL_OF = "refine_level_of"  # Custom property of a level object: its original
 Members = list[SplatObject]  # Objects by name, at least one
+Masks = dict[str, NDArray[np.bool_] | None]  # Splats of all that are ``protected`` and ``removed``
 
 
 class Outcome(NamedTuple):
@@ -91,33 +92,32 @@ def members(active: bpy.types.Object) -> Members:
     return group
 
 
-def forced(scene: bpy.types.Scene, group: Members) -> Forced:
-    """Protected and removed splats of all objects, by the scene; see `Demands`."""
+def forced(scene: bpy.types.Scene, group: Members) -> Masks:
+    """Protected and removed splats, by the scene; see `Demands`."""
     return _as_one(Demands.of_scene(scene).of_each(group), group)
 
 
-def refresh(scene: bpy.types.Scene, group: Members) -> Forced:
+def refresh(scene: bpy.types.Scene, group: Members) -> Masks:
     """Mark the scene's demands on each object; see `demands.refresh`."""
     return _as_one(demands.refresh(scene, group), group)
 
 
-def check_forced(scene: bpy.types.Scene, group: Members, before: Forced) -> None:
+def check_forced(scene: bpy.types.Scene, group: Members, before: Masks) -> None:
     """Raise `RefineError` if other splats are protected or removed than before."""
     now = forced(scene, group)
-    pairs = ((before.protected, now.protected), (before.removed, now.removed))
-    if any(not np.array_equal(*(_filled(mask, group) for mask in pair)) for pair in pairs):
+    if any(not np.array_equal(_filled(before[n], group), _filled(now[n], group)) for n in now):
         raise RefineError(
             "what must stay or go has changed meanwhile; nothing was removed: apply again"
         )
 
 
-def _as_one(each: Sequence[Forced], group: Members) -> Forced:
-    masks = []
+def _as_one(each: Sequence[Forced], group: Members) -> Masks:
+    masks: Masks = {}
     for name in ("protected", "removed"):
         parts = [getattr(one, name) for one in each]
         filled = [_filled(part, [member]) for part, member in zip(parts, group, strict=True)]
-        masks.append(None if all(part is None for part in parts) else np.concatenate(filled))
-    return Forced(*masks)
+        masks[name] = None if all(part is None for part in parts) else np.concatenate(filled)
+    return masks
 
 
 def _rows(counts: Iterable[int]) -> list[slice]:
@@ -207,7 +207,7 @@ def store(
 
 
 def stored_arguments(
-    group: Members, budget: Budget, demanded: Forced, method: Method, views: ViewSet | None = None
+    group: Members, budget: Budget, masks: Masks, method: Method, views: ViewSet | None = None
 ) -> dict[str, Any]:
     """Arguments of `prune` from stored scores; `views` for merging and refitting, None to delete.
     `RefineError` if splats have no scores, or objects were not scored together."""
@@ -217,9 +217,8 @@ def stored_arguments(
         "views": views,
         "budget": budget,
         "method": method,
-        "scores": mesh_scores.stored_scores(group, demanded.removed),
-        "protected": demanded.protected,
-        "removed": demanded.removed,
+        "scores": mesh_scores.stored_scores(group, masks["removed"]),
+        **masks,
         # The longest row counts, so that the file is never larger than the budget.
         "sizes": (max(row for row, _ in sizes), sum(fixed for _, fixed in sizes)),
     }

@@ -169,8 +169,7 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
         checked, settings = mesh_layout.check(context.object), context.scene.refine
         mesh_edit.check_writable(checked.obj)
         cleaning = Cleaning(settings.to_reasons(), settings.views)
-        forced = splat_group.forced(context.scene, [checked])
-        masks = {"protected": forced.protected, "removed": forced.removed}
+        masks = splat_group.forced(context.scene, [checked])
         splats, views = splat_group.gather([checked]), chosen_views(context)
         return [checked], partial(clean, splats, views, cleaning, **masks)
 

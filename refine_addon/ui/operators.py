@@ -24,7 +24,6 @@ from ..core.result import Result
 from ..core.scores import Scores
 from ..core.views import ViewSet
 from ..core.visibility import frustum
-from ..core.volumes import Forced
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..objects import splat_group
@@ -43,12 +42,12 @@ def chosen_views(context: Context) -> ViewSet:
     return CameraChoice.of_scene(context.scene).views(context, context.object)
 
 
-def apply_arguments(context: Context, group: Members, forced: Forced) -> dict[str, Any]:
+def apply_arguments(context: Context, group: Members) -> dict[str, Any]:
     """Arguments of `prune` for the selected objects, from the panel's settings."""
-    settings = context.scene.refine
+    settings, masks = context.scene.refine, splat_group.forced(context.scene, group)
     method = splat_group.possible(group, settings.to_method())
     views = chosen_views(context) if method.changes else None
-    return splat_group.stored_arguments(group, settings.to_budget(), forced, method, views)
+    return splat_group.stored_arguments(group, settings.to_budget(), masks, method, views)
 
 
 def _of_objects(group: Members) -> str:
@@ -71,8 +70,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
             mesh_edit.check_writable(member.obj)
         quality = method.name != "closed-form" or settings.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
-        forced = splat_group.refresh(context.scene, group)  # before `origin` reads the marks
-        masks = {"protected": forced.protected, "removed": forced.removed}
+        masks = splat_group.refresh(context.scene, group)  # before `origin` reads the marks
         call = partial(score, splats, views, method, **masks, quality=quality)
         return group, (call, [plans.origin(member.obj) for member in group])
 
@@ -126,29 +124,28 @@ class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
         return self.execute(context)
 
     def gather(self, context: Context) -> tuple[Members, Any]:
-        """The arguments of `prune`, the demands, and the input of `changes`."""
+        """The arguments of `prune`, and the input of `changes`."""
         group = splat_group.members(context.object)
         for member in group:
             mesh_edit.check_deletable(member.obj)
-        forced = splat_group.forced(context.scene, group)
         frames, form = splat_group.frames_of(group), context.scene.refine.to_form()
         reads = [splat_group.read_for_export(member) for member in group] if form else []
-        return group, (apply_arguments(context, group, forced), forced, frames, form, reads)
+        return group, (apply_arguments(context, group), frames, form, reads)
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> tuple[Result, list[Change]]:
         """The result, and the change of each object."""
-        arguments, _, frames, form, reads = job
+        arguments, frames, form, reads = job
         arguments = splat_group.sized(arguments, form, reads) if form else arguments
         result = prune(**arguments, partial=True, progress=progress)
         return result, splat_group.changes(frames, result)
 
     def put(self, context: Context, group: Members, job: Any, result: Any) -> None:
         """Delete removed splats, and change kept ones."""
-        (arguments, forced, *_), (result, changes) = job, result
+        (arguments, *_), (result, changes) = job, result
         context.view_layer.update()
         if arguments["method"].changes:  # volumes may have moved meanwhile
-            splat_group.check_forced(context.scene, group, forced)
+            splat_group.check_forced(context.scene, group, arguments)
         stored = [] if arguments["method"].changes else group  # who is not measured anew
         changed = plans.stale(*(each.obj for each in stored))
         drifts = [note for each in group for note in splat_group.drift_notes(each)]
@@ -185,8 +182,7 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         group, settings = [mesh_layout.check(context.object)], context.scene.refine
         method, levels = settings.to_method(), settings.to_levels()
         splats = splat_group.gather(group, whole=True if method.changes else None)
-        forced = splat_group.forced(context.scene, group)
-        masks = {"protected": forced.protected, "removed": forced.removed}
+        masks = splat_group.forced(context.scene, group)
         return group, partial(lod, splats, chosen_views(context), levels, method, **masks)
 
     @staticmethod
@@ -220,8 +216,7 @@ class REFINE_OT_compare(Job, OnSplats, bpy.types.Operator):
         """Apply's arguments, the splats, the active camera's view, and the present plan."""
         view = CameraChoice("ACTIVE").views(context, context.object)[0]
         group = splat_group.members(context.object)
-        forced = splat_group.forced(context.scene, group)
-        arguments = apply_arguments(context, group, forced)
+        arguments = apply_arguments(context, group)
         splats = arguments["splats"] or splat_group.gather(group, whole=None)
         plan = plans.stored(context.object, context.scene.refine)
         return [], (arguments, splats, ViewSet((replace(view, weight=1.0),)), plan)

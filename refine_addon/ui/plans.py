@@ -220,10 +220,10 @@ def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> Non
 def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     settings, record = scene.refine, mesh_scores.record(obj.data) or {}
     group = splat_group.members(obj)
-    forced, budget = splat_group.refresh(scene, group), settings.to_budget()
+    masks, budget = splat_group.refresh(scene, group), settings.to_budget()
     method = settings.to_method().deleting()
-    arguments = splat_group.stored_arguments(group, budget, forced, method)
-    scores, protected, removed = (arguments[name] for name in ("scores", "protected", "removed"))
+    arguments = splat_group.stored_arguments(group, budget, masks, method)
+    scores, protected, removed = arguments["scores"], masks["protected"], masks["removed"]
     count, curve = len(scores.values), scores.quality
     rest = np.ones(count, np.bool_) if removed is None else ~removed
     left, way = int(np.count_nonzero(rest)), WAYS.get(settings.method, "delete")

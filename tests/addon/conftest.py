@@ -73,9 +73,9 @@ def keep_mask(addon, obj, budget, protect=""):
     """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
     checked = addon.mesh.layout.check(obj)
     found = addon.objects.demands.Demands((protect,) if protect else ()).forced(checked)
-    method = addon.core.Occlusion()
-    arguments = addon.objects.splat_group.stored_arguments([checked], budget, found, method, None)
-    return addon.core.prune(**arguments).keep
+    masks = {"protected": found.protected, "removed": found.removed}
+    stored, core = addon.objects.splat_group.stored_arguments, addon.core
+    return core.prune(**stored([checked], budget, masks, core.Occlusion())).keep
 
 
 def applied(addon, checked, result):
