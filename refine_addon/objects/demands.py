@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Sequence
+import pickle
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -119,23 +120,21 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
     """An object as a volume in the world: a mesh evaluated with modifiers, an empty as drawn.
     Whether a mesh is closed is checked when it is used."""
     label, graph = f"object '{obj.name}'", bpy.context.evaluated_depsgraph_get()
-    make: Callable[[], Volume]
+    make: partial[Volume]
     if obj.type == "MESH":
         local, triangles = _surface(obj, graph)
-        vertices = moved(local, world_matrix(obj, graph))
-        key, make = _digest(vertices, triangles), partial(Solid, vertices, triangles)
+        make = partial(Solid, moved(local, world_matrix(obj, graph)), triangles)
     elif _is_shape(obj):
         kind, size = obj.empty_display_type, obj.empty_display_size
-        matrix = world_matrix(obj, graph)
         ball, box = Sphere((0.0, 0.0, 0.0), size), Box((-size,) * 3, (size,) * 3)
-        key = _digest(repr((kind, size)).encode(), matrix)
-        make = partial(MovedVolume, ball if kind == "SPHERE" else box, matrix)
+        shape = ball if kind == "SPHERE" else box
+        make = partial(MovedVolume, shape, world_matrix(obj, graph))
     else:
         what = f"of type {obj.type}"
         if obj.type == "EMPTY":
             what = f"an empty shown as {obj.empty_display_type.replace('_', ' ').lower()}"
         raise RefineError(f"{label}: is {what}, {UNFIT}")
-    return Zone(role, label, _CachedVolume(label, key, make), idle)
+    return Zone(role, label, _CachedVolume(label, make), idle)
 
 
 def _is_shape(obj: bpy.types.Object) -> bool:
@@ -228,11 +227,12 @@ class _CachedVolume:
     """A volume that caches its last answers: sliders repeat the same questions."""
 
     label: str
-    key: bytes
-    make: Callable[[], Volume]
+    make: partial[Volume]
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        key = _digest(self.key, points)
+        digest = hashlib.blake2b(pickle.dumps(self.make), digest_size=16)
+        digest.update(np.ascontiguousarray(points))
+        key = digest.digest()
         if key not in _masks:
             try:
                 mask = self.make().inside(points)
@@ -242,10 +242,3 @@ class _CachedVolume:
                 del _masks[next(iter(_masks))]  # the oldest
             _masks[key] = mask
         return _masks[key]
-
-
-def _digest(*parts: Any) -> bytes:
-    digest = hashlib.blake2b(digest_size=16)
-    for part in parts:
-        digest.update(part if isinstance(part, bytes) else np.ascontiguousarray(part))
-    return digest.digest()
