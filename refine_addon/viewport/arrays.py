@@ -224,10 +224,3 @@ def _directions(means: NDArray[np.float32], eye: Eye) -> NDArray[np.float32]:
     lengths = np.linalg.norm(away, axis=1, keepdims=True)
     away /= np.where(lengths > 0.0, lengths, np.float32(1.0))
     return away
-
-
-def same(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
-    """Whether two arrays are equal, or both None."""
-    if one is None or other is None:
-        return one is other
-    return np.array_equal(one, other)

@@ -23,7 +23,7 @@ from ..mesh import selection as mesh_selection
 from ..mesh.layout import SplatObject, check, has, sh_degree
 from ..objects.instances import Key, Placing, placings
 from . import shader
-from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
+from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack
 
 
 class Marks(NamedTuple):
@@ -207,13 +207,14 @@ class Content:
         held.marks = marks = Marks(
             *(None if values is None else values[packed.vertices] for values in held.read)
         )
-        if not same(before.selected, marks.selected):
+        # Two `None` are equal for `np.array_equal`, too.
+        if not np.array_equal(before.selected, marks.selected):
             self.selections += 1
             self._tints = True
-        if not same(before.forced, marks.forced):
+        if not np.array_equal(before.forced, marks.forced):
             held.marked += 1
             held.kinds = tuple(k for k in MARKS if marks.forced is not None and k in marks.forced)
-        if not same(before.ranks, marks.ranks):
+        if not np.array_equal(before.ranks, marks.ranks):
             held.scored += 1
             held.important = None
         if held.important is None:

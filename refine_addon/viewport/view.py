@@ -25,7 +25,6 @@ from .arrays import (
     in_front,
     marked,
     ramp,
-    same,
     tinted,
 )
 from .content import Atlas, Content, Marks, Slot
@@ -188,7 +187,7 @@ class View:
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
         look = (self._order.key, self._colors_key, self._camera_key, shape)
         wanted = (*look, size, content.selections)
-        if self._picture and wanted == self._drawn and same(depths, self.depths):
+        if self._picture and wanted == self._drawn and np.array_equal(depths, self.depths):
             return
         self._drawn, self.depths = wanted, depths
         if not self._picture or (self._picture.width, self._picture.height) != size:
