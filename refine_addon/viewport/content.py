@@ -48,7 +48,6 @@ class MeshSplats:
     read: Marks = field(default_factory=Marks)
     marks: Marks = field(default_factory=Marks)
     important: NDArray[np.int32] | None = None
-    degree: int = 0
     scored: int = 0
     marked: int = 0
     kinds: tuple[int, ...] = ()
@@ -181,7 +180,6 @@ class Content:
         """Read a mesh, and pack it anew if its splats changed; `uid` identifies the drawn mesh."""
         mesh = checked.mesh
         held = self._held.setdefault(uid, MeshSplats())
-        held.degree = sh_degree(mesh)
         held.read = Marks(
             _attribute(mesh, mesh_scores.RANK, "FLOAT"),
             _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN"),
@@ -189,7 +187,7 @@ class Content:
             _attribute(mesh, mesh_selection.name_of(mesh), "BOOLEAN"),
             _attribute(mesh, mesh_selection.HIDDEN, "BOOLEAN"),
         )
-        signature = (len(checked), held.degree, mesh_attributes.digest(checked))
+        signature = (len(checked), sh_degree(mesh), mesh_attributes.digest(checked))
         if signature != held.signature:
             equal = [one for one in self._held.values() if one.signature == signature]
             if packed := next((one.packed for one in equal if not one.future), None):

@@ -27,7 +27,7 @@ from .arrays import (
     ramp,
     tinted,
 )
-from .content import Atlas, Content, Marks, Slot
+from .content import Content, Marks, Slot
 
 REST = 0.2  # Seconds without a change after which a view counts as resting
 SHAPES = {"ELLIPSES": 1, "CENTERS": 2}  # The shader's shape in a mode, in others 0: splats
@@ -75,7 +75,7 @@ _Sorted = tuple[NDArray[np.float32], int, NDArray[np.float32] | None]
 class _Order(NamedTuple):
     texture: gpu.types.GPUTexture
     count: int
-    key: object
+    key: tuple[Any, ...]  # first the atlas
 
 
 class View:
@@ -89,8 +89,7 @@ class View:
         self._order: _Order | None = None
         self._colors: gpu.types.GPUTexture | None = None
         self._colors_key: object = None
-        self._colored: Atlas | None = None
-        self._job: tuple[object, object, Future[_Sorted]] | None = None
+        self._job: tuple[tuple[Any, ...], object, Future[_Sorted]] | None = None
         self._camera_key = b""
         self._changed = 0.0
         self.complete = False
@@ -124,7 +123,7 @@ class View:
         self._take()
         by_card = gpu.platform.device_type_get() != "SOFTWARE"
         few, wide = BY_CARD if by_card else BY_PROCESSOR
-        if self._colored is not atlas:
+        if self._order is not None and self._order.key[0] is not atlas:
             self._order, self._colors = None, None
         if moving:
             self._sort((*full, few), shown, camera, mode, few)
@@ -155,8 +154,7 @@ class View:
         order, count, painted = future.result()
         self._order = _Order(shader.texture(order, 1, "R32F"), count, order_key)
         if painted is not None:
-            self._colors = shader.texture(painted, 4, "RGBA16F")
-            self._colors_key, self._colored = colors_key, order_key[0]
+            self._colors_key, self._colors = colors_key, shader.texture(painted, 4, "RGBA16F")
 
     def _start(self, pool, key, parts, near, mode, few):
         """Start the thread that sorts all splats, and colours them if colours changed.
@@ -166,7 +164,8 @@ class View:
         if mode == "HEAT":
             colors_key += tuple(p.slot.held.scored for p in parts)
         else:
-            colors_key += tuple(p.eye.place.tobytes() for p in parts if p.slot.held.degree)
+            varying = (p for p in parts if p.slot.packed.harmonics.shape[1] > 1)
+            colors_key += tuple(p.eye.place.tobytes() for p in varying)
         rows = None if colors_key == self._colors_key else key[0].rows
         if self._colors is None and key[0].rows > few:
             key, colors_key = (*key, few), None
