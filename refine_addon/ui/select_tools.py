@@ -29,6 +29,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import selection
 from ..mesh.layout import SplatObject
 from ..viewport import draw as viewport_draw
+from ..viewport.view import Camera
 from .operator_bases import FAILURES, Answer, Needing, Worker, fail, idle, on_splats
 from .plans import cached
 
@@ -74,18 +75,13 @@ class Stroke:
 
     def _read(self, context: Context) -> Callable[[Progress], dict[object, Prepared | Sight]]:
         """Read selection and view; a thread-safe callable gives what `_kept` is to hold."""
-        obj, region, eye = self.obj, context.region, context.region_data
+        obj, camera = self.obj, Camera.of(context)
         matrix = world_matrix(obj, context.evaluated_depsgraph_get())
-        camera = (
-            np.array(eye.view_matrix, np.float64),
-            np.array(eye.window_matrix, np.float64),
-            (region.width, region.height),
-        )
         with selection.readable(obj) as checked:
             away, self.before = _not_drawn(checked), selection.selected(checked.obj)
             digest = mesh_attributes.digest(checked)
             splats = (obj.data.session_uid, digest, matrix.tobytes(), away.tobytes())
-            view = (splats, camera[0].tobytes(), camera[1].tobytes(), camera[2])
+            view = (splats, camera.key())
             source = _kept.get(view) or _kept.get(splats) or _drawn(checked, away)
 
         def look(_progress: Progress) -> dict[object, Prepared | Sight]:

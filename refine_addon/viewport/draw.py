@@ -141,26 +141,21 @@ def _guarded(work: Callable[[], None]) -> None:
 
 def _draw() -> None:
     context = bpy.context
-    region, region_3d, space = context.region, context.region_data, context.space_data
+    space = context.space_data
     visible = {obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)}
     refused = len(_state.content.refused)
     shown = (p for p in placings(context.view_layer.depsgraph) if p.shown_by in visible)
     placed = _state.content.update(shown, _existing)
     if len(_state.content.refused) > refused:  # Blender is to draw these
         bpy.app.timers.register(_hide_points, first_interval=0.0)
-    key = region.as_pointer()
+    key = context.region.as_pointer()
     view = _state.views.pop(key, None) or View()
     _state.views[key] = view  # the one drawn last is last
     while len(_state.views) > _VIEWS:
         del _state.views[next(iter(_state.views))]
-    camera = Camera(
-        np.array(region_3d.view_matrix, np.float64),
-        np.array(region_3d.window_matrix, np.float64),
-        (region.width, region.height),
-    )
     solid = not overlays.is_xray(space.shading)
     solid = solid and not all(looks_like_splats(obj) for obj in context.visible_objects)
-    view.draw(_state.content, placed, camera, _state.mode, solid=solid)
+    view.draw(_state.content, placed, Camera.of(context), _state.mode, solid=solid)
     overlays.draw(context, mixed=view.count > 0, has_depths=view.depths is not None)
     if not view.complete and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)

@@ -8,6 +8,7 @@ import time
 from concurrent.futures import Future
 from typing import Any, NamedTuple
 
+import bpy
 import gpu
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,13 @@ class Camera(NamedTuple):
     view: NDArray[np.float64]
     projection: NDArray[np.float64]
     size: tuple[int, int]
+
+    @classmethod
+    def of(cls, context: bpy.types.Context) -> Camera:
+        """Camera of the context's 3D view."""
+        region, eye = context.region, context.region_data
+        matrices = (np.array(each, np.float64) for each in (eye.view_matrix, eye.window_matrix))
+        return cls(*matrices, (region.width, region.height))
 
     @property
     def perspective(self) -> bool:
