@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -185,6 +185,16 @@ def holds_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
     """Whether an object's data seems to hold splats."""
     attributes = data.attributes
     return ("opacity" in attributes and "f_dc_0" in attributes) or is_native(data)
+
+
+def changed_data(
+    depsgraph: bpy.types.Depsgraph | None,
+) -> Iterator[bpy.types.Mesh | bpy.types.PointCloud]:
+    """Meshes and point clouds whose geometry an update of Blender's changed."""
+    for update in depsgraph.updates if depsgraph else ():
+        data = getattr(update.id.original, "data", update.id.original)
+        if update.is_updated_geometry and isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud)):
+            yield data
 
 
 def is_native(data: bpy.types.ID) -> bool:

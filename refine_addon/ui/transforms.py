@@ -118,29 +118,21 @@ def _draw_apply(menu: bpy.types.Menu, context: Context) -> None:
 @persistent
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Forget the drift of changed objects; stamp new splats soon."""
-    for update in depsgraph.updates if depsgraph else ():
-        if update.is_updated_geometry:
-            data = getattr(update.id.original, "data", update.id.original)
-            _drifts.pop(getattr(data, "session_uid", 0), None)
-            if _is_new(data):
-                _stamp_soon()
+    for data in mesh_layout.changed_data(depsgraph):
+        _drifts.pop(data.session_uid, None)
+        if _is_new(data):
+            _stamp_soon()
 
 
 @persistent
 def _changed(*_: object) -> None:
     """Forget all drift after undo, redo and loading; stamp new splats soon."""
     _drifts.clear()
-    if any(_is_new(data) for data in (*bpy.data.meshes, *bpy.data.pointclouds)):
-        _stamp_soon()
+    _stamp_soon()
 
 
-def _is_new(data: object) -> bool:
-    return (
-        isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud))
-        and mesh_layout.holds_splats(data)
-        and not data.library
-        and not mesh_drift.is_stamped(data)
-    )
+def _is_new(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
+    return mesh_layout.holds_splats(data) and not (data.library or mesh_drift.is_stamped(data))
 
 
 def _stamp_soon() -> None:
@@ -151,7 +143,7 @@ def _stamp_soon() -> None:
 
 def _stamp() -> None:
     for obj in bpy.data.objects:
-        if _is_new(obj.data) and obj.mode != "EDIT":
+        if mesh_layout.looks_like_splats(obj) and _is_new(obj.data) and obj.mode != "EDIT":
             try:
                 mesh_drift.stamp(mesh_layout.check(obj).mesh)
             except RefineError:

@@ -16,7 +16,7 @@ from bpy.app.handlers import persistent
 from numpy.typing import NDArray
 
 from ..core.errors import RefineError
-from ..mesh.layout import looks_like_splats, splat_count
+from ..mesh.layout import changed_data, looks_like_splats, splat_count
 from ..objects.instances import Key, placings
 from . import overlays, shader
 from .content import Content, hide_points, is_edited
@@ -246,15 +246,12 @@ def _opened(*_: object) -> None:
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     if depsgraph is None or _state.mode == "OFF":
         return
-    for update in depsgraph.updates:
-        if update.is_updated_geometry:
-            data = getattr(update.id.original, "data", update.id.original)
-            if isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud)):
-                _state.content.has_changed(data.session_uid)
-                if getattr(data, "is_editmode", False) and not _state.reads:
-                    _state.edited_at = time.monotonic()
-                    if not bpy.app.timers.is_registered(_read_edited):
-                        bpy.app.timers.register(_read_edited, first_interval=_EDIT_REST)
+    for data in changed_data(depsgraph):
+        _state.content.has_changed(data.session_uid)
+        if getattr(data, "is_editmode", False) and not _state.reads:
+            _state.edited_at = time.monotonic()
+            if not bpy.app.timers.is_registered(_read_edited):
+                bpy.app.timers.register(_read_edited, first_interval=_EDIT_REST)
     hide_points(depsgraph, _state.content.refused)
 
 
