@@ -19,7 +19,7 @@ from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.formats.ply_columns import THIRD_SCALE, Columns
 from ..core.formats.registry import scene_name
 from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
-from .layout import KINDS, Column, SplatObject, add_attributes, rest_count, splat_count
+from .layout import KINDS, Column, SplatObject, add_attributes, has, rest_count, splat_count
 
 _GROUP = 16  # Columns transposed together: float32 numbers in a cache line of 64 bytes
 _ROWS = 4096  # Rows transposed at a time: 256 kB, which fits a cache
@@ -173,6 +173,11 @@ def read_attribute(mesh: bpy.types.Mesh, name: str) -> NDArray[Any]:
     values: NDArray[Any] = np.empty(len(attribute.data) * kind.width, kind.dtype)
     attribute.data.foreach_get(kind.field, values)
     return values if kind.width == 1 else values.reshape(-1, kind.width)
+
+
+def attribute_if_any(mesh: bpy.types.Mesh, name: str, *kinds: str) -> NDArray[Any] | None:
+    """A point attribute of one of these types, as `read_attribute` gives it; None without one."""
+    return read_attribute(mesh, name) if has(mesh, name, *kinds) else None
 
 
 def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDArray[Any]) -> None:

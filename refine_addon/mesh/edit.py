@@ -147,8 +147,7 @@ def refuse_name(obj: bpy.types.Object, name: str) -> NoReturn:
 
 def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     """Splats marked by hand with `PROTECT` or `MUST_GO`, (N,); None without the attribute."""
-    marked = has(obj.data, name, "BOOLEAN")
-    return mesh_attributes.read_attribute(obj.data, name) if marked else None
+    return mesh_attributes.attribute_if_any(obj.data, name, "BOOLEAN")
 
 
 def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:

@@ -102,8 +102,6 @@ def _in_edit_mode(obj: bpy.types.Object) -> bool:
 
 
 def _flags(mesh: bpy.types.Mesh | bpy.types.PointCloud, name: str) -> NDArray[np.bool_]:
-    attribute, count = mesh.attributes.get(name), splat_count(mesh)
-    fits = attribute and attribute.domain == "POINT" and len(attribute.data) == count
-    if not fits or attribute.data_type not in {"BOOLEAN", "FLOAT"}:
-        return np.zeros(count, np.bool_)
-    return np.asarray(mesh_attributes.read_attribute(mesh, name) > 0)
+    values = mesh_attributes.attribute_if_any(mesh, name, "BOOLEAN", "FLOAT")
+    count = splat_count(mesh)
+    return np.zeros(count, np.bool_) if values is None or len(values) != count else values > 0

@@ -316,9 +316,8 @@ def _same(one: Any, other: Any, scale: float = 0.0) -> bool:
 
 
 def _marked(obj: bpy.types.Object, kind: int) -> list[int]:
-    if mesh_edit.FORCE not in obj.data.attributes:
-        return mesh_scores.digest(None)
-    return mesh_scores.digest(mesh_attributes.read_attribute(obj.data, mesh_edit.FORCE) == kind)
+    force = mesh_attributes.attribute_if_any(obj.data, mesh_edit.FORCE, "INT")
+    return mesh_scores.digest(None if force is None else force == kind)
 
 
 def _cameras(scene: bpy.types.Scene) -> list[Any]:

@@ -20,7 +20,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh import selection as mesh_selection
-from ..mesh.layout import SplatObject, check, has, sh_degree
+from ..mesh.layout import SplatObject, check, sh_degree
 from ..objects.instances import Key, Placing, placings
 from . import shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack
@@ -181,11 +181,11 @@ class Content:
         mesh = checked.mesh
         held = self._held.setdefault(uid, MeshSplats())
         held.read = Marks(
-            _attribute(mesh, mesh_scores.RANK, "FLOAT"),
-            _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN"),
-            _attribute(mesh, mesh_edit.FORCE, "INT"),
-            _attribute(mesh, mesh_selection.name_of(mesh), "BOOLEAN"),
-            _attribute(mesh, mesh_selection.HIDDEN, "BOOLEAN"),
+            mesh_attributes.attribute_if_any(mesh, mesh_scores.RANK, "FLOAT"),
+            mesh_attributes.attribute_if_any(mesh, mesh_edit.REMOVE, "BOOLEAN"),
+            mesh_attributes.attribute_if_any(mesh, mesh_edit.FORCE, "INT"),
+            mesh_attributes.attribute_if_any(mesh, mesh_selection.name_of(mesh), "BOOLEAN"),
+            mesh_attributes.attribute_if_any(mesh, mesh_selection.HIDDEN, "BOOLEAN"),
         )
         signature = (len(checked), sh_degree(mesh), mesh_attributes.digest(checked))
         if signature != held.signature:
@@ -251,10 +251,6 @@ def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:
     values["more_covariances"] = covariances[:, 4:]
     textures = {n: shader.texture(as_texture(v), 4, "RGBA32F") for n, v in values.items()}
     return Atlas(slots, textures)
-
-
-def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | None:
-    return mesh_attributes.read_attribute(mesh, name) if has(mesh, name, kind) else None
 
 
 def hide_points(depsgraph: bpy.types.Depsgraph | None, refused: Container[int] | None) -> None:
