@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.formats.ply import REQUIRED, SplatFile
-from ..core.formats.ply_columns import THIRD_SCALE, Columns
+from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.formats.registry import scene_name
 from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, SplatObject, add_attributes, has, rest_count, splat_count
@@ -64,7 +64,7 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
 def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
     """Splats of an object, in its own frame. Without `sh_rest` one coefficient replaces all above
     the constant: NaN if any is not finite, else 0. Scoring needs no more (saves 0.5 GB at 3 M)."""
-    read = _Reader(checked)
+    read = StoredColumns(checked)
     rest = [f"f_rest_{index}" for index in range(rest_count(checked.mesh))]
     count = len(checked)
     if sh_rest:
@@ -118,17 +118,12 @@ def _groups_of(
     checked: SplatObject, replaced: AbstractSet[str]
 ) -> Iterator[tuple[list[str], Sequence[NDArray[Any] | None]]]:
     """Names and values of columns transposed together; None for replaced ones."""
-    read, dtype = _Reader(checked), checked.layout.row_dtype
+    read, dtype = StoredColumns(checked), checked.layout.row_dtype
     for names in _groups([column.name for column in checked.layout.columns], dtype):
         if dtype[names[0]].str == "<f4" and not replaced & set(names):
             yield names, read.planes(names)  # one array, for which Linux uses large pages
         else:
             yield names, [None if name in replaced else read[name] for name in names]
-
-
-def stored_columns(checked: SplatObject) -> Columns:
-    """Columns of a splat object by name, each read on demand."""
-    return _Reader(checked)
 
 
 def write_columns(
@@ -208,8 +203,8 @@ def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:
         mesh.attributes.remove(attribute)
 
 
-class _Reader:
-    """Columns of a mesh by name; caches the last vector attribute."""
+class StoredColumns:
+    """Columns of a mesh by name, read on demand; caches the last vector attribute."""
 
     def __init__(self, checked: SplatObject) -> None:
         self.mesh = checked.mesh
@@ -232,6 +227,7 @@ class _Reader:
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
 
     def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
+        """Columns as float32, (len(names), N)."""
         values = np.empty((len(names), splat_count(self.mesh)), np.float32)
         pairs = zip(values, names, strict=True)
         # Sorted by attribute, so that each vector attribute is read once.

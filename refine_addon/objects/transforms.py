@@ -53,8 +53,7 @@ def read_to_move(
     splats = mesh_attributes.splats_from_object(checked)
     has_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
     names = {*values_by_name(splats), *(_NORMALS if has_normals else ())} - {"opacity"}
-    stored = mesh_attributes.stored_columns(checked)
-    normals = np.stack([stored[name] for name in _NORMALS], axis=-1) if has_normals else None
+    normals = mesh_attributes.StoredColumns(checked).planes(_NORMALS).T if has_normals else None
     return names, partial(_moved, splats, normals, matrix, repair)
 
 

@@ -64,7 +64,7 @@ def test_splats_are_selected_hidden_and_taken_by_what_they_are(addon, quarter, k
     assert len(after("REVEAL")) == COUNT
     assert ".hide_vert" not in obj.data.attributes
 
-    columns = addon.mesh.attributes.stored_columns(addon.mesh.layout.check(obj))
+    columns = addon.mesh.attributes.StoredColumns(addon.mesh.layout.check(obj))
     logits = np.asarray(columns["opacity"], np.float64)
     logs = np.max([columns[f"scale_{axis}"] for axis in range(3)], axis=0)
     settings = bpy.context.scene.refine
