@@ -6,7 +6,7 @@ which Blender keeps with their vertices, also in files."""
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import bpy
@@ -42,14 +42,6 @@ class Drift(NamedTuple):
     mendable: bool
 
 
-class Mending(NamedTuple):
-    """What repairs drift. `moves`: maps that positions alone followed, with their splats;
-    `regrouped`: (N,) SH degree under whose attribute names a splat's harmonics are, 0 if right."""
-
-    moves: list[Move]
-    regrouped: NDArray[np.int64]
-
-
 def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     """Note the present state of all splats as free of drift."""
     position = mesh_attributes.read_attribute(mesh, "position")
@@ -67,7 +59,7 @@ def is_stamped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
 def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
     """Drift of a mesh; None without drift or notes. Counts are estimates from a sample.
     Takes 10 ms per million splats if nothing changed."""
-    if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
+    if (notes := disturbed(mesh)) is None:
         return None
     moves, sampled, single = notes.moves(max(1, len(notes.codes) // _SAMPLE))
     share = len(notes.codes) / max(sampled, 1)
@@ -99,11 +91,10 @@ def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
     return Drift(sentences, mendable) if sentences else None
 
 
-def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Callable[[], Mending] | None:
-    """Read the notes; a thread-safe callable that computes the repair, None if nothing changed."""
-    if not is_stamped(mesh) or (notes := _Notes(mesh)).undisturbed:
-        return None
-    return lambda: Mending(notes.moves()[0], notes.regrouped())
+def disturbed(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Notes | None:
+    """Notes of a mesh, from which drift is repaired; None without notes or if nothing changed."""
+    notes = Notes(mesh) if is_stamped(mesh) else None
+    return None if notes is None or notes.undisturbed else notes
 
 
 def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
@@ -112,7 +103,7 @@ def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
         stamp(mesh)
 
 
-class _Notes:
+class Notes:
     """Notes and present values of a mesh, read once, usable on any thread."""
 
     def __init__(self, mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:

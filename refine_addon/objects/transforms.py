@@ -47,23 +47,24 @@ def read_to_move(
     (N,), and the number mended."""
     matrix = np.eye(4) if matrix is None else matrix
     check_affine(matrix)
-    repair = mesh_drift.mending(checked.mesh) if mend else None
-    if repair is None and np.array_equal(matrix, np.eye(4)):
+    notes = mesh_drift.disturbed(checked.mesh) if mend else None
+    if notes is None and np.array_equal(matrix, np.eye(4)):
         return set(), lambda: ({}, 0)
     splats = mesh_attributes.splats_from_object(checked)
     has_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
     names = {*values_by_name(splats), *(_NORMALS if has_normals else ())} - {"opacity"}
     normals = mesh_attributes.StoredColumns(checked).planes(_NORMALS).T if has_normals else None
-    return names, partial(_moved, splats, normals, matrix, repair)
+    return names, partial(_moved, splats, normals, matrix, notes)
 
 
 def _moved(
     splats: Splats,
     normals: NDArray[np.float32] | None,
     matrix: NDArray[np.float64],
-    repair: Callable[[], mesh_drift.Mending] | None,
+    notes: mesh_drift.Notes | None,
 ) -> tuple[dict[str, NDArray[Any]], int]:
-    moves, regrouped = repair() if repair else ([], np.zeros(len(splats), np.int64))
+    moves = notes.moves()[0] if notes else []
+    regrouped = notes.regrouped() if notes else np.zeros(len(splats), np.int64)
     if regrouped.any():
         splats = replace(splats, sh_rest=_regrouped(splats.sh_rest, regrouped))
     mended = regrouped > 0
@@ -99,7 +100,7 @@ def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> 
 
 
 def _regrouped(rest: NDArray[Any], degrees: NDArray[np.int64]) -> NDArray[Any]:
-    """Harmonics, (N, K, 3), put right; `degrees`: as in `mesh.drift.Mending.regrouped`."""
+    """Harmonics, (N, K, 3), put right; `degrees`: as in `mesh.drift.Notes.regrouped`."""
     rest = np.array(rest)
     for degree in np.unique(degrees[degrees > 0]).tolist():
         rows, own = degrees == degree, above_constant(degree)
