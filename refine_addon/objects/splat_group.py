@@ -190,16 +190,15 @@ def store(
 ) -> None:
     """Write scores of `gather`'s splats to each mesh, with its origin; see `mesh.scores.store`."""
     _check_counts(group, len(scores.values))
-    ranks, scoring, all_scored = rank(scores.values), uuid.uuid4().hex, scores.scored is None
+    ranks, scoring, scored = rank(scores.values), uuid.uuid4().hex, scores.scored
     protected = parts_of(record.pop("protected", None), group)
     each = zip(group, origins, _rows(map(len, group)), protected, strict=True)
     for member, origin, rows, mask in each:
         own, together = scores, None
         if len(group) > 1:
             values, seen = scores.values[rows], scores.seen[rows]
-            scored = np.ones(len(values), np.bool_) if all_scored else scores.scored[rows]
-            undrawable = int(np.count_nonzero((values == 0.0) & scored))
-            own = replace(scores, values=values, seen=seen, undrawable=undrawable, scored=scored)
+            known = None if scored is None else scored[rows]
+            own = replace(scores, values=values, seen=seen, scored=known)
             together = (scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
             member, own, method, origin=origin, protected=mask, together=together, **record
