@@ -188,10 +188,11 @@ class Running:
             redraw_panels(context)
 
     def over(self, context: Context) -> None:
-        """Stop workers and clear the bars."""
+        """Stop the worker and clear the bars, once."""
+        if self not in _now:
+            return
+        _now.clear()
         self.worker.cancel()
-        if self in _now:
-            _now.clear()
         context.window_manager.event_timer_remove(self._timer)
         if not bpy.app.background:
             # Later: Blender crashes if a window is drawn while it is being closed.
@@ -315,7 +316,6 @@ class Job(AtOnce):
 
     doing, partial_step = "", None
     by_hand = False  # Whether a user started it; `invoke` sets it, also before a file browser
-    _running: Running | None = None
 
     @staticmethod
     def compute(job: Any, progress: Progress) -> Any:
@@ -338,13 +338,13 @@ class Job(AtOnce):
 
     def launch(self, context: Context) -> Answer:
         """Read the scene, start the thread, and have Blender call `modal`."""
-        self._running = Running(self, context, self.gather(context))
+        Running(self, context, self.gather(context))  # held as `now`
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context: Context, event: bpy.types.Event) -> Answer:
         """Wait for the thread, then put its result."""
-        if (running := self._running) is None:
+        if (running := now()) is None:
             return {"CANCELLED"}
         if event.type == "TIMER":
             return self._check(context, running)
@@ -355,8 +355,8 @@ class Job(AtOnce):
 
     def cancel(self, context: Context) -> None:
         """End the thread when Blender ends the operator, closing its window or file."""
-        if (running := self._running) is not None:
-            self._over(context, running)
+        if (running := now()) is not None:
+            running.over(context)
             running.worker.end()
 
     def _check(self, context: Context, running: Running) -> Answer:
@@ -367,10 +367,10 @@ class Job(AtOnce):
                 running.tell(context)
                 return {"PASS_THROUGH"}
             result, group = running.worker.result(), running.unchanged()
-            self._over(context, running)
+            running.over(context)
             self.put(context, group, running.job, result)
         except BaseException as error:
-            self._over(context, running)
+            running.over(context)
             if isinstance(error, FAILURES):
                 return fail(self, error)
             if not isinstance(error, Cancelled):
@@ -379,24 +379,13 @@ class Job(AtOnce):
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def _over(self, context: Context, running: Running) -> None:
-        if self._running is not None:
-            self._running = None
-            running.over(context)
-
-
-def unregister() -> None:
-    """End the work: Blender drops the operator silently."""
-    if (running := now()) is not None:
-        _end()
-        running.over(bpy.context)
-
 
 @persistent
-def _end(*_arguments: object) -> None:
+def unregister(*_arguments: object) -> None:
+    """End the work; also where a file is opened, since Blender drops the operator silently."""
     if (running := now()) is not None:
-        _now.clear()
+        running.over(bpy.context)
         running.worker.end()
 
 
-HANDLERS = {_end: ("load_pre",)}
+HANDLERS = {unregister: ("load_pre",)}

@@ -226,7 +226,6 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             bpy.app.timers.register(_draw_whole, first_interval=_SETTLED)
         if self._running is not None:
             self._running.over(context)
-            self._running = None
 
 
 def _draw_whole() -> None:

@@ -31,7 +31,7 @@ def start(addon, obj):
         return started_in_a_window(addon, cls or addon.ui.operators.REFINE_OT_score, **properties)
 
     yield start
-    addon.ui.operator_bases._end()
+    addon.ui.operator_bases.unregister()
 
 
 @pytest.fixture
