@@ -5,6 +5,7 @@ handlers of Blender's events, with the events, in `HANDLERS`."""
 from __future__ import annotations
 
 import importlib
+from functools import partial
 
 import bpy
 from bpy.props import PointerProperty
@@ -45,7 +46,7 @@ def register() -> None:
         if hasattr(module, "register"):
             module.register()
     images.use(BlenderImages())
-    _commands.append(bpy.utils.register_cli_command("refine", _run_command))
+    _commands.append(bpy.utils.register_cli_command("refine", partial(command.main, scene=True)))
 
 
 def unregister() -> None:
@@ -62,7 +63,3 @@ def unregister() -> None:
     del bpy.types.Scene.refine
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
-
-
-def _run_command(arguments: list[str]) -> int:
-    return command.main(arguments, scene=True)
