@@ -40,7 +40,8 @@ class Marks(NamedTuple):
 class MeshSplats:
     """The splats of a mesh, its N vertices packed to M drawable ones. `signature`: of the packed
     values; `future`: while packing; `read`: marks of the N; `marks`: of the M; `important`: (M,),
-    most important first; `scored`, `marked`: counters of changes; `kinds`: `MARKS` among them."""
+    most important first; `marked`: counts changes of marks that are drawn in colours; `kinds`:
+    `MARKS` among them."""
 
     signature: tuple[Any, ...] = ()
     future: Future[Packed] | None = None
@@ -48,7 +49,6 @@ class MeshSplats:
     read: Marks = field(default_factory=Marks)
     marks: Marks = field(default_factory=Marks)
     important: NDArray[np.int32] | None = None
-    scored: int = 0
     marked: int = 0
     kinds: tuple[int, ...] = ()
 
@@ -213,21 +213,17 @@ class Content:
             held.marked += 1
             held.kinds = tuple(k for k in MARKS if marks.forced is not None and k in marks.forced)
         if not np.array_equal(before.ranks, marks.ranks):
-            held.scored += 1
+            held.marked += 1
             held.important = None
         if held.important is None:
             held.important = most_important_first(packed, marks.ranks)
         self.changes += 1
 
     def _place(self, wanted: set[Key], existing: Callable[[], set[Key]]) -> None:
-        slots = self.atlas.slots
-        fresh = {
-            key for key in wanted if key in slots and slots[key].packed is self._held[key[1]].packed
-        }
-        if fresh == wanted:
+        drawn = {key: slot.packed for key, slot in self.atlas.slots.items()}
+        if all(drawn.get(key) is self._held[key[1]].packed for key in wanted):
             return
-        keys = sorted(wanted | (slots.keys() & existing()))
-        keys = [key for key in keys if self._held[key[1]].packed is not None]
+        keys = sorted(wanted | (drawn.keys() & existing()))
         meshes = {mesh for _, mesh in keys}
         self._held = {
             mesh: held for mesh, held in self._held.items() if mesh in meshes or held.future

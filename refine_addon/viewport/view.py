@@ -169,9 +169,7 @@ class View:
         For the first picture only the most important ones, in constant colours."""
         objects = [(p.slot.number, p.slot.held.marked) for p in parts]
         colors_key: tuple[Any, ...] = (key[0], mode, objects)
-        if mode == "HEAT":
-            colors_key += tuple(p.slot.held.scored for p in parts)
-        else:
+        if mode != "HEAT":
             varying = (p for p in parts if p.slot.packed.harmonics.shape[1] > 1)
             colors_key += tuple(p.eye.place.tobytes() for p in varying)
         rows = None if colors_key == self._colors_key else key[0].rows

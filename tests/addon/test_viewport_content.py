@@ -42,10 +42,10 @@ def test_splats_are_drawn_as_they_are_packed(addon, few, monkeypatch):
     assert drawn() is None
     packing.run()
     slot = drawn()
-    ranks, scored = slot.held.marks.ranks, slot.held.scored
+    ranks, marked = slot.held.marks.ranks, slot.held.marked
     keep = np.arange(3976) >= 100
     stay = keep[slot.packed.vertices]
-    assert drawn().held.scored == scored
+    assert drawn().held.marked == marked
     addon.objects.splat_group.delete_splats(addon.mesh.layout.check(few), keep)
     slot = drawn()
     assert slot.packed.vertices.max() == 3975
@@ -55,9 +55,9 @@ def test_splats_are_drawn_as_they_are_packed(addon, few, monkeypatch):
     assert slot.packed.vertices.max() == 3875
     np.testing.assert_array_equal(slot.held.marks.ranks, ranks[stay])
 
-    scored, values = slot.held.scored, few.data.attributes[addon.mesh.scores.RANK].data
+    marked, values = slot.held.marked, few.data.attributes[addon.mesh.scores.RANK].data
     values[0].value = 1.0 - values[0].value
-    assert drawn().held.scored == scored + 1
+    assert drawn().held.marked == marked + 1
 
     for row in (0, 1):  # selected splats are tinted, but not once graded
         addon.mesh.selection.select(few, np.arange(3876) == row)
