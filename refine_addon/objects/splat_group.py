@@ -412,11 +412,8 @@ def add_levels(
             obj.hide_set(True)
             obj.hide_render = True
     except BaseException:
-        data = [obj.data for obj in collection.objects]
-        for obj in list(collection.objects):
-            bpy.data.objects.remove(obj)
-        bpy.data.batch_remove(data)
-        bpy.data.collections.remove(collection)
+        made = list(collection.objects)
+        bpy.data.batch_remove([*made, *(obj.data for obj in made), collection])
         raise
     return collection
 
