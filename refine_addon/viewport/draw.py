@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -43,7 +42,7 @@ warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []  # Sources of
 
 
 _state: Any = SimpleNamespace(
-    mode="OFF", failure="", content=Content(), views={}, handles=[], edited_at=0.0, reads=False
+    mode="OFF", failure="", content=Content(), views={}, handles=[], reads=False
 )
 """State while splats are drawn, not saved; `views`: by region."""
 
@@ -186,10 +185,7 @@ def _tick() -> float | None:
     return None if complete() else _TICK
 
 
-def _read_edited() -> float | None:
-    waits = _EDIT_REST - (time.monotonic() - _state.edited_at)
-    if waits > 0.0:
-        return waits
+def _read_edited() -> None:
     layers = [window.view_layer for window in bpy.context.window_manager.windows]
     _state.reads = True  # reading makes Blender report a change
     for obj in {obj for layer in layers for obj in layer.objects}:
@@ -200,7 +196,6 @@ def _read_edited() -> float | None:
         layer.update()
     _state.reads = False
     _redraw()
-    return None
 
 
 def _redraw() -> None:
@@ -234,12 +229,8 @@ def _saving(*_: object) -> None:
 
 @persistent
 def _opened(*_: object) -> None:
-    wanted = bpy.context.scene.get(SHOWN) if not bpy.app.background else None
-    if wanted in {name for name, *_ in MODES}:
-        show(wanted)
-    if _state.mode != "OFF":
-        _hide_points()
-        _redraw()
+    wanted = None if bpy.app.background else bpy.context.scene.get(SHOWN)
+    show(wanted if wanted in {name for name, *_ in MODES} else _state.mode)
 
 
 @persistent
@@ -249,9 +240,9 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
     for data in changed_data(depsgraph):
         _state.content.has_changed(data.session_uid)
         if getattr(data, "is_editmode", False) and not _state.reads:
-            _state.edited_at = time.monotonic()
-            if not bpy.app.timers.is_registered(_read_edited):
-                bpy.app.timers.register(_read_edited, first_interval=_EDIT_REST)
+            if bpy.app.timers.is_registered(_read_edited):
+                bpy.app.timers.unregister(_read_edited)
+            bpy.app.timers.register(_read_edited, first_interval=_EDIT_REST)
     hide_points(depsgraph, _state.content.refused)
 
 
