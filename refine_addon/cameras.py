@@ -44,8 +44,7 @@ def view_from_camera(
 ) -> View:
     """View of a camera object as Blender renders it, at the scene's size, named after the object.
     Of an imported camera the image size and all unchanged numbers are those of the file."""
-    evaluated = obj.evaluated_get(depsgraph)
-    data = evaluated.data if evaluated.is_evaluated else obj.data
+    data = obj.evaluated_get(depsgraph).data
     if data.type != "PERSP":
         kind = {"ORTHO": "orthographic", "PANO": "panoramic"}.get(data.type, data.type.lower())
         raise RefineError(

@@ -203,13 +203,11 @@ def _surface(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Vertices, (V, 3), and triangles, (T, 3), of a mesh with its modifiers."""
     evaluated = obj.evaluated_get(depsgraph)
-    if not evaluated.is_evaluated:
-        if obj.modifiers:
-            raise RefineError(
-                f"object '{obj.name}': is disabled in viewports or excluded from the view layer, "
-                "where Blender applies no modifiers; enable it first"
-            )
-        evaluated = obj
+    if obj.modifiers and not evaluated.is_evaluated:
+        raise RefineError(
+            f"object '{obj.name}': is disabled in viewports or excluded from the view layer, "
+            "where Blender applies no modifiers; enable it first"
+        )
     mesh = evaluated.to_mesh()
     try:
         mesh.calc_loop_triangles()
