@@ -77,10 +77,9 @@ def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
 
 
 def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
-    """Delete the marked vertices, (N,) bool; `all_or_nothing` undoes a failure.
-    An applied geometry-nodes modifier is the fastest way, and keeps attributes of every type,
-    vertex groups, materials and custom properties."""
-    check_deletable(obj)
+    """Delete the marked vertices, (N,) bool, where `check_deletable` allows it.
+    `all_or_nothing` undoes a failure. An applied geometry-nodes modifier is the fastest way, and
+    keeps attributes of every type, vertex groups, materials and custom properties."""
     mesh_attributes.remove_attribute(obj.data, REMOVE)
     if not remove.any():
         return

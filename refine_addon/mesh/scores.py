@@ -79,8 +79,7 @@ def store(
 
 
 def forget(checked: SplatObject) -> None:
-    """Remove an object's scores, their record, and the preview of what goes."""
-    mesh_edit.check_writable(checked.obj)
+    """Remove a writable object's scores, their record, and the preview of what goes."""
     mesh = checked.mesh
     for name in (SCORE, RANK, SEEN, SCORED, mesh_edit.REMOVE):
         mesh_attributes.remove_attribute(mesh, name)
@@ -163,8 +162,7 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
 
 
 def store_floaters(checked: SplatObject, cleaned: Cleaned) -> None:
-    """Write floaters and their record to an object's mesh."""
-    mesh_edit.check_writable(checked.obj)
+    """Write floaters and their record to a writable object's mesh."""
     reasons = np.zeros(len(cleaned.keep), np.int32)
     for number, name in enumerate(REASONS, start=1):
         reasons[cleaned.by_reason[name]] = number

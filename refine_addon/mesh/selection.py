@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import attributes as mesh_attributes
-from .edit import check_writable, mark
+from .edit import mark
 from .layout import SplatObject, check, splat_count
 
 HIDDEN = ".hide_vert"
@@ -82,7 +82,6 @@ def readable(obj: bpy.types.Object) -> Iterator[SplatObject]:
 def _store(
     obj: bpy.types.Object, wanted: NDArray[np.bool_], out_of_sight: NDArray[np.bool_]
 ) -> None:
-    check_writable(obj)
     mesh = obj.data
     if _in_edit_mode(obj):
         vertices = bmesh.from_edit_mesh(mesh).verts
