@@ -43,11 +43,9 @@ def call(function: Callable[[], Any]) -> Any:
 
 def serve() -> None:
     """Run the waiting calls on the main thread."""
-    with contextlib.suppress(queue.Empty):
-        while True:
-            function, answer = _calls.get_nowait()
-            if not answer.set_running_or_notify_cancel():
-                continue
+    while not _calls.empty():  # no other thread takes any
+        function, answer = _calls.get()
+        if answer.set_running_or_notify_cancel():
             try:
                 answer.set_result(function())
             except BaseException as error:
