@@ -368,11 +368,9 @@ def _standard(obj: bpy.types.Object) -> Layout:
             f"object '{obj.name}': has {len(rest) // width} attributes {name}*, expected "
             f"{', '.join(map(str, counts))} or {most} of them (degree 0 to 4)"
         )
-    normals: tuple[str, ...] = ("nx", "ny", "nz") if "nx" in attributes else ()
-    places = PLACES | _native_places(obj.data)
-    if not normals and has(obj.data, "normal", "FLOAT_VECTOR"):
-        normals = tuple(NORMAL_PLACES)
-        places.update(NORMAL_PLACES)
+    folded = "nx" not in attributes and has(obj.data, "normal", "FLOAT_VECTOR")
+    places = PLACES | _native_places(obj.data) | (NORMAL_PLACES if folded else {})
+    normals = NORMAL_PLACES if folded or "nx" in attributes else ()
     names = [*PLACES, *normals, *REQUIRED[3:6], *rest, *REQUIRED[6:]]
     if THIRD_SCALE not in attributes and THIRD_SCALE not in places and "scale_1" in attributes:
         names.remove(THIRD_SCALE)
