@@ -39,21 +39,19 @@ _DEFAULT_NEAR, _DEFAULT_FAR = 0.01, 1000.0
 _FEW = 16  # Cameras looked at, at most, to know whether all must be turned
 
 
-def view_from_camera(
-    obj: bpy.types.Object, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph
-) -> View:
+def view_from_camera(obj: bpy.types.Object) -> View:
     """View of a camera object as Blender renders it, at the scene's size, named after the object.
     Of an imported camera the image size and all unchanged numbers are those of the file."""
-    data = obj.evaluated_get(depsgraph).data
+    data = _evaluated(obj).data
     if data.type != "PERSP":
         kind = {"ORTHO": "orthographic", "PANO": "panoramic"}.get(data.type, data.type.lower())
         raise RefineError(
             f"camera '{obj.name}' is {kind}, expected a perspective one; change its lens type, or "
             "choose cameras without it"
         )
-    matrix = world_matrix(obj, depsgraph)
+    matrix = world_matrix(obj)
     source = _source(obj)
-    size, aspect = render_size(scene)
+    size, aspect = render_size(bpy.context.scene)
     if source:
         size, aspect = (source["width"], source["height"]), 1.0
     rotation, center = pose(obj.name, matrix)
@@ -87,11 +85,11 @@ def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
     return (width, height), render.pixel_aspect_y / render.pixel_aspect_x
 
 
-def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArray[np.float64]:
+def world_matrix(obj: bpy.types.Object) -> NDArray[np.float64]:
     """An object's matrix to the world, (4, 4), with quarter turns made exact.
     `RefineError` if Blender does not evaluate it (disabled, excluded) though it is animated or
     constrained."""
-    evaluated = obj.evaluated_get(depsgraph)
+    evaluated = _evaluated(obj)
     if evaluated.is_evaluated:
         return snapped(np.array(evaluated.matrix_world, np.float64))
     moving = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
@@ -103,8 +101,12 @@ def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArr
     matrix = np.array(obj.matrix_basis, np.float64)
     if obj.parent:
         inverse = np.array(obj.matrix_parent_inverse, np.float64)
-        matrix = world_matrix(obj.parent, depsgraph) @ inverse @ matrix
+        matrix = world_matrix(obj.parent) @ inverse @ matrix
     return snapped(matrix)
+
+
+def _evaluated(obj: bpy.types.Object) -> bpy.types.Object:
+    return obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
 
 
 def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
@@ -275,9 +277,8 @@ class CameraChoice:
             raise RefineError(
                 f"no cameras: none is {where[self.source]}; scoring needs at least one"
             )
-        depsgraph = context.evaluated_depsgraph_get()
-        views = tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras)
-        return ViewSet(views, turn=_turn(cameras, views, splats, depsgraph))
+        views = tuple(map(view_from_camera, cameras))
+        return ViewSet(views, turn=_turn(cameras, views, splats))
 
 
 def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
@@ -288,10 +289,9 @@ def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
         return 0
     cameras = choice.cameras(context)
     cameras = cameras[:: len(cameras) // _FEW + 1]
-    depsgraph = context.evaluated_depsgraph_get()
     try:
-        views = [view_from_camera(camera, context.scene, depsgraph) for camera in cameras]
-        return (_turn(cameras, views, splats, depsgraph) if cameras else None) or 0
+        views = list(map(view_from_camera, cameras))
+        return (_turn(cameras, views, splats) if cameras else None) or 0
     except RefineError:  # scoring reports it
         return 0
 
@@ -322,16 +322,15 @@ def views_from_frames(
         raise RefineError(
             f"no frames: the range starts at {frames.start} and ends at {frames.stop - 1}"
         )
-    now = world_matrix(splats, context.evaluated_depsgraph_get()) if splats else None
+    now = world_matrix(splats) if splats else None
     before = (scene.frame_current, scene.frame_subframe, scene.camera)
     views = []
     try:
         for frame in frames:
             scene.frame_set(frame)
-            depsgraph = context.evaluated_depsgraph_get()
-            view = view_from_camera(active_camera(scene), scene, depsgraph)
+            view = view_from_camera(active_camera(scene))
             if now is not None:
-                view = _against(view, splats, now, world_matrix(splats, depsgraph))
+                view = _against(view, splats, now, world_matrix(splats))
             views.append(replace(view, name=f"{view.name}, frame {frame}"))
     finally:
         scene.frame_set(before[0], subframe=before[1])
@@ -340,10 +339,7 @@ def views_from_frames(
 
 
 def _turn(
-    cameras: Sequence[bpy.types.Object],
-    views: Sequence[View],
-    splats: bpy.types.Object | None,
-    depsgraph: bpy.types.Depsgraph,
+    cameras: Sequence[bpy.types.Object], views: Sequence[View], splats: bpy.types.Object | None
 ) -> int | None:
     """Quarter turns about x that these cameras need, the same for all; None if unknown: the splats
     or more than half of the cameras were not imported, cameras differ, or nobody named the axes of
@@ -352,7 +348,7 @@ def _turn(
     ours = data is not None and (LAYOUT in data or is_native(data))
     if splats is None or not ours or data.get(AXES) == UNKNOWN_AXES:
         return None
-    linear = world_matrix(splats, depsgraph)[:3, :3]
+    linear = world_matrix(splats)[:3, :3]
     scale = np.cbrt(np.linalg.det(linear))
     axes = linear / scale if scale else linear
     if np.abs(axes @ axes.T - np.eye(3)).max() > SHEAR:

@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(960, 540))
     options = parser.parse_args(arguments)
     scene = set_up(options.scene / "point_cloud.ply", options.view, options.size)
-    view = view_from_camera(scene.camera, scene, bpy.context.evaluated_depsgraph_get())
+    view = view_from_camera(scene.camera)
     splats = read_ply(options.scene / "point_cloud.ply").splats()
     near = scene.camera.data.clip_start
     expected = render(splats, view, near=near)

@@ -96,8 +96,8 @@ def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
 
 def world_means(checked: SplatObject) -> NDArray[np.float64]:
     """Centres of an object's splats in the world, (N, 3)."""
-    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
-    return moved(mesh_attributes.read_attribute(checked.mesh, "position"), matrix)
+    means = mesh_attributes.read_attribute(checked.mesh, "position")
+    return moved(means, world_matrix(checked.obj))
 
 
 def finite_means(checked: SplatObject) -> NDArray[np.float64]:
@@ -119,16 +119,15 @@ def can_be_volume(obj: bpy.types.Object) -> bool:
 def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
     """An object as a volume in the world: a mesh evaluated with modifiers, an empty as drawn.
     Whether a mesh is closed is checked when it is used."""
-    label, graph = f"object '{obj.name}'", bpy.context.evaluated_depsgraph_get()
+    label = f"object '{obj.name}'"
     make: partial[Volume]
     if obj.type == "MESH":
-        local, triangles = _surface(obj, graph)
-        make = partial(Solid, moved(local, world_matrix(obj, graph)), triangles)
+        local, triangles = _surface(obj)
+        make = partial(Solid, moved(local, world_matrix(obj)), triangles)
     elif _is_shape(obj):
         kind, size = obj.empty_display_type, obj.empty_display_size
         ball, box = Sphere((0.0, 0.0, 0.0), size), Box((-size,) * 3, (size,) * 3)
-        shape = ball if kind == "SPHERE" else box
-        make = partial(MovedVolume, shape, world_matrix(obj, graph))
+        make = partial(MovedVolume, ball if kind == "SPHERE" else box, world_matrix(obj))
     else:
         what = f"of type {obj.type}"
         if obj.type == "EMPTY":
@@ -198,11 +197,9 @@ def _store(mesh: bpy.types.Mesh, counts: dict[str, Any]) -> None:
     mesh[RECORD] = json.dumps({"splats": splat_count(mesh), **counts})
 
 
-def _surface(
-    obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _surface(obj: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Vertices, (V, 3), and triangles, (T, 3), of a mesh with its modifiers."""
-    evaluated = obj.evaluated_get(depsgraph)
+    evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
     if obj.modifiers and not evaluated.is_evaluated:
         raise RefineError(
             f"object '{obj.name}': is disabled in viewports or excluded from the view layer, "

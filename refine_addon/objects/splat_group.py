@@ -142,7 +142,7 @@ def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splat
     scales are uniform, to estimate the pictures' quality. `RefineError` names the object."""
     parts = []
     for checked in group:
-        matrix = _matrix(checked)
+        matrix = world_matrix(checked.obj)
         harmonics = is_uniform(matrix) if whole is None else whole
         splats = mesh_attributes.splats_from_object(checked, sh_rest=harmonics)
         if not np.array_equal(matrix, np.eye(4)):
@@ -154,13 +154,9 @@ def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splat
     return joined(parts)
 
 
-def _matrix(checked: SplatObject) -> NDArray[np.float64]:
-    return world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
-
-
 def possible(group: Sequence[SplatObject], method: Method) -> Method:
     """The method, or `Occlusion` for merging where an object's scale is uneven."""
-    even = all(is_uniform(_matrix(member)) for member in group)
+    even = all(is_uniform(world_matrix(member.obj)) for member in group)
     return method if even or not isinstance(method, Merge) else method.deleting()
 
 
@@ -267,7 +263,9 @@ class Change(NamedTuple):
 def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
     """Read what `changes` needs of each object."""
     return [
-        Frame(len(member), mesh_layout.sh_degree(member.mesh), np.linalg.inv(_matrix(member)))
+        Frame(
+            len(member), mesh_layout.sh_degree(member.mesh), np.linalg.inv(world_matrix(member.obj))
+        )
         for member in group
     ]
 
@@ -357,7 +355,7 @@ def read_for_export(
     `apply_transform` puts splats into the world, harmonics turned; not if the matrix is flat."""
     if not apply_transform:
         return mesh_attributes.read_for_file(checked)
-    names, move = read_to_move(checked, _matrix(checked))
+    names, move = read_to_move(checked, world_matrix(checked.obj))
     if names:
         header = mesh_layout.VERTICAL_AXIS.sub("", checked.layout.header.decode("latin-1"))
         layout = replace(checked.layout, header=header.encode("latin-1"))
@@ -367,7 +365,7 @@ def read_for_export(
 
 def export_notes(checked: SplatObject, *, apply_transform: bool = False) -> list[str]:
     """Notes on an exported object; see `drift_notes`, `uneven_notes`."""
-    uneven = uneven_notes(checked, _matrix(checked)) if apply_transform else []
+    uneven = uneven_notes(checked, world_matrix(checked.obj)) if apply_transform else []
     return [*drift_notes(checked), *uneven]
 
 
@@ -516,6 +514,6 @@ def _scene(
         lambda: replace(mesh_attributes.read_for_file(checked)(), axes=axes),
         (row, fixed),
         form,
-        _matrix(checked),
+        world_matrix(checked.obj),
         (*modifier_notes(checked.obj), *drift_notes(checked)),
     )

@@ -76,7 +76,7 @@ class Stroke:
     def _read(self, context: Context) -> Callable[[Progress], dict[object, Prepared | Sight]]:
         """Read selection and view; a thread-safe callable gives what `_kept` is to hold."""
         obj, camera = self.obj, Camera.of(context)
-        matrix = world_matrix(obj, context.evaluated_depsgraph_get())
+        matrix = world_matrix(obj)
         with selection.readable(obj) as checked:
             away, self.before = _not_drawn(checked), selection.selected(checked.obj)
             digest = mesh_attributes.digest(checked)

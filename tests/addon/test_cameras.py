@@ -30,9 +30,7 @@ def _set(target, values):
 
 
 def _view(addon, obj):
-    return addon.cameras.view_from_camera(
-        obj, bpy.context.scene, bpy.context.evaluated_depsgraph_get()
-    )
+    return addon.cameras.view_from_camera(obj)
 
 
 def _project(view, points):

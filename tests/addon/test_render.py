@@ -47,9 +47,7 @@ def rendered():
 
 def drawn(addon, scene, obj):
     """Return what core draws of an object in the scene's camera, alpha not multiplied."""
-    view = addon.cameras.view_from_camera(
-        scene.camera, scene, bpy.context.evaluated_depsgraph_get()
-    )
+    view = addon.cameras.view_from_camera(scene.camera)
     picture = addon.core.pictures.draw(splats_of(addon, obj), view)
     picture[:3] /= np.maximum(picture[3], 1e-6)
     return np.moveaxis(picture, 0, -1).clip(0.0, 1.0)
@@ -124,7 +122,7 @@ def test_meshes_hide_splats_by_depth_and_alpha(addon, shot, quarter):
     shot.view_settings.view_transform = "Standard"
     shot.cycles.samples = 64
     open_ = rendered()
-    view = addon.cameras.view_from_camera(shot.camera, shot, bpy.context.evaluated_depsgraph_get())
+    view = addon.cameras.view_from_camera(shot.camera)
     depths = (splats_of(addon, quarter).means - view.center) @ view.rotation[2]
     plane(shot, float(np.median(depths[depths > 0.2])), (0.0, 0.0, 0.0), width=90.0)
     plain = rendered()
