@@ -275,14 +275,13 @@ def existing(name: str) -> bpy.types.Scene:
     return scene
 
 
-def set_frames(name: str, frames: Sequence[int]) -> bpy.types.Scene:
+def set_frames(name: str, frames: Sequence[int]) -> None:
     """Make a copied scene render evenly spaced frames, and go to the first."""
     scene = existing(name)
     scene.frame_start, scene.frame_end = frames[0], frames[-1]
     scene.frame_step = frames[1] - frames[0] if frames[1:] else 1
     if scene.frame_current != frames[0]:
         scene.frame_set(frames[0])
-    return scene
 
 
 def remove_all() -> None:
