@@ -23,10 +23,6 @@ from .mesh.layout import AXES, LAYOUT, VERTICAL_AXIS, is_native
 
 WEIGHT = "refine_weight"  # Custom property of a camera object: the weight of its view, 1 without it
 SOURCE = "refine_view"  # Custom property of an imported camera: its view in the file, exact, JSON
-UPRIGHT = np.eye(4)
-UPRIGHT[:3, :3] = QUARTER
-"""A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
-
 SENSOR = 36.0
 """Sensor width given to imported cameras, millimetres."""
 
@@ -110,7 +106,7 @@ def _evaluated(obj: bpy.types.Object) -> bpy.types.Object:
 
 
 def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
-    """New camera object of a view, in no collection; `upright`: turned by `UPRIGHT`.
+    """New camera object of a view, in no collection; `upright`: turned by `QUARTER`.
     Frames the view's image if the render size has its aspect; uses fx where fy differs."""
     view = view.turned(QUARTER) if upright else view
     name = PurePosixPath(view.name).name or "view"

@@ -13,8 +13,8 @@ from bpy.props import BoolProperty, CollectionProperty, IntProperty, StringPrope
 from bpy.types import Context
 from bpy_extras.io_utils import ImportHelper
 
-from ..cameras import SHEAR, SOURCE, UPRIGHT, create_cameras, known_turn, y_down
-from ..core.affine import AXES
+from ..cameras import SHEAR, SOURCE, create_cameras, known_turn, y_down
+from ..core.affine import AXES, QUARTER
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError, described
 from ..core.execute import Progress, part, report
@@ -170,7 +170,7 @@ def _splats_in(context: Context) -> bpy.types.Object | None:
 
 def _is_upright(obj: bpy.types.Object) -> bool:
     """Whether an object stands as *Upright* turns it; float32 leaves 7.5e-8 of the zeros."""
-    return np.allclose(np.array(obj.matrix_world)[:3, :3], UPRIGHT[:3, :3], atol=SHEAR)
+    return np.allclose(np.array(obj.matrix_world)[:3, :3], QUARTER, atol=SHEAR)
 
 
 _ROWS = 1 << 16  # Rows read between two checks for cancelling
@@ -301,7 +301,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         mesh_drift.stamp(mesh)
         obj = bpy.data.objects.new(mesh.name, mesh)
         if self.upright:
-            obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
+            obj.matrix_world = mathutils.Matrix(QUARTER.tolist()).to_4x4()
         operator_bases.target_collection(context).objects.link(obj)
         self.tell(mesh_attributes.import_notes(file))
         return obj
