@@ -505,14 +505,13 @@ def _scene(
 ) -> Scene:
     """The object in the world, which is also the views' frame."""
     axes = checked.mesh.get(mesh_layout.AXES, "")
-    row, fixed = mesh_attributes.file_size(checked)
     return Scene(
         f"{bpy.data.filepath}#{checked.obj.name}",
-        row * len(checked) + fixed,
+        checked.layout.file_bytes(len(checked)),
         gather([checked], whole=harmonics),
         demands.forced(checked),
         lambda: replace(mesh_attributes.read_for_file(checked)(), axes=axes),
-        (row, fixed),
+        mesh_attributes.file_size(checked),
         form,
         world_matrix(checked.obj),
         (*modifier_notes(checked.obj), *drift_notes(checked)),
