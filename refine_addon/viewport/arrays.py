@@ -95,7 +95,8 @@ def pack(splats: Splats) -> Packed:
             axes *= scales(part.log_scales)[:, None, :]
             matrices = axes @ axes.transpose(0, 2, 1)
             covariances[chunk] = matrices[:, rows, columns]
-        harmonics[chunk, 0], harmonics[chunk, 1:] = _half(part.sh_dc), _half(part.sh_rest)
+        coefficients = np.concatenate([part.sh_dc[:, None], part.sh_rest], axis=1)
+        harmonics[chunk] = np.clip(coefficients, -_LARGEST_HALF, _LARGEST_HALF)
     means = np.ascontiguousarray(splats.means[vertices], np.float32)
     return Packed(vertices, means, covariances, opacities[vertices], harmonics, splats.model)
 
@@ -208,12 +209,6 @@ def first_of_each(counts: list[int], most: int) -> list[int]:
     if total <= most:
         return list(counts)
     return [count * most // total for count in counts]
-
-
-def _half(values: NDArray[Any]) -> NDArray[Any]:
-    if values.size and max(values.max(), -values.min()) > _LARGEST_HALF:
-        return np.clip(values, -_LARGEST_HALF, _LARGEST_HALF)
-    return values
 
 
 def _directions(means: NDArray[np.float32], eye: Eye) -> NDArray[np.float32]:
