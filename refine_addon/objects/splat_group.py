@@ -416,10 +416,8 @@ def add_levels(
     return collection
 
 
-def has_levels(obj: bpy.types.Object | None) -> bool:
+def has_levels(obj: bpy.types.Object) -> bool:
     """Whether an object is a level, or has some."""
-    if obj is None:
-        return False
     return LEVEL_OF in obj or any(each.get(LEVEL_OF) == obj for each in bpy.data.objects)
 
 

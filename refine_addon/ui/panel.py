@@ -243,7 +243,7 @@ class REFINE_PT_deliver(InSidebar, bpy.types.Panel):
         column = wrapped.named_column(layout)
         column.prop(settings, "levels")
         column.operator("refine.levels", icon="MOD_DECIM")
-        if splat_group.has_levels(obj):
+        if obj and splat_group.has_levels(obj):
             column.operator("refine.export_levels", icon="EXPORT")
         names = ("export_ply", "levels", "export_levels", "render")
         _draw_progress(layout, *(f"refine.{name}" for name in names))
