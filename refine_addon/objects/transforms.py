@@ -37,15 +37,11 @@ _TRANSFORM = (
 
 
 def read_to_move(
-    checked: SplatObject,
-    matrix: NDArray[np.float64] | None = None,
-    *,
-    mend: bool = False,
+    checked: SplatObject, matrix: NDArray[np.float64], *, mend: bool = False
 ) -> tuple[set[str], Callable[[], tuple[dict[str, NDArray[Any]], int]]]:
     """Read an object to move its splats by `matrix`, (4, 4) in its frame, first repaired if `mend`.
     Gives the properties that change (maybe none), and a thread-safe callable for their values,
     (N,), and the number mended."""
-    matrix = np.eye(4) if matrix is None else matrix
     check_affine(matrix)
     notes = mesh_drift.disturbed(checked.mesh) if mend else None
     if notes is None and np.array_equal(matrix, np.eye(4)):

@@ -8,6 +8,7 @@ from typing import Any
 
 import bpy
 import mathutils
+import numpy as np
 from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 from bpy.types import Context
@@ -65,7 +66,7 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
         group = [mesh_layout.check(obj) for obj in drifted.values()]
         for each in group:
             mesh_edit.check_changeable(each.obj)
-        moves = [transforms.read_to_move(each, mend=True)[1] for each in group]
+        moves = [transforms.read_to_move(each, np.eye(4), mend=True)[1] for each in group]
         return group, partial(run_all, lambda move: move(), moves, threads=1)
 
     def put(self, context: Context, group: list[SplatObject], _job: Any, mended: Any) -> None:
