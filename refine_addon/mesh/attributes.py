@@ -176,7 +176,8 @@ def attribute_if_any(mesh: bpy.types.Mesh, name: str, *kinds: str) -> NDArray[An
 
 
 def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDArray[Any]) -> None:
-    """Store a point attribute, replacing one of another type or domain."""
+    """Store a point attribute, unsigned integers by their bits, replacing one of another type or
+    domain."""
     attribute = mesh.attributes.get(name)
     if attribute and (attribute.data_type, attribute.domain) != (data_type, "POINT"):
         mesh.attributes.remove(attribute)
@@ -241,21 +242,17 @@ class StoredColumns:
 
 
 def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -> None:
-    places = {column.name: column for column in columns}
+    places = {column.name: column.place for column in columns}
     position = np.empty((len(rows), 3), np.float32)
     for names in _groups(list(places), rows.dtype):
         for name, plane in zip(names, _planes(rows, names), strict=True):
-            place = places[name].place
-            if place.attribute == "position":
-                with np.errstate(over="ignore"):
-                    position[:, place.component] = plane
-                continue
-            kind = KINDS[place.kinds[0]]
-            values = plane.view(np.int32) if plane.dtype == np.uint32 else plane
+            place = places[name]
             with np.errstate(over="ignore"):  # large doubles become infinite; see `import_notes`
-                values = np.ascontiguousarray(values, kind.dtype)
-            mesh.attributes[place.attribute].data.foreach_set(kind.field, values)
-    mesh.attributes["position"].data.foreach_set("vector", position.ravel())
+                if place.attribute == "position":
+                    position[:, place.component] = plane
+                else:
+                    write_attribute(mesh, place.attribute, place.kinds[0], plane)
+    write_attribute(mesh, "position", "FLOAT_VECTOR", position)
 
 
 def _groups(names: list[str], dtype: np.dtype[Any]) -> list[list[str]]:
