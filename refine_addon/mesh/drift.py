@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.affine import Move, affine_moves
-from ..core.formats.ply_columns import THIRD_SCALE
 from . import attributes as mesh_attributes
 from .layout import ROTATION, SCALE, has, is_native, sh_degree
 
@@ -154,11 +153,9 @@ class Notes:
 def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.float32]]:
     """Attributes that hold scales and rotations, (N,) or (N, width) each."""
     names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
-    if THIRD_SCALE not in mesh.attributes:  # discs
-        names.remove(THIRD_SCALE)
-    if is_native(mesh):
-        names = [SCALE, ROTATION]
-    return [mesh_attributes.read_attribute(mesh, name) for name in names]
+    names = [SCALE, ROTATION] if is_native(mesh) else names
+    there = (name for name in names if name in mesh.attributes)  # discs have no third scale
+    return [mesh_attributes.read_attribute(mesh, name) for name in there]
 
 
 def _checksums(shapes: Sequence[NDArray[np.float32]], step: int = 1) -> NDArray[np.uint32]:
