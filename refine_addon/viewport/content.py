@@ -155,17 +155,15 @@ class Content:
             mesh = key[1]
             if mesh in self.refused:
                 continue
-            if is_edited(obj):
-                if mesh not in self._held:
-                    continue  # until `read_edited`
-            elif mesh not in self._held or mesh in self._stale:
+            if not is_edited(obj) and (mesh not in self._held or mesh in self._stale):
                 self._stale.discard(mesh)
                 try:
                     self._read(check(obj), mesh)
                 except RefineError:
                     self.refused.add(mesh)
                     continue
-            if self._held[mesh].packed is not None:
+            held = self._held.get(mesh)  # none in edit mode until `read_edited`
+            if held and held.packed is not None:
                 wanted[key] = matrix
         self._place(set(wanted), existing)
         return wanted
