@@ -198,8 +198,6 @@ class Content:
 
     def _mark(self, held: MeshSplats) -> None:
         packed, before = held.packed, held.marks
-        if packed is None:
-            return
         held.marks = marks = Marks(
             *(None if values is None else values[packed.vertices] for values in held.read)
         )

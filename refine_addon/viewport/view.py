@@ -72,7 +72,7 @@ class Camera(NamedTuple):
 class _Part(NamedTuple):
     slot: Slot
     marks: Marks
-    important: NDArray[np.int32] | None
+    important: NDArray[np.int32]
     eye: Eye
 
 
@@ -265,7 +265,7 @@ def _in_view(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Rows of an object's `count` most important splats that the view draws, and their depths."""
     slot, important = part.slot, part.important
-    if count == slot.count or important is None:
+    if count == slot.count:
         shown, depths = in_front(slot.packed.means[:count], part.eye, near)
     else:
         chosen = important[important < slot.count][:count]
