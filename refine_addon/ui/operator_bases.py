@@ -381,11 +381,11 @@ class Job(AtOnce):
 
 
 @persistent
-def unregister(*_arguments: object) -> None:
-    """End the work; also where a file is opened, since Blender drops the operator silently."""
+def _end(*_: object) -> None:
+    """End the work: Blender drops the operator silently."""
     if (running := now()) is not None:
         running.over(bpy.context)
         running.worker.end()
 
 
-HANDLERS = {unregister: ("load_pre",)}
+unregister, HANDLERS = _end, {_end: ("load_pre",)}
