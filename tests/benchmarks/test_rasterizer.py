@@ -56,8 +56,7 @@ def dense_render(
     toward = scene.means - camera.center
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     harmonics = np.concatenate([scene.sh_dc[:, None], scene.sh_rest], axis=1)
-    values = basis(toward, scene.sh_degree)
-    shown = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", values, harmonics))
+    shown = (0.5 + np.einsum("nk,nkc->nc", basis(toward, scene.sh_degree), harmonics)).clip(0.0)
     opacities, count = opacity(scene.opacity_logits), len(scene)
     stats = {n: np.zeros(count) for n in ("weight_sum", "weight_max", "opacity_sum", "hits")}
     for _, i, u, v, inverse in dense_geometry(scene, camera):

@@ -139,8 +139,7 @@ def test_colours_in_float32_are_those_in_float64(degree):
     along = random.normal(size=(50, 3))
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     harmonics = random.normal(size=(50, (degree + 1) ** 2, 3)).astype(np.float32)
-    dc, rest = harmonics[:, 0], harmonics[:, 1:]
-    found = spherical_harmonics.colors(along, dc, rest)
+    found = spherical_harmonics.colors(along, harmonics[:, 0], harmonics[:, 1:])
     expected = 0.5 + np.einsum("nk,nkc->nc", spherical_harmonics.basis(along, degree), harmonics)
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
