@@ -87,14 +87,14 @@ def colors(
     ``0.5 + sum of harmonics times coefficients`` (Kerbl et al. 2023), display-referred;
     `directions` and `sh_dc` are (N, 3), `sh_rest` is (N, K, 3), each at most `LARGEST`.
     """
-    columns = np.ascontiguousarray(directions.T, np.float32)
-    values = _values(columns, math.isqrt(sh_rest.shape[1] + 1) - 1)
+    degree = math.isqrt(sh_rest.shape[1] + 1) - 1  # one alone stands for all: no colour
+    values = _values(np.ascontiguousarray(directions.T, np.float32), degree)
     # In one memory layout, since einsum sums in an order that depends on it.
     dc, rest = (
         np.ascontiguousarray(each.clip(-LARGEST, LARGEST), np.float32) for each in (sh_dc, sh_rest)
     )
     result = values[0] * dc.T
-    if rest.shape[1]:
+    if degree:
         result += np.einsum("nk,nkc->cn", np.stack(values[1:], axis=1), rest)
     return np.asarray(result.T + np.float32(0.5))
 
