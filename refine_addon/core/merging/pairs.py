@@ -339,7 +339,8 @@ def _full(covariances: Array) -> Array:
 
 def flat(covariances: Array) -> Array:
     """Covariances, (M, 6), without their shortest axis."""
-    values, vectors = np.linalg.eigh(_full(covariances))
+    # Of what is not finite LAPACK gives an error; such pairs have no mass, and are not merged.
+    values, vectors = np.linalg.eigh(np.nan_to_num(_full(covariances)))
     sides = vectors[:, :, 1:] * np.sqrt(np.maximum(values[:, None, 1:], 0.0))
     return packed(sides @ np.swapaxes(sides, 1, 2))
 
