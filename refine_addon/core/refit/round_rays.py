@@ -49,7 +49,6 @@ SHIFT, MAX_SHIFT = 0.7, 0.1
 VALIDATION_VIEWS = 12  # about the most that validation rays go from
 
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
-_CHUNK = 1 << 12  # what stays in the second-level cache
 _EVERY = 2  # validation rays go through every second row of a round's rays
 _NOTHING = 1e-30  # hits of a ray; keeps a division finite
 
