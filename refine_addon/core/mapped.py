@@ -28,7 +28,7 @@ from .splats import ARRAYS, Splats
 from .whole_file import explained
 
 Result = TypeVar("Result")
-REGION = 1 << 20  # most splats of a region; merging takes about 900 bytes of each
+REGION = 1 << 20  # most splats of a region; merging takes about 400 bytes of each
 _ROWS = 1 << 16  # splats copied at a time
 _SAMPLE = 1 << 14  # splats that decide along which axis a box is divided
 _ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32(3.0)

@@ -16,6 +16,7 @@ from ..visibility import frustum
 from ..visibility.scene import Scene
 
 Array = NDArray[np.float64]
+Real = NDArray[np.floating[Any]]
 Index = NDArray[np.int64] | NDArray[np.int32]
 Footprint = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 """Covariances in a plane: xx, xy and yy, (M,) each."""
@@ -30,16 +31,16 @@ _BRIGHTEST = 1e18  # its square is a float32
 
 @dataclass(eq=False)
 class Field:
-    """N splats as merging needs them, in float64; merged splats replace one of their two."""
+    """N splats as merging needs them; merged splats replace one of their two."""
 
     means: Array  # (N, 3), world units
     covariances: Array  # (N, 6): xx, xy, xz, yy, yz, zz; world units squared
     opacity: Array  # (N,), 0..1
     contribution: Array  # (N,): W, the sum of T alpha over pixels, >= 0
     error: Array  # (N,): E, the sum of (T alpha)^2 times the squared contrast, >= 0
-    direction: Array  # (N, 3): mean direction in which views look at it, hidden or not; length 1
-    deviation: Array  # (N, 3): standard deviation of these along their widest axis; sign arbitrary
-    color: Array  # (N, 3), as viewed along `direction`
+    direction: Real  # (N, 3) float32: mean in which views look at it, hidden or not; length 1
+    deviation: Real  # (N, 3) float32: standard deviation along their widest axis; sign arbitrary
+    color: Real  # (N, 3) float32, as viewed along `direction`
     blur: Array  # (N,): variance of the low-pass at the splat, world units squared
     _: KW_ONLY
     model: Model = "default"
@@ -103,8 +104,8 @@ def measured_field(
     `BESIDE` of that if it does not hold the centre.
     """
     count = len(rows)
-    shapes = (3,), (6,), (), (), (), (3,), (3,), (3,), ()
-    result = Field(*(np.empty((count, *shape)) for shape in shapes), model=splats.model)
+    kinds = "3f8", "6f8", "f8", "f8", "f8", "3f4", "3f4", "3f4", "f8"
+    result = Field(*(np.empty(count, kind) for kind in kinds), model=splats.model)
     mass, seen = np.empty((2, count))
     spread = views.spread(DIRECTION_VIEWS)
     weighted = [pair for pair in zip(spread, spread.weights, strict=True) if pair[1]]
@@ -173,7 +174,7 @@ def packed(matrices: Array) -> Array:
     return upper
 
 
-def across(normal: Array) -> tuple[Array, Array]:
+def across(normal: Real) -> tuple[Real, Real]:
     """Orthogonal unit vectors, (3, M), at right angles to `normal`, (M, 3) (Duff et al. 2017)."""
     x, y, z = normal.T
     sign = np.where(z >= 0.0, z.dtype.type(1.0), z.dtype.type(-1.0))
@@ -184,7 +185,7 @@ def across(normal: Array) -> tuple[Array, Array]:
     return u, v
 
 
-def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
+def footprint(covariances: Array, plane: tuple[Real, Real], blur: Array) -> Footprint:
     """Covariances in planes, ``(u, v)' C (u, v) + blur I``; u and v are orthogonal, (3, M) each."""
     u, v = plane
     xx, xy, xz, yy, yz, zz = covariances.T

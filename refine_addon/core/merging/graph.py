@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import Progress, chunks, part, report, run_all, silent
+from ..execute import Progress, chunks, part, report, return_freed, run_all, silent
 from ..splats import rotation_matrices
 from ..visibility.scene import MIX, Scene, spatial_order
 from . import pairs as pricing
@@ -90,6 +90,7 @@ class MergeGraph:
             done = CONNECTING + (1.0 - CONNECTING) * (start - count) / (start - goal)
             of_round = part(progress, done, done)
             report(of_round, 0.0, "merging")
+            return_freed()
             if count < self.connected / 2:
                 self.connect(of_round)
             count -= self._round(min(max(int(BATCH * count), 1), count - goal), of_round)
@@ -98,10 +99,18 @@ class MergeGraph:
 
     def connect(self, progress: Progress = silent) -> None:
         """Find the pairs of neighbouring splats, and price them."""
+        self.first, self.second = self._neighbours(part(progress, 0.0, 0.6))
+        return_freed()
+        self.cost = np.empty(len(self.first), np.float32)
+        self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.6, 1.0))
+        self.connected = int(np.count_nonzero(self.alive))
+
+    def _neighbours(self, progress: Progress) -> tuple[Rows, Rows]:
+        """Rows of pairs of neighbouring splats, (E,) each."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
         place = self.scene.positions(self.field.means, rows, threads=self.threads)  # (R, 3)
         near = nearest(
-            place, NEIGHBOURS, progress=part(progress, 0.0, 0.5), threads=self.threads
+            place, NEIGHBOURS, progress=part(progress, 0.0, 0.8), threads=self.threads
         )  # (R, k)
         del place
 
@@ -114,14 +123,11 @@ class MergeGraph:
 
         edges = run_all(
             pairs, chunks(max(len(rows), 1), _CHUNK),
-            progress=part(progress, 0.5, 0.6), what="merging", threads=self.threads,
+            progress=part(progress, 0.8, 1.0), what="merging", threads=self.threads,
         )  # fmt: skip
         # int32 takes half the memory of int64, and no file holds two billion splats.
-        self.first, self.second = map(np.concatenate, zip(*edges, strict=True))
-        del edges
-        self.cost = np.empty(len(self.first), np.float32)
-        self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.6, 1.0))
-        self.connected = int(np.count_nonzero(self.alive))
+        first, second = map(np.concatenate, zip(*edges, strict=True))
+        return first, second
 
     def _price(self, edges: Index, progress: Progress) -> None:
         """Set the costs of some pairs; infinite where deleting one of the two costs less."""

@@ -12,15 +12,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..affine import quaternion
 from ..execute import Progress, chunks, run_all
 from ..splats import ALPHA_MAX, LOG_ZERO, LOW_PASS, Model
 from ..visibility.projection import disc_axes
-from .field import Array, Field, Footprint, Index, across, footprint, normalized, packed
+from .field import Array, Field, Footprint, Index, Real, across, footprint, normalized, packed
 
-Real = NDArray[np.floating[Any]]
 FLATTEST = 1e-14  # least eigenvalue of a covariance over their sum; rounding hides smaller ones
 
 ASIDE = 0.1
@@ -99,7 +97,7 @@ class _Ends(NamedTuple):
 def _gather(splats: Field, first: Index, second: Index, kind: type[np.floating[Any]]) -> _Ends:
     """Ends of pairs as `kind`, float32 or float64."""
 
-    def both(values: Array) -> list[Real]:
+    def both(values: Real) -> list[Real]:
         return [
             values.take(rows, axis=0).T.astype(kind, order="C", copy=False)
             for rows in (first, second)

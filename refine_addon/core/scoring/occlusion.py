@@ -67,9 +67,9 @@ def score(
 ) -> tuple[Scores, Measured]:
     """Score splats, in memory or files, by how much the views change without them, with occlusion.
 
-    A splat's value is the share of splats removed up to it, in (0, 1]; 0 if undrawable. Memory: 300
-    bytes a splat, 100 more for each further thread, and 100 for each point
-    (`points.MAX_POINTS`) of a view in each thread. A stage of the job if splats lie in files.
+    A splat's value is the share of splats removed up to it, in (0, 1]; 0 if undrawable. Memory: 100
+    bytes a splat, and in each thread 160 for each splat that its view shows. A stage of the job if
+    splats lie in files.
 
     Parameters
     ----------

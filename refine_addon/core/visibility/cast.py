@@ -51,6 +51,7 @@ BEHIND = 1e-4
 LOG_DIM = -6.9  # of the transmittance, 1e-3, where `cast_visible` ends rays
 
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
+_FOOTPRINTS = 1 << 18  # whose boxes are held at a time
 _SPLATS = 1 << 12  # whose colours are computed at a time, likewise
 _MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
@@ -290,37 +291,39 @@ def hits(
     Columns, rows and aims are those of `Rays`. About `limit` pairs of footprint and pixel in its
     bounding box are held at once; `wanted` says which pairs to test, by footprints and rays, (p,).
     """
-    squared_radius = _squared_radius(footprints.alphas)  # (n,)
-    # Of each footprint: the first column and row in its bounding box, and how many lie in it.
-    across, down = (
-        _bounding_boxes(footprints, squared_radius, axis, places)
-        for axis, places in enumerate((columns, rows))
-    )
-    if aims is not None:  # the cell before may reach into the box
+    for piece in chunks(len(footprints.index), _FOOTPRINTS):
+        some = footprints.part(piece)
+        squared_radius = _squared_radius(some.alphas)  # (n,)
+        # Of each footprint: the first column and row in its bounding box, and how many lie in it.
         across, down = (
-            (np.maximum(first - 1, 0), count + (first > 0)) for first, count in (across, down)
+            _bounding_boxes(some, squared_radius, axis, places)
+            for axis, places in enumerate((columns, rows))
         )
-    boxed = np.flatnonzero(across[1] * down[1] > 0)  # (r,)
-    ends = np.cumsum((across[1] * down[1])[boxed])
-    cuts = np.searchsorted(ends, np.arange(0, int(ends[-1:].sum()), limit)).tolist()
-    for start, end in pairwise([*cuts, len(boxed)]):
-        checkpoint()
-        owner, column, row = _boxed_pixels(boxed[start:end], across, down)
-        pixel = row * np.int32(len(columns)) + column
-        if wanted is not None:
-            left = np.flatnonzero(wanted(owner, pixel))
-            if len(left) < len(owner):
-                owner, pixel = owner.take(left), pixel.take(left)
-                column, row = column.take(left), row.take(left)
-        if aims is None:
-            place = columns.take(column), rows.take(row)
-        else:
-            place = aims[0].take(pixel), aims[1].take(pixel)
-        squared = _squared_distances(footprints, owner, *place)
-        inside = np.flatnonzero(squared < squared_radius.take(owner))
-        owner = owner[inside]
-        alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
-        yield owner, pixel[inside], np.minimum(alpha, np.float32(ALPHA_MAX))
+        if aims is not None:  # the cell before may reach into the box
+            across, down = (
+                (np.maximum(first - 1, 0), count + (first > 0)) for first, count in (across, down)
+            )
+        boxed = np.flatnonzero(across[1] * down[1] > 0)  # (r,)
+        ends = np.cumsum((across[1] * down[1])[boxed])
+        cuts = np.searchsorted(ends, np.arange(0, int(ends[-1:].sum()), limit)).tolist()
+        for start, end in pairwise([*cuts, len(boxed)]):
+            checkpoint()
+            owner, column, row = _boxed_pixels(boxed[start:end], across, down)
+            pixel = row * np.int32(len(columns)) + column
+            if wanted is not None:
+                left = np.flatnonzero(wanted(owner + piece.start, pixel))
+                if len(left) < len(owner):
+                    owner, pixel = owner.take(left), pixel.take(left)
+                    column, row = column.take(left), row.take(left)
+            if aims is None:
+                place = columns.take(column), rows.take(row)
+            else:
+                place = aims[0].take(pixel), aims[1].take(pixel)
+            squared = _squared_distances(some, owner, *place)
+            inside = np.flatnonzero(squared < squared_radius.take(owner))
+            owner = owner[inside]
+            alpha = some.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
+            yield owner + piece.start, pixel[inside], np.minimum(alpha, np.float32(ALPHA_MAX))
 
 
 def _boxed_pixels(chosen, across, down):

@@ -150,7 +150,7 @@ def _measure_view(gaussians, scene, view):
         if len(footprints.index):
             points = scatter(footprints, view, cell_size(footprints, view))
             integrals = _integrals(gaussians, footprints, points)
-    return footprints, (footprints.index, footprints.inside, *integrals)
+    return footprints, (footprints.index.astype(np.int32), footprints.inside, *integrals)
 
 
 def _integrals(gaussians, footprints, points):
@@ -194,9 +194,12 @@ def _integrals(gaussians, footprints, points):
             total += np.bincount(owners, of_points, count)
     # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
     # footprint that lies in the image.
-    error *= points.share_inside / np.maximum(points.squares, 1e-30)
-    mass_squared = np.float32(0.5) * mass * (alphas + np.float32(ALPHA_CUT))
-    return mass * visible, mass_squared * error
+    error *= points.share_inside
+    error /= np.maximum(points.squares, np.float32(1e-30))
+    visible *= mass
+    mass *= np.float32(0.5) * (alphas + np.float32(ALPHA_CUT))
+    error *= mass
+    return visible.astype(np.float32), error.astype(np.float32)
 
 
 def _evenness(footprints, area):

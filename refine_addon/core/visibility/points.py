@@ -44,7 +44,7 @@ DENSITY = 3.7
 """Points per standard deviation that is as long as a cell."""
 
 MAX_POINTS = 1 << 22
-"""Most points of a view, as estimated, about 100 bytes each: cells grow until there are fewer."""
+"""Most points of a view, as estimated: cells grow until there are fewer."""
 
 LEAST_POINTS = 1.25
 """Points of a footprint that are always allowed: each has one at least, however large the cells."""
@@ -87,8 +87,8 @@ class Points(NamedTuple):
     owners: NDArray[np.int32]  # (m,), rows of the `Footprints`
     shares: NDArray[np.float32]  # (m,), of the splat's mass
     counts: NDArray[np.int64]  # (C,), points of each cell: its column
-    share_inside: NDArray[np.float64]  # (n,), sum of the shares in the image
-    squares: NDArray[np.float64]  # (n,), sum of their squares
+    share_inside: NDArray[np.float32]  # (n,), sum of the shares in the image
+    squares: NDArray[np.float32]  # (n,), sum of their squares
     area: float  # of a cell, px^2
 
 
@@ -135,6 +135,7 @@ def scatter(footprints: Footprints, view: View, side: float) -> Points:
     counts = filled[filled > 0]  # (C,)
     # A stable sort keeps the points of a cell front to back; those `_OUTSIDE` come last.
     order = np.argsort(cells, kind="stable")[: counts.sum()]
+    del cells
     checkpoint()
     owners, shares = owners.take(order), shares.take(order)
     _merge(owners, shares, squares, counts)
@@ -163,7 +164,7 @@ def _points_of(footprints, view, side, kinds, piece):
         cells[at], shares[at] = _flat_points(footprints, of_all, view, side)
         sums[:, replaced] = shares[at].sum(axis=1), (shares[at] ** 2).sum(axis=1)
     sums = np.stack([np.bincount(rows, sum_, len(vast)) for sum_ in sums])
-    return owners, cells, shares, sums.astype(float, copy=False)
+    return owners, cells, shares, sums.astype(np.float32)
 
 
 def _kinds(footprints, view, scale):

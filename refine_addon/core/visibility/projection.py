@@ -6,7 +6,7 @@ import itertools
 import secrets
 import shutil
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -96,8 +96,8 @@ class Gaussians:
                 for name in ("means", "covariances", "normals")
             }  # fmt: skip
             yield rows.start, replace(
-                self, index=np.arange(len(largest)), largest=largest, alphas=self.alphas[rows],
-                boxes=None, **arrays,
+                self, index=self.index[rows], largest=largest, alphas=self.alphas[rows], boxes=None,
+                **arrays,
             )  # fmt: skip
 
     def take(self, keep: NDArray[Any]) -> Gaussians:
@@ -124,11 +124,17 @@ class Footprints:
 
     def take(self, rows: NDArray[np.int64]) -> Footprints:
         """Some footprints, in that order."""
-        taken: dict[str, Any] = {
-            name: None if values is None else np.take(values, rows, axis=-1)
-            for name, values in vars(self).items()
+        return self._each(lambda values: np.take(values, rows, axis=-1))
+
+    def part(self, piece: slice) -> Footprints:
+        """Some footprints, not copied."""
+        return self._each(lambda values: values[..., piece])
+
+    def _each(self, change: Callable[[Any], Any]) -> Footprints:
+        changed: dict[str, Any] = {
+            name: None if values is None else change(values) for name, values in vars(self).items()
         }
-        return Footprints(**taken)
+        return Footprints(**changed)
 
 
 def prepare(
@@ -246,14 +252,14 @@ def project(
     turned = (view.rotation @ scene.axes.T).astype(np.float32)
     rotation = _rotation6(view.rotation @ scene.axes.T)
     views, low_pass = (view, window or view), DISC_LOW_PASS if discs else LOW_PASS
-    none = np.empty((7, 0), np.float32)
-    hit: tuple[NDArray[Any], ...] = (none,) if discs else ()
-    # Depths, and what footprints hold.
-    pieces = [(none[0], none[0].astype(np.int64), *[none[:2]] * 4, none[0] > 0.0, none[0], *hit)]
+    parts = [*gaussians.parts(scene, *views)] if _computable(scene, view) else []
+    # Depths, and what footprints hold: more room than is filled takes no memory.
+    count, filled = sum(len(chunk) for _, chunk in parts), 0
+    shapes = (), (), (2,), (2,), (2,), (2,), (), (), *([(7,)] if discs else ())
+    kinds = np.float32, np.int64, *[np.float32] * 4, np.bool_, np.float32, np.float32
+    arrays = [np.empty((*shape, count), kind) for shape, kind in zip(shapes, kinds, strict=False)]
     starts = (
-        (first, chunk, start)
-        for first, chunk in gaussians.parts(scene, *views)
-        for start in range(0, len(chunk) if _computable(scene, view) else 0, _CHUNK)
+        (first, chunk, start) for first, chunk in parts for start in range(0, len(chunk), _CHUNK)
     )
     for first, chunk, start in starts:
         checkpoint()
@@ -266,6 +272,7 @@ def project(
             shape, rows = _product(rotation, covariances), touching + start  # (6, n), (n,)
             alphas, (across, down) = chunk.alphas.take(rows), local[:2] / local[2]
             centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
+            hit = []
             if chunk.normals is not None:
                 normals = _product(turned, np.take(chunk.normals, rows, axis=1))
                 axes, *hit = _discs(across, down, local[2], shape, normals, view, planes[0])
@@ -274,14 +281,15 @@ def project(
                 if gaussians.model == "antialiased":
                     alphas *= kept
             inside = frustum.contains(view, local, planes)
-            pieces.append((local[2], rows + first, centers, *axes, inside, alphas, *hit))
-    depth, *columns = zip(*pieces, strict=True)
-    del pieces
+            found = local[2], rows + first, centers, *axes, inside, alphas, *hit
+            for array, values in zip(arrays, found, strict=True):
+                array[..., filled : filled + len(rows)] = values
+            filled += len(rows)
     checkpoint()
-    order = _by_depth(np.concatenate(depth))
+    order = _by_depth(arrays.pop(0)[:filled])
     # One by one: all in both orders would be the most memory that a view takes.
-    arrays = (np.concatenate(columns.pop(0), axis=-1) for _ in range(len(columns)))
-    footprints = Footprints(*(array.take(order, axis=-1) for array in arrays))
+    ordered = (arrays.pop(0)[..., :filled].take(order, axis=-1) for _ in range(len(arrays)))
+    footprints = Footprints(*ordered)
     if gaussians.model == "antialiased":  # some are now too faint to be drawn
         return footprints.take(np.flatnonzero(footprints.alphas > ALPHA_CUT))
     return footprints
