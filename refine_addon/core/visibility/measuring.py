@@ -165,9 +165,10 @@ def _integrals(gaussians, footprints, points):
     alphas, count = footprints.alphas, len(footprints.alphas)
     mass = np.float32(2.0 * math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
     mass *= alphas - np.float32(ALPHA_CUT)
-    # What points take from their splats, in one table: one look-up is faster than six.
-    traits = np.empty((count, 6), np.float32)
-    traits[:, :3] = gaussians.colors[footprints.index]
+    # What points take from their splats, in one table: one look-up is faster than six, and rows of
+    # 32 bytes, two of these columns unused, are copied twice as fast as rows of 24.
+    traits = np.empty((count, 8), np.float32)
+    traits[:, :3] = gaussians.colors.take(footprints.index, axis=0)
     traits[:, 3] = mass / np.float32(points.area)
     np.minimum(alphas, np.float32(ALPHA_MAX), out=traits[:, 4])
     traits[:, 5] = _evenness(footprints, points.area)
