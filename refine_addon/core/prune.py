@@ -133,7 +133,7 @@ def with_quality(
         return scores
     curve = quality_curve(
         scores.ray_sample, scores.values, protected=protected, settled=scores.settled,
-        between=scores.between, progress=progress, threads=threads,
+        between=scores.between if scores.tells else None, progress=progress, threads=threads,
     )  # fmt: skip
     return replace(scores, quality=curve)
 

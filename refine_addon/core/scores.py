@@ -15,6 +15,9 @@ from .splats import among_all
 from .views import ViewSet
 from .visibility.cast import RaySample
 
+TELLING = 12
+"""Fewest views by which it is told what views elsewhere lose: by 8 it was up to 5 dB too high."""
+
 _DISTINCT = 1 << 24  # largest number of equal steps from 0 to 1 that are distinct in float32
 
 
@@ -58,6 +61,11 @@ class Scores:
     settled: int | None = None
     scored: NDArray[np.bool_] | None = None
     deciding: ViewSet | None = None
+
+    @property
+    def tells(self) -> bool:
+        """Whether `between` is near enough to what is lost in views elsewhere, see `TELLING`."""
+        return self.views_used >= TELLING
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
         """Scores of all N splats, from these of the splats in `rest`, (N,) bool; others get 0."""

@@ -22,6 +22,7 @@ from ..core.prune import prune
 from ..core.quality.alignment import Alignment
 from ..core.quality.curve import Quality, Way, expected_seconds, in_words, out_of_reach, parted
 from ..core.report import MANY_UNSEEN, sizes_in_words
+from ..core.scores import TELLING
 from ..core.selection import Budget, quality_of
 from ..core.splats import MODELS
 from ..mesh import attributes as mesh_attributes
@@ -133,8 +134,8 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
     """The panel's warnings on a plan without an error; `record`: of its scoring."""
     alignment = Alignment.from_facts(record.get("alignment"))
     curve, share, texts = plan["quality"], plan["share"], [alignment.turned()]
-    if record["views_used"] == 1:
-        texts.append("one camera decides: add others if the splats are seen from elsewhere too")
+    if record["views_used"] < TELLING:
+        texts.append("few cameras decide: add others if the splats are seen from elsewhere too")
     if curve is not None:
         way = plan["becomes"] if curve.foretold else "delete"
         between = curve.at_between(share, way)
