@@ -30,9 +30,8 @@ from .methods import DEFAULT, Method
 from .operations import read_scene
 from .prune import prune, score
 from .quality.curve import PSNR_CAP
-from .report import Clock, scored, scoring_notes
+from .report import Clock, scoring_notes, seen_by
 from .result import Origin, Result
-from .scores import Scores
 from .selection import Budget
 from .splats import Model, Splats, among_all
 from .views import ViewSet
@@ -116,8 +115,7 @@ class Level:
 
     number: int  # from 1; level 0 is the original
     goal: float  # the share or the PSNR, dB
-    result: Result
-    scores: Scores
+    result: Result  # the scores are those of all levels
 
     @property
     def psnr(self) -> float | None:
@@ -186,17 +184,15 @@ def lod(
         rest = ~gone
         splats = splats.take(rest)
         protected = None if protected is None else protected[rest]
-    left, number, scores = len(whole), 0, None
+    left, number = len(whole), 0
     results = _results(splats, views, budgets, method, protected, progress, threads)
     for goal, result in zip(levels.goals, results, strict=True):
-        scores = result.scores if scores is None else scores
         kept = int(np.count_nonzero(result.keep))
         if kept < left:
             number, left = number + 1, kept
-            assert scores is not None
             if rest is not None:
                 result = replace(result.for_all(rest), source=whole)
-            yield Level(number, goal, result, scores)
+            yield Level(number, goal, result)
     if not number:
         raise RefineError(f"no level has fewer splats than the input, which has {len(whole)}")
 
@@ -385,11 +381,13 @@ def lod_file(
             protected=demands.protected, removed=demands.removed, progress=making, threads=threads,
         ):  # fmt: skip
             if level.number == 1:
-                seen = scored(level.scores)
-                seen["splats"] |= {"before": count, **demands.counts()}
+                scores = level.result.scores
+                assert scores is not None
+                seen = seen_by(scores, demands.removed)
+                seen["splats"] |= demands.counts()
                 summary |= {"source": {"file": file.name, "bytes": scene.bytes}, **seen}
                 summary["nested"] = not method.changes
-                notes += scoring_notes(level.scores)
+                notes += scoring_notes(scores)
             name, size, missing, more = add(scene, level)
             notes += [note for note in more if note not in notes]
             entry = level.facts() | {"left_out": missing, "file": name, "bytes": size}

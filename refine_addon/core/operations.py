@@ -30,7 +30,7 @@ from .pictures import PictureFiles
 from .prune import prune, score
 from .quality.alignment import alignment
 from .quality.psnr import psnr_against
-from .report import Clock, kept_and_removed, prices, scored, scoring_notes, seen_by
+from .report import Clock, kept_and_removed, prices, scoring_notes, seen_by
 from .result import Result, file_of
 from .selection import Budget
 from .splats import Model, Splats, joined
@@ -369,14 +369,13 @@ def clean_file(
         )  # fmt: skip
         clock.lap("clean_s")
         report: dict[str, Any] = {
-            **seen_by(cleaned.seen, cleaned.undrawable, cleaned.views_given, cleaned.views_used),
+            **seen_by(cleaned, demands.removed),
             "settings": asdict(cleaning),
             "volumes": list(demands.facts),
             "cleaned": cleaned.facts(),
             "notes": cleaned.notes(),
         }
         report["splats"] |= kept_and_removed(cleaned.keep) | demands.counts()
-        report["splats"]["unseen"] -= report["splats"]["removed_by_user"]
         return Result(cleaned.keep, report)
 
     return _run_file(
@@ -397,17 +396,14 @@ def score_scene(
             progress=progress, threads=threads,
         )  # fmt: skip
         clock.lap("score_s")
-        gone = demands.counts()["removed_by_user"]
         report: dict[str, Any] = {
-            **scored(scores),
+            **seen_by(scores, demands.removed),
             "settings": method.facts(),
             "volumes": list(demands.facts),
             "weights": scores.facts,
             "prices": prices(scores, clock.timings["score_s"]),
             "notes": scoring_notes(scores),
         }
-        report["splats"] |= {"removed_by_user": gone}
-        report["splats"]["unseen"] -= gone
         keep = np.ones(len(scene.splats), np.bool_)
         return Result(keep, report, columns={PROPERTY: scores.values})
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .cleaning.clean import Cleaned
 from .methods import ClosedForm, Method
 from .quality.curve import FEWEST, Way, expected, expected_seconds, in_words, out_of_reach, parted
 from .scores import Scores
@@ -74,20 +75,17 @@ def scoring_notes(scores: Scores) -> list[str]:
 
 
 def seen_by(
-    seen: NDArray[np.int32], undrawable: int, given: int, used: int, between: int = 0
+    found: Scores | Cleaned, removed: NDArray[np.bool_] | None = None
 ) -> dict[str, dict[str, int]]:
-    """Counts of splats and views for every report; `seen`, (N,), counts the views of each splat."""
-    unseen = int(np.count_nonzero(seen == 0))
+    """Counts of splats and views for every report; `removed`, (N,), by the user: seen by none."""
+    gone = 0 if removed is None else int(np.count_nonzero(removed))
+    unseen = int(np.count_nonzero(found.seen == 0)) - gone
+    counts = {"before": len(found.seen), "undrawable": found.undrawable, "unseen": unseen}
+    between = found.views_between if isinstance(found, Scores) else 0
     return {
-        "splats": {"before": len(seen), "undrawable": undrawable, "unseen": unseen},
-        "views": {"given": given, "used": used, "between": between},
+        "splats": {**counts, "removed_by_user": gone},
+        "views": {"given": found.views_given, "used": found.views_used, "between": between},
     }
-
-
-def scored(scores: Scores) -> dict[str, dict[str, int]]:
-    """`seen_by` for the splats and views of a scoring."""
-    given, used = scores.views_given, scores.views_used
-    return seen_by(scores.seen, scores.undrawable, given, used, scores.views_between)
 
 
 def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
@@ -118,7 +116,7 @@ def of_prune(
     predicted. `outcome` is that of merging, `tried` its PSNR if deletion was as good.
     """
     count, curve = len(keep), scores.quality
-    report: dict[str, Any] = {**scored(scores)}
+    report: dict[str, Any] = {**seen_by(scores)}
     report["splats"] |= kept_and_removed(keep)
     report["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
     removed = report["splats"]["removed"]
