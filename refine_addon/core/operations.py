@@ -55,9 +55,9 @@ class Scene:
     demands: Forced
     file: Callable[[], SplatFile]  # what is written, in the source's frame
     sizes: tuple[float, int]  # bytes of a splat in a plain PLY, and of the rest
-    form: Format | None = None  # of the output, None for plain PLY
     matrix: NDArray[np.float64] | None = None  # (4, 4), source to views
     notes: tuple[str, ...] = ()
+    form: Format | None = None  # of the output, None for plain PLY; `run` sets it
 
 
 def by_cameras(file: SplatFile, views: ViewSet) -> SplatFile:
@@ -75,26 +75,25 @@ def read_scene(
     path: Path | str,
     zones: Sequence[Zone] = (),
     model: Model | None = None,
-    form: Format | None = None,
     axes: str | None = None,
     views: ViewSet | None = None,
 ) -> Scene:
     """Read a file of splats, of any format, into memory; its frame is that of views and zones.
 
     `model` and `axes` count if the file does not say, see `read_splats`; without `axes` the views
-    decide on those of an SPZ. `form` is the output's format.
+    decide on those of an SPZ.
     """
     file = read_splats(path, model, axes=axes)
     file = file if views is None else by_cameras(file, views)
     splats = file.splats()
     return Scene(
         str(file.path), file.stored_bytes, splats, forced(zones, splats.means), lambda: file,
-        (file.row_bytes, file.fixed_bytes), form,
+        (file.row_bytes, file.fixed_bytes),
     )  # fmt: skip
 
 
 def run(
-    read: Callable[[Format | None], Scene],
+    read: Callable[[], Scene],
     decide: Callable[[Scene, Clock, Progress], Result],
     output: Path | None,
     *,
@@ -110,9 +109,9 @@ def run(
     """Read, decide, write and compare; the report of the result is complete afterwards.
 
     If this fails nothing is written, but for the last round of a refit that is cancelled, and for a
-    file whose comparison fails. `read` gets the output's format, None for plain PLY; without
-    `output`, or in a dry run, no splats are written. `source` is the file that is read meanwhile.
-    In `views` a lossy file and `pictures` are compared with all splats. `save` follows the writing.
+    file whose comparison fails. Without `output`, or in a dry run, no splats are written. `source`
+    is the file that is read meanwhile. In `views` a lossy file and `pictures` are compared with all
+    splats. `save` follows the writing.
     """
     clock, written = Clock(), None if dry_run else output
     with contextlib.nullcontext() if pictures is None or views is None else pictures.opened(views):
@@ -121,7 +120,7 @@ def run(
             if source is not None:
                 refuse_mapped(written, source)
         form = None if output is None else format_named(output)
-        scene = read(form)
+        scene = replace(read(), form=form)
         clock.lap("read_s")
         count = len(scene.splats)
         drawing = 0.0 if pictures is None else seconds("draw", count, 6)
@@ -341,7 +340,7 @@ def prune_file(
 
 def _run_file(source, output, decide, views, zones, model, axes, **how: Any) -> Result:
     return run(
-        lambda form: read_scene(source, zones, model, form, axes, views), decide,
+        lambda: read_scene(source, zones, model, axes, views), decide,
         None if output is None else expanded(output), source=expanded(source), views=views, **how,
     )  # fmt: skip
 
@@ -478,9 +477,9 @@ def convert_files(
         raise RefineError(f"degree is {degree}, expected a whole number from 0 to 4")
     alone = len(sources) == 1 and not (matrices or morton or level) and degree is None
 
-    def read(form: Format | None) -> Scene:
+    def read() -> Scene:
         if alone:
-            return read_scene(sources[0], model=model, form=form, axes=axes)
+            return read_scene(sources[0], model=model, axes=axes)
         paths = [expanded(path) for path in sources]
         of_level = [path for path in paths if path.name.lower().endswith(INDEX)] or paths
         files = [read_splats(path, model, level if path in of_level else 0, axes) for path in paths]

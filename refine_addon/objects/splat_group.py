@@ -476,7 +476,7 @@ def prune_object(
                 raise RefineError(f"{why}; nothing was removed{also}") from error
 
     return run(
-        lambda form: _scene(checked, demands, harmonics, form),
+        lambda: _scene(checked, demands, harmonics),
         prune_scene(views, budget, method, reusable=save),
         target,
         dry_run=dry_run, views=views, pictures=pictures, save=saved if save else None, **how,
@@ -495,12 +495,10 @@ def score_object(
     """Score an object of the open scene into a PLY, the scene unchanged; see `prune_object`."""
     checked = mesh_layout.check(find(name))
     work, target = score_scene(views, method), expanded(output)
-    return run(lambda form: _scene(checked, demands, None, form), work, target, **how).report
+    return run(lambda: _scene(checked, demands, None), work, target, **how).report
 
 
-def _scene(
-    checked: SplatObject, demands: Demands, harmonics: bool | None, form: Format | None
-) -> Scene:
+def _scene(checked: SplatObject, demands: Demands, harmonics: bool | None) -> Scene:
     """The object in the world, which is also the views' frame."""
     axes = checked.mesh.get(mesh_layout.AXES, "")
     return Scene(
@@ -510,7 +508,6 @@ def _scene(
         demands.forced(checked),
         lambda: replace(mesh_attributes.read_for_file(checked)(), axes=axes),
         mesh_attributes.file_size(checked),
-        form,
         world_matrix(checked.obj),
         (*modifier_notes(checked.obj), *drift_notes(checked)),
     )

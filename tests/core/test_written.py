@@ -72,7 +72,7 @@ def test_a_file_in_another_frame_is_moved_to_that_of_the_views(source, tmp_path)
         scene = replace(operations.read_scene(aside), matrix=matrix)
         decided = replace(result, keep=np.ones(len(moved), np.bool_), report=dict(result.report))
         return operations.run(
-            lambda form: scene, lambda *_: decided, tmp_path / "b.glb",
+            lambda: scene, lambda *_: decided, tmp_path / "b.glb",
             overwrite=True, views=cameras(),
         ).report["written_psnr"]  # fmt: skip
 
