@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,21 @@ class Scene:
     form: Format | None = None  # of the output, None for plain PLY; `run` sets it
 
 
+Decide = Callable[[Scene, Clock, Progress, "int | None"], Result]
+"""Decides which splats of a scene stay; the last argument is the number of threads."""
+
+
+class Options(TypedDict, total=False):
+    """What `prune_file`, `clean_file` and `score_file` all take; see the first of them."""
+
+    zones: Sequence[Zone]
+    model: Model | None
+    axes: str | None
+    overwrite: bool
+    progress: Progress
+    threads: int | None
+
+
 def by_cameras(file: SplatFile, views: ViewSet) -> SplatFile:
     """The file; an SPZ that does not name its axes is turned if the views see it better then."""
     if file.axes != UNKNOWN_AXES:
@@ -94,7 +109,7 @@ def read_scene(
 
 def run(
     read: Callable[[], Scene],
-    decide: Callable[[Scene, Clock, Progress], Result],
+    decide: Decide,
     output: Path | None,
     *,
     source: Path | None = None,
@@ -127,7 +142,7 @@ def run(
         deciding, writing, comparing = stages(
             progress, seconds("measure", count, 64), seconds("write", count), drawing
         )
-        result = decide(scene, clock, deciding)
+        result = decide(scene, clock, deciding, threads)
         stopped = result.stopped
         if stopped is not None and save is not None:  # nothing is saved over what is unfinished
             raise stopped
@@ -197,12 +212,12 @@ def _reread(path: Path, axes: str, matrix: NDArray[np.float64] | None) -> Splats
 
 
 def prune_scene(
-    views: ViewSet, budget: Budget, method: Method = DEFAULT, cleaning: Cleaning | None = None,
-    *, reusable: bool = False, threads: int | None = None,
-) -> Callable[[Scene, Clock, Progress], Result]:  # fmt: skip
+    views: ViewSet, budget: Budget, method: Method, cleaning: Cleaning | None = None,
+    *, reusable: bool = False,
+) -> Decide:  # fmt: skip
     """`decide` of `run` that cleans, if there is `cleaning`, and prunes the rest; see `prune`."""
 
-    def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
+    def decide(scene: Scene, clock: Clock, progress: Progress, threads: int | None) -> Result:
         demands, splats, left = scene.demands, scene.splats, None
         if cleaning is not None:
             cleaned = clean_splats(
@@ -299,15 +314,10 @@ def prune_file(
     budget: Budget,
     method: Method = DEFAULT,
     *,
-    zones: Sequence[Zone] = (),
     cleaning: Cleaning | None = None,
     pictures: PictureFiles | None = None,
-    model: Model | None = None,
-    axes: str | None = None,
-    overwrite: bool = False,
     dry_run: bool = False,
-    progress: Progress = silent,
-    threads: int | None = None,
+    **options: Unpack[Options],
 ) -> Result:
     """Prune a file of splats, and write the result to another.
 
@@ -315,13 +325,13 @@ def prune_file(
     ----------
     source, output : path-like, of any format, by suffix; without output nothing is written
     views, budget, method, progress, threads : see `prune`
-    zones : sequence of Zone, which splats to protect and remove
     cleaning : Cleaning, optional; what to clean away first, the budget then counts the rest
     pictures : PictureFiles, optional; where pictures before and after go
+    dry_run : bool, whether to decide as for the output and write no splats
+    zones : sequence of Zone, which splats to protect and remove
     model : Model, optional; where the file does not say how splats are drawn, or is wrong
     axes : {"rub", "rdf"}, optional; of an SPZ, see `read_splats`; without, the views decide
     overwrite : bool, whether files may be replaced
-    dry_run : bool, whether to decide as for the output and write no splats
 
     Returns
     -------
@@ -331,14 +341,11 @@ def prune_file(
     ------
     RefineError, Cancelled : see `read_splats`, `prune` and `write_splats`
     """
-    return _run_file(
-        source, output, prune_scene(views, budget, method, cleaning, threads=threads),
-        views, zones, model, axes, overwrite=overwrite, dry_run=dry_run,
-        pictures=pictures, progress=progress, threads=threads,
-    )  # fmt: skip
+    decide = prune_scene(views, budget, method, cleaning)
+    return _run_file(source, output, decide, views, pictures=pictures, dry_run=dry_run, **options)
 
 
-def _run_file(source, output, decide, views, zones, model, axes, **how: Any) -> Result:
+def _run_file(source, output, decide, views, *, zones=(), model=None, axes=None, **how: Any):
     return run(
         lambda: read_scene(source, zones, model, axes, views), decide,
         None if output is None else expanded(output), source=expanded(source), views=views, **how,
@@ -350,17 +357,11 @@ def clean_file(
     output: Path | str | None,
     views: ViewSet,
     cleaning: Cleaning,
-    *,
-    zones: Sequence[Zone] = (),
-    model: Model | None = None,
-    axes: str | None = None,
-    overwrite: bool = False,
-    progress: Progress = silent,
-    threads: int | None = None,
+    **options: Unpack[Options],
 ) -> Result:
     """Clean a file of splats, and write the rest to another; see `prune_file` and `clean`."""
 
-    def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
+    def decide(scene: Scene, clock: Clock, progress: Progress, threads: int | None) -> Result:
         demands = scene.demands
         cleaned = clean_splats(
             scene.splats, views, cleaning, protected=demands.protected, removed=demands.removed,
@@ -377,18 +378,13 @@ def clean_file(
         report["splats"] |= kept_and_removed(cleaned.keep) | demands.counts()
         return Result(cleaned.keep, report)
 
-    return _run_file(
-        source, output, decide, views, zones, model, axes,
-        overwrite=overwrite, progress=progress, threads=threads,
-    )  # fmt: skip
+    return _run_file(source, output, decide, views, **options)
 
 
-def score_scene(
-    views: ViewSet, method: Method, threads: int | None = None
-) -> Callable[[Scene, Clock, Progress], Result]:
+def score_scene(views: ViewSet, method: Method) -> Decide:
     """`decide` of `run` that keeps all splats, with their scores as a property."""
 
-    def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
+    def decide(scene: Scene, clock: Clock, progress: Progress, threads: int | None) -> Result:
         demands = scene.demands
         scores = score(
             scene.splats, views, method, protected=demands.protected, removed=demands.removed,
@@ -414,19 +410,10 @@ def score_file(
     output: Path | str,
     views: ViewSet,
     method: Method = DEFAULT,
-    *,
-    zones: Sequence[Zone] = (),
-    model: Model | None = None,
-    axes: str | None = None,
-    overwrite: bool = False,
-    progress: Progress = silent,
-    threads: int | None = None,
+    **options: Unpack[Options],
 ) -> Result:
     """Write a file with the float property ``refine_score``; see `prune_file` and `score`."""
-    return _run_file(
-        source, output, score_scene(views, method, threads), views, zones, model, axes,
-        overwrite=overwrite, progress=progress, threads=threads,
-    )  # fmt: skip
+    return _run_file(source, output, score_scene(views, method), views, **options)
 
 
 def convert_files(
@@ -503,7 +490,7 @@ def convert_files(
             notes=(f"splats are written anew, without {names}",) if lost else (),
         )  # fmt: skip
 
-    def decide(scene: Scene, _clock: Clock, _progress: Progress) -> Result:
+    def decide(scene: Scene, *_: Any) -> Result:
         count = len(scene.splats)
         return Result(np.ones(count, np.bool_), {"splats": {"before": count}, "notes": []})
 
