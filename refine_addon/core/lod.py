@@ -373,21 +373,12 @@ def lod_file(
         scene = read_scene(source, zones, model, axes=axes, views=views)
         clock.lap("read_s")
         demands, entries, notes, remarks = scene.demands, list[dict[str, Any]](), list[str](), {}
-        summary: dict[str, Any] = {"settings": method.facts(), "volumes": list(demands.facts)}
         count = len(scene.splats)
         making, writing = stages(progress, seconds("merge", count), seconds("write", count))
         for level in lod(
             scene.splats, views, levels, method,
             protected=demands.protected, removed=demands.removed, progress=making, threads=threads,
         ):  # fmt: skip
-            if level.number == 1:
-                scores = level.result.scores
-                assert scores is not None
-                seen = seen_by(scores, demands.removed)
-                seen["splats"] |= demands.counts()
-                summary |= {"source": {"file": file.name, "bytes": scene.bytes}, **seen}
-                summary["nested"] = not method.changes
-                notes += scoring_notes(scores)
             name, size, missing, more = add(scene, level)
             notes += [note for note in more if note not in notes]
             entry = level.facts() | {"left_out": missing, "file": name, "bytes": size}
@@ -396,10 +387,18 @@ def lod_file(
         report(writing, 0.5, "writing")
         notes += levels.notes(remarks) + finish()
         clock.lap("levels_s")
-    clock.stop()
-    return summary | {
+    scores = level.result.scores
+    assert scores is not None
+    seen = seen_by(scores, demands.removed)
+    seen["splats"] |= demands.counts()
+    return {
+        "settings": method.facts(),
+        "volumes": list(demands.facts),
+        "source": {"file": file.name, "bytes": scene.bytes},
+        **seen,
+        "nested": not method.changes,
         "levels": entries,
         "files": {"input": scene.name, "output": str(path)},
-        "timings": clock.timings,
-        "notes": notes,
+        "timings": clock.stop(),
+        "notes": scoring_notes(scores) + notes,
     }

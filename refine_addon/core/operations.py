@@ -193,8 +193,7 @@ def run(
             if written is not None:
                 stop.add_note(f"{written} is written, its pictures and report are not")
             raise
-    clock.stop()
-    result.report["timings"] = clock.timings
+    result.report["timings"] = clock.stop()
     return result
 
 

@@ -40,9 +40,10 @@ class Clock:
         now = time.perf_counter()
         self.timings[step], self._last = now - self._last, now
 
-    def stop(self) -> None:
-        """Store the time since the start as ``total_s``."""
+    def stop(self) -> dict[str, float]:
+        """All times, with that since the start as ``total_s``."""
         self.timings["total_s"] = time.perf_counter() - self._start
+        return self.timings
 
 
 def size_in_words(count: int) -> str:

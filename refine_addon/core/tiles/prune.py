@@ -107,7 +107,6 @@ def prune_tiles(
             sizes = outputs.write(kept, writing, threads)
             outputs.publish()
         clock.lap("write_s")
-    clock.stop()
     target = None if outputs is None else str(output)
     report["files"] = {
         "input": f"{len(tiles)} tiles", "output": target,
@@ -121,7 +120,7 @@ def prune_tiles(
         dict(zip(names, (str(t.path), to, t.splats, kept, unseen, t.size, after), strict=True))
         for t, to, (kept, unseen), after in zip(tiles, targets, counts, sizes, strict=True)
     ]
-    report["timings"] = clock.timings
+    report["timings"] = clock.stop()
     return report
 
 
