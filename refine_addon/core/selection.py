@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -44,15 +43,13 @@ class Budget:
         if len(given) != 1:
             raise RefineError(f"expected one of {', '.join(vars(self))}, got {given or 'none'}")
         value = getattr(self, self.kind)
-        # Functions, so that only the check of the given value runs.
-        checks: dict[str, tuple[str, Callable[[], bool]]] = {
-            "ratio": ("0 <= ratio < 1", lambda: 0 <= value < 1),
-            "keep": ("a whole number of at least 1", lambda: value >= 1 and value % 1 == 0),
-            "max_mb": ("a positive number", lambda: 0 < value < math.inf),
-            "psnr": (f"more than 0 and less than {PSNR_CAP:g} dB", lambda: 0 < value < PSNR_CAP),
-        }
-        expected, holds = checks[self.kind]
-        if not holds():
+        expected, holds = {
+            "ratio": ("0 <= ratio < 1", 0 <= value < 1),
+            "keep": ("a whole number of at least 1", value >= 1 and value % 1 == 0),
+            "max_mb": ("a positive number", 0 < value < math.inf),
+            "psnr": (f"more than 0 and less than {PSNR_CAP:g} dB", 0 < value < PSNR_CAP),
+        }[self.kind]
+        if not holds:
             raise RefineError(f"{self.kind} is {value}, expected {expected}")
 
     @property
