@@ -155,10 +155,7 @@ def of_prune(
     if method.changes and outcome is None and removed:
         notes.append(deleted_note(psnr, None if tried is None else tried["merge"]))
     deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
-    seconds = None
-    if timed and not isinstance(method, ClosedForm):
-        took = expected_seconds(clock.timings["score_s"], share, once=method.changes)
-        seconds = {way: round(value, 1) for way, value in took.items()}
+    took = None if deletes == "closed-form" or not timed else clock.timings["score_s"]
     report |= {
         "budget": {budget.kind: getattr(budget, budget.kind)},
         "settings": method.facts(),
@@ -173,8 +170,7 @@ def of_prune(
         "method": {
             "asked": method.name,
             "done": deletes if outcome is None or outcome.done == "delete" else outcome.done,
-            **predicted(scores, share, estimates),
-            "seconds": seconds,
+            **_predicted(scores, share, estimates, took, once=method.changes),
         },
         "quality": None if curve is None else curve.facts(),
         "budget_remark": why,
@@ -209,24 +205,21 @@ def prices(scores: Scores, took: float) -> list[dict[str, Any]]:
     if curve is None or scores.method == "closed-form":
         return []
     return [
-        {
-            "removed": share,
-            **predicted(scores, share, {"delete": curve.at(share)}),
-            "seconds": {
-                way: round(value, 1)
-                for way, value in expected_seconds(took, share, once=False).items()
-            },
-        }
+        {"removed": share, **_predicted(scores, share, {"delete": curve.at(share)}, took)}
         for share in PRICED
     ]
 
 
-def predicted(scores: Scores, share: float, measured: Mapping[Way, float | None]) -> dict[str, Any]:
-    """PSNR of each method at a share removed, dB, measured or predicted, and why one is missing."""
+def _predicted(scores, share, measured, took, *, once=False):
+    """PSNR of each method at a share removed, dB, measured or predicted, why one is missing, and
+    seconds by those that scoring `took`, None if unknown; see `expected_seconds`.
+    """
     rays, many = scores.ray_sample, len(scores.values) >= FEWEST
     hits = rays.hits_of_ray() if rays is not None and many else None
     psnr = expected(scores.quality, share, measured, hits)
+    seconds = None if took is None else expected_seconds(took, share, once=once)
     return {
         "psnr": {way: None if value is None else round(value, 2) for way, value in psnr.items()},
         "note": None if psnr["merge"] is not None or scores.quality is None else NOT_PREDICTED,
+        "seconds": seconds and {way: round(value, 1) for way, value in seconds.items()},
     }
