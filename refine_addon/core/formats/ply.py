@@ -510,25 +510,23 @@ def write_rows(
     """Write kept rows, a chunk at a time, with `columns` set or appended (`SplatFile.write`)."""
     columns = columns or {}
     plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
-    changed = columns if isinstance(columns, ChangedColumns) else None
-    row = rows.dtype if changed is not None else _grown(rows.dtype, columns)
+    row = _grown(rows.dtype, columns)
     at: Any = {"names": ["stored"], "formats": [plain.dtype], "itemsize": row.itemsize}
 
     def bytes_of(piece: slice) -> NDArray[Any]:
         stored = plain[piece]
-        if changed is not None:
-            stored = changed.put(stored, rows.dtype, piece)
-        kept = slice(None) if keep is None else keep[piece]
-        chunk = stored[kept]
-        if columns and changed is None:
-            read, chunk = chunk, np.empty(len(chunk), row)
-            chunk.view(np.dtype(at))["stored"] = read
+        if isinstance(columns, ChangedColumns):
+            stored = columns.put(stored, rows.dtype, piece)
+        elif columns:
+            read, stored = stored, np.empty(len(stored), row)
+            stored.view(np.dtype(at))["stored"] = read
             # A double may be too large or too small for a float; a signalling NaN becomes quiet.
             with np.errstate(over="ignore", under="ignore", invalid="ignore"):
                 for name, values in columns.items():
-                    chunk[name] = values[piece][kept]
+                    stored[name] = values[piece]
         # As bytes, since NumPy gives no buffer of rows that have a field such as a:b.
-        return np.ascontiguousarray(chunk).view(np.dtype((np.void, row.itemsize)))
+        every = np.ascontiguousarray(stored).view(np.dtype((np.void, row.itemsize)))
+        return every if keep is None else every[keep[piece]]
 
     pieces = chunks(len(plain), _CHANGED_ROWS if columns else _ROWS)
     for batch in chunks(len(pieces), _AHEAD):
@@ -540,6 +538,6 @@ def write_rows(
 def _grown(dtype, columns):
     """Row dtype with columns appended, in the byte order of x."""
     names, order = dtype.names or (), dtype["x"].byteorder
-    more = [(name, values.dtype.newbyteorder(order)) for name, values in columns.items()]
+    new = [name for name in columns if name not in names]
     fields = [(name, dtype[name]) for name in names]
-    return np.dtype([*fields, *(field for field in more if field[0] not in names)])
+    return np.dtype([*fields, *((name, columns[name].dtype.newbyteorder(order)) for name in new)])
