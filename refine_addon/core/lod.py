@@ -36,7 +36,7 @@ from .selection import Budget
 from .splats import Model, Splats, among_all
 from .views import ViewSet
 from .visibility import frustum
-from .volumes import Zone, must_go
+from .volumes import Forced, Zone, must_go
 
 MAX_LEVELS = 16  # the last of so many halvings would hold 0.0015 % of the splats
 SHARES = (0.5, 0.25, 0.12, 0.06)  # shares kept, by default
@@ -179,43 +179,41 @@ def lod(
         second = list(lod(file.splats(), views, Levels((0.5, 0.25))))[1]
         replace(second.result, source=file).write("out.ply")
     """
-    whole, rest, budgets = splats, None, levels.budgets(len(splats))
-    if (gone := must_go(removed, protected)) is not None:
-        rest = ~gone
-        splats = splats.take(rest)
-        protected = None if protected is None else protected[rest]
-    left, number = len(whole), 0
-    results = _results(splats, views, budgets, method, protected, progress, threads)
+    gone, budgets = must_go(removed, protected), levels.budgets(len(splats))
+    left, number = len(splats), 0
+    results = _results(splats, views, budgets, method, protected, gone, progress, threads)
     for goal, result in zip(levels.goals, results, strict=True):
         kept = int(np.count_nonzero(result.keep))
         if kept < left:
             number, left = number + 1, kept
-            if rest is not None:
-                result = replace(result.for_all(rest), source=whole)
             yield Level(number, goal, result)
     if not number:
-        raise RefineError(f"no level has fewer splats than the input, which has {len(whole)}")
+        raise RefineError(f"no level has fewer splats than the input, which has {len(splats)}")
 
 
-def _results(splats, views, budgets, method, protected, progress, threads):
+def _results(splats, views, budgets, method, protected, gone, progress, threads):
     """Yield results for all splats: by one ranking, or each from the one before."""
     scores, whole, origin = None, None, None
     # Shares of the time: a level takes half of that before it, or, once scored, hardly any.
     times = (0.5**place if method.changes else 0.02 for place in range(len(budgets)))
     scoring, *of_levels = stages(progress, 0.0 if method.changes else 1.0, *times)
     if not method.changes:
-        scores = score(splats, views, method, quality=True, progress=scoring, threads=threads)
+        scores = score(
+            splats, views, method, removed=gone, quality=True, progress=scoring, threads=threads
+        )
+    left, demands = splats, Forced(protected, gone)
     for budget, of_level in zip(budgets, of_levels, strict=True):
-        spared = protected if protected is None or whole is None else protected[whole.keep]
         result = prune(
-            splats if whole is None else whole.splats, views, budget, method, protected=spared,
+            left, views, budget, method, protected=demands.protected, removed=demands.removed,
             scores=scores, origin=origin, progress=of_level, threads=threads,
         )  # fmt: skip
         if method.changes:
+            left, demands = result.splats, demands.of(result.keep)
             result = replace(result if whole is None else _both(whole, result), source=splats)
             if origin is None:
                 assert result.scores is not None
-                origin = Origin(splats, result.scores.ray_sample, result.scores.between, None)
+                rest = splats if gone is None else splats.take(~gone)
+                origin = Origin(rest, result.scores.ray_sample, result.scores.between, None)
             origin, whole = replace(origin, psnr=result.report["estimated_psnr"]), result
         yield result
 
