@@ -217,7 +217,7 @@ def use_ply(folder: Path) -> None:
     describe(file)
     file.write(again, overwrite=True)
     same = path.read_bytes() == again.read_bytes()
-    assert same or file.origin is not None, "rewritten with nothing pruned it is another file"
+    assert same or not file.format.startswith("binary"), "with nothing pruned it differs"
     keep = np.arange(len(file)) % 2 == 0
     file.write(again, keep, columns={"mine": np.ones(len(file), np.float32)}, overwrite=True)
     assert len(read_ply(again)) == int(keep.sum()), "pruned it holds another number of splats"

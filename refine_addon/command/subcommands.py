@@ -217,7 +217,7 @@ def describe(file: core.SplatFile) -> dict[str, Any]:
         "splats": len(file),
         "sh_degree": splats.sh_degree,
         "bytes": file.stored_bytes,
-        "bytes_per_splat": file.row_bytes if file.origin is None else average,
+        "bytes_per_splat": file.row_bytes if file.format.startswith("binary") else average,
         "format": file.format,
         "model": file.model,
         "extent_low": means.min(axis=0).tolist() if len(means) else None,

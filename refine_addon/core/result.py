@@ -14,7 +14,6 @@ from .affine import transformed
 from .errors import RefineError
 from .execute import Cancelled
 from .formats.format import new_file
-from .formats.ply import Origin as FileOrigin
 from .formats.ply import SplatFile
 from .formats.ply_columns import ChangedColumns
 from .formats.registry import write_splats
@@ -123,7 +122,7 @@ class Result:
 def file_of(splats: Splats, path: Path = Path("splats.ply"), stored_bytes: int = 0) -> SplatFile:
     """A plain PLY in memory, with `path` as its name, of splats that are not of one file."""
     file, copied = new_file(
-        path, FileOrigin("arranged", stored_bytes), len(splats), splats.sh_degree, splats.model
+        path, ("arranged", stored_bytes), len(splats), splats.sh_degree, splats.model
     )
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # doubles to float32
         for name in ARRAYS:

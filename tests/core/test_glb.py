@@ -384,7 +384,7 @@ def test_a_gltf_is_read_with_its_bytes_beside_it_and_in_itself(tmp_path):
 
     assert file.rows.tobytes() == read_splats(tmp_path / "a.glb").rows.tobytes()
     assert file.format == f"glTF with {SPLATTING}"
-    assert file.origin.size == len(text) + len(binary)
+    assert file.stored_bytes == len(text) + len(binary)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import RefineError
 from ..execute import chunks
 from ..splats import MODELS, SH_C0, Model, Splats, base_color, opacity, opacity_logits
-from .ply import Origin, SplatFile, new_header, with_model
+from .ply import SplatFile, new_header, with_model
 from .ply_columns import empty_rows
 
 CHUNK = 1 << 15
@@ -38,12 +38,12 @@ class Format:
 
 
 def new_file(
-    path: Path, origin: tuple[str, int], count: int, degree: int, model: Model = "default"
+    path: Path, read: tuple[str, int], count: int, degree: int, model: Model = "default"
 ) -> tuple[SplatFile, Splats]:
-    """Plain PLY of `count` splats, and their arrays to fill; `origin`: input's format and bytes."""
+    """Plain PLY of `count` splats, and their arrays to fill; `read`: input's format and bytes."""
     rows, splats = empty_rows(count, degree)
     header = with_model(new_header(rows.dtype, count), model)
-    return SplatFile(path, rows, header, origin=Origin(*origin)), splats
+    return SplatFile(path, rows, header, format=read[0], stored_bytes=read[1]), splats
 
 
 def pieces(count: int) -> list[slice]:

@@ -59,13 +59,6 @@ _CHANGED_ROWS = 1 << 14
 _AHEAD = 16  # chunks that are copied before the first of them is written
 
 
-class Origin(NamedTuple):
-    """Format and bytes of a source file that is no binary PLY."""
-
-    format: str
-    size: int
-
-
 @dataclass(frozen=True, eq=False)
 class SplatFile:
     """An opened 3DGS PLY file of N splats, or one in memory for a file of another format."""
@@ -77,7 +70,8 @@ class SplatFile:
     before: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     after: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     indexing: tuple[str, ...] = ()  # other elements whose rows hold indices of splats
-    origin: Origin | None = None  # set where the file is no binary PLY
+    format: str = ""  # of the file that was read, such as ``binary_little_endian 1.0``
+    stored_bytes: int = 0  # size of that file
     remarks: tuple[str, ...] = ()  # sentences for the user on how it was read
     axes: str = ""  # of an SPZ: `affine.AXES` or `UNKNOWN_AXES`; other files are written with them
 
@@ -93,16 +87,6 @@ class SplatFile:
     def fixed_bytes(self) -> int:
         """Bytes of everything but the splats."""
         return len(self.header) + len(self.before) + len(self.after)
-
-    @property
-    def format(self) -> str:
-        """Format in the header, such as ``binary_little_endian 1.0``, or of the `origin`."""
-        return format_of(self.header) if self.origin is None else self.origin.format
-
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the file that was read, bytes."""
-        return self.size() if self.origin is None else self.origin.size
 
     @property
     def model(self) -> Model:
@@ -228,7 +212,8 @@ def read_plain(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         return _text_file(header, vertex, filled, body.tobytes())
     rows = body[at].view(header.elements[vertex].dtype(header.order))
     indexing = tuple(name for name in filled if name in INDEXING)
-    return SplatFile(path, rows, header.raw, body[: at.start], body[at.stop :], indexing)
+    beside = body[: at.start], body[at.stop :]
+    return SplatFile(path, rows, header.raw, *beside, indexing, format_of(header.raw), len(data))
 
 
 class Header(NamedTuple):
@@ -370,9 +355,10 @@ def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> S
     left = _listed([name for name in filled if name != "vertex"])
     remark = f"{path.name} is text; a PLY that is written of it is binary"
     remark += f", without the elements beside its splats ({left})" if left else ""
-    origin = Origin(format_of(header.raw), len(header.raw) + len(body))
-    head = vertex_header(header.raw)
-    return SplatFile(Path(path), rows, head, origin=origin, remarks=(remark,))
+    return SplatFile(
+        Path(path), rows, vertex_header(header.raw), format=format_of(header.raw),
+        stored_bytes=len(header.raw) + len(body), remarks=(remark,),
+    )  # fmt: skip
 
 
 def _numbers(path, dtype, lines):
