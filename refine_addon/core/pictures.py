@@ -19,14 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError
-from .execute import Progress, chunks, part, run_all, silent
+from .execute import Progress, chunks, part, run_all, silent, stages
 from .images import png
 from .quality.psnr import psnr_of
 from .splats import NEAR_RELATIVE, SH_C0, Splats
 from .views import View, ViewSet
 from .visibility import frustum, projection
 from .visibility.cast import colors_from, hits
-from .visibility.projection import Gaussians
 from .visibility.rays import LOG_OPAQUE, in_front
 from .visibility.scene import Scene
 from .whole_file import new_folder, refuse_existing, whole_file
@@ -94,7 +93,7 @@ def draw(
         splats, ViewSet((view,)), scene, progress=part(progress, 0.0, 0.1), threads=threads
     )
     rest = part(progress, 0.1, 1.0)
-    return drawn(splats, gaussians, scene, view, layers, progress=rest, threads=threads)
+    return _drawn(splats, gaussians, scene, view, layers, rest, threads)
 
 
 def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
@@ -106,16 +105,7 @@ def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
     return replace(splats.up_to_degree(0), sh_dc=(colors.T - 0.5) / SH_C0)
 
 
-def drawn(
-    splats: Splats,
-    gaussians: Gaussians,
-    scene: Scene,
-    view: View,
-    layers: Layers | None = None,
-    *,
-    progress: Progress,
-    threads: int | None,
-) -> NDArray[np.float64]:
+def _drawn(splats, gaussians, scene, view, layers, progress, threads):
     """`draw` for splats prepared by `projection.prepare`."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
@@ -245,13 +235,10 @@ def compare(
         )
         if not pictures:
             views = ViewSet(tuple(fitted(view, scene.size) for view in views))
-        rest, share = part(progress, start + 0.1, start + 0.5), 1.0 / len(views)
+        rest = stages(part(progress, start + 0.1, start + 0.5), *[1.0] * len(views))
         pictures.append([
-            drawn(
-                splats, gaussians, scene, view,
-                progress=part(rest, k * share, (k + 1) * share), threads=threads,
-            )[:3]
-            for k, view in enumerate(views)
+            _drawn(splats, gaussians, scene, view, None, each, threads)[:3]
+            for view, each in zip(views, rest, strict=True)
         ])  # fmt: skip
     return [
         Comparison(view, _rounded(one), _rounded(other), _psnr(other, one, view))
