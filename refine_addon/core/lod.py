@@ -23,7 +23,7 @@ from . import whole_file
 from .errors import RefineError
 from .execute import Progress, report, seconds, silent, stages
 from .formats import registry, sog
-from .formats.registry import format_named, held_splats, left_out, notes, scene_name, write_splats
+from .formats.registry import format_named, held_splats, left_out, notes, scene_name
 from .formats.streamed_sog import INDEX, StreamedSog, folder_for
 from .images import codec_for
 from .methods import DEFAULT, Method
@@ -257,12 +257,11 @@ def _into_folder(source, target, count, overwrite):
     paths, written = level_paths(source, target, count), list[Path]()
 
     def add(scene, level):
-        path, keep, file = paths[level.number - 1], level.result.keep, scene.file()
-        columns, form = level.result.changed(file.rows), format_named(path)
-        write_splats(path, file, keep, columns=columns, overwrite=overwrite)
+        path, file = paths[level.number - 1], scene.file()
+        replace(level.result, source=file).write(path, overwrite=overwrite)
         written.append(path)
-        missing, said = left_out(file, form, keep), notes(file, form, keep)
-        return path.name, path.stat().st_size, missing, said
+        output = file, format_named(path), level.result.keep
+        return path.name, path.stat().st_size, left_out(*output), notes(*output)
 
     def finish():
         more = level_paths(source, target, MAX_LEVELS)[len(written) :]

@@ -199,15 +199,14 @@ def run(
 
 def _reread(path: Path, axes: str, matrix: NDArray[np.float64] | None) -> Splats | None:
     """Splats of a lossy file in the views' frame; None if unreadable or `matrix` is not uniform."""
-    matrix = np.eye(4) if matrix is None else matrix
     try:
         path.open("rb").close()
     except PermissionError:
         return None
-    if not is_uniform(matrix):
+    if matrix is not None and not is_uniform(matrix):
         return None
     splats = read_splats(path, axes=axes or None).splats()
-    return splats if np.array_equal(matrix, np.eye(4)) else transformed(splats, matrix)
+    return splats if matrix is None else transformed(splats, matrix)
 
 
 def prune_scene(

@@ -19,7 +19,7 @@ from .formats.ply_columns import ChangedColumns
 from .formats.registry import write_splats
 from .merging.merge import Merged
 from .scores import Scores
-from .splats import ARRAYS, Splats, among_all
+from .splats import Splats, among_all, assign
 from .visibility.cast import RaySample
 
 
@@ -125,6 +125,5 @@ def file_of(splats: Splats, path: Path = Path("splats.ply"), stored_bytes: int =
         path, ("arranged", stored_bytes), len(splats), splats.sh_degree, splats.model
     )
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # doubles to float32
-        for name in ARRAYS:
-            getattr(copied, name)[:] = getattr(splats, name)
+        assign(copied, splats)
     return file.without_third_scale()

@@ -19,10 +19,9 @@ import numpy as np
 from ..affine import AXES, UNKNOWN_AXES, turned
 from ..errors import RefineError
 from ..place import GZIP, SPZ, Place, is_spz
-from ..splats import MODELS, above_constant, opacity, opacity_logits, unit_quaternions
+from ..splats import MODELS, above_constant, assign, opacity, opacity_logits, unit_quaternions
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
 from .ply import SplatFile
-from .ply_columns import values_by_name
 
 NAME, SUFFIX = "SPZ", ".spz"
 
@@ -109,8 +108,7 @@ def _read(path, data):
 
 def turned_from(axes: str, file: SplatFile, why: str) -> SplatFile:
     """An SPZ whose axes have these letters, turned in place to those of a PLY."""
-    for name, values in values_by_name(turned(file.splats(), axes)).items():
-        file.rows[name] = values
+    assign(file.splats(), turned(file.splats(), axes))  # views of the rows
     remark = f"{file.path.name}: brought from axes {axes.upper()} to those of a PLY, RDF, {why}"
     return replace(file, axes=AXES[0], remarks=(*file.remarks, remark))
 
