@@ -60,8 +60,6 @@ class Levels:
     psnr: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("shares", "psnr"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
         if bool(self.shares) == bool(self.psnr):
             got = "both" if self.shares else "none"
             raise RefineError(

@@ -110,7 +110,6 @@ class Cleaning:
     views: int = 64
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "reasons", tuple(self.reasons))
         unknown = [reason for reason in self.reasons if reason not in REASONS]
         if unknown or not self.reasons:
             got = repr(unknown[0]) if unknown else "none"
