@@ -10,12 +10,12 @@ import re
 import secrets
 import stat
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 from .errors import RefineError, reason_of
-from .execute import REPLACES_MAPPED, checkpoint
+from .execute import REPLACES_MAPPED, Item, checkpoint
 
 ABANDONED = 86_400.0  # seconds after which a temporary file is deleted: a killed run left it
 
@@ -90,13 +90,19 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
         raise RefineError(f"{path}: cannot be written, there is no folder {missing}")
 
 
+def alike(items: Iterable[Item], key: Callable[[Item], str]) -> Iterator[tuple[Item, Item]]:
+    """Yield each item whose key an earlier one has, behind the first of these."""
+    first: dict[str, Item] = {}
+    for item in items:
+        other = first.setdefault(key(item), item)
+        if other is not item:
+            yield other, item
+
+
 def refuse_one_file(paths: Iterable[Path]) -> None:
     """Raise `RefineError` if two of the outputs are one file by links."""
-    first: dict[str, Path] = {}
-    for path in paths:
-        other = first.setdefault(os.path.realpath(path), path)
-        if other is not path:
-            raise RefineError(f"{path}: is the same file as {other}, by a link; remove the link")
+    for other, path in alike(paths, os.path.realpath):
+        raise RefineError(f"{path}: is the same file as {other}, by a link; remove the link")
 
 
 def refuse_mapped(path: Path, source: Path) -> None:

@@ -71,10 +71,9 @@ def test_a_file_in_another_frame_is_moved_to_that_of_the_views(source, tmp_path)
         """Of the other file, as told of the first."""
         scene = replace(operations.read_scene(aside), matrix=matrix)
         decided = replace(result, keep=np.ones(len(moved), np.bool_), report=dict(result.report))
-        return operations.run(
-            lambda: scene, lambda *_: decided, tmp_path / "b.glb",
-            overwrite=True, views=cameras(),
-        ).report["written_psnr"]  # fmt: skip
+        how = {"overwrite": True, "views": cameras()}
+        done = operations.run(lambda: scene, lambda *_: decided, tmp_path / "b.glb", **how)
+        return done.report["written_psnr"]
 
     assert psnr(matrix) == pytest.approx(told, abs=0.02)
     assert psnr(np.diag([1.0, 2.0, 1.0, 1.0])) is None

@@ -15,7 +15,7 @@ from ..formats import ply
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..mapped import on_disk
 from ..splats import Model, Splats, joined, with_model
-from ..whole_file import Url
+from ..whole_file import Url, alike
 from . import storage
 
 ROWS = 1 << 16  # of a tile, read together: 15 MB at degree 3
@@ -48,14 +48,10 @@ class Tile(NamedTuple):
 
 def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
     """Tiles of a scene (`tile_at`); `RefineError` also for a file twice, other models, no splat."""
-    given: dict[str, Tile] = {}
-    for path in paths:
-        tile = tile_at(path, model)
-        first = given.setdefault(storage.identity(tile.path), tile)
-        if first is not tile:
-            also = "" if first.path == tile.path else f", also as {first.path}"
-            raise RefineError(f"{tile.path}: is given twice{also}")
-    tiles = list(given.values())
+    tiles = [tile_at(path, model) for path in paths]
+    for first, tile in alike(tiles, lambda tile: storage.identity(tile.path)):
+        also = "" if first.path == tile.path else f", also as {first.path}"
+        raise RefineError(f"{tile.path}: is given twice{also}")
     ply.refuse_other_models(tiles)
     if not any(tile.splats for tile in tiles):
         raise RefineError(f"none of {len(tiles)} tiles has a splat: there is nothing to prune")

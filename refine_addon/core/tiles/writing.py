@@ -19,7 +19,7 @@ from ..formats.ply import with_count, with_model, write_rows
 from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
 from ..mapped import Interrupted, Mapped, note, noted, whole
 from ..splats import Splats
-from ..whole_file import Url, refuse_one_file
+from ..whole_file import Url, alike, refuse_one_file
 from . import storage
 from .source import ROWS, Tile, bytes_of, rows_of
 
@@ -66,10 +66,8 @@ class Outputs:
     overwrite: bool
 
     def __post_init__(self) -> None:
-        first: dict[str, Tile] = {}
-        for tile in self.tiles:
-            if first.setdefault(tile.path.name, tile) is not tile:
-                raise RefineError(f"{tile.path}: another tile is called {tile.path.name} too")
+        for _, tile in alike(self.tiles, lambda tile: tile.path.name):
+            raise RefineError(f"{tile.path}: another tile is called {tile.path.name} too")
         refuse_one_file(target for target in self.targets if isinstance(target, Path))
         read = {storage.identity(tile.path) for tile in self.tiles}
         for target in self.targets:
