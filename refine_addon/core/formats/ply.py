@@ -25,7 +25,6 @@ from ..execute import chunks, run
 from ..mapped import file_bytes
 from ..place import Place, foreign_kind, refuse_pointer
 from ..splats import MODELS, Model, Splats
-from ..splats import with_model as drawn_as
 from ..whole_file import Url, expanded, refuse_mapped, whole_file
 from . import ply_columns
 from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, Changes, Keep
@@ -117,7 +116,7 @@ class SplatFile:
 
     def splats(self) -> Splats:
         """The rows as splats; the arrays are views of the file if its layout permits."""
-        return drawn_as(ply_columns.splats_from_columns(self.rows), self.model)
+        return ply_columns.splats_from_columns(self.rows, self.model)
 
     def size(self, keep: Keep = None, columns: Changes = None) -> int:
         """Bytes that `write` would write."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from ..splats import LOG_ZERO, Splats, above_constant
+from ..splats import LOG_ZERO, Model, Splats, above_constant
 
 _NAMES = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
 REQUIRED = tuple(_NAMES.split())
@@ -19,18 +19,18 @@ THIRD_SCALE = "scale_2"  # the only one that discs (2DGS) may lack
 REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}  # number of ``f_rest_*`` -> degree
 
 
-def splats_from_columns(columns: Columns) -> Splats:
+def splats_from_columns(columns: Columns, model: Model = "default") -> Splats:
     """Splats of properties by name, (N,) each: all of `REQUIRED`, and any ``f_rest_*``.
 
-    Harmonics are all of red, then green, then blue. Without ``scale_2`` the splats are discs. The
-    arrays are views where properties lie side by side, else copies.
+    Harmonics are all of red, then green, then blue. Without ``scale_2``, which "2dgs" ignores, the
+    splats are discs. The arrays are views where properties lie side by side, else copies.
     """
     names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
     count = sum(name.startswith("f_rest_") for name in names)
     rest = [f"f_rest_{index}" for index in range(count)]
     size = len(columns["x"])
     planes = _stack(columns, rest) if rest else np.zeros((size, 0), np.float32)
-    flat = THIRD_SCALE not in names
+    flat = model == "2dgs" or THIRD_SCALE not in names
     scales = _stack(columns, REQUIRED[7 : 9 if flat else 10])
     if flat:
         scales = np.column_stack([scales, np.full(size, LOG_ZERO, scales.dtype)])
@@ -41,7 +41,7 @@ def splats_from_columns(columns: Columns) -> Splats:
         opacity_logits=columns["opacity"],
         sh_dc=_stack(columns, ["f_dc_0", "f_dc_1", "f_dc_2"]),
         sh_rest=planes.reshape(size, 3, count // 3).transpose(0, 2, 1),
-        model="2dgs" if flat else "default",
+        model="2dgs" if flat else model,
     )
 
 

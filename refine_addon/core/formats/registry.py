@@ -13,7 +13,7 @@ from ..affine import AXES, UNKNOWN_AXES, turned
 from ..errors import RefineError
 from ..mapped import file_bytes
 from ..place import LARGEST_NUMBER, Place, refuse_pointer
-from ..splats import Model, Splats, drawable, with_model
+from ..splats import Model, Splats, drawable
 from ..whole_file import Url, expanded, whole_file
 from . import by_name, compressed_ply, glb, sog, spz, streamed_sog
 from .format import Format
@@ -165,7 +165,7 @@ def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: 
             if name not in (rows.dtype.names or ()):
                 Place(path).fail(f"{form.suffix} holds no property '{name}'; write to a .ply")
             rows[name] = values if keep is None else values[keep]
-    splats = with_model(splats_from_columns(rows), file.model)
+    splats = splats_from_columns(rows, file.model)
     good = drawable(splats)
     if not good.any():
         Place(path).fail(f"none of the {len(splats)} splats can be drawn: nothing to write")

@@ -14,7 +14,7 @@ from ..execute import Progress, chunks, run
 from ..formats import ply
 from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..mapped import on_disk
-from ..splats import Model, Splats, joined, with_model
+from ..splats import Model, Splats, joined
 from ..whole_file import Url, alike
 from . import storage
 
@@ -110,10 +110,10 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
 def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
     """Copy tiles to files of a new folder, of their widest types and highest degree, else 0."""
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
-    kinds = [with_model(splats_from_columns(np.empty(0, each)), tiles[0].model) for each in dtypes]
+    kinds = [splats_from_columns(np.empty(0, each), tiles[0].model) for each in dtypes]
     pieces = [(tile, part.start, part.stop) for tile in tiles for part in chunks(tile.splats, ROWS)]
 
     def read(piece: tuple[Tile, int, int]) -> Splats:
-        return joined([*kinds, with_model(splats_from_columns(rows_of(*piece)), piece[0].model)])
+        return joined([*kinds, splats_from_columns(rows_of(*piece), tiles[0].model)])
 
     return on_disk(folder, run(read, pieces, progress=progress, what="reading", threads=threads))
