@@ -23,7 +23,7 @@ from . import whole_file
 from .errors import RefineError
 from .execute import Progress, report, seconds, silent, stages
 from .formats import registry, sog
-from .formats.registry import format_named, held_splats, left_out, notes, scene_name
+from .formats.registry import format_named, held_splats, losses, scene_name
 from .formats.streamed_sog import INDEX, StreamedSog, folder_for
 from .images import codec_for
 from .methods import DEFAULT, Method
@@ -258,8 +258,8 @@ def _into_folder(source, target, count, overwrite):
         path, file = paths[level.number - 1], scene.file()
         replace(level.result, source=file).write(path, overwrite=overwrite)
         written.append(path)
-        output = file, format_named(path), level.result.keep
-        return path.name, path.stat().st_size, left_out(*output), notes(*output)
+        lost = losses(file, format_named(path), level.result.keep)
+        return path.name, path.stat().st_size, *lost
 
     def finish():
         more = level_paths(source, target, MAX_LEVELS)[len(written) :]
@@ -295,10 +295,10 @@ def _streamed(target, views, overwrite):
                 distance = viewing_distance(scene.splats, views)
                 streamed.append(StreamedSog(finest.means, distance, folder))
                 streamed[0].add(finest)
-                said = notes(file, sog.FORMAT, whole)
+                _, said = losses(file, sog.FORMAT, whole)
             keep, columns = level.result.keep, level.result.changed(file.rows)
             size = streamed[0].add(held_splats(target, sog.FORMAT, file, keep, columns))
-            missing = left_out(file, sog.FORMAT, keep)
+            missing, _ = losses(file, sog.FORMAT, keep)
             return f"{level.number}_*/{sog.META}", size, missing, said
 
         def finish():

@@ -161,11 +161,11 @@ def run(
             if written is not None:
                 stopped.add_note(f"{written} is written with what that had reached")
             raise stopped
-        missing = registry.left_out(file, form, keep)
+        missing, told = registry.losses(file, form, keep)
         left = int(np.count_nonzero(keep)) - missing
         counts = {"written": None if written is None else left, "left_out": missing}
         result.report["splats"] |= counts
-        result.report["notes"] += [*registry.notes(file, form, keep), *scene.notes]
+        result.report["notes"] += [*told, *scene.notes]
         result.report["files"] = {
             "input": scene.name, "output": None if written is None else str(written),
             "input_bytes": scene.bytes, "output_bytes": size,

@@ -16,7 +16,7 @@ from bpy_extras.io_utils import ExportHelper
 from ..core.affine import AXES
 from ..core.execute import Progress, report
 from ..core.formats import registry, sog
-from ..core.formats.registry import SUFFIXES, notes, write_splats
+from ..core.formats.registry import SUFFIXES, losses, write_splats
 from ..core.formats.streamed_sog import INDEX, StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
 from ..mesh import layout as mesh_layout
@@ -124,7 +124,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         report(progress, 0.0, target.name)
         file, form = read(), registry.format_named(target)
         write_splats(target, file, overwrite=overwrite)
-        told = notes(file, form, np.ones(len(file), np.bool_))
+        _, told = losses(file, form, np.ones(len(file), np.bool_))
         return [*told, f"Wrote the splats to {target}"]
 
 

@@ -117,8 +117,7 @@ BOUNDS = {key: dict(zip(NAMES, bounds, strict=True)) for key, bounds in BOUNDS.i
 @pytest.mark.parametrize("suffix", SUFFIX)
 def test_what_comes_back_lies_within_the_bounds(tmp_path, suffix, degree):
     """Written, read as what it is, compared splat by splat with activated values.
-    A file of any format is read under any name: only .splat has no signature but its name. Written
-    as a plain PLY it has the same numbers to the bit."""
+    Any format but .splat is read under any name. A plain PLY of it has the same numbers."""
     path = written(tmp_path, suffix, scene(degree))
     other = path.rename(tmp_path / ("in.bin" if suffix != ".splat" else "IN.SPLAT"))
     file = read_splats(other)
@@ -127,7 +126,8 @@ def test_what_comes_back_lies_within_the_bounds(tmp_path, suffix, degree):
     found = differences(in_order(file.splats()), source.splats())
     moved = np.linalg.norm(in_order(file.splats()).means - source.splats().means, axis=1).max()
     note = f"{suffix} moves splats by up to {moved:.3g}, those beside an outlier farthest"
-    assert (note in registry.notes(source, form, np.ones(COUNT, np.bool_))) == (form is FORMATS[0])
+    _, told = registry.losses(source, form, np.ones(COUNT, np.bool_))
+    assert (note in told) == (form is FORMATS[0])
     assert (len(file), file.splats().sh_degree) == (COUNT, min(degree, form.degree))
     assert file.format.startswith(form.name)
     assert file.stored_bytes == other.stat().st_size
@@ -140,16 +140,15 @@ def test_what_comes_back_lies_within_the_bounds(tmp_path, suffix, degree):
 @pytest.mark.parametrize("suffix", SUFFIX)
 def test_what_a_format_cannot_hold_is_left_out_with_a_note(tmp_path, suffix):
     """Of 40 splats, one has no number as mean and one opacity 0: 38 are written.
-    No format but PLY and SPZ holds degree 4, none a property that is no splat's; to write one is
-    refused."""
+    Only PLY and SPZ hold degree 4, only PLY a property that is no splat's; others refuse it."""
     columns = {**scene(4, 40), "mine": np.zeros(40, np.float32)}
     columns["y"][3], columns["opacity"][5] = np.nan, -np.inf
     columns["scale_1"][7] = -np.inf  # flat, which can be drawn
     columns["opacity"][9] = np.inf
     splats = read_splats(written(tmp_path, suffix, columns)).splats()
     source, form = read_splats(tmp_path / "in.ply"), FORMATS[SUFFIX.index(suffix)]
-    notes = registry.notes(source, form, np.ones(40, np.bool_))
-    assert (len(splats), splats.sh_degree) == (38, form.degree)
+    missing, notes = registry.losses(source, form, np.ones(40, np.bool_))
+    assert (len(splats), missing, splats.sh_degree) == (38, 2, form.degree)
     assert any(note.startswith("2 of the kept splats cannot be drawn") for note in notes)
     degrees = f"degree {form.degree}, the file has degree 4"
     assert any(degrees in note for note in notes) == (form.degree < 4)

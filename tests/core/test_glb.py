@@ -247,7 +247,7 @@ def test_scales_of_one_primitive_are_all_logarithms_or_none(opened):
     expected = [[-3.0, -2.0, 0.5], [0.0, 1.0, 2.0], [0.0, 0.0, np.nan], [-104.0, 0.0, 0.0]]
     np.testing.assert_array_equal(file.splats().log_scales, expected)
     note = "a.glb has negative scales: its scales are read as logarithms"
-    assert registry.notes(file, None, np.ones(4, np.bool_)) == [note]
+    assert registry.losses(file, None, np.ones(4, np.bool_)) == (0, [note])
     assert drawable(file.splats()).tolist() == [True, True, False, True]
 
 

@@ -123,7 +123,7 @@ def test_text_is_written_as_the_binary_file_of_its_splats(folder, case, data):
     kept = [line for line in beside if line.startswith((b"comment", b"obj_info"))]
     assert kept == [line for line in again.header.split(case.line_end) if line in kept]
     assert (file.format, again.format) == ("ascii 1.0", "binary_little_endian 1.0")
-    (note,) = registry.notes(file, None, keep)
+    _, (note,) = registry.losses(file, None, keep)
     assert note.startswith("in.ply is text; a PLY that is written of it is binary")
     for line in beside:
         words = line.split()

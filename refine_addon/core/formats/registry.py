@@ -193,17 +193,15 @@ def written_size(
         return stream.seek(0, 2)  # to its end
 
 
-def left_out(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> int:
-    """Number of kept splats that a format leaves out: only plain PLY holds undrawable ones."""
-    return 0 if form is None else int(np.count_nonzero(keep & ~drawable(file.splats())))
+def losses(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> tuple[int, list[str]]:
+    """Number of kept splats that a format leaves out, and sentences for the user about writing.
 
-
-def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list[str]:
-    """Sentences for the user about writing the kept splats in a format."""
+    Only plain PLY holds splats that cannot be drawn.
+    """
     if form is None:
         kept = "beside the splats is kept as it is; its indices may point past the end"
         indexing = () if keep.all() else file.indexing
-        return [*file.remarks, *(f"element '{name}' {kept}" for name in indexing)]
+        return 0, [*file.remarks, *(f"element '{name}' {kept}" for name in indexing)]
     splats, suffix, model = file.splats(), form.suffix, file.model
     good, degree = keep & drawable(splats), splats.sh_degree
     lost = int(np.count_nonzero(keep & ~good))
@@ -222,4 +220,4 @@ def notes(file: SplatFile, form: Format | None, keep: NDArray[np.bool_]) -> list
         f"coordinates go to {suffix} turned to y up and z back": is_spz and up,
         f"coordinates go to {suffix} as they stand, y up is documented": is_spz and not up,
     }
-    return [*file.remarks, *(sentence for sentence, applies in said.items() if applies)]
+    return lost, [*file.remarks, *(sentence for sentence, applies in said.items() if applies)]
