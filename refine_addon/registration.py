@@ -1,6 +1,6 @@
 """Registration with Blender, in order; `unregister` undoes it in reverse.
-Modules list their classes in `CLASSES`, functions that draw into Blender's menus in `MENUS`, and
-handlers of Blender's events, with the events, in `HANDLERS`."""
+Every class of Blender's kinds in `MODULES` is registered. Modules list functions that draw into
+Blender's menus in `MENUS`, and handlers of Blender's events, with the events, in `HANDLERS`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,12 @@ _NAMES = """
     ui.camera_operators ui.panel viewport.draw
 """
 MODULES = [importlib.import_module(f".{name}", __package__) for name in _NAMES.split()]
-CLASSES = tuple(cls for module in MODULES for cls in getattr(module, "CLASSES", ()))
+CLASSES = [
+    cls
+    for module in MODULES
+    for cls in vars(module).values()
+    if hasattr(cls, "bl_rna") and cls.__module__ == module.__name__  # not an imported one
+]
 MENUS = [pair for module in MODULES for pair in getattr(module, "MENUS", {}).items()]
 _HANDLERS = [
     (getattr(bpy.app.handlers, event), handler)

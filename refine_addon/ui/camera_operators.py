@@ -173,9 +173,3 @@ def _join(context: bpy.types.Context, ring: bpy.types.Collection) -> None:
         for camera in CameraChoice.of_scene(scene).cameras(context):
             ring.objects.link(camera)
         settings.collection, settings.source = ring, "COLLECTION"
-
-
-CLASSES = (
-    REFINE_OT_turn_cameras,
-    REFINE_OT_add_ring,
-)

@@ -174,5 +174,4 @@ def _draw_menu(menu: bpy.types.Menu, _context: Context) -> None:
     menu.layout.operator("refine.export_ply", text=f"Gaussian Splats ({', '.join(SUFFIXES)})")
 
 
-CLASSES = (REFINE_OT_export_ply, REFINE_OT_export_levels)
 MENUS = {"TOPBAR_MT_file_export": _draw_menu}

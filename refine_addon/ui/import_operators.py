@@ -137,7 +137,6 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
 class REFINE_FH_cameras(_Dropped, bpy.types.FileHandler):
     """Camera files dropped on the 3D view."""
 
-    bl_idname = "REFINE_FH_cameras"
     bl_label = "Splat Cameras (REFINE)"
     bl_import_operator = "refine.import_cameras"
     bl_file_extensions = ".json;.bin;.txt"
@@ -310,7 +309,6 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
 class REFINE_FH_ply(_Dropped, bpy.types.FileHandler):
     """Splat files dropped on the 3D view."""
 
-    bl_idname = "REFINE_FH_ply"
     bl_label = "Gaussian Splats (REFINE)"
     bl_import_operator = "refine.import_ply"
     # Without .json, whose handler is that of cameras: Blender would ask which is meant.
@@ -336,11 +334,3 @@ def _draw_menu(menu: bpy.types.Menu, _context: Context) -> None:
 
 
 MENUS = {"TOPBAR_MT_file_import": _draw_menu}
-
-
-CLASSES = (
-    REFINE_OT_import_cameras,
-    REFINE_FH_cameras,
-    REFINE_OT_import_ply,
-    REFINE_FH_ply,
-)

@@ -224,13 +224,3 @@ class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
         outcome = splat_group.delete_splats(checked, ~going)
         plans.refresh(context)
         self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, kept {outcome.kept:,}")
-
-
-CLASSES = (
-    RefineVolume,
-    REFINE_OT_add_volume,
-    REFINE_OT_drop_volume,
-    REFINE_OT_protect,
-    REFINE_OT_find_floaters,
-    REFINE_OT_delete,
-)

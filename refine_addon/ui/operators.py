@@ -284,11 +284,3 @@ def _fit(names: list[str]) -> None:
             region = next(each for each in area.regions if each.type == "WINDOW")
             with bpy.context.temp_override(window=window, area=area, region=region):
                 bpy.ops.image.view_all(fit_view=True)
-
-
-CLASSES = (
-    REFINE_OT_score,
-    REFINE_OT_apply,
-    REFINE_OT_levels,
-    REFINE_OT_compare,
-)

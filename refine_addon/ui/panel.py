@@ -31,7 +31,8 @@ from .marks import ROLES
 from .operator_bases import Answer, AtOnce, idle, in_object_mode, tooltips
 from .plans import cached
 from .properties import HINTS, METHODS
-from .select_operators import REFINE_PT_select
+from .select_operators import ACTIONS
+from .select_tools import SHAPES, selected_count
 from .wrapped import InSidebar, counted
 
 
@@ -196,6 +197,54 @@ class REFINE_PT_clean(InSidebar, bpy.types.Panel):
         _draw_progress(layout, "refine.find_floaters")
 
 
+class REFINE_PT_select(InSidebar, bpy.types.Panel):
+    """The selection, its tools and its uses."""
+
+    bl_label = "Select"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Whether there are splats to select."""
+        return mesh_layout.looks_like_splats(context.object)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the count, the tools, other ways to select, and the uses."""
+        layout, settings, obj = self.layout, context.scene.refine, context.object
+        total = mesh_layout.splat_count(obj.data)
+        text = f"{selected_count(context):,} of {total:,} selected"
+        layout.label(text=text, icon="RESTRICT_SELECT_OFF")
+        grid = layout.grid_flow(columns=3, even_columns=True, align=True)
+        for shape, text, _ in SHAPES:
+            grid.operator("wm.tool_set_by_id", text=text).name = f"refine.select_{shape.lower()}"
+        row = layout.row()
+        row.prop(settings, "select_hidden")
+        row.prop(settings, "select_connected")
+        if obj.mode == "EDIT":
+            wrapped.label(layout, "More in object mode", icon="INFO")
+            return
+        grid = layout.grid_flow(columns=3, even_columns=True, align=True)
+        for action, text, _, icon, _ in ACTIONS:
+            grid.operator("refine.select", text=text, icon=icon).action = action
+        row = layout.row(align=True)
+        row.operator("refine.grow_selection", text="Grow", icon="ADD").shrink = False
+        row.operator("refine.grow_selection", text="Shrink", icon="REMOVE").shrink = True
+        layout.row(align=True).prop(settings, "select_mode", expand=True, icon_only=True)
+        menu = layout.operator_menu_enum("refine.select_by", "what", text="Select By")
+        menu.mode = settings.select_mode
+        row = layout.row(align=True)
+        row.prop(settings, "select_opacity")
+        row.prop(settings, "select_size")
+        row = layout.row(align=True)
+        marks = ("STAY", "Stay", "LOCKED"), ("GO", "Go", "TRASH"), ("NONE", "", "X")
+        for mark, text, icon in marks:
+            row.operator("refine.protect", text=text, icon=icon).mark = mark
+        column = layout.column(align=True)
+        column.operator("refine.grade", icon="COLOR")
+        column.operator("refine.separate_selected", text="Separate", icon="MOD_EXPLODE")
+        column.operator("refine.delete", text="Delete", icon="X").what = "SELECTED"
+
+
 class REFINE_PT_protect(InSidebar, bpy.types.Panel):
     """Protected splats and those removed by the user."""
 
@@ -315,16 +364,3 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
         button.mode = "OFF" if mode == now else mode
     if viewport_draw.failure():
         layout.label(text=viewport_draw.failure(), icon="ERROR")
-
-
-CLASSES = (
-    REFINE_OT_view,
-    REFINE_OT_make_real,
-    REFINE_PT_splats,
-    REFINE_PT_cameras,
-    REFINE_PT_prune,
-    REFINE_PT_clean,
-    REFINE_PT_select,
-    REFINE_PT_protect,
-    REFINE_PT_deliver,
-)

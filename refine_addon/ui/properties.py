@@ -299,9 +299,3 @@ def fill(values: Any, context: bpy.types.Context, *names: str) -> None:
     for name in names if addon else ():
         if addon.preferences.is_property_set(name) and not values.is_property_set(name):
             setattr(values, name, getattr(addon.preferences, name))
-
-
-CLASSES = (
-    RefineSettings,
-    RefinePreferences,
-)

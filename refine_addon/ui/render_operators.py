@@ -280,6 +280,5 @@ def _returned(*_: object) -> None:
         meshes.restore()
 
 
-CLASSES = (REFINE_OT_render, REFINE_OT_watch_render)
 MENUS = {"TOPBAR_MT_render": draw_menu}
 HANDLERS = {_began: ("render_init",), _returned: ("undo_post", "redo_post", "load_post")}

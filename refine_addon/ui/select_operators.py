@@ -1,4 +1,4 @@
-"""The box *Select* of the panel, with its settings and operators."""
+"""Settings and operators of the box *Select* of the panel."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
 from ..viewport import draw as viewport_draw
-from . import plans, wrapped
+from . import plans
 from .operator_bases import Answer, AtOnce, Job, OnSplats, tooltips
-from .select_tools import MODES, SHAPES, selected_count
+from .select_tools import MODES
 
 ACTIONS = (
     ("ALL", "All", "Select all splats that are not hidden", "CHECKBOX_HLT", 0),
@@ -252,60 +252,3 @@ class SelectSettings:
         min=1e-6,
         precision=3,
     )
-
-
-class REFINE_PT_select(wrapped.InSidebar, bpy.types.Panel):
-    """The selection, its tools and its uses."""
-
-    bl_label = "Select"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Whether there are splats to select."""
-        return mesh_layout.looks_like_splats(context.object)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw the count, the tools, other ways to select, and the uses."""
-        layout, settings, obj = self.layout, context.scene.refine, context.object
-        total = mesh_layout.splat_count(obj.data)
-        text = f"{selected_count(context):,} of {total:,} selected"
-        layout.label(text=text, icon="RESTRICT_SELECT_OFF")
-        grid = layout.grid_flow(columns=3, even_columns=True, align=True)
-        for shape, text, _ in SHAPES:
-            grid.operator("wm.tool_set_by_id", text=text).name = f"refine.select_{shape.lower()}"
-        row = layout.row()
-        row.prop(settings, "select_hidden")
-        row.prop(settings, "select_connected")
-        if obj.mode == "EDIT":
-            wrapped.label(layout, "More in object mode", icon="INFO")
-            return
-        grid = layout.grid_flow(columns=3, even_columns=True, align=True)
-        for action, text, _, icon, _ in ACTIONS:
-            grid.operator("refine.select", text=text, icon=icon).action = action
-        row = layout.row(align=True)
-        row.operator("refine.grow_selection", text="Grow", icon="ADD").shrink = False
-        row.operator("refine.grow_selection", text="Shrink", icon="REMOVE").shrink = True
-        layout.row(align=True).prop(settings, "select_mode", expand=True, icon_only=True)
-        menu = layout.operator_menu_enum("refine.select_by", "what", text="Select By")
-        menu.mode = settings.select_mode
-        row = layout.row(align=True)
-        row.prop(settings, "select_opacity")
-        row.prop(settings, "select_size")
-        row = layout.row(align=True)
-        marks = ("STAY", "Stay", "LOCKED"), ("GO", "Go", "TRASH"), ("NONE", "", "X")
-        for mark, text, icon in marks:
-            row.operator("refine.protect", text=text, icon=icon).mark = mark
-        column = layout.column(align=True)
-        column.operator("refine.grade", icon="COLOR")
-        column.operator("refine.separate_selected", text="Separate", icon="MOD_EXPLODE")
-        column.operator("refine.delete", text="Delete", icon="X").what = "SELECTED"
-
-
-CLASSES = (
-    REFINE_OT_select,
-    REFINE_OT_select_by,
-    REFINE_OT_grow_selection,
-    REFINE_OT_separate_selected,
-    REFINE_OT_grade,
-)

@@ -357,6 +357,3 @@ def unregister() -> None:
     while _tools:
         bpy.utils.unregister_tool(_tools.pop())
     _kept.clear()
-
-
-CLASSES = (REFINE_OT_select_stroke,)

@@ -164,6 +164,5 @@ def unregister() -> None:
     _drifts.clear()
 
 
-CLASSES = (REFINE_OT_bake_transform, REFINE_OT_mend)
 MENUS = {"VIEW3D_MT_object_apply": _draw_apply}
 HANDLERS = {_updated: ("depsgraph_update_post",), _changed: ("undo_post", "redo_post", "load_post")}
