@@ -8,6 +8,7 @@ import importlib
 from functools import partial
 
 import bpy
+from bpy.app.handlers import persistent
 from bpy.props import PointerProperty
 
 from . import command
@@ -29,7 +30,7 @@ CLASSES = [
 ]
 MENUS = [pair for module in MODULES for pair in getattr(module, "MENUS", {}).items()]
 _HANDLERS = [
-    (getattr(bpy.app.handlers, event), handler)
+    (getattr(bpy.app.handlers, event), persistent(handler))  # stays when a file is opened
     for module in MODULES
     for handler, events in getattr(module, "HANDLERS", {}).items()
     for event in events

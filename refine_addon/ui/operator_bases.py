@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import bpy
-from bpy.app.handlers import persistent
 from bpy.types import Context
 
 from .. import main_thread
@@ -380,7 +379,6 @@ class Job(AtOnce):
         return {"FINISHED"}
 
 
-@persistent
 def _end(*_: object) -> None:
     """End the work: Blender drops the operator silently."""
     if (running := now()) is not None:

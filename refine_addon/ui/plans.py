@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import bpy
 import numpy as np
-from bpy.app.handlers import persistent
 
 from ..cameras import SOURCE, WEIGHT, CameraChoice, render_size
 from ..core.errors import RefineError
@@ -364,12 +363,10 @@ def cached(what: Hashable, compute: Callable[[], Value]) -> Value:
     return _values[key]
 
 
-@persistent
 def _forget(*_arguments: object) -> None:
     _values.clear()
 
 
-@persistent
 def _undone(*_: object) -> None:
     """After undo or redo, mark again what may differ, and draw the right chart."""
     _forget()
@@ -378,7 +375,6 @@ def _undone(*_: object) -> None:
         (mark_again if bpy.context.scene.refine.volumes else changed)(None, bpy.context)
 
 
-@persistent
 def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Renew the marks after volumes, or splats, have moved."""
     _forget()

@@ -11,7 +11,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 
 from .. import main_thread
@@ -246,7 +245,6 @@ def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
     draw_buttons(menu.layout, "Render Animation with Splats")
 
 
-@persistent
 def _began(scene: bpy.types.Scene, *_: object) -> None:
     """Check whether a render leaves splats out; runs on the rendering thread."""
     if meshes.COPY_OF in scene:
@@ -272,7 +270,6 @@ def _say() -> float | None:
     return None if over else 0.5
 
 
-@persistent
 def _returned(*_: object) -> None:
     """Remove leftovers of a finished render that an undo or a file brought back."""
     if not bpy.app.is_job_running("RENDER"):

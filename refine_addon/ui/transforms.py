@@ -9,7 +9,6 @@ from typing import Any
 import bpy
 import mathutils
 import numpy as np
-from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 from bpy.types import Context
 
@@ -116,7 +115,6 @@ def _draw_apply(menu: bpy.types.Menu, context: Context) -> None:
         menu.layout.operator("refine.bake_transform", text="Bake Transform of Splats")
 
 
-@persistent
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Forget the drift of changed objects; stamp new splats soon."""
     for data in mesh_layout.changed_data(depsgraph):
@@ -125,7 +123,6 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
             _stamp_soon()
 
 
-@persistent
 def _changed(*_: object) -> None:
     """Forget all drift after undo, redo and loading; stamp new splats soon."""
     _drifts.clear()

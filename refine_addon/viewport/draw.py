@@ -11,7 +11,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from bpy.app.handlers import persistent
 from numpy.typing import NDArray
 
 from ..core.errors import RefineError
@@ -120,7 +119,6 @@ def unregister() -> None:
         bpy.types.SpaceView3D.draw_handler_remove(_state.handles.pop(), "WINDOW")
 
 
-@persistent
 def _forget(*_: object) -> None:
     _state.content.pool.shutdown(wait=False, cancel_futures=True)
     _state.content, _state.views = Content(), {}
@@ -217,7 +215,6 @@ def areas(context: bpy.types.Context, kind: str = "VIEW_3D") -> list[bpy.types.A
     return [a for window in windows for a in window.screen.areas if a.type == kind]
 
 
-@persistent
 def _saving(*_: object) -> None:
     """Store the mode in scenes with splats."""
     if bpy.app.background:
@@ -227,13 +224,11 @@ def _saving(*_: object) -> None:
             scene[SHOWN] = _state.mode
 
 
-@persistent
 def _opened(*_: object) -> None:
     wanted = None if bpy.app.background else bpy.context.scene.get(SHOWN)
     show(wanted if wanted in {name for name, *_ in MODES} else _state.mode)
 
 
-@persistent
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     if depsgraph is None or _state.mode == "OFF":
         return
@@ -246,7 +241,6 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
     hide_points(depsgraph, _state.content.refused)
 
 
-@persistent
 def _undone(*_: object) -> None:
     if _state.mode != "OFF":
         _state.content.has_changed()
