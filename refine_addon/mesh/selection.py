@@ -47,13 +47,21 @@ def _in_edit(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
 
 def select(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
     """Select exactly these splats, (N,) bool, except hidden ones."""
-    away = hidden(obj)
-    _store(obj, wanted & ~away, away)
+    wanted = wanted & ~hidden(obj)
+    if not _in_edit_mode(obj):
+        mark(obj, name_of(obj.data), wanted)
+        return
+    vertices = bmesh.from_edit_mesh(obj.data).verts
+    vertices.ensure_lookup_table()
+    for row in np.flatnonzero(selected(obj) != wanted).tolist():
+        vertices[row].select = bool(wanted[row])
+    bmesh.update_edit_mesh(obj.data, loop_triangles=False, destructive=False)
 
 
 def hide(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
-    """Hide exactly these splats, (N,) bool, and deselect them."""
-    _store(obj, selected(obj) & ~wanted, wanted)
+    """Hide exactly these splats, (N,) bool, and deselect them; in object mode."""
+    mark(obj, HIDDEN, wanted)
+    select(obj, selected(obj))
 
 
 def count(obj: bpy.types.Object) -> int:
@@ -77,23 +85,6 @@ def readable(obj: bpy.types.Object) -> Iterator[SplatObject]:
     finally:
         bpy.data.objects.remove(copy)
         bpy.data.meshes.remove(mesh)
-
-
-def _store(
-    obj: bpy.types.Object, wanted: NDArray[np.bool_], out_of_sight: NDArray[np.bool_]
-) -> None:
-    mesh = obj.data
-    if _in_edit_mode(obj):
-        vertices = bmesh.from_edit_mesh(mesh).verts
-        vertices.ensure_lookup_table()
-        for row in np.flatnonzero(hidden(obj) != out_of_sight).tolist():
-            vertices[row].hide_set(bool(out_of_sight[row]))
-        for row in np.flatnonzero(selected(obj) != wanted).tolist():
-            vertices[row].select = bool(wanted[row])
-        bmesh.update_edit_mesh(mesh, loop_triangles=False, destructive=False)
-        return
-    for name, flags in ((name_of(mesh), wanted), (HIDDEN, out_of_sight)):
-        mark(obj, name, flags)
 
 
 def _in_edit_mode(obj: bpy.types.Object) -> bool:

@@ -73,8 +73,6 @@ class Demands:
     def _forced(self, checked: SplatObject, *named: NDArray[np.bool_] | None) -> Forced:
         protected = any_of(mesh_edit.marks(checked.obj, mesh_edit.PROTECT), *named)
         out = mesh_edit.marks(checked.obj, mesh_edit.MUST_GO)
-        if not self.zones and out is None:
-            return Forced(protected)
         means = world_means(checked) if self.zones else np.empty((0, 3))
         try:
             return forced(self.zones, means, protected, out)
