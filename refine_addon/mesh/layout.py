@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -147,6 +147,12 @@ class SplatObject:
 
     def __len__(self) -> int:
         return splat_count(self.obj.data)
+
+
+def rows_of(counts: Iterable[int]) -> list[slice]:
+    """Slices of each object's splats in the concatenated arrays of several."""
+    ends = np.cumsum(list(counts)).tolist()
+    return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def recorded(mesh: bpy.types.ID, name: str, read: Callable[[Any], Any]) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import uuid
 import zlib
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -19,7 +20,7 @@ from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
-from .layout import SplatObject, has, recorded, splat_count
+from .layout import SplatObject, has, recorded, rows_of, splat_count
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: score, rank from 0 (removed first) to 1, number of views with the splat."""
@@ -34,48 +35,46 @@ FLOATERS = "refine_floaters"  # Custom property of the mesh: floaters by reason,
 
 
 def store(
-    checked: SplatObject,
+    group: Sequence[SplatObject],
     scores: Scores,
     method: Method,
     *,
-    origin: dict[str, Any] | None = None,
+    origins: Sequence[dict[str, Any] | None] = (None,),
     cameras: list[tuple[str, int]] | None = None,
     protected: NDArray[np.bool_] | None = None,
-    together: tuple[str, int, NDArray[np.float64]] | None = None,
     seconds: float | None = None,
 ) -> None:
-    """Write scores and their record to an object's mesh. `origin`: see `plans.origin`. `cameras`:
-    name and number of splats of each view. `protected`: (N,) bool, as the quality curve has it.
-    `together`, if scored with other objects: its id, splats of all, ranks among all, (N,)."""
-    mesh_edit.check_writable(checked.obj)
-    mesh = checked.mesh
-    ranks = together[2] if together else rank(scores.values)
-    new_record = json.dumps(
-        {
-            "splats": len(scores.values),
-            "settings": method.facts(),
-            "method": scores.method,
-            "views_given": scores.views_given,
-            "views_used": scores.views_used,
-            "views_between": scores.views_between,
-            "weights": scores.facts,
-            "notes": scores.notes,
-            "quality": scores.quality.facts() if scores.quality else None,
-            "alignment": scores.alignment.facts() if scores.alignment else None,
-            "origin": origin,
-            "cameras": cameras,
-            "protected": digest(protected),
-            "seconds": seconds,
-            "together": together and {"id": together[0], "splats": together[1]},
-        }
-    )
-    mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
-    mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
-    mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
-    scored = np.ones(len(checked), np.bool_) if scores.scored is None else scores.scored
-    mesh_attributes.write_attribute(mesh, SCORED, "BOOLEAN", scored)
-    mesh[RECORD] = new_record
-    mesh_attributes.updated(mesh)
+    """Write scores of all splats of some objects, scored together, and a record to each mesh.
+    `origins`: of each object, see `plans.origin`. `cameras`: name and number of splats of each
+    view. `protected`: (N,) bool of all, as the quality curve has it."""
+    for checked in group:
+        mesh_edit.check_writable(checked.obj)
+    total, ranks = len(scores.values), rank(scores.values)
+    scored = np.ones(total, np.bool_) if scores.scored is None else scores.scored
+    protected = np.zeros(total, np.bool_) if protected is None else protected
+    of_all = {
+        "settings": method.facts(),
+        "method": scores.method,
+        "views_given": scores.views_given,
+        "views_used": scores.views_used,
+        "views_between": scores.views_between,
+        "weights": scores.facts,
+        "notes": scores.notes,
+        "quality": scores.quality.facts() if scores.quality else None,
+        "alignment": scores.alignment.facts() if scores.alignment else None,
+        "cameras": cameras,
+        "seconds": seconds,
+        "together": {"id": uuid.uuid4().hex, "splats": total} if len(group) > 1 else None,
+    }
+    for checked, origin, rows in zip(group, origins, rows_of(map(len, group)), strict=True):
+        mesh = checked.mesh
+        mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values[rows])
+        mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks[rows])
+        mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen[rows])
+        mesh_attributes.write_attribute(mesh, SCORED, "BOOLEAN", scored[rows])
+        own = {"splats": len(checked), "origin": origin, "protected": digest(protected[rows])}
+        mesh[RECORD] = json.dumps(of_all | own)
+        mesh_attributes.updated(mesh)
 
 
 def forget(checked: SplatObject) -> None:
@@ -118,15 +117,15 @@ _KINDS = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
 def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | None = None) -> Scores:
     """Scores of several objects, concatenated; splats in `removed`, (N,) bool of all, need none.
     `RefineError` if others have none, or if the objects were not scored together."""
-    records, columns, start = [], [], 0
+    records, columns = [], []
     removed = np.zeros(sum(map(len, group)), np.bool_) if removed is None else removed
-    for checked in group:
+    for checked, rows in zip(group, rows_of(map(len, group)), strict=True):
         scoring, label = record(checked.mesh), f"object '{checked.obj.name}'"
         if scoring is None or not all(has(checked.mesh, *each) for each in _KINDS.items()):
             raise RefineError(f"{label}: has no scores; score it first")
         own = [mesh_attributes.read_attribute(checked.mesh, name) for name in _KINDS]
-        count = len(own[0])
-        unscored = int(np.count_nonzero(~own[2] & ~removed[start : start + count]))
+        count = len(checked)
+        unscored = int(np.count_nonzero(~own[2] & ~removed[rows]))
         if count > scoring["splats"] or unscored:
             raise RefineError(
                 f"{label}: scored with {scoring['splats']} splats, has {count} now, "
@@ -134,7 +133,6 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
             )
         records.append(scoring)
         columns.append(own)
-        start += count
     values, seen, scored = (np.concatenate(parts) for parts in zip(*columns, strict=True))
     together = [each.get("together") or {} for each in records]
     if len(group) > 1 and len({each.get("id") or index for index, each in enumerate(together)}) > 1:

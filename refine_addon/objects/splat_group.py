@@ -4,8 +4,7 @@ A function does all it says, or raises `RefineError` and changes nothing."""
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -28,8 +27,7 @@ from ..core.operations import Scene, prune_scene, run, score_scene, to_size
 from ..core.pictures import PictureFiles
 from ..core.prune import prune
 from ..core.result import Result
-from ..core.scores import Scores
-from ..core.selection import Budget, rank
+from ..core.selection import Budget
 from ..core.spherical_harmonics import recolored
 from ..core.splats import Splats, joined
 from ..core.views import ViewSet
@@ -40,7 +38,7 @@ from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject
+from ..mesh.layout import SplatObject, rows_of
 from . import demands
 from .demands import NONE, Demands
 from .transforms import read_to_move, uneven_notes
@@ -120,18 +118,6 @@ def _as_one(each: Sequence[Forced], group: Members) -> Masks:
     return masks
 
 
-def _rows(counts: Iterable[int]) -> list[slice]:
-    """Slices of each object's splats in the concatenated arrays."""
-    ends = np.cumsum(list(counts)).tolist()
-    return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
-
-
-def parts_of(mask: NDArray[np.bool_] | None, group: Members) -> list[NDArray[np.bool_]]:
-    """Each object's part of a mask of all splats, (N,); None marks none."""
-    whole = _filled(mask, group)
-    return [whole[rows] for rows in _rows(map(len, group))]
-
-
 def _filled(mask: NDArray[np.bool_] | None, group: Members) -> NDArray[np.bool_]:
     return np.zeros(sum(map(len, group)), np.bool_) if mask is None else mask
 
@@ -181,26 +167,6 @@ def drift_notes(checked: SplatObject) -> list[str]:
     return [f"object '{checked.obj.name}': {sentence}{remedy}" for sentence in drift.sentences]
 
 
-def store(
-    group: Members, scores: Scores, method: Method, origins: Sequence[dict[str, Any]], **record: Any
-) -> None:
-    """Write scores of `gather`'s splats to each mesh, with its origin; see `mesh.scores.store`."""
-    _check_counts(group, len(scores.values))
-    ranks, scoring, scored = rank(scores.values), uuid.uuid4().hex, scores.scored
-    protected = parts_of(record.pop("protected", None), group)
-    each = zip(group, origins, _rows(map(len, group)), protected, strict=True)
-    for member, origin, rows, mask in each:
-        own, together = scores, None
-        if len(group) > 1:
-            values, seen = scores.values[rows], scores.seen[rows]
-            known = None if scored is None else scored[rows]
-            own = replace(scores, values=values, seen=seen, scored=known)
-            together = (scoring, len(scores.values), ranks[rows])
-        mesh_scores.store(
-            member, own, method, origin=origin, protected=mask, together=together, **record
-        )
-
-
 def stored_arguments(
     group: Members, budget: Budget, masks: Masks, method: Method, views: ViewSet | None = None
 ) -> dict[str, Any]:
@@ -239,8 +205,8 @@ def sized(
 
 def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
     """Mark splats outside `keep`, (N,) of all objects."""
-    for member, going in zip(group, parts_of(~keep, group), strict=True):
-        mesh_edit.mark(member.obj, mesh_edit.REMOVE, going)
+    for member, rows in zip(group, rows_of(map(len, group)), strict=True):
+        mesh_edit.mark(member.obj, mesh_edit.REMOVE, ~keep[rows])
 
 
 class Frame(NamedTuple):
@@ -273,7 +239,7 @@ def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
 def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
     """Change of each object's splats, from the result for all; arrays only."""
     parts, first, merged = [], 0, result.merged
-    for frame, rows in zip(frames, _rows(frame.count for frame in frames), strict=True):
+    for frame, rows in zip(frames, rows_of(frame.count for frame in frames), strict=True):
         keep = result.keep[rows]
         start, first = first, first + int(np.count_nonzero(keep))
         if merged is None:
@@ -291,8 +257,7 @@ def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
 def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
     """Delete the splats that are not kept and store changed values: in all objects or none.
     All else stays; the scores' record goes, as scores hold for all splats together. `RefineError`
-    if the number of splats changed, or an object would end up empty."""
-    _check_counts(group, sum(len(part.keep) for part in parts))
+    if an object would end up empty."""
     outcomes = []
     for checked, part in zip(group, parts, strict=True):
         mesh_edit.check_deletable(checked.obj)
@@ -336,16 +301,6 @@ def grade(checked: SplatObject, rows: NDArray[np.int64], matrix: NDArray[np.floa
     columns = {name: values[name] for name in values if name.startswith("f_")}
     with mesh_edit.all_or_nothing(checked.obj):
         mesh_attributes.write_columns(checked, columns, rows)
-
-
-def _check_counts(group: Sequence[SplatObject], count: int) -> None:
-    total = sum(len(member) for member in group)
-    if total != count:
-        names = ", ".join(repr(member.obj.name) for member in group)
-        raise RefineError(
-            f"objects {names}: have {total} splats together and had {count} when the work began; "
-            "do it again"
-        )
 
 
 def read_for_export(
@@ -466,7 +421,7 @@ def prune_object(
         (change,) = changes(frames_of([checked]), result)
         with mesh_edit.all_or_nothing(checked.obj):
             assert result.scores is not None
-            mesh_scores.store(checked, result.scores, method)
+            mesh_scores.store([checked], result.scores, method)
             reduce_object(checked, change)
             try:
                 bpy.ops.wm.save_mainfile()

@@ -26,6 +26,7 @@ from ..core.views import ViewSet
 from ..core.visibility import frustum
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
 from ..objects import splat_group
 from ..objects.splat_group import Change, Members
 from ..viewport import draw as viewport_draw
@@ -92,7 +93,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         pairs = zip(views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         record = {"cameras": cameras, "protected": masks["protected"], "seconds": seconds}
-        splat_group.store(group, scores, method, origins, **record)
+        mesh_scores.store(group, scores, method, origins=origins, **record)
         plans.refresh(context)
         removed = masks["removed"]
         out = 0 if removed is None else int(np.count_nonzero(removed))

@@ -160,7 +160,7 @@ def score(addon):
     def score(obj, views):
         method, checked = addon.core.ClosedForm(), addon.mesh.layout.check(obj)
         scores = addon.core.score(addon.objects.splat_group.gather([checked]), views, method)
-        addon.mesh.scores.store(checked, scores, method)
+        addon.mesh.scores.store([checked], scores, method)
 
     return score
 
