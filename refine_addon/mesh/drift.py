@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.affine import Move, affine_moves
+from ..core.errors import RefineError
 from . import attributes as mesh_attributes
-from .layout import ROTATION, SCALE, has, is_native, sh_degree
+from .layout import ROTATION, SCALE, check, has, is_native, sh_degree
 
 HOME = "refine_home"
 """Point vector: the splat's position when its scales, rotation and harmonics were written."""
@@ -32,6 +33,7 @@ _MIX = np.uint32(0x9E3779B1)
 
 _FEW, _FEW_SHARE = 100, 0.01  # Splats moved singly without a warning: number, share of all
 _SAMPLE = 1 << 15  # Splats looked at for the panel's text, spread evenly
+known: dict[int, Drift | None] = {}  # By the data's `session_uid`, until the caller drops it
 
 
 class Drift(NamedTuple):
@@ -88,6 +90,19 @@ def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
             "REFINE never saw: undo that"
         )
     return Drift(sentences, mendable) if sentences else None
+
+
+def of(obj: bpy.types.Object) -> Drift | None:
+    """Drift of an object, None without or in edit mode; computed once for each change."""
+    if obj.mode == "EDIT":
+        return None
+    key = obj.data.session_uid
+    if key not in known:
+        try:
+            known[key] = found(check(obj).mesh)
+        except RefineError:
+            known[key] = None
+    return known[key]
 
 
 def disturbed(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Notes | None:

@@ -1,4 +1,4 @@
-"""Operators that bake and mend transforms; warnings where Blender's own tools moved splats."""
+"""Operators that bake and mend transforms; what Blender's own tools moved, in the panel."""
 
 from __future__ import annotations
 
@@ -17,16 +17,13 @@ from ..core.execute import run_all
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
-from ..mesh.drift import Drift
 from ..mesh.layout import SplatObject
 from ..objects import splat_group, transforms
-from ..viewport import draw as viewport_draw
 from . import plans, wrapped
 from .operator_bases import AtOnce, Job, OnSplats, in_object_mode
 from .wrapped import counted
 
 _SOON = 0.1  # Seconds until new splats are stamped: Blender's operator is over by then
-_drifts: dict[int, Drift | None] = {}  # By the data's `session_uid`, until it changes
 
 
 class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
@@ -61,7 +58,9 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
         """Selected objects with drift, and a call that computes each one's new values."""
         mesh_layout.check(context.object)
-        drifted = {obj.data: obj for obj in splat_group.chosen(context.object) if of(obj)}
+        drifted = {
+            obj.data: obj for obj in splat_group.chosen(context.object) if mesh_drift.of(obj)
+        }
         group = [mesh_layout.check(obj) for obj in drifted.values()]
         for each in group:
             mesh_edit.check_changeable(each.obj)
@@ -76,31 +75,9 @@ class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
         self.report({"INFO"}, f"Mended {counted(sum(count for _, count in mended), 'splat')}")
 
 
-def of(obj: bpy.types.Object) -> Drift | None:
-    """Drift of an object, None without; computed once for each change."""
-    if obj.mode == "EDIT":
-        return None
-    key = obj.data.session_uid
-    if key not in _drifts:
-        try:
-            _drifts[key] = mesh_drift.found(mesh_layout.check(obj).mesh)
-        except RefineError:
-            _drifts[key] = None
-    return _drifts[key]
-
-
-def _warnings(context: Context) -> list[str]:
-    """A sentence for each visible object that needs mending, as the panel may be closed."""
-    return [
-        f"'{obj.name}' was transformed by Blender's own tools: Mend Splats in the tab REFINE"
-        for obj in context.visible_objects
-        if mesh_layout.looks_like_splats(obj) and (drift := of(obj)) and drift.mendable
-    ]
-
-
 def draw(layout: bpy.types.UILayout, objects: Sequence[bpy.types.Object]) -> None:
     """Draw the objects' drift, and the buttons that move splats."""
-    drifts = [drift for drift in map(of, objects) if drift]
+    drifts = [drift for drift in map(mesh_drift.of, objects) if drift]
     for sentence in dict.fromkeys(s for drift in drifts for s in drift.sentences):
         wrapped.label(layout, sentence, icon="ERROR")
     if any(drift.mendable for drift in drifts):
@@ -118,14 +95,14 @@ def _draw_apply(menu: bpy.types.Menu, context: Context) -> None:
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Forget the drift of changed objects; stamp new splats soon."""
     for data in mesh_layout.changed_data(depsgraph):
-        _drifts.pop(data.session_uid, None)
+        mesh_drift.known.pop(data.session_uid, None)
         if _is_new(data):
             _stamp_soon()
 
 
 def _changed(*_: object) -> None:
     """Forget all drift after undo, redo and loading; stamp new splats soon."""
-    _drifts.clear()
+    mesh_drift.known.clear()
     _stamp_soon()
 
 
@@ -148,17 +125,11 @@ def _stamp() -> None:
                 continue  # it only looks like splats
 
 
-def register() -> None:
-    """Have the 3D views warn of drift."""
-    viewport_draw.warned_by.append(_warnings)
-
-
 def unregister() -> None:
-    """Undo `register`."""
-    viewport_draw.warned_by.remove(_warnings)
+    """Stop the timer, and forget all drift."""
     if bpy.app.timers.is_registered(_stamp):
         bpy.app.timers.unregister(_stamp)
-    _drifts.clear()
+    mesh_drift.known.clear()
 
 
 MENUS = {"VIEW3D_MT_object_apply": _draw_apply}

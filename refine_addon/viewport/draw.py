@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import RefineError
+from ..mesh import drift as mesh_drift
 from ..mesh.layout import changed_data, looks_like_splats, splat_count
 from ..objects.instances import Key, placings
 from . import overlays, shader
@@ -35,9 +36,6 @@ SHOWN = "refine_shown"  # Custom property of the scene: the mode when the file w
 _TICK = 0.03  # Seconds between two looks at the sorting thread
 _EDIT_REST = 0.3  # Seconds without a change in edit mode before splats are read again
 _VIEWS = 16  # Regions whose pictures stay on the graphics card
-
-
-warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []  # Sources of a view's warnings
 
 
 _state: Any = SimpleNamespace(
@@ -168,7 +166,11 @@ def _existing() -> set[Key]:
 
 
 def _draw_legend() -> None:
-    warnings = [text for source in warned_by for text in source(bpy.context)]
+    warnings = [  # here too, as the panel may be closed
+        f"'{obj.name}' was transformed by Blender's own tools: Mend Splats in the tab REFINE"
+        for obj in bpy.context.visible_objects
+        if looks_like_splats(obj) and (drift := mesh_drift.of(obj)) and drift.mendable
+    ]
     overlays.draw_legend(bpy.context, _state.mode, _state.content.marks(), warnings)
 
 

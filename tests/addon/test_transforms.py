@@ -51,7 +51,7 @@ def assert_alike(got, expected):
 
 def told_of(addon, obj):
     """Return what the panel says that others did to an object's splats."""
-    drift = addon.ui.transforms.of(obj)
+    drift = addon.mesh.drift.of(obj)
     return drift.sentences if drift else []
 
 
@@ -217,7 +217,7 @@ def test_splats_that_are_bent_and_what_is_no_splat_are_named(addon, imported):
     bpy.ops.object.join()
     (told,) = told_of(addon, imported)
     assert "8 vertices were joined that are no splats" in told
-    assert not addon.ui.transforms.of(imported).mendable
+    assert not addon.mesh.drift.of(imported).mendable
 
 
 def test_who_changes_all_of_a_splat_is_left_alone(addon, imported, room_cameras, capfd):

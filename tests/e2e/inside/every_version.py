@@ -91,7 +91,7 @@ def mended(step, form, cloud):
     objects = [imported(cloud, form) for _ in PLACES]
     for obj, place in zip(objects, PLACES, strict=True):
         obj.matrix_world = place
-    before, drift = seen(objects), extension.module("ui.transforms")
+    before, drift = seen(objects), extension.module("mesh.drift")
     extension.select(*objects)
     bpy.ops.object.join() if step == "join" else bpy.ops.object.transform_apply()
     left = [obj for obj in bpy.context.scene.objects if obj.type == form]

@@ -137,7 +137,7 @@ def splats(but=None):
 
 def said():
     """Return what the panel says of the splats."""
-    drift = extension.module("ui.transforms").of(splats())
+    drift = extension.module("mesh.drift").of(splats())
     return drift.sentences if drift else []
 
 
