@@ -103,7 +103,7 @@ def refresh(scene: bpy.types.Scene, group: Members) -> Masks:
 def check_forced(scene: bpy.types.Scene, group: Members, before: Masks) -> None:
     """Raise `RefineError` if other splats are protected or removed than before."""
     now = forced(scene, group)
-    if any(not np.array_equal(_filled(before[n], group), _filled(now[n], group)) for n in now):
+    if not all(np.array_equal(before[name], now[name]) for name in now):
         raise RefineError(
             "what must stay or go has changed meanwhile; nothing was removed: apply again"
         )
@@ -112,14 +112,12 @@ def check_forced(scene: bpy.types.Scene, group: Members, before: Masks) -> None:
 def _as_one(each: Sequence[Forced], group: Members) -> Masks:
     masks: Masks = {}
     for name in ("protected", "removed"):
-        parts = [getattr(one, name) for one in each]
-        filled = [_filled(part, [member]) for part, member in zip(parts, group, strict=True)]
-        masks[name] = None if all(part is None for part in parts) else np.concatenate(filled)
+        whole = np.zeros(sum(map(len, group)), np.bool_)
+        for one, rows in zip(each, rows_of(map(len, group)), strict=True):
+            part = getattr(one, name)
+            whole[rows] = False if part is None else part
+        masks[name] = whole if whole.any() else None
     return masks
-
-
-def _filled(mask: NDArray[np.bool_] | None, group: Members) -> NDArray[np.bool_]:
-    return np.zeros(sum(map(len, group)), np.bool_) if mask is None else mask
 
 
 def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splats:
