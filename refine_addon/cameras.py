@@ -340,9 +340,8 @@ def _turn(
     """Quarter turns about x that these cameras need, the same for all; None if unknown: the splats
     or more than half of the cameras were not imported, cameras differ, or nobody named the axes of
     an SPZ."""
-    data = None if splats is None else splats.data
-    ours = data is not None and (LAYOUT in data or is_native(data))
-    if splats is None or not ours or data.get(AXES) == UNKNOWN_AXES:
+    data = splats and splats.data
+    if not data or not (LAYOUT in data or is_native(data)) or data.get(AXES) == UNKNOWN_AXES:
         return None
     linear = world_matrix(splats)[:3, :3]
     scale = np.cbrt(np.linalg.det(linear))

@@ -104,10 +104,8 @@ def read_for_file(
         rows, values = np.empty(count, layout.row_dtype), columns()
         while groups:
             names, planes = groups.popleft()  # freed once written
-            if values.keys() & set(names):
-                pairs = zip(names, planes, strict=True)
-                planes = [values.get(name, plane) for name, plane in pairs]
-            _interleave(rows, names, planes)
+            pairs = zip(names, planes, strict=True)
+            _interleave(rows, names, [values.get(name, plane) for name, plane in pairs])
         no_elements = np.empty(0, np.uint8)
         return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
 

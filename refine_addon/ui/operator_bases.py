@@ -352,11 +352,9 @@ class Job(AtOnce):
         running.worker.cancel()
         return {"RUNNING_MODAL"}
 
-    def cancel(self, context: Context) -> None:
+    def cancel(self, _context: Context) -> None:
         """End the thread when Blender ends the operator, closing its window or file."""
-        if (running := now()) is not None:
-            running.over(context)
-            running.worker.end()
+        _end()
 
     def _check(self, context: Context, running: Running) -> Answer:
         """Put the result if the thread is done; Blender prints errors that are no `FAILURES`."""

@@ -205,9 +205,7 @@ def as_texture(values: NDArray[Any]) -> NDArray[np.float32]:
 
 def first_of_each(counts: list[int], most: int) -> list[int]:
     """Splats drawn of each object if at most `most` are drawn in all: equal shares."""
-    total = sum(counts)
-    if total <= most:
-        return list(counts)
+    total = max(sum(counts), most)
     return [count * most // total for count in counts]
 
 
