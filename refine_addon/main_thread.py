@@ -52,6 +52,20 @@ def serve() -> None:
                 answer.set_exception(error)
 
 
+def stored(path: Path) -> NDArray[np.float32]:
+    """Pixels of an image file as they are stored, (height, width, 4), 0..1, lowest row first."""
+    image = bpy.data.images.load(str(path))
+    try:
+        image.colorspace_settings.name = "Non-Color"
+        image.alpha_mode = "CHANNEL_PACKED"
+        width, height = image.size
+        pixels = np.empty((height, width, 4), np.float32)
+        image.pixels.foreach_get(pixels.ravel())
+    finally:
+        bpy.data.images.remove(image)
+    return pixels
+
+
 class BlenderImages(Codec):
     """A codec on Blender's main thread."""
 
@@ -67,21 +81,12 @@ class BlenderImages(Codec):
         with _file() as path:
             path.write_bytes(data)
             try:
-                image = bpy.data.images.load(str(path))
+                pixels = stored(path)
             except RuntimeError as error:
                 raise ValueError(str(error).strip()) from error
-            try:
-                image.colorspace_settings.name = "Non-Color"
-                image.alpha_mode = "CHANNEL_PACKED"
-                width, height = image.size
-                if (width, height) != self.size(data):
-                    raise ValueError("damaged")
-                values = np.empty(width * height * 4, np.float32)
-                image.pixels.foreach_get(values)
-            finally:
-                bpy.data.images.remove(image)
-        pixels = np.rint(values * 255.0).astype(np.uint8)
-        return pixels.reshape(height, width, 4)[::-1]  # Blender's first row is the lowest
+        if pixels.shape[1::-1] != self.size(data):
+            raise ValueError("damaged")
+        return np.rint(pixels * 255.0).astype(np.uint8)[::-1]
 
     def _encode(self, pixels: NDArray[np.uint8]) -> bytes:
         height, width = pixels.shape[:2]

@@ -17,6 +17,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import main_thread
 from ..cameras import active_camera
 from ..core.execute import Cancelled
 from ..core.images import read_exr
@@ -174,23 +175,19 @@ class Meshes:
         return np.split(np.concatenate(bands, axis=1), len(pictures), axis=1)
 
     def _band_shown(self, band):
-        scene, path = existing(self._any), str(self._folder / "shown.png")
+        scene, path = existing(self._any), self._folder / "shown.png"
         height, width = band.shape[1:]
         pixels = np.ones((height, width, 4), np.float32)
         pixels[..., :3] = np.moveaxis(band, 0, -1)
-        images = [bpy.data.images.new("REFINE", width, height, float_buffer=True)]
+        image = bpy.data.images.new("REFINE", width, height, float_buffer=True)
         try:
-            images[0].pixels.foreach_set(pixels.ravel())
+            image.pixels.foreach_set(pixels.ravel())
             write_png(scene)
-            images[0].save_render(path, scene=scene)
-            images.append(bpy.data.images.load(path))
-            images[1].colorspace_settings.name = "Non-Color"
-            images[1].alpha_mode = "CHANNEL_PACKED"
-            images[1].pixels.foreach_get(pixels.ravel())
+            image.save_render(str(path), scene=scene)
         finally:
-            bpy.data.batch_remove(images)
+            bpy.data.images.remove(image)
             write_exr(scene, Path(scene.render.filepath))
-        return np.moveaxis(pixels[..., :3], -1, 0)
+        return np.moveaxis(main_thread.stored(path)[..., :3], -1, 0)
 
 
 def _has_card() -> bool:
