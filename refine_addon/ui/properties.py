@@ -32,7 +32,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING
 from . import plans, wrapped
 from .marks import RefineVolume
-from .select_operators import SelectSettings
+from .select_tools import MODES
 
 METHODS = (
     ("closed-form", "Closed Form", "REFINE's formula, ignores occlusion. Kept splats unchanged"),
@@ -145,7 +145,7 @@ class _Preferred:
     )
 
 
-class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
+class RefineSettings(_Preferred, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
     model: EnumProperty(
@@ -230,6 +230,41 @@ class RefineSettings(_Preferred, SelectSettings, bpy.types.PropertyGroup):
         name="Levels",
         description="Shares of the splats that stay in the levels of detail, the finest first",
         default="0.5, 0.25, 0.12, 0.06",
+    )
+    select_radius: FloatProperty(
+        name="Radius",
+        description="Radius of the brush, in pixels",
+        subtype="PIXEL",
+        default=40.0,
+        min=1.0,
+        max=1000.0,
+    )
+    select_hidden: BoolProperty(
+        name="Through", description="Also select splats that others hide, behind surfaces"
+    )
+    select_tolerance: FloatProperty(
+        name="Tolerance",
+        description="How much red, green or blue may differ from the colour under the mouse",
+        subtype="FACTOR",
+        default=0.1,
+        min=0.0,
+        max=1.0,
+    )
+    select_connected: BoolProperty(
+        name="Connected", description="Select only the connected piece under the mouse"
+    )
+    select_mode: EnumProperty(
+        name="Mode", description="How Select By changes the selection", items=MODES
+    )
+    select_opacity: FloatProperty(
+        name="Opacity", description="Limit of Opacity Below", default=0.1, min=0.0, max=1.0
+    )
+    select_size: FloatProperty(
+        name="Size",
+        description="Limit of Size Above: the longest standard deviation, units of the object",
+        default=0.1,
+        min=1e-6,
+        precision=3,
     )
 
     @property

@@ -1,4 +1,4 @@
-"""Settings and operators of the box *Select* of the panel."""
+"""Operators of the box *Select* of the panel."""
 
 from __future__ import annotations
 
@@ -212,43 +212,3 @@ def some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if not chosen.any():
         raise RefineError(f"object '{obj.name}': no splat is selected; select some first")
     return chosen
-
-
-class SelectSettings:
-    """Settings of the tools and the box *Select*; part of `RefineSettings`."""
-
-    select_radius: FloatProperty(
-        name="Radius",
-        description="Radius of the brush, in pixels",
-        subtype="PIXEL",
-        default=40.0,
-        min=1.0,
-        max=1000.0,
-    )
-    select_hidden: BoolProperty(
-        name="Through", description="Also select splats that others hide, behind surfaces"
-    )
-    select_tolerance: FloatProperty(
-        name="Tolerance",
-        description="How much red, green or blue may differ from the colour under the mouse",
-        subtype="FACTOR",
-        default=0.1,
-        min=0.0,
-        max=1.0,
-    )
-    select_connected: BoolProperty(
-        name="Connected", description="Select only the connected piece under the mouse"
-    )
-    select_mode: EnumProperty(
-        name="Mode", description="How Select By changes the selection", items=MODES
-    )
-    select_opacity: FloatProperty(
-        name="Opacity", description="Limit of Opacity Below", default=0.1, min=0.0, max=1.0
-    )
-    select_size: FloatProperty(
-        name="Size",
-        description="Limit of Size Above: the longest standard deviation, units of the object",
-        default=0.1,
-        min=1e-6,
-        precision=3,
-    )
