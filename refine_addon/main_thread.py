@@ -3,11 +3,10 @@ With them core's formats read and write WebP images through Blender."""
 
 from __future__ import annotations
 
-import contextlib
 import queue
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, wait
 from functools import partial
 from pathlib import Path
@@ -78,7 +77,8 @@ class BlenderImages(Codec):
         return call(partial(self._encode, pixels))
 
     def _decode(self, data: bytes) -> NDArray[np.uint8]:
-        with _file() as path:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "image.webp"
             path.write_bytes(data)
             try:
                 pixels = stored(path)
@@ -95,14 +95,9 @@ class BlenderImages(Codec):
             image.alpha_mode = "CHANNEL_PACKED"
             image.pixels.foreach_set((pixels[::-1] / np.float32(255.0)).astype(np.float32).ravel())
             image.file_format = "WEBP"
-            with _file() as path:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "image.webp"
                 image.save(filepath=str(path), quality=_LOSSLESS)
                 return path.read_bytes()
         finally:
             bpy.data.images.remove(image)
-
-
-@contextlib.contextmanager
-def _file() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory() as folder:
-        yield Path(folder) / "image.webp"

@@ -155,6 +155,9 @@ def rows_of(counts: Iterable[int]) -> list[slice]:
     return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
+_parsed = lru_cache(maxsize=16)(json.loads)  # panels read records at each redraw
+
+
 def recorded(mesh: bpy.types.ID, name: str, read: Callable[[Any], Any]) -> Any:
     """`read` of a JSON record in a custom property; None where that fails, as another program may
     have written there. `read` must not change the record, which is cached."""
@@ -162,11 +165,6 @@ def recorded(mesh: bpy.types.ID, name: str, read: Callable[[Any], Any]) -> Any:
         return read(_parsed(mesh[name]))
     except (AttributeError, KeyError, StopIteration, TypeError, ValueError):
         return None
-
-
-@lru_cache(maxsize=16)  # panels read records at each redraw
-def _parsed(text: str) -> Any:
-    return json.loads(text)
 
 
 def has(mesh: bpy.types.ID, name: str, *kinds: str) -> bool:
