@@ -67,7 +67,7 @@ class RaySample:
 
     Views have the weights of `ViewSet.by_distance`. With `few_views` about `VALIDATION_VIEWS` are
     cast, enough to compare, not for a curve; `rays` holds None for the others. `splat_rows`, (M,),
-    are the splats of the Gaussians, `share` is the number of rays over the usual number.
+    are the splats of the Gaussians; `shares` are numbers of rays and hits over the usual ones.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class RaySample:
         few_views: bool = False,
         scoring: bool = False,
     ) -> None:
-        self.views, self.splats, self.scoring, self.share = views, splats, scoring, 1.0
+        self.views, self.splats, self.scoring, self.shares = views, splats, scoring, (1.0, 1.0)
         self._step = max(math.ceil(len(views) / VALIDATION_VIEWS), 1) if few_views else 1
         self.splat_rows = np.asarray(gaussians.index)
         self.rays: list[Rays | None] = [None] * len(views)
@@ -106,7 +106,7 @@ class RaySample:
             with np.errstate(under="ignore"):
                 footprints = projection.project(gaussians, scene, self.views[number][0])
                 self.rays[number] = cast_view(
-                    self.views, number, footprints, scoring=self.scoring, share=self.share
+                    self.views, number, footprints, scoring=self.scoring, shares=self.shares
                 )
 
         run_all(
@@ -121,7 +121,7 @@ class RaySample:
     def validating(self) -> list[int]:
         """Numbers of at most `VALIDATION_VIEWS` views that see splats, or more with a low share."""
         seeing = self.seeing()
-        return seeing[:: max(math.ceil(self.share * len(seeing) / VALIDATION_VIEWS), 1)]
+        return seeing[:: max(math.ceil(self.shares[0] * len(seeing) / VALIDATION_VIEWS), 1)]
 
     def hits_of_ray(self) -> float:
         """Mean number of splats that a ray hits, hidden ones included."""
@@ -147,15 +147,15 @@ def cast_view(
     footprints: Footprints,
     *,
     scoring: bool = False,
-    share: float = 1.0,
+    shares: tuple[float, float] = (1.0, 1.0),
 ) -> Rays:
     """Rays of view `number` of the `views` of a sample, which share its rays equally."""
     view = views[number][0]
     rays_of_all, hits_of_all = VALIDATION_RAYS, MAX_VALIDATION_HITS
     if scoring:
         rays_of_all, hits_of_all = SCORING_RAYS, MAX_SCORING_HITS
-    most_rays = min(share * rays_of_all / len(views), MAX_RAYS_OF_VIEW)
-    most_hits = min(share * hits_of_all / len(views), MAX_HITS_OF_VIEW)
+    most_rays = min(shares[0] * rays_of_all / len(views), MAX_RAYS_OF_VIEW)
+    most_hits = min(shares[1] * hits_of_all / len(views), MAX_HITS_OF_VIEW)
     count = min(most_rays, most_hits / max(depth_complexity(footprints, view), 1.0))
     # Half a step of the sequence keeps the two samples apart in every view, however many there are.
     return cast(footprints, *pixels(view, number + 0.5 * scoring, count))
