@@ -135,8 +135,9 @@ def of_prune(
         why,
         "" if outcome is None else outcome.merged.note(),
     ]
-    if between is not None and parted(psnr, between):
-        more = in_words(between) if scores.tells else "how much is not known"
+    told = between if scores.tells else None
+    if parted(psnr, between):
+        more = "how much is not known" if told is None else in_words(told)
         notes.append(f"views between these lose more, {more}: add cameras, or remove less")
     estimates = dict(measured)
     if tried is not None and budget.psnr is None:  # of as many kept splats
@@ -164,9 +165,7 @@ def of_prune(
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
         "estimated_psnr": None if psnr is None else round(psnr, 2),
         "estimated_psnr_note": note,
-        "estimated_psnr_between": None
-        if between is None or not scores.tells
-        else round(between, 2),
+        "estimated_psnr_between": None if told is None else round(told, 2),
         "method": {
             "asked": method.name,
             "done": deletes if outcome is None or outcome.done == "delete" else outcome.done,

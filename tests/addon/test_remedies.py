@@ -165,7 +165,7 @@ def test_a_ring_sees_all_and_joins_the_collection_that_decides(addon, few, room_
     found = warned()
     seen = {name: seen for name, (seen, _) in cameras(addon).items()}
 
-    assert told(of_one, "One camera decides: add others")
+    assert told(of_one, "Few cameras decide: add others")
     share = np.mean(unseen == 0)
     assert of_one[1] == f"{share:.0%} of the splats lie in no view; {goes:.0%} of these go"
     assert bpy.context.scene.refine.collection == room_cameras

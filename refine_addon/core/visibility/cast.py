@@ -321,9 +321,9 @@ def hits(
                 place = aims[0].take(pixel), aims[1].take(pixel)
             squared = _squared_distances(some, owner, *place)
             inside = np.flatnonzero(squared < squared_radius.take(owner))
-            owner = owner[inside]
-            alpha = some.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
-            yield owner + piece.start, pixel[inside], np.minimum(alpha, np.float32(ALPHA_MAX))
+            owner = owner.take(inside)
+            alpha = some.alphas.take(owner) * np.exp(squared.take(inside) / np.float32(-2.0))
+            yield owner + piece.start, pixel.take(inside), np.minimum(alpha, np.float32(ALPHA_MAX))
 
 
 def _boxed_pixels(chosen, across, down):
