@@ -172,7 +172,7 @@ def test_a_ring_sees_all_and_joins_the_collection_that_decides(addon, few, room_
     assert len(room_cameras.all_objects) == len(seen) == 17
     ring = bpy.data.collections["Ring of Cameras"].objects
     assert min(seen[camera.name] for camera in ring) > 0.9 * 3976
-    assert not told(found, "One camera decides")
+    assert not told(found, "Few cameras decide")
     assert not told(found, "in no view")
     places = np.full((3976, 3), np.inf, np.float32)
     addon.mesh.attributes.write_attribute(few.data, "position", "FLOAT_VECTOR", places)
