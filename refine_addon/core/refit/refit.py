@@ -395,6 +395,9 @@ class _Both(Gaussians):
     every: Gaussians
     others: NDArray[np.bool_]
 
+    def most(self, *seen: Any) -> int:
+        return len(self) + self.every.most(*seen)
+
     def parts(self, *seen: Any) -> Iterator[tuple[int, Gaussians]]:
         yield 0, self
         for first, chunk in self.every.parts(*seen):

@@ -96,9 +96,16 @@ class Gaussians:
                 for name in ("means", "covariances", "normals")
             }  # fmt: skip
             yield rows.start, replace(
-                self, index=self.index[rows], largest=largest, alphas=self.alphas[rows], boxes=None,
-                **arrays,
+                self, index=np.arange(len(largest)), largest=largest, alphas=self.alphas[rows],
+                boxes=None, **arrays,
             )  # fmt: skip
+
+    def most(self, scene: Scene, view: View, window: View) -> int:
+        """Number of Gaussians in `parts`, or a few more, without reading them."""
+        if self.boxes is None:
+            return len(self)
+        touched = boxes_touch(self.boxes, scene, view, window)
+        return self.means.shape[2] * int(np.count_nonzero(touched))
 
     def take(self, keep: NDArray[Any]) -> Gaussians:
         """Gaussians at `keep`, a mask or rows."""
@@ -252,14 +259,15 @@ def project(
     turned = (view.rotation @ scene.axes.T).astype(np.float32)
     rotation = _rotation6(view.rotation @ scene.axes.T)
     views, low_pass = (view, window or view), DISC_LOW_PASS if discs else LOW_PASS
-    parts = [*gaussians.parts(scene, *views)] if _computable(scene, view) else []
     # Depths, and what footprints hold: more room than is filled takes no memory.
-    count, filled = sum(len(chunk) for _, chunk in parts), 0
+    count, filled = gaussians.most(scene, *views) if _computable(scene, view) else 0, 0
     shapes = (), (), (2,), (2,), (2,), (2,), (), (), *([(7,)] if discs else ())
     kinds = np.float32, np.int64, *[np.float32] * 4, np.bool_, np.float32, np.float32
     arrays = [np.empty((*shape, count), kind) for shape, kind in zip(shapes, kinds, strict=False)]
     starts = (
-        (first, chunk, start) for first, chunk in parts for start in range(0, len(chunk), _CHUNK)
+        (first, chunk, start)
+        for first, chunk in (gaussians.parts(scene, *views) if count else ())
+        for start in range(0, len(chunk), _CHUNK)
     )
     for first, chunk, start in starts:
         checkpoint()
