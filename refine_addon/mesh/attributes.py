@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.formats.registry import scene_name
 from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
-from .layout import KINDS, Column, SplatObject, add_attributes, has, rest_count, splat_count
+from .layout import KINDS, Column, Layout, SplatObject, add_attributes, has, rest_count, splat_count
 
 _GROUP = 16  # Columns transposed together: float32 numbers in a cache line of 64 bytes
 _ROWS = 4096  # Rows transposed at a time: 256 kB, which fits a cache
@@ -52,9 +52,9 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
     try:
         mesh.vertices.add(len(rows))
         remove_attribute(mesh, ".select_vert")  # with which Blender selects all
-        columns = add_attributes(mesh, rows.dtype, source.header)
-        _fill(mesh, rows, columns)
-        mesh.update()
+        layout = add_attributes(mesh, rows.dtype, source.header)
+        for names in _groups([column.name for column in layout.columns], rows.dtype):
+            write_columns(mesh, layout, dict(zip(names, _planes(rows, names), strict=True)))
     except BaseException:
         bpy.data.meshes.remove(mesh)
         raise
@@ -118,28 +118,25 @@ def _groups_of(
     """Names and values of columns transposed together; None for replaced ones."""
     read, dtype = StoredColumns(checked), checked.layout.row_dtype
     for names in _groups([column.name for column in checked.layout.columns], dtype):
-        if dtype[names[0]].str == "<f4" and not replaced & set(names):
-            yield names, read.planes(names)  # one array, for which Linux uses large pages
-        else:
-            yield names, [None if name in replaced else read[name] for name in names]
+        yield names, [None if name in replaced else read[name] for name in names]
 
 
 def write_columns(
-    checked: SplatObject,
+    mesh: bpy.types.Mesh | bpy.types.PointCloud,
+    layout: Layout,
     columns: Mapping[str, NDArray[Any]],
     rows: slice | NDArray[np.int64] = slice(None),
 ) -> None:
     """Store columns by PLY property, (M,) each, in M rows, by default all; others keep every bit.
     One attribute at a time, as allocating memory takes longest."""
-    mesh = checked.mesh
     parts: dict[str, list[Column]] = {}
-    for column in checked.layout.columns:
+    for column in layout.columns:
         if column.name in columns:
             parts.setdefault(column.place.attribute, []).append(column)
     for attribute, own in parts.items():
         kind, values = mesh.attributes[attribute].data_type, read_attribute(mesh, attribute)
         components = values.reshape(len(values), -1)
-        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # float64 to float32
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # see `import_notes`
             for column in own:
                 new, coding = columns[column.name], column.place.coding
                 new = coding.to_attribute(new) if coding else new
@@ -237,20 +234,6 @@ class StoredColumns:
             else:
                 row[:] = self[name]
         return values
-
-
-def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -> None:
-    places = {column.name: column.place for column in columns}
-    position = np.empty((len(rows), 3), np.float32)
-    for names in _groups(list(places), rows.dtype):
-        for name, plane in zip(names, _planes(rows, names), strict=True):
-            place = places[name]
-            with np.errstate(over="ignore"):  # large doubles become infinite; see `import_notes`
-                if place.attribute == "position":
-                    position[:, place.component] = plane
-                else:
-                    write_attribute(mesh, place.attribute, place.kinds[0], plane)
-    write_attribute(mesh, "position", "FLOAT_VECTOR", position)
 
 
 def _groups(names: list[str], dtype: np.dtype[Any]) -> list[list[str]]:

@@ -397,8 +397,8 @@ def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
     ]
 
 
-def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> tuple[Column, ...]:
-    """Add an attribute for each property of a file and store the layout; columns in file order."""
+def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> Layout:
+    """Add an attribute for each property of a file, and store the layout; the layout."""
     columns = []
     for name in rows.names or ():
         kind = rows[name].str
@@ -414,7 +414,7 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
     record = [[c.name, c.dtype, c.attribute, c.place.component] for c in columns]
     text = vertex_header(header).decode("latin-1")
     mesh[LAYOUT] = json.dumps({"header": text, "columns": record})
-    return tuple(columns)
+    return Layout(tuple(columns), header)
 
 
 def forget_axis(mesh: bpy.types.ID) -> None:

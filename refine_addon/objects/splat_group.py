@@ -282,7 +282,7 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
 def reduce_object(checked: SplatObject, change: Change) -> None:
     """Delete removed splats, store changed ones, drop the scores' record."""
     mesh_edit.delete_vertices(checked.obj, ~change.keep)
-    mesh_attributes.write_columns(checked, change.columns, change.rows)
+    mesh_attributes.write_columns(checked.mesh, checked.layout, change.columns, change.rows)
     if change.columns:
         mesh_drift.renew(checked.mesh)
     mesh_scores.forget_floaters(checked.mesh)
@@ -298,7 +298,7 @@ def grade(checked: SplatObject, rows: NDArray[np.int64], matrix: NDArray[np.floa
     values = values_by_name(replace(splats, sh_dc=sh_dc, sh_rest=sh_rest))
     columns = {name: values[name] for name in values if name.startswith("f_")}
     with mesh_edit.all_or_nothing(checked.obj):
-        mesh_attributes.write_columns(checked, columns, rows)
+        mesh_attributes.write_columns(checked.mesh, checked.layout, columns, rows)
 
 
 def read_for_export(

@@ -132,7 +132,7 @@ def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) ->
     with ExitStack() as stack:
         for checked, columns in parts:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
-            mesh_attributes.write_columns(checked, columns)
+            mesh_attributes.write_columns(checked.mesh, checked.layout, columns)
             mesh_drift.stamp(checked.mesh)
             if columns:
                 mesh_layout.forget_axis(checked.mesh)

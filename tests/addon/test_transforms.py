@@ -234,7 +234,7 @@ def test_who_changes_all_of_a_splat_is_left_alone(addon, imported, room_cameras,
     turned = addon.core.affine.transformed(splats, np.array(SOMEWHERE))
     values = addon.core.formats.ply_columns.values_by_name(turned)
     columns = {name: column.astype(np.float32) for name, column in values.items()}
-    addon.mesh.attributes.write_columns(checked, columns)
+    addon.mesh.attributes.write_columns(imported.data, checked.layout, columns)
     assert told_of(addon, imported) == []
 
 
