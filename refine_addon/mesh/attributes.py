@@ -72,7 +72,7 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
         coefficients = planes.transpose(2, 1, 0)
     else:
         finite = np.ones(count, np.bool_)
-        for attribute in dict.fromkeys(read.columns[name].attribute for name in rest):
+        for attribute in dict.fromkeys(read.columns[name].place.attribute for name in rest):
             values = np.isfinite(read_attribute(checked.mesh, attribute))
             finite &= values if values.ndim == 1 else values.all(axis=1)
         coefficients = np.where(finite, 0.0, np.nan).astype(np.float32)[:, None, None]
@@ -186,7 +186,7 @@ def digest(checked: SplatObject) -> int:
     """Checksum of an object's splats and model; harmonics above the constant do not count."""
     columns = (column for column in checked.layout.columns if column.name in REQUIRED)
     checksum = 0
-    for name in dict.fromkeys(column.attribute for column in columns):
+    for name in dict.fromkeys(column.place.attribute for column in columns):
         checksum = zlib.crc32(read_attribute(checked.mesh, name).data, checksum)
     model = checked.layout.model
     return checksum if model == MODELS[0] else zlib.crc32(model.encode(), checksum)
@@ -227,8 +227,8 @@ class StoredColumns:
         values = np.empty((len(names), splat_count(self.mesh)), np.float32)
         pairs = zip(values, names, strict=True)
         # Sorted by attribute, so that each vector attribute is read once.
-        for row, name in sorted(pairs, key=lambda pair: self.columns[pair[1]].attribute):
-            attribute = self.mesh.attributes[self.columns[name].attribute]
+        for row, name in sorted(pairs, key=lambda pair: self.columns[pair[1]].place.attribute):
+            attribute = self.mesh.attributes[self.columns[name].place.attribute]
             if KINDS[attribute.data_type].width == 1:
                 attribute.data.foreach_get("value", row)
             else:

@@ -104,11 +104,6 @@ class Column:
     dtype: str
     place: Place
 
-    @property
-    def attribute(self) -> str:
-        """Name of the attribute."""
-        return self.place.attribute
-
 
 @dataclass(frozen=True)
 class Layout:
@@ -218,14 +213,13 @@ def _native_places(data: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Pla
     if not is_native(data):
         return {}
     count = _harmonics(data)
-    by_name = {f"f_dc_{channel}": Place(BASE, channel, _FOUR_FLOATS) for channel in range(3)}
-    for channel in range(3):
-        for index in range(count):
-            place = Place(f"{HARMONIC}{index}", channel, ("FLOAT_VECTOR",))
-            by_name[f"f_rest_{channel * count + index}"] = place
-    by_name["opacity"] = Place(BASE, 3, _FOUR_FLOATS, _LOGIT)
-    for axis in range(3):
+    by_name = {"opacity": Place(BASE, 3, _FOUR_FLOATS, _LOGIT)}
+    for axis in range(3):  # or channel: red, green, blue
+        by_name[f"f_dc_{axis}"] = Place(BASE, axis, _FOUR_FLOATS)
         by_name[f"scale_{axis}"] = Place(SCALE, axis, ("FLOAT_VECTOR",), _LOG)
+        for index in range(count):
+            place = Place(f"{HARMONIC}{index}", axis, ("FLOAT_VECTOR",))
+            by_name[f"f_rest_{axis * count + index}"] = place
     for index in range(4):
         by_name[f"rot_{index}"] = Place(ROTATION, index, ("QUATERNION",))
     return by_name
@@ -269,7 +263,7 @@ def check(obj: bpy.types.Object) -> SplatObject:
     absent = [name for name in REQUIRED if name not in properties]
     if absent == [THIRD_SCALE]:  # discs
         absent = []
-    absent += [column.attribute for column in layout.columns if column.attribute not in attributes]
+    absent += [c.place.attribute for c in layout.columns if c.place.attribute not in attributes]
     if absent:
         present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
         more = ", ..." if len(present) > _MOST_NAMES else ""
@@ -280,8 +274,8 @@ def check(obj: bpy.types.Object) -> SplatObject:
             f"(it has {', '.join(present[:_MOST_NAMES])}{more})"
         )
     for column in layout.columns:
-        if not has(obj.data, column.attribute, *column.place.kinds):
-            attribute = attributes[column.attribute]
+        if not has(obj.data, column.place.attribute, *column.place.kinds):
+            attribute = attributes[column.place.attribute]
             raise RefineError(
                 f"{label}: attribute '{attribute.name}' is {attribute.data_type} on "
                 f"{attribute.domain}, expected {' or '.join(column.place.kinds)} on POINT"
@@ -379,7 +373,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
     if THIRD_SCALE not in attributes and THIRD_SCALE not in places and "scale_1" in attributes:
         names.remove(THIRD_SCALE)
     columns = _floats(names, places)
-    columns += _further_columns(obj.data, {*names, *(column.attribute for column in columns)})
+    columns += _further_columns(obj.data, {*names, *(c.place.attribute for c in columns)})
     header = new_header(_row(columns), splat_count(obj.data))
     return Layout(tuple(columns), header)
 
@@ -411,7 +405,7 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
         attribute = mesh.attributes.new(name if plain else other, STORAGE[kind[1:]], "POINT")
         attribute = attribute or mesh.attributes.new(other, STORAGE[kind[1:]], "POINT")
         columns.append(Column(name, kind, _plain(kind, attribute.name)))
-    record = [[c.name, c.dtype, c.attribute, c.place.component] for c in columns]
+    record = [[c.name, c.dtype, c.place.attribute, c.place.component] for c in columns]
     text = vertex_header(header).decode("latin-1")
     mesh[LAYOUT] = json.dumps({"header": text, "columns": record})
     return Layout(tuple(columns), header)
