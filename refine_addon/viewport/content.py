@@ -20,7 +20,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh import selection as mesh_selection
-from ..mesh.layout import SplatObject, check, sh_degree
+from ..mesh.layout import SplatObject, check, rows_of, sh_degree
 from ..objects.instances import Key, Placing, placings
 from . import shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack
@@ -55,18 +55,13 @@ class MeshSplats:
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """An object's splats in the textures: rows `start` to `start + count`."""
+    """An object's splats in the textures: `count` in `rows`."""
 
     held: MeshSplats
     packed: Packed
     number: int
-    start: int
+    rows: slice
     count: int
-
-    @property
-    def rows(self) -> slice:
-        """Rows of the textures."""
-        return slice(self.start, self.start + self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,13 +227,12 @@ def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:
     counts = first_of_each([len(packed) for packed in packs], MOST)
     means = np.empty((sum(counts), 4), np.float32)
     covariances = np.zeros((sum(counts), 8), np.float32)
-    slots, start = {}, 0
-    for number, (key, packed, count) in enumerate(zip(keys, packs, counts, strict=True)):
-        slots[key] = slot = Slot(held[key[1]], packed, number, start, count)
-        means[slot.rows, :3], means[slot.rows, 3] = packed.means[:count], number
-        covariances[slot.rows, :6] = packed.covariances[:count]
-        covariances[slot.rows, 6] = MODELS.index(packed.model)
-        start += count
+    slots, each = {}, zip(keys, packs, rows_of(counts), counts, strict=True)
+    for number, (key, packed, rows, count) in enumerate(each):
+        slots[key] = Slot(held[key[1]], packed, number, rows, count)
+        means[rows, :3], means[rows, 3] = packed.means[:count], number
+        covariances[rows, :6] = packed.covariances[:count]
+        covariances[rows, 6] = MODELS.index(packed.model)
     values = {"means": means, "covariances": covariances[:, :4]}
     values["more_covariances"] = covariances[:, 4:]
     textures = {n: shader.texture(as_texture(v), 4, "RGBA32F") for n, v in values.items()}

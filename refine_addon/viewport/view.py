@@ -277,7 +277,7 @@ def _in_view(
         wanted = going[shown] == (mode == "GOES")
     if hidden is not None:
         wanted &= ~hidden[shown]
-    return shown[wanted] + slot.start, depths[wanted]
+    return shown[wanted] + slot.rows.start, depths[wanted]
 
 
 def _depths(size: tuple[int, int]) -> NDArray[np.float32] | None:
