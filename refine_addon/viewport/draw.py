@@ -67,9 +67,8 @@ def drawn(region: bpy.types.Region) -> int:
 
 def select(mesh: int, chosen: NDArray[np.bool_]) -> None:
     """Show splats of a mesh, (N,), as selected during a tool's stroke; nothing is stored."""
-    if _state.mode != "OFF":
-        _state.content.select(mesh, chosen)
-        _redraw()
+    _state.content.select(mesh, chosen)
+    _redraw()
 
 
 def untint() -> None:
@@ -244,8 +243,7 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
 
 
 def _undone(*_: object) -> None:
-    if _state.mode != "OFF":
-        _state.content.has_changed()
+    _state.content.has_changed()
 
 
 HANDLERS: dict[Callable[..., None], tuple[str, ...]] = {

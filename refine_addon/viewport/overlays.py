@@ -140,8 +140,6 @@ def draw_legend(
 ) -> None:
     """Draw the legend of a mode and of marks (`MARKED`) into a view, warnings above it.
     It is at the lower right: Blender opens *Adjust Last Operation* at the lower left."""
-    if mode not in WORDS and not marks and not warnings:
-        return
     scale = context.preferences.system.ui_scale
     blf.size(0, _FONT * scale)
     line, high, wide = _EDGE * scale, _HIGH * scale, _WIDE * scale
