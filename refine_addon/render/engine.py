@@ -4,7 +4,6 @@ it on a thread of its own, with the data evaluated for that render."""
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -46,7 +45,6 @@ class Shared:
     Esc, which Blender forgets where a render begins."""
 
     layers: Callable[[], Layers | None] | None = None
-    transparent: bool = False
     card: bool = False
     finished: Path | None = None
     splats: int = 0
@@ -105,7 +103,7 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
         else:
             frame = scene_of(splats.means, drawable(splats), camera)
             picture = draw(splats, view, layers, frame, progress=self._progress)
-        if not shared.transparent:
+        if not scene.render.film_transparent:
             picture[3] = 1.0
         return picture
 
@@ -209,7 +207,6 @@ def steps(
     with _session(shared) as folder:
         others, whole = meshes.Meshes(scene, folder), _whole(scene, "whole")
         shared.engine, shared.renders = others.engine, others.renders + 1
-        shared.transparent = scene.render.film_transparent
         movie = write and scene.render.is_movie_format
         kept = not scene.render.use_overwrite, scene.render.use_placeholder
         if movie:  # written by one render, after all frames are drawn
@@ -259,14 +256,13 @@ def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
 @contextmanager
 def _session(shared: Shared) -> Iterator[Path]:
     """Register the engine and yield a temporary folder; remove both and all copies afterwards."""
-    folder = Path(tempfile.mkdtemp(prefix="refine-"))
-    meshes.remove_all()
-    bpy.utils.register_class(REFINE_engine)
-    REFINE_engine.shared = shared
-    try:
-        yield folder
-    finally:
-        REFINE_engine.shared = None
+    with tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True) as folder:
         meshes.remove_all()
-        bpy.utils.unregister_class(REFINE_engine)
-        shutil.rmtree(folder, ignore_errors=True)
+        bpy.utils.register_class(REFINE_engine)
+        REFINE_engine.shared = shared
+        try:
+            yield Path(folder)
+        finally:
+            REFINE_engine.shared = None
+            meshes.remove_all()
+            bpy.utils.unregister_class(REFINE_engine)
