@@ -32,9 +32,10 @@ from ..core.volumes import (
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject, recorded, splat_count
+from ..mesh.layout import SplatObject, recorded, rows_of, splat_count
 
 RECORD = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
+Masks = dict[str, NDArray[np.bool_] | None]  # Splats of all that are ``protected`` and ``removed``
 UNFIT = "expected a mesh, or an empty that is shown as a cube or a sphere"
 _MOST_MASKS = 16  # Most cached masks; 1 MB each at a million splats
 _masks: dict[bytes, NDArray[np.bool_]] = {}  # Points in each volume, by a digest of both
@@ -58,9 +59,9 @@ class Demands:
     def __add__(self, other: Demands) -> Demands:
         return Demands(self.names + other.names, self.zones + other.zones)
 
-    def forced(self, checked: SplatObject) -> Forced:
-        """Protected and removed splats of an object."""
-        return self.of_each([checked])[0]
+    def masks(self, group: Sequence[SplatObject]) -> Masks:
+        """Protected and removed splats of some objects."""
+        return _as_one(self.of_each(group), group)
 
     def of_each(self, group: Sequence[SplatObject]) -> list[Forced]:
         """The same for each object. A name protects in the objects that have it, at least one."""
@@ -81,6 +82,17 @@ class Demands:
 
 
 NONE = Demands()
+
+
+def _as_one(each: Sequence[Forced], group: Sequence[SplatObject]) -> Masks:
+    masks: Masks = {}
+    for name in ("protected", "removed"):
+        whole = np.zeros(sum(map(len, group)), np.bool_)
+        for one, rows in zip(each, rows_of(map(len, group)), strict=True):
+            part = getattr(one, name)
+            whole[rows] = False if part is None else part
+        masks[name] = whole if whole.any() else None
+    return masks
 
 
 def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
@@ -163,8 +175,8 @@ def _mark(checked: SplatObject, forced: Forced, reasons: Collection[str]) -> Non
         mesh.pop(RECORD, None)
 
 
-def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced]:
-    """Mark a scene's demands on each object; the demands of each."""
+def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> Masks:
+    """Mark a scene's demands on each object; protected and removed splats."""
     try:
         each = Demands.of_scene(scene).of_each(group)
         for checked, forced in zip(group, each, strict=True):
@@ -173,7 +185,7 @@ def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> list[Forced
         for checked in group:
             _store(checked.mesh, {"error": str(error)})
         raise
-    return each
+    return _as_one(each, group)
 
 
 def record(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:

@@ -31,22 +31,18 @@ from ..core.selection import Budget
 from ..core.spherical_harmonics import recolored
 from ..core.splats import Splats, joined
 from ..core.views import ViewSet
-from ..core.volumes import Forced
-from ..core.whole_file import expanded
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject, rows_of
-from . import demands
-from .demands import NONE, Demands
+from .demands import NONE, Demands, Masks
 from .transforms import read_to_move, uneven_notes
 
 LEVEL_STATS = "refine_lod"  # Custom property of a level object: its stats, as in files' reports
 LEVEL_OF = "refine_level_of"  # Custom property of a level object: its original
 Members = list[SplatObject]  # Objects by name, at least one
-Masks = dict[str, NDArray[np.bool_] | None]  # Splats of all that are ``protected`` and ``removed``
 
 
 class Outcome(NamedTuple):
@@ -90,34 +86,13 @@ def members(active: bpy.types.Object) -> Members:
     return group
 
 
-def forced(scene: bpy.types.Scene, group: Members) -> Masks:
-    """Protected and removed splats, by the scene; see `Demands`."""
-    return _as_one(Demands.of_scene(scene).of_each(group), group)
-
-
-def refresh(scene: bpy.types.Scene, group: Members) -> Masks:
-    """Mark the scene's demands on each object; see `demands.refresh`."""
-    return _as_one(demands.refresh(scene, group), group)
-
-
 def check_forced(scene: bpy.types.Scene, group: Members, before: Masks) -> None:
     """Raise `RefineError` if other splats are protected or removed than before."""
-    now = forced(scene, group)
+    now = Demands.of_scene(scene).masks(group)
     if not all(np.array_equal(before[name], now[name]) for name in now):
         raise RefineError(
             "what must stay or go has changed meanwhile; nothing was removed: apply again"
         )
-
-
-def _as_one(each: Sequence[Forced], group: Members) -> Masks:
-    masks: Masks = {}
-    for name in ("protected", "removed"):
-        whole = np.zeros(sum(map(len, group)), np.bool_)
-        for one, rows in zip(each, rows_of(map(len, group)), strict=True):
-            part = getattr(one, name)
-            whole[rows] = False if part is None else part
-        masks[name] = whole if whole.any() else None
-    return masks
 
 
 def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splats:
@@ -407,7 +382,6 @@ def prune_object(
     # None: an uneven scale is not refused, since only the pictures would need harmonics.
     compares = method.name != "closed-form" or budget.psnr is not None or pictures is not None
     harmonics = True if method.changes else None if compares else False
-    target = None if output is None else expanded(output)
     if save:
         mesh_edit.check_deletable(checked.obj)
         if not bpy.data.filepath:
@@ -431,7 +405,7 @@ def prune_object(
     return run(
         lambda: _scene(checked, demands, harmonics),
         prune_scene(views, budget, method, reusable=save),
-        target,
+        output,
         dry_run=dry_run, views=views, pictures=pictures, save=saved if save else None, **how,
     ).report  # fmt: skip
 
@@ -447,8 +421,8 @@ def score_object(
 ) -> dict[str, Any]:
     """Score an object of the open scene into a PLY, the scene unchanged; see `prune_object`."""
     checked = mesh_layout.check(find(name))
-    work, target = score_scene(views, method), expanded(output)
-    return run(lambda: _scene(checked, demands, None), work, target, **how).report
+    work = score_scene(views, method)
+    return run(lambda: _scene(checked, demands, None), work, output, **how).report
 
 
 def _scene(checked: SplatObject, demands: Demands, harmonics: bool | None) -> Scene:
@@ -458,7 +432,7 @@ def _scene(checked: SplatObject, demands: Demands, harmonics: bool | None) -> Sc
         f"{bpy.data.filepath}#{checked.obj.name}",
         checked.layout.file_bytes(len(checked)),
         gather([checked], whole=harmonics),
-        demands.forced(checked),
+        demands.of_each([checked])[0],
         lambda: replace(mesh_attributes.read_for_file(checked)(), axes=axes),
         mesh_attributes.file_size(checked),
         world_matrix(checked.obj),

@@ -148,7 +148,6 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         """Write the marks; a splat has one of the two."""
         obj = context.object
-        mesh_edit.check_writable(obj)
         chosen = some(obj, selection.selected(obj))
         for mark, name in _MARKS.items():
             before = mesh_edit.marks(obj, name)
@@ -169,7 +168,7 @@ class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
         checked, settings = mesh_layout.check(context.object), context.scene.refine
         mesh_edit.check_writable(checked.obj)
         cleaning = Cleaning(settings.to_reasons(), settings.views)
-        masks = splat_group.forced(context.scene, [checked])
+        masks = demands.Demands.of_scene(context.scene).masks([checked])
         splats, views = splat_group.gather([checked]), chosen_views(context)
         return [checked], partial(clean, splats, views, cleaning, **masks)
 

@@ -27,7 +27,7 @@ from ..core.visibility import frustum
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..objects import splat_group
+from ..objects import demands, splat_group
 from ..objects.splat_group import Change, Members
 from ..viewport import draw as viewport_draw
 from . import plans
@@ -45,7 +45,7 @@ def chosen_views(context: Context) -> ViewSet:
 
 def apply_arguments(context: Context, group: Members) -> dict[str, Any]:
     """Arguments of `prune` for the selected objects, from the panel's settings."""
-    settings, masks = context.scene.refine, splat_group.forced(context.scene, group)
+    settings, masks = context.scene.refine, demands.Demands.of_scene(context.scene).masks(group)
     method = splat_group.possible(group, settings.to_method())
     views = chosen_views(context) if method.changes else None
     return splat_group.stored_arguments(group, settings.to_budget(), masks, method, views)
@@ -71,7 +71,7 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
             mesh_edit.check_writable(member.obj)
         quality = method.name != "closed-form" or settings.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
-        masks = splat_group.refresh(context.scene, group)  # before `origin` reads the marks
+        masks = demands.refresh(context.scene, group)  # before `origin` reads the marks
         call = partial(score, splats, views, method, **masks, quality=quality)
         return group, (call, [plans.origin(member.obj) for member in group])
 
@@ -183,7 +183,7 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         group, settings = [mesh_layout.check(context.object)], context.scene.refine
         method, levels = settings.to_method(), settings.to_levels()
         splats = splat_group.gather(group, whole=True if method.changes else None)
-        masks = splat_group.forced(context.scene, group)
+        masks = demands.Demands.of_scene(context.scene).masks(group)
         return group, partial(lod, splats, chosen_views(context), levels, method, **masks)
 
     @staticmethod

@@ -220,7 +220,7 @@ def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> Non
 def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     settings, record = scene.refine, mesh_scores.record(obj.data) or {}
     group = splat_group.members(obj)
-    masks, budget = splat_group.refresh(scene, group), settings.to_budget()
+    masks, budget = demands.refresh(scene, group), settings.to_budget()
     method = settings.to_method().deleting()
     arguments = splat_group.stored_arguments(group, budget, masks, method)
     scores, protected, removed = arguments["scores"], masks["protected"], masks["removed"]

@@ -59,7 +59,6 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: Context) -> None:
         """Do it."""
         obj = context.object
-        mesh_edit.check_writable(obj)
         chosen, hidden = selection.selected(obj), selection.hidden(obj)
         if self.action == "HIDE":
             selection.hide(obj, hidden | some(obj, chosen))
@@ -110,8 +109,8 @@ def taken(context: Context, checked: SplatObject, what: str) -> NDArray[np.bool_
                 f"object '{checked.obj.name}': nothing goes yet; score the splats first"
             )
         return mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
-    forced = Demands.of_scene(context.scene).forced(checked)
-    mask = forced.protected if what == "STAYING" else forced.removed
+    masks = Demands.of_scene(context.scene).masks([checked])
+    mask = masks["protected" if what == "STAYING" else "removed"]
     return np.zeros(len(checked), np.bool_) if mask is None else mask
 
 

@@ -72,8 +72,7 @@ def splats_of(addon, obj):
 def keep_mask(addon, obj, budget, protect=""):
     """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
     checked = addon.mesh.layout.check(obj)
-    found = addon.objects.demands.Demands((protect,) if protect else ()).forced(checked)
-    masks = {"protected": found.protected, "removed": found.removed}
+    masks = addon.objects.demands.Demands((protect,) if protect else ()).masks([checked])
     stored, core = addon.objects.splat_group.stored_arguments, addon.core
     return core.prune(**stored([checked], budget, masks, core.Occlusion())).keep
 
