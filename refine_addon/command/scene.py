@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,10 +15,9 @@ from ..objects import splat_group
 from ..render import engine
 
 
-def opened(words: Sequence[str] | None = None) -> str:
+def opened(words: Sequence[str]) -> str:
     """Path of the open .blend, "" if never saved; `words`: Blender's command line.
     `RefineError` if they name a .blend that is not open: Blender runs the command all the same."""
-    words = sys.argv if words is None else words
     starts = (place for place, word in enumerate(words) if word in ("-c", "--command"))
     named = [word for word in words[1 : next(starts, 0)] if word.lower().endswith(".blend")]
     if named and not bpy.data.filepath:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
         if scene:
             from .scene import opened
 
-            options.blend = opened()
+            options.blend = opened(sys.argv)
         try:
             complete(options)
             check(options)
@@ -282,7 +283,7 @@ def _of_object(options: argparse.Namespace) -> Any:
             also = f", nor a group or attribute of '{obj.name}'" if role == "protect" else ""
             zones.append(_zone(role, text, volume, also))
     scene = demands.Demands.of_scene(bpy.context.scene)
-    return scene + demands.Demands(tuple(names), tuple(zones))
+    return demands.Demands((*scene.names, *names), (*scene.zones, *zones))
 
 
 def _named(options: argparse.Namespace) -> Iterator[tuple[Role, str, Volume | None]]:

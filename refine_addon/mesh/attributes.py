@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.formats.registry import scene_name
-from ..core.splats import MODELS, Splats, single_unit_quaternions, with_model
+from ..core.splats import Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, has, rest_count, splat_count
 
 _GROUP = 16  # Columns transposed together: float32 numbers in a cache line of 64 bytes
@@ -188,8 +188,7 @@ def digest(checked: SplatObject) -> int:
     checksum = 0
     for name in dict.fromkeys(column.place.attribute for column in columns):
         checksum = zlib.crc32(read_attribute(checked.mesh, name).data, checksum)
-    model = checked.layout.model
-    return checksum if model == MODELS[0] else zlib.crc32(model.encode(), checksum)
+    return zlib.crc32(checked.layout.model.encode(), checksum)
 
 
 def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:

@@ -56,9 +56,6 @@ class Demands:
         zones = (zone(item.role.lower(), item.object, idle=True) for item in listed(scene))
         return cls((settings.protect,) if settings.protect else (), tuple(zones))
 
-    def __add__(self, other: Demands) -> Demands:
-        return Demands(self.names + other.names, self.zones + other.zones)
-
     def masks(self, group: Sequence[SplatObject]) -> Masks:
         """Protected and removed splats of some objects."""
         return _as_one(self.of_each(group), group)

@@ -183,7 +183,7 @@ def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
 
 
 class Frame(NamedTuple):
-    """Input of `changes` of an object: splats, degree of harmonics, world-to-object (4, 4)."""
+    """Input of `changes` of an object: splats, degree of harmonics, matrix to the world (4, 4)."""
 
     count: int
     degree: int
@@ -202,9 +202,7 @@ class Change(NamedTuple):
 def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
     """Read what `changes` needs of each object."""
     return [
-        Frame(
-            len(member), mesh_layout.sh_degree(member.mesh), np.linalg.inv(world_matrix(member.obj))
-        )
+        Frame(len(member), mesh_layout.sh_degree(member.mesh), world_matrix(member.obj))
         for member in group
     ]
 
@@ -221,7 +219,7 @@ def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
         changing = np.flatnonzero(merged.changed[start:first])
         splats = merged.splats.take(start + changing).up_to_degree(frame.degree)
         if not np.array_equal(frame.matrix, np.eye(4)):
-            splats = transformed(splats, frame.matrix)
+            splats = transformed(splats, np.linalg.inv(frame.matrix))
         columns = {name: np.ascontiguousarray(v) for name, v in values_by_name(splats).items()}
         parts.append(Change(keep, changing, columns))
     return parts

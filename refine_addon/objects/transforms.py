@@ -108,9 +108,7 @@ def _regrouped(rest: NDArray[Any], degrees: NDArray[np.int64]) -> NDArray[Any]:
 
 def _turned_normals(normals: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[Any]:
     """Normals, (M, 3), of surfaces moved by a matrix; zeros, as most files have, stay."""
-    if not normals.any():
-        return normals
-    turned = normals @ np.linalg.inv(matrix[:3, :3])
+    turned = normals @ np.linalg.inv(matrix[:3, :3]) + 0.0  # no -0
     lengths = np.linalg.norm(turned, axis=1, keepdims=True)
     return np.asarray(turned / np.where(lengths > 0.0, lengths, 1.0))
 

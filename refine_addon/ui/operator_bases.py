@@ -58,8 +58,7 @@ class Worker:
         self.cancelled = self.cancelled or time.monotonic()
 
     def end(self) -> None:
-        """Ask it to stop, and wait until it has or `PATIENCE` is over."""
-        self.cancel()
+        """Wait until it has stopped, after `cancel`, or `PATIENCE` is over."""
         self._thread.join(PATIENCE)
 
     def result(self) -> Any:

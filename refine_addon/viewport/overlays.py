@@ -133,10 +133,7 @@ def _edges(shape: str) -> NDArray[np.float64]:
 
 
 def draw_legend(
-    context: bpy.types.Context,
-    mode: str,
-    marks: Collection[int] = (),
-    warnings: Collection[str] = (),
+    context: bpy.types.Context, mode: str, marks: Collection[int], warnings: Collection[str]
 ) -> None:
     """Draw the legend of a mode and of marks (`MARKED`) into a view, warnings above it.
     It is at the lower right: Blender opens *Adjust Last Operation* at the lower left."""
