@@ -6,8 +6,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +52,7 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
         mesh.vertices.add(len(rows))
         remove_attribute(mesh, ".select_vert")  # with which Blender selects all
         layout = add_attributes(mesh, rows.dtype, source.header)
-        for names in _groups([column.name for column in layout.columns], rows.dtype):
+        for names in _groups(layout):
             write_columns(mesh, layout, dict(zip(names, _planes(rows, names), strict=True)))
     except BaseException:
         bpy.data.meshes.remove(mesh)
@@ -97,28 +96,19 @@ def read_for_file(
 ) -> Callable[[], SplatFile]:
     """Read the object now; the thread-safe callable builds its PLY file, once.
     Properties in `replaced` take the values that `columns` gives then, (N,) each."""
-    groups = deque(_groups_of(checked, frozenset(replaced)))
     name, layout, count = checked.obj.name, checked.layout, len(checked)
+    read, groups = StoredColumns(checked), _groups(layout)
+    stored = deque([None if n in replaced else read[n] for n in names] for names in groups)
 
     def file() -> SplatFile:
         rows, values = np.empty(count, layout.row_dtype), columns()
-        while groups:
-            names, planes = groups.popleft()  # freed once written
-            pairs = zip(names, planes, strict=True)
+        for names in groups:
+            pairs = zip(names, stored.popleft(), strict=True)  # freed once written
             _interleave(rows, names, [values.get(name, plane) for name, plane in pairs])
         no_elements = np.empty(0, np.uint8)
         return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
 
     return file
-
-
-def _groups_of(
-    checked: SplatObject, replaced: AbstractSet[str]
-) -> Iterator[tuple[list[str], Sequence[NDArray[Any] | None]]]:
-    """Names and values of columns transposed together; None for replaced ones."""
-    read, dtype = StoredColumns(checked), checked.layout.row_dtype
-    for names in _groups([column.name for column in checked.layout.columns], dtype):
-        yield names, [None if name in replaced else read[name] for name in names]
 
 
 def write_columns(
@@ -235,15 +225,16 @@ class StoredColumns:
         return values
 
 
-def _groups(names: list[str], dtype: np.dtype[Any]) -> list[list[str]]:
-    """Adjacent columns of one type, at most `_GROUP`, to be transposed together.
+def _groups(layout: Layout) -> list[list[str]]:
+    """Names of adjacent columns of one type, at most `_GROUP`, to be transposed together.
     One by one, each would read the whole file: a row fills several cache lines."""
     groups: list[list[str]] = []
-    for name in names:
-        if groups and len(groups[-1]) < _GROUP and dtype[groups[-1][0]] == dtype[name]:
-            groups[-1].append(name)
-        else:
-            groups.append([name])
+    dtype = ""
+    for column in layout.columns:
+        if column.dtype != dtype or len(groups[-1]) == _GROUP:
+            groups.append([])
+        groups[-1].append(column.name)
+        dtype = column.dtype
     return groups
 
 
