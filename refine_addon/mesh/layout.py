@@ -26,7 +26,6 @@ BASE, SCALE, ROTATION, HARMONIC = "radiance:base", "scale", "rotation", "radianc
 NATIVE = "GAUSSIAN_SPLAT"  # Type of point clouds that Blender draws as splats, since 5.3
 _NATIVE_NAMES = f"{BASE}, {SCALE}, {ROTATION}"
 _FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")  # Types of `BASE`: in 5.3, and in older versions
-_MOST = 24  # Harmonics of degree 4, without the constant
 LAYOUT = "refine_layout"  # Custom property of the mesh: layout of its file, JSON
 AXES = "refine_spz_axes"  # Custom property of the mesh: `SplatFile.axes` of what was imported
 MODEL = "refine_model"  # Custom property of the mesh: one of `splats.MODELS`, set by the user
@@ -202,17 +201,12 @@ def is_native(data: bpy.types.ID) -> bool:
     return hasattr(data, "points") and BASE in attributes and SCALE in attributes
 
 
-def _harmonics(cloud: bpy.types.PointCloud) -> int:
-    """Number of harmonics attributes of a point cloud, without the constant."""
-    return sum(f"{HARMONIC}{index}" in cloud.attributes for index in range(_MOST))
-
-
 def _native_places(data: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Place]:
     """Property -> place in a point cloud of Blender's own splats; empty for other data.
     Each ``radiance:sh_*`` holds RGB of one harmonic; a file has all of red first."""
     if not is_native(data):
         return {}
-    count = _harmonics(data)
+    count = rest_count(data) // 3
     by_name = {"opacity": Place(BASE, 3, _FOUR_FLOATS, _LOGIT)}
     for axis in range(3):  # or channel: red, green, blue
         by_name[f"f_dc_{axis}"] = Place(BASE, axis, _FOUR_FLOATS)
@@ -307,9 +301,13 @@ def layout_if_any(obj: bpy.types.Object | None) -> Layout | None:
 
 def rest_count(mesh: bpy.types.Mesh) -> int:
     """Number of ``f_rest_*`` properties that a mesh has attributes for."""
-    if is_native(mesh):
-        return 3 * _harmonics(mesh)
-    return sum(f"f_rest_{index}" in mesh.attributes for index in range(max(REST_COUNTS)))
+    name, width = _harmonics(mesh)
+    return width * sum(f"{name}{i}" in mesh.attributes for i in range(max(REST_COUNTS) // width))
+
+
+def _harmonics(mesh: bpy.types.Mesh) -> tuple[str, int]:
+    """How names of attributes with harmonics begin, and properties in each."""
+    return (HARMONIC, 3) if is_native(mesh) else ("f_rest_", 1)
 
 
 def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
@@ -360,7 +358,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
     attributes = obj.data.attributes
     rest = [f"f_rest_{index}" for index in range(rest_count(obj.data))]
     if len(rest) not in REST_COUNTS:
-        name, width = (HARMONIC, 3) if is_native(obj.data) else ("f_rest_", 1)
+        name, width = _harmonics(obj.data)
         *counts, most = (each // width for each in REST_COUNTS)
         raise RefineError(
             f"object '{obj.name}': has {len(rest) // width} attributes {name}*, expected "
