@@ -164,10 +164,9 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
     """Store a point attribute, unsigned integers by their bits, replacing one of another type or
     domain."""
     attribute = mesh.attributes.get(name)
-    if attribute and (attribute.data_type, attribute.domain) != (data_type, "POINT"):
-        mesh.attributes.remove(attribute)
-        attribute = None
-    attribute = attribute or mesh.attributes.new(name, data_type, "POINT")
+    if not has(mesh, name, data_type):
+        remove_attribute(mesh, name)
+        attribute = mesh.attributes.new(name, data_type, "POINT")
     kind = KINDS[data_type]
     attribute.data.foreach_set(kind.field, np.ascontiguousarray(values, kind.dtype).ravel())
 

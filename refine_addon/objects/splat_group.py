@@ -323,8 +323,7 @@ def add_levels(
             copy.name = copy.data.name = f"{name}_lod{level.number}"
             bpy.context.view_layer.update()  # its place in the world
             group = [mesh_layout.check(copy)]
-            frames = frames_of(group)
-            apply(group, changes(frames, level.result))
+            apply(group, changes(frames_of(group), level.result))
             stats = {**level.facts(), "distance": distance}
             copy[LEVEL_STATS] = {key: value for key, value in stats.items() if value is not None}
             copy.select_set(False)
