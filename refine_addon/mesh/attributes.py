@@ -126,7 +126,7 @@ def write_columns(
     for attribute, own in parts.items():
         kind, values = mesh.attributes[attribute].data_type, read_attribute(mesh, attribute)
         components = values.reshape(len(values), -1)
-        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # see `import_notes`
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # float64 to float32
             for column in own:
                 new, coding = columns[column.name], column.place.coding
                 new = coding.to_attribute(new) if coding else new
@@ -205,7 +205,7 @@ class StoredColumns:
             values = read_attribute(self.mesh, place.attribute)
         if values.ndim > 1:
             self.vectors = {place.attribute: values}
-            values = values[:, place.component]
+            values = values[:, place.component].copy()  # alone in memory, without the others
         if place.coding:
             return place.coding.to_file(values)
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
