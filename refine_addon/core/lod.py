@@ -178,29 +178,17 @@ def lod(
         replace(second.result, source=file).write("out.ply")
     """
     gone, budgets = must_go(removed, protected), levels.budgets(len(splats))
-    left, number = len(splats), 0
-    results = _results(splats, views, budgets, method, protected, gone, progress, threads)
-    for goal, result in zip(levels.goals, results, strict=True):
-        kept = int(np.count_nonzero(result.keep))
-        if kept < left:
-            number, left = number + 1, kept
-            yield Level(number, goal, result)
-    if not number:
-        raise RefineError(f"no level has fewer splats than the input, which has {len(splats)}")
-
-
-def _results(splats, views, budgets, method, protected, gone, progress, threads):
-    """Yield results for all splats: by one ranking, or each from the one before."""
     scores, whole, origin = None, None, None
     # Shares of the time: a level takes half of that before it, or, once scored, hardly any.
     times = (0.5**place if method.changes else 0.02 for place in range(len(budgets)))
     scoring, *of_levels = stages(progress, 0.0 if method.changes else 1.0, *times)
-    if not method.changes:
+    if not method.changes:  # one ranking for all, else each level is made from the one before
         scores = score(
             splats, views, method, removed=gone, quality=True, progress=scoring, threads=threads
         )
     left, demands = splats, Forced(protected, gone)
-    for budget, of_level in zip(budgets, of_levels, strict=True):
+    number, fewest = 0, len(splats)
+    for goal, budget, of_level in zip(levels.goals, budgets, of_levels, strict=True):
         result = prune(
             left, views, budget, method, protected=demands.protected, removed=demands.removed,
             scores=scores, origin=origin, progress=of_level, threads=threads,
@@ -213,7 +201,12 @@ def _results(splats, views, budgets, method, protected, gone, progress, threads)
                 rest = splats if gone is None else splats.take(~gone)
                 origin = Origin(rest, result.scores.ray_sample, result.scores.between, None)
             origin, whole = replace(origin, psnr=result.report["estimated_psnr"]), result
-        yield result
+        kept = int(np.count_nonzero(result.keep))
+        if kept < fewest:
+            number, fewest = number + 1, kept
+            yield Level(number, goal, result)
+    if not number:
+        raise RefineError(f"no level has fewer splats than the input, which has {len(splats)}")
 
 
 def _both(first, second):

@@ -119,13 +119,18 @@ def select(
         If more would be removed than `Scores.settled`, or there is no curve for a PSNR.
     """
     values = scores.values
-    keep = np.ones(len(values), np.bool_)  # (N,), as `free`
-    free = keep.copy() if protected is None else ~protected
+    # Rows that may go.
+    rows = np.arange(len(values)) if protected is None else np.flatnonzero(~protected)
     removals = budget.removals(len(values), row_bytes, fixed_bytes)
     if removals is None:
         removals = math.floor(quality_of(scores).share(budget.psnr or 0.0) * len(values))
-    if removals:
-        _remove_lowest(keep, values, free, removals)
+    keep = np.ones(len(values), np.bool_)
+    if removals := min(removals, len(rows)):
+        some = np.where(np.isnan(values[rows]), np.float32(np.inf), values[rows])
+        edge = np.partition(some, removals - 1)[removals - 1]
+        gone, ties = some < edge, np.flatnonzero(some == edge)
+        gone[ties[: removals - np.count_nonzero(gone)]] = True
+        keep[rows[gone]] = False
     if scores.settled is not None:
         _refuse_unsettled(scores, budget, ~keep)
     return keep
@@ -151,19 +156,6 @@ def quality_of(scores: Scores) -> Quality:
             "budget, or choose another budget where the views see too little"
         )
     return scores.quality
-
-
-def _remove_lowest(
-    keep: NDArray[np.bool_], values: NDArray[np.float32], free: NDArray[np.bool_], amount: int
-) -> None:
-    """Set `keep` to False for the lowest `amount` of `free` values; of equal, for the first."""
-    rows = np.flatnonzero(free)
-    some = np.where(np.isnan(values[rows]), np.float32(np.inf), values[rows])
-    if amount := min(amount, len(rows)):
-        edge = np.partition(some, amount - 1)[amount - 1]
-        gone, ties = some < edge, np.flatnonzero(some == edge)
-        gone[ties[: amount - np.count_nonzero(gone)]] = True
-        keep[rows[gone]] = False
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
