@@ -377,13 +377,11 @@ def lod_file(
         clock.lap("levels_s")
     scores = level.result.scores
     assert scores is not None
-    seen = seen_by(scores, demands.removed)
-    seen["splats"] |= demands.counts()
     return {
         "settings": method.facts(),
         "volumes": list(demands.facts),
         "source": {"file": file.name, "bytes": scene.bytes},
-        **seen,
+        **seen_by(scores, demands),
         "nested": not method.changes,
         "levels": entries,
         "files": {"input": scene.name, "output": str(path)},

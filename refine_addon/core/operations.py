@@ -367,13 +367,13 @@ def clean_file(
         )  # fmt: skip
         clock.lap("clean_s")
         report: dict[str, Any] = {
-            **seen_by(cleaned, demands.removed),
+            **seen_by(cleaned, demands),
             "settings": asdict(cleaning),
             "volumes": list(demands.facts),
             "cleaned": cleaned.facts(),
             "notes": cleaned.notes(),
         }
-        report["splats"] |= kept_and_removed(cleaned.keep) | demands.counts()
+        report["splats"] |= kept_and_removed(cleaned.keep)
         return Result(cleaned.keep, report)
 
     return _run_file(source, output, decide, views, **options)
@@ -390,7 +390,7 @@ def score_scene(views: ViewSet, method: Method) -> Decide:
         )  # fmt: skip
         clock.lap("score_s")
         report: dict[str, Any] = {
-            **seen_by(scores, demands.removed),
+            **seen_by(scores, demands),
             "settings": method.facts(),
             "volumes": list(demands.facts),
             "weights": scores.facts,

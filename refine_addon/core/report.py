@@ -15,6 +15,7 @@ from .methods import ClosedForm, Method
 from .quality.curve import FEWEST, Way, expected, expected_seconds, in_words, out_of_reach, parted
 from .scores import Scores
 from .selection import Budget
+from .volumes import Forced
 
 SEES_TOO_LITTLE = "the views see too little for an estimate of the pictures' quality"
 NOT_ESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is the budget"
@@ -75,18 +76,13 @@ def scoring_notes(scores: Scores) -> list[str]:
     return notes
 
 
-def seen_by(
-    found: Scores | Cleaned, removed: NDArray[np.bool_] | None = None
-) -> dict[str, dict[str, int]]:
-    """Counts of splats and views for every report; `removed`, (N,), by the user: seen by none."""
-    gone = 0 if removed is None else int(np.count_nonzero(removed))
-    unseen = int(np.count_nonzero(found.seen == 0)) - gone
+def seen_by(found: Scores | Cleaned, demands: Forced) -> dict[str, dict[str, int]]:
+    """Counts of splats and views for every report; no view sees what the user removed."""
+    forced = demands.counts()
+    unseen = int(np.count_nonzero(found.seen == 0)) - forced["removed_by_user"]
     counts = {"before": len(found.seen), "undrawable": found.undrawable, "unseen": unseen}
-    between = found.views_between if isinstance(found, Scores) else 0
-    return {
-        "splats": {**counts, "removed_by_user": gone},
-        "views": {"given": found.views_given, "used": found.views_used, "between": between},
-    }
+    views = {"given": found.views_given, "used": found.views_used, "between": found.views_between}
+    return {"splats": counts | forced, "views": views}
 
 
 def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
@@ -117,7 +113,7 @@ def of_prune(
     predicted. `outcome` is that of merging, `tried` its PSNR if deletion was as good.
     """
     count, curve = len(keep), scores.quality
-    report: dict[str, Any] = {**seen_by(scores)}
+    report: dict[str, Any] = {**seen_by(scores, Forced())}
     report["splats"] |= kept_and_removed(keep)
     report["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
     removed = report["splats"]["removed"]

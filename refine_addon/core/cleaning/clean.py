@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +141,7 @@ class Cleaned:
     views_given: int
     views_used: int
     settings: Cleaning
+    views_between: ClassVar[int] = 0  # none decide
 
     def counts(self) -> dict[str, int]:
         """Splats to remove for each reason that is switched on."""
