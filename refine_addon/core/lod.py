@@ -29,13 +29,13 @@ from .images import codec_for
 from .methods import DEFAULT, Method
 from .operations import read_scene
 from .prune import prune, score
+from .quality.alignment import in_picture
 from .quality.curve import PSNR_CAP
 from .report import Clock, scoring_notes, seen_by
 from .result import Origin, Result
 from .selection import Budget
 from .splats import Model, Splats, among_all
 from .views import ViewSet
-from .visibility import frustum
 from .volumes import Forced, Zone, must_go
 
 MAX_LEVELS = 16  # the last of so many halvings would hold 0.0015 % of the splats
@@ -306,16 +306,11 @@ def viewing_distance(splats: Splats, views: ViewSet) -> float:
 
     A streamed SOG's chunks are at most this wide: far ends are at most twice as far as near ones.
     """
-    distances = [np.empty(0)]
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):
         means = splats.means[:: max(len(splats) // _SAMPLE, 1)].astype(np.float64)
-        for view in views.spread(_VIEWS):
-            local = view.rotation @ (means - view.center).T  # (3, n)
-            planes = frustum.clip_planes(view, float(np.finfo(np.float64).tiny))
-            inside = frustum.contains(view, local, planes)
-            distances.append(np.linalg.norm(local[:, inside], axis=0))
-    every = np.concatenate(distances)
-    return float(np.median(every)) if len(every) else math.inf
+        points = np.hstack([in_picture(means, view) for view in views.spread(_VIEWS)])
+        distances = np.linalg.norm(points, axis=0)
+    return float(np.median(distances)) if len(distances) else math.inf
 
 
 def lod_file(

@@ -16,11 +16,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..affine import QUARTERS
 from ..execute import run_all
 from ..splats import Splats
-from ..views import ViewSet
+from ..views import View, ViewSet
 from ..visibility import frustum, projection
 from ..visibility.cast import cast, pixels
 
@@ -133,7 +134,7 @@ def alignment(
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
         for view in views:
             if view.weight:
-                points = _in_picture(means, view)
+                points = in_picture(means, view)
                 in_pictures, count = in_pictures + points.shape[1], count + len(means)
                 far += [view.name] if _is_far(points, view) else []
         unturned = Alignment(far=tuple(far))
@@ -153,20 +154,19 @@ def _spread_rows(splats, count):
     return np.arange(0, len(splats), max(len(splats) // count, 1))
 
 
-def _in_picture(means, view):
-    """Places, (2, m), in depths from the lens's middle, of points, (n, 3), in a view's picture."""
+def in_picture(means: NDArray[np.float64], view: View) -> NDArray[np.float64]:
+    """Points, (n, 3), that lie in a view's picture, in the axes of the view, (3, m)."""
     with np.errstate(over="ignore", invalid="ignore"):
         local = view.rotation @ (means - view.center).T  # (3, n)
         planes = frustum.clip_planes(view, float(np.finfo(np.float64).tiny))
-        local = local[:, frustum.contains(view, local, planes)]
-        return local[:2] / local[2]
+        return local[:, frustum.contains(view, local, planes)]
 
 
 def _is_far(points, view):
-    """Whether all that a view sees, (2, m), lies in a small part of its picture."""
+    """Whether all that a view sees, (3, m) as of `in_picture`, lies in a small part of it."""
     if points.shape[1] < FEW:
         return False
-    ordered, tenth = np.sort(points, axis=1), points.shape[1] // 10
+    ordered, tenth = np.sort(points[:2] / points[2], axis=1), points.shape[1] // 10
     widths = ordered[:, -1 - tenth] - ordered[:, tenth]  # (2,)
     return (widths * (view.fx / view.width, view.fy / view.height)).max() < SMALL
 
