@@ -19,7 +19,6 @@ from ..whole_file import Url, alike
 from . import storage
 
 ROWS = 1 << 16  # of a tile, read together: 15 MB at degree 3
-_HEADER = 1 << 16  # bytes that are read of a tile for its header, which hardly ever has more
 _PIECE = 1 << 24  # bytes beside the rows that are copied at a time
 
 
@@ -64,10 +63,7 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
     size, changed = storage.state(place)
     if place.name in ("", ".", ".."):
         raise RefineError(f"{place}: names no file")
-    head = storage.beginning(place, _HEADER, size)
-    if b"end_header" not in head:
-        head = storage.beginning(place, ply.HEADER_LIMIT, size)
-    header, vertex = ply.splat_header(place, head)
+    header, vertex = ply.splat_header(place, storage.beginning(place, ply.HEADER_LIMIT, size))
     if header.order == ply.TEXT:
         raise RefineError(
             f"{place}: is {ply.format_of(header.raw)}, expected a plain binary PLY as a tile, "
