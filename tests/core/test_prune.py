@@ -48,7 +48,8 @@ def file():
 @pytest.fixture(scope="module")
 def views():
     names = json.loads((ROOM / "split.json").read_text())["train"]
-    return read_cameras(ROOM / "cameras.json").select(names)
+    every = {view.name: view for view in read_cameras(ROOM / "cameras.json")}
+    return ViewSet(tuple(every[name] for name in names))
 
 
 @pytest.fixture(scope="module")
