@@ -138,25 +138,22 @@ def score(
                 alone[:] = np.where(alone == 0.0, UNSEEN / away, alone)
             alone *= columns.alpha[piece]
             alone *= columns.good[piece]
-            sums = [float(np.sum(alone * g)) for g in columns.three_g(piece)]
             if local:
                 cells[piece] = _cells(axes @ points)
-        seen[piece] *= columns.good[piece]
-        return [*sums, float(np.sum(seen[piece]))]
+            seen[piece] *= columns.good[piece]
+            return [float(np.sum(alone * g)) for g in columns.three_g(piece)]
 
-    sums = np.array(
-        run_all(
-            complete, chunks(total, _CHUNK), progress=completing, what="scoring", threads=threads
-        )
+    sums = run_all(
+        complete, chunks(total, _CHUNK), progress=completing, what="scoring", threads=threads
     )
-    if frustum and not sums[:, 3].any():
+    if frustum and not seen.any():
         raise RefineError(
             f"no camera sees the splats: none of {total} lies in the frustum of any of "
             f"{len(views)} views; check that cameras and splats share their frame and unit"
         )
     statistics = _statistics(tallies)
     weights = lambdas(**statistics)
-    means = np.sum(sums[:, :3], axis=0) / total  # of H G, for each of the three G
+    means = np.sum(sums, axis=0) / total  # of H G, for each of the three G
     factors = np.divide(weights, means, out=np.zeros(3), where=means > 0.0)
     values = np.empty(total, np.float32)
 
@@ -308,29 +305,20 @@ def _near_order(means):
 
 @cache
 def _places():
-    """Place of each cell along the curve (Skilling, AIP Conf. Proc. 707, 2004)."""
-    cells = np.arange(1 << 3 * _BITS)
-    axes = np.stack([cells >> 2 * _BITS, cells >> _BITS, cells]) & ((1 << _BITS) - 1)  # (3, cells)
-    for bit in range(_BITS - 1, 0, -1):
-        lower = (1 << bit) - 1
-        for axis in axes:
-            # Where the bit is set the lower ones of the first axis turn over, elsewhere they are
-            # exchanged with this axis'.
-            turned = (axis >> bit & 1).astype(bool)
-            swap = np.where(turned, 0, (axes[0] ^ axis) & lower)
-            axes[0] ^= np.where(turned, lower, swap)
-            np.bitwise_xor(axis, swap, out=axis)
-    axes[1] ^= axes[0]
-    axes[2] ^= axes[1]
-    turns = np.zeros_like(cells)
-    for bit in range(_BITS - 1, 0, -1):
-        turns ^= np.where(axes[2] >> bit & 1, (1 << bit) - 1, 0)
-    axes ^= turns
-    places = np.zeros_like(cells)
-    for bit in range(_BITS - 1, -1, -1):
-        for axis in axes:
-            places = places << 1 | axis >> bit & 1
-    return places.astype(np.uint16)
+    """Place of each cell along the curve (as by Skilling, AIP Conf. Proc. 707, 2004)."""
+    x = y = z = np.zeros(1, np.intp)  # of the cells, along the curve through a cube of one
+    for bit in range(_BITS):
+        size = 1 << bit
+        # Through half of a cube twice as wide four times, turned, then back in the mirror image.
+        half = np.hstack([
+            (y, z, x), (y, x, z + size), (x, y + size, z + size),
+            (size - 1 - z, y + size, size - 1 - x),
+        ])  # fmt: skip
+        x, y, z = np.hstack([half, half[:, ::-1]])
+        x[len(x) // 2 :] = 2 * size - 1 - x[len(x) // 2 :]
+    places = np.empty(len(x), np.uint16)
+    places[x << 2 * _BITS | y << _BITS | z] = np.arange(len(x))
+    return places
 
 
 class _Views:
