@@ -64,7 +64,7 @@ class Sight:
     prepared: Prepared
     view: View
     footprints: Footprints  # front to back
-    rows: NDArray[np.int64]  # (n,), splats whose centres lie in the image
+    centered: Gaussians  # the n whose centres lie in the image
     pixels: NDArray[np.int64]  # (2, n), column and row of each centre
     visible: NDArray[np.bool_]  # (n,), see the top of this file
 
@@ -76,17 +76,14 @@ class Sight:
         self, center: NDArray[np.float64], radius: float, *, hidden: bool = False
     ) -> NDArray[np.bool_]:
         """Splats in the image with centres in a ball, (N,) bool; `center`, (3,), in their frame."""
-        away = self.prepared.splats.means[self.rows] - center
+        away = self.prepared.splats.means[self.centered.index] - center
         return self._of(np.einsum("ij,ij->i", away, away) <= radius * radius, hidden)
 
     def of_color(
         self, color: NDArray[np.float64], tolerance: float, *, hidden: bool = False
     ) -> NDArray[np.bool_]:
         """Splats in the image of a red, green and blue, within `tolerance`, all 0..1, (N,) bool."""
-        gaussians = self.prepared.gaussians
-        place = np.full(len(self.prepared.splats), -1)
-        place[gaussians.index] = np.arange(len(gaussians))
-        colors = np.minimum(gaussians.colors[place[self.rows]], 1.0)
+        colors = np.minimum(self.centered.colors, 1.0)
         return self._of(np.abs(colors - color).max(axis=1) <= tolerance, hidden)
 
     def piece(self, chosen: NDArray[np.bool_], place: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -130,7 +127,7 @@ class Sight:
 
     def _of(self, chosen, hidden):
         mask = np.zeros(len(self.prepared.splats), np.bool_)
-        mask[self.rows[chosen if hidden else chosen & self.visible]] = True
+        mask[self.centered.index[chosen if hidden else chosen & self.visible]] = True
         return mask
 
 
@@ -155,8 +152,8 @@ def look(prepared: Prepared, view: View) -> Sight:
     thick = THICKNESS * np.sqrt(np.maximum(covariances[5, shown], 0.0))
     end = ends[rows[shown] // step, columns[shown] // step]
     pixels, visible = np.stack([columns[shown], rows[shown]]), centers[2, shown] <= end + thick
-    index = gaussians.index[footprints.index[shown]]
-    return Sight(prepared, view, footprints, index, pixels, visible)
+    centered = gaussians.take(footprints.index[shown])
+    return Sight(prepared, view, footprints, centered, pixels, visible)
 
 
 def surfaces(

@@ -234,4 +234,4 @@ def test_without_perspective_centres_lie_where_parallel_rays_meet_them():
     across = found.fx * local[:, 0] / local[:, 2] + found.cx
     down = found.fy * local[:, 1] / local[:, 2] + found.cy
     np.testing.assert_allclose(np.stack([across, down], axis=1), expected, atol=0.2)
-    assert sorted(shown.rows.tolist()) == [0, 1, 2, 3]
+    assert sorted(shown.centered.index.tolist()) == [0, 1, 2, 3]
