@@ -361,10 +361,8 @@ def start(cost: float, threads: int | None = None) -> None:
     """Start the processes that `run` will use soon for work of the same `cost` and `threads`."""
     number = default_threads() if threads is None else threads
     if _worth(cost, number):
-        with suppress(_LostError):
-            team = _taken(number)
-            with _lock:
-                _idle.extend(team)
+        with suppress(_LostError), _lock:
+            _fill_idle(number)
 
 
 def _worth(cost, number):
@@ -381,7 +379,9 @@ def _in_processes(work, items, number, tell):
         folder = tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
     with folder:
         task = _stored(work, Path(folder.name) / "arrays")
-        team = _taken(number)
+        with _lock:
+            _fill_idle(number)
+            team, _idle[:] = _idle[:number], _idle[number:]
         free = deque(team)
 
         def call(item):
@@ -424,20 +424,14 @@ def _tell_all(team: list[_Process], message: tuple[str, Any]) -> None:
             process.answer()
 
 
-def _taken(number: int) -> list[_Process]:
-    """Processes nobody else uses, idle or new; or raise `_LostError`."""
-    with _lock:
-        team = [process for process in _idle if process.ready]
-        _kill(set(_idle) - set(team))
-        _idle[:] = team[number:]
-        team = team[:number]
-    try:
-        while len(team) < number:
-            team.append(_Process())
-    except OSError as error:
-        _kill(team)
-        raise _LostError from error
-    return team
+def _fill_idle(number: int) -> None:
+    """Start processes until so many have nothing to do, or raise `_LostError`; needs the lock."""
+    ready = [process for process in _idle if process.ready]
+    _kill(set(_idle) - set(ready))
+    _idle[:] = ready
+    with _lost(OSError):
+        while len(_idle) < number:
+            _idle.append(_Process())
 
 
 def _kill(team: Iterable[_Process]) -> None:
