@@ -250,7 +250,7 @@ def test_a_count_that_the_file_does_not_back_allocates_nothing(tmp_path, count):
     for file in ("cameras", "images"):
         path = write(tmp_path, ".bin") / f"{file}.bin"
         path.write_bytes(number + path.read_bytes()[8:])
-        wrong(tmp_path, path.name, f"truncated: number of {file}: {count} of at least ")
+        wrong(tmp_path, path.name, f"truncated: {file[:-1]} row 1: expected ")
     write(tmp_path, ".bin", images=binary_images([IMAGE])[:-8] + number)
     wrong(tmp_path, "images.bin", f"truncated: {count} points of image row 0")
 

@@ -157,15 +157,12 @@ class _Binary:
         self.file.at(f"byte {self.offset}").fail(f"truncated: {problem}, got {left}")
 
 
-def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, str, CameraPlace]]:
-    """Yield the file, name and place of each row; rows have `least` bytes or more."""
+def _rows(file: CameraPlace, thing: str) -> Iterator[tuple[_Binary, str, CameraPlace]]:
+    """Yield the file, name and place of each row."""
     # Memory-mapped, since images.bin is mostly observations, which are skipped.
     with opened(file) as (stream, _), mmap(stream.fileno(), 0, access=ACCESS_READ) as mapped:
         data = _Binary(file, mapped)
         (count,) = data.take("Q", f"number of {thing}s")
-        if count * least > len(data.data) - data.offset:
-            announced = f"{count} of at least {least} bytes each are announced"
-            data.truncated(f"number of {thing}s: {announced}")
         for index in range(count):
             row = f"{thing} row {index}"
             yield data, row, file.at(f"{row} at byte {data.offset}")
@@ -177,7 +174,7 @@ def _rows(file: CameraPlace, thing: str, least: int) -> Iterator[tuple[_Binary, 
 
 def _binary_cameras(file: CameraPlace) -> Iterator[Any]:
     """Yield place, id and `_lens` of each camera."""
-    for data, row, place in _rows(file, "camera", 24 + 8 * 2):
+    for data, row, place in _rows(file, "camera"):
         camera_id, model_id, *size = data.take("IiQQ", row)
         if not 0 <= model_id < len(MODELS):
             place.fail(f"unknown camera model {model_id}, expected 0 to {len(MODELS) - 1}")
@@ -188,7 +185,7 @@ def _binary_cameras(file: CameraPlace) -> Iterator[Any]:
 
 def _binary_images(file: CameraPlace) -> Iterator[Any]:
     """Yield name, id, place, pose (world to camera) and camera id of each registered image."""
-    for data, row, place in _rows(file, "image", 73):
+    for data, row, place in _rows(file, "image"):
         image_id, *pose, camera_id = data.take("I7dI", row)
         name = data.name(f"name of {row}")
         (points,) = data.take("Q", f"number of points of {row}")
