@@ -129,19 +129,15 @@ def alignment(
     threads: int | None = None,
 ) -> Alignment:
     """Whether views are to be turned, by some of `used`, and which are far (docs/method.md, 10)."""
-    far, in_pictures, count = [], 0, 0
     with np.errstate(under="ignore", invalid="ignore"):  # signalling NaN
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
-        for view in views:
-            if view.weight:
-                points = in_picture(means, view)
-                in_pictures, count = in_pictures + points.shape[1], count + len(means)
-                far += [view.name] if _is_far(points, view) else []
-        unturned = Alignment(far=tuple(far))
+        seen = [(view, in_picture(means, view)) for view in views if view.weight]
+        unturned = Alignment(far=tuple(view.name for view, points in seen if _is_far(points, view)))
         if views.turn is not None:
             return replace(unturned, turn=views.turn, known=True)
         one_way = np.linalg.norm(views.rotations[:, 2].mean(axis=0)) >= ONE_WAY
-        if used is None or one_way or in_pictures >= WHOLE * count:
+        in_pictures = sum(points.shape[1] for _, points in seen)
+        if used is None or one_way or in_pictures >= WHOLE * (len(means) * len(seen)):
             return unturned
         fineness = _fineness(splats, used.spread(VIEWS), threads)
     best = list(QUARTERS)[int(np.argmax(fineness))]
