@@ -58,15 +58,12 @@ def cluster(workers: int | str) -> Iterator[Cluster]:
         scheduler: Any = workers
         if not isinstance(workers, str):
             held.enter_context(dask.config.set(_MEMORY))
-
-            def start() -> Any:
-                return distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, processes=True,
-                    dashboard_address=None, memory_limit=None, silence_logs=50,
-                )  # fmt: skip
-
             try:
-                scheduler = held.enter_context(_uninterrupted(start))
+                local = _uninterrupted(
+                    distributed.LocalCluster, n_workers=workers, threads_per_worker=1,
+                    processes=True, dashboard_address=None, memory_limit=None, silence_logs=50,
+                )  # fmt: skip
+                scheduler = held.enter_context(local)
             except Exception as error:
                 raise Interrupted(
                     f"workers ended while they were started ({error}); try again"
@@ -77,10 +74,10 @@ def cluster(workers: int | str) -> Iterator[Cluster]:
         yield Cluster(client)
 
 
-def _uninterrupted(make: Callable[[], Any]) -> Any:
+def _uninterrupted(make: Callable[..., Any], **how: Any) -> Any:
     """Run `make` without Ctrl-C, raised later: a half-started cluster could not be closed."""
     with ThreadPoolExecutor(1, initializer=_block_ctrl_c) as pool:
-        future = pool.submit(make)
+        future = pool.submit(make, **how)
         try:
             return future.result()
         except KeyboardInterrupt:
