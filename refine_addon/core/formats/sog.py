@@ -263,11 +263,11 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
     if across > _MOST_PIXELS:
         raise RefineError(f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}")
 
-    def image(values):
-        """Image with a pixel for each splat; `values`, (N, C), are the first channels."""
-        pixels = np.zeros((-(-count // across), across, 4), np.uint8)
+    def image(values, across):
+        """Image of a width in pixels; `values`, (n, C), are the first channels of n of them."""
+        pixels = np.zeros((-(-len(values) // across), across, 4), np.uint8)
         pixels[..., 3] = 255
-        pixels.reshape(-1, 4)[:count, : values.shape[1]] = values
+        pixels.reshape(-1, 4)[: len(values), : values.shape[1]] = values
         return pixels
 
     means = np.asarray(splats.means, np.float64)
@@ -292,7 +292,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
         meta["model"] = splats.model
     turns = np.column_stack([codes(others * math.sqrt(0.5) + 0.5), largest + _ROTATIONS])
     values = [code & 255, code >> 8, turns, scales, np.column_stack([colors, alpha])]
-    images = [*map(image, values)]
+    images = [image(each, across) for each in values]
     if splats.sh_degree:  # a palette of the mean harmonics of each group
         labels = _grouped(splats.sh_rest.reshape(count, -1))
         entries = int(labels.max()) + 1
@@ -302,11 +302,9 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
             column = np.asarray(splats.sh_rest[:, k, channel], np.float64)
             means[:, k, channel] = np.bincount(labels, column) / sizes
         table, places = _tabulated(means)
-        rows = -(-entries // _ACROSS)
-        palette = np.zeros((rows, _ACROSS * coefficients, 4), np.uint8)
-        palette[..., 3] = 255
-        palette.reshape(-1, coefficients, 4)[:entries, :, :3] = places
-        images += [image(np.column_stack([labels & 255, labels >> 8])), palette]
+        labels = np.column_stack([labels & 255, labels >> 8])
+        palette = image(places.reshape(-1, 3), _ACROSS * coefficients)
+        images += [image(labels, across), palette]
         held = {"count": entries, "bands": splats.sh_degree, "codebook": table.tolist()}
         meta["shN"] = {**held, "files": ["shN_centroids.webp", "shN_labels.webp"]}
     yield META, json.dumps(meta).encode()
