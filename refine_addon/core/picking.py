@@ -176,7 +176,7 @@ def surfaces(
         order = np.argsort(rays, kind="stable")  # hits of a ray stay front to back
         ray, thick = rays[order], -np.log1p(-alphas[order].astype(np.float64))
         met, counts = np.unique(ray, return_counts=True)
-        behind = in_front(thick, counts) + thick + thickness[ray] if len(met) else thick
+        behind = in_front(thick, counts) + thick + thickness[ray]
         dark = np.flatnonzero(behind > limit)
         ended, first = np.unique(ray[dark], return_index=True)
         ends[ended] = depths[owners[order[dark[first]]]]

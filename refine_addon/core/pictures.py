@@ -191,8 +191,6 @@ def _strip(footprints, colors, columns, rows, cut):
 def _weights(pixel, alpha, log_left):
     """Weight of each hit in its pixel, (h,); updates `log_left`, (P,), to that behind the hits."""
     # Hits come pixel by pixel, ascending, and front to back in each.
-    if not len(pixel):
-        return np.empty(0)
     log_passed = np.log1p(-alpha).astype(np.float64)
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     counts = np.diff(np.append(first, len(pixel)))
