@@ -131,21 +131,15 @@ def select(
         gone, ties = some < edge, np.flatnonzero(some == edge)
         gone[ties[: removals - np.count_nonzero(gone)]] = True
         keep[rows[gone]] = False
-    if scores.settled is not None:
-        _refuse_unsettled(scores, budget, ~keep)
+    if (settled := scores.settled) is not None:
+        # A PSNR that all of the curve reaches may be reached beyond its end, too.
+        beyond = budget.psnr is not None and budget.psnr <= quality_of(scores).psnr[-1]
+        if beyond or not keep[np.argsort(values, kind="stable")[settled:]].all():
+            raise RefineError(
+                f"these scores were computed for a budget that removes up to {settled} of "
+                f"{len(keep)} splats, and this one removes more: score again, for all budgets"
+            )
     return keep
-
-
-def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -> None:
-    """Raise `RefineError` if `gone`, (N,), goes beyond the settled scores."""
-    settled = scores.settled or 0
-    # A PSNR that all of the curve reaches may be reached beyond its end, too.
-    beyond = budget.psnr is not None and budget.psnr <= quality_of(scores).psnr[-1]
-    if beyond or gone[np.argsort(scores.values, kind="stable")[settled:]].any():
-        raise RefineError(
-            f"these scores were computed for a budget that removes up to {settled} of "
-            f"{len(gone)} splats, and this one removes more: score again, for all budgets"
-        )
 
 
 def quality_of(scores: Scores) -> Quality:
