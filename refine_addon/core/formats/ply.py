@@ -55,8 +55,6 @@ _ROWS = 1 << 12
 _CHANGED_ROWS = 1 << 14
 """Rows copied at a time where columns are set, which takes a few calls for each column."""
 
-_AHEAD = 16  # chunks that are copied before the first of them is written
-
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
@@ -514,10 +512,8 @@ def write_rows(
         return every if keep is None else every[keep[piece]]
 
     pieces = chunks(len(plain), _CHANGED_ROWS if columns else _ROWS)
-    for batch in chunks(len(pieces), _AHEAD):
-        here = pieces[batch]
-        copies = map(bytes_of, here) if threads == 1 else run(bytes_of, here, threads=threads)
-        stream.writelines(chunk.data for chunk in copies)
+    copies = map(bytes_of, pieces) if threads == 1 else run(bytes_of, pieces, threads=threads)
+    stream.writelines(chunk.data for chunk in copies)
 
 
 def _grown(dtype, columns):
