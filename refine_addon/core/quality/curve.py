@@ -48,7 +48,10 @@ REFIT_GAIN, REFIT_HITS, FEWER_RAYS = (2.9, 3.2, 3.8, 4.7), 78.0, 1.3
 loss for each doubling: rounds use a number of hits, so dense scenes get fewer rays."""
 
 UNSEEN = 60.0
-"""PSNR in dB above which pictures look the same: rounding to 8 bits alone makes 59."""
+"""PSNR in dB above which estimates are told as equal."""
+
+ROUNDED = 58.9
+"""PSNR of rounding to 8 bits, ``20 log10(255) + 10 log10(12)`` dB: pictures show no more."""
 
 AS_GOOD = 0.5
 """Gain of merging up to which deletion is as good, dB: nobody sees it, and rows keep their bits."""
@@ -197,7 +200,7 @@ def expected(
 
 def deletion_will_do(psnr: float | None) -> bool:
     """Whether nobody sees what deletion at `psnr` dB loses; also if views see too little (None)."""
-    return psnr is None or psnr > UNSEEN
+    return psnr is None or psnr > ROUNDED
 
 
 def needed(gone: int | None, count: int) -> int | None:
