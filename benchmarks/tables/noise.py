@@ -67,8 +67,8 @@ def held_out(splats: Splats, views: ViewSet) -> RaySample:
     """Return rays of the held-out views."""
     gaussians, scene, _ = projection.prepare(splats, views)
     sample = RaySample(views.by_distance(), gaussians, splats)
-    sample.share = RAYS / cast.VALIDATION_RAYS
-    sample.cast_all(gaussians, scene, silent, None)
+    with mock.patch.dict(cast.RAYS, validation=(RAYS, cast.RAYS["validation"][1])):
+        sample.cast_all(gaussians, scene, silent, None)
     return sample
 
 

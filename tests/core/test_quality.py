@@ -46,7 +46,7 @@ CURVE = Quality(*np.array([[0.2, 0.5, 0.8], [50.0, 40.0, 30.0], [52.0, 47.0, 38.
 def test_rays_tell_the_psnr_of_the_picture(monkeypatch, rays, within):
     """Of 24,000 pixels as many rays leave nothing to chance, a third a quarter of a dB."""
     splats, views, keep = cloud(), ring(), np.random.default_rng(5).random(300) < 0.5
-    monkeypatch.setattr(cast, "VALIDATION_RAYS", rays)
+    monkeypatch.setitem(cast.RAYS, "validation", (rays, 1 << 24))
     found = validation_rays(splats, views)
     whole = np.mean([one.psnr for one in compare(splats, splats.take(keep), views)])
     count = sum(len(rays.columns) * len(rays.rows) for rays in found.rays)

@@ -74,7 +74,7 @@ def scene():
     views = ViewSet((one, replace(two, weight=3.0)))
     splats = cloud()
     gaussians, frame, _ = projection.prepare(splats, views)
-    sample = RaySample(views.by_distance(), gaussians, splats, scoring=True)
+    sample = RaySample(views.by_distance(), gaussians, splats, "scoring")
     sample.cast_all(gaussians, frame, silent, None)
     count = len(gaussians)
     random = np.random.default_rng(2)
@@ -141,12 +141,12 @@ def test_equally_many_scoring_and_validation_rays_lie_apart(count, monkeypatch):
 
     By `number + len(views)` 16 views had their rays 1 to 2 pixels apart.
     """
-    monkeypatch.setattr(cast, "SCORING_RAYS", cast.VALIDATION_RAYS)
+    monkeypatch.setitem(cast.RAYS, "scoring", cast.RAYS["validation"])
     view = replace(WIDE, width=480, height=320, fx=450.0, fy=450.0, cx=240.0, cy=160.0)
     views, footprints = [(view, 1.0 / count)] * count, footprints_in(view)
     for number in (0, count // 2, count - 1):
         some, others = (
-            cast.cast_view(views, number, footprints, scoring=scoring) for scoring in (False, True)
+            cast.cast_view(views, number, footprints, kind) for kind in ("validation", "scoring")
         )
         across, down = (
             np.abs(one[:, None] - other).min()
@@ -163,7 +163,7 @@ def test_large_pictures_full_of_vast_splats_take_bounded_memory(monkeypatch):
     while they are cast: 2.4 GB on two threads. A fifth of a million of each are 48 MB at most.
     Where splats are few, rays are as many as 16 bits tell apart.
     """
-    few = cast.cast_view([(WIDE, 1.0)], 0, footprints_in(WIDE), scoring=True)
+    few = cast.cast_view([(WIDE, 1.0)], 0, footprints_in(WIDE), "scoring")
     assert 59_000 < few.count < 1 << 16
     monkeypatch.setattr(cast, "MAX_HITS_OF_VIEW", 200_000)
     view = replace(WIDE, width=1920, height=1080, fx=1e3, fy=1e3, cx=960.0, cy=540.0)

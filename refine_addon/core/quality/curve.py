@@ -50,8 +50,8 @@ loss for each doubling: rounds use a number of hits, so dense scenes get fewer r
 UNSEEN = 60.0
 """PSNR in dB above which estimates are told as equal."""
 
-ROUNDED = 58.9
-"""PSNR of rounding to 8 bits, ``20 log10(255) + 10 log10(12)`` dB: pictures show no more."""
+INVISIBLE = 57.7
+"""PSNR of errors of a third of an 8-bit level, ``20 log10(3 255)`` dB; rounding makes 58.9."""
 
 AS_GOOD = 0.5
 """Gain of merging up to which deletion is as good, dB: nobody sees it, and rows keep their bits."""
@@ -200,7 +200,7 @@ def expected(
 
 def deletion_will_do(psnr: float | None) -> bool:
     """Whether nobody sees what deletion at `psnr` dB loses; also if views see too little (None)."""
-    return psnr is None or psnr > ROUNDED
+    return psnr is None or psnr > INVISIBLE
 
 
 def needed(gone: int | None, count: int) -> int | None:

@@ -37,12 +37,8 @@ LEAST = 0.1
 EXPONENT = 0.25
 """Exponent of the contribution."""
 
-BETWEEN = 12
+BETWEEN = 24
 """Most views halfway between that are estimated."""
-
-BETWEEN_RAYS, BETWEEN_HITS = 18.0, 0.375
-"""Rays of v views in between over `VALIDATION_RAYS`, times v, and the most of their hits over
-`MAX_VALIDATION_HITS`: by a quarter of the rays in 12 views `park` was told 1 dB too high."""
 
 LEFT_OUT = 2.5
 """Views in between decide, too, if views left out lose this much more, dB: those of five scenes
@@ -110,7 +106,7 @@ def score(
     ordered = views.by_distance()
     samples = [RaySample(ordered, gaussians, splats, few_views=few_views)]
     if rounds > 1:
-        samples.append(RaySample(ordered, gaussians, splats, scoring=True))
+        samples.append(RaySample(ordered, gaussians, splats, "scoring"))
     sample, index = coverage.sample(gaussians), np.asarray(gaussians.index)
     measured, of_groups, errors = measure(
         gaussians, scene, ordered, view_groups(len(ordered)),
@@ -141,8 +137,7 @@ def score(
     between = None
     told = views_beside(views, gaussians, scene) if more else views_between(views, BETWEEN)
     if told:
-        between = RaySample(ViewSet(tuple(told)).by_distance(), gaussians, splats)
-        between.shares = BETWEEN_RAYS / len(told), BETWEEN_HITS
+        between = RaySample(ViewSet(tuple(told)).by_distance(), gaussians, splats, "between")
         between.cast_all(gaussians, scene, casting, threads)
     del gaussians, of_groups, errors  # not needed any more where memory is highest
     rays = samples.pop() if rounds > 1 else None
@@ -173,7 +168,7 @@ def in_rounds(
     own = len(deciding) - scores.views_between
     views, more = replace(deciding, views=deciding.views[:own]), deciding.views[own:]
     gaussians, scene, good = projection.prepare(splats, views, progress=progress, threads=threads)
-    rays = RaySample((), gaussians, splats, scoring=True)
+    rays = RaySample((), gaussians, splats, "scoring")
     for some in (views.by_distance(), _with_between(views, more)[1]):  # own views get more rays
         rays.extend(some)
         rays.cast_all(gaussians, scene, progress, threads)

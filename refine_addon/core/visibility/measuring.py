@@ -110,7 +110,7 @@ def measure(
     lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]
     measured = run(
         partial(_measure_and_cast, gaussians, scene, views),
-        [(n, [rays.scoring for rays in some]) for n, some in zip(numbers, lacking, strict=True)],
+        [(n, [rays.kind for rays in some]) for n, some in zip(numbers, lacking, strict=True)],
         cost=SECONDS * len(gaussians) * len(numbers),
         progress=progress, what="scoring", threads=threads,
     )  # fmt: skip
@@ -136,9 +136,7 @@ def _measure_and_cast(gaussians, scene, views, number_and_kinds):
     number, kinds = number_and_kinds
     footprints, measurement = _measure_view(gaussians, scene, views[number][0])
     with np.errstate(under="ignore"):
-        return measurement, [
-            cast_view(views, number, footprints, scoring=scoring) for scoring in kinds
-        ]
+        return measurement, [cast_view(views, number, footprints, kind) for kind in kinds]
 
 
 def _measure_view(gaussians, scene, view):
