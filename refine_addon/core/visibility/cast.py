@@ -29,7 +29,7 @@ Kind = Literal["validation", "scoring", "between"]
 RAYS: dict[Kind, tuple[int, int]] = {
     "validation": (1 << 14, 1 << 24),
     "scoring": (1 << 16, 3 << 24),
-    "between": (3 << 14, 3 << 23),
+    "between": (3 << 14, 3 << 22),
 }
 """Rays of all views together, and about the most of their hits, 12 bytes each: dense scenes get
 fewer rays. By a quarter of the rays in 12 views between, `park` was told 1 dB too high."""
@@ -67,7 +67,7 @@ class RaySample:
 
     Views have the weights of `ViewSet.by_distance`. With `few_views` about `VALIDATION_VIEWS` are
     cast, enough to compare, not for a curve; `rays` holds None for the others. `splat_rows`, (M,),
-    are the splats of the Gaussians.
+    are the splats of the Gaussians; `truths` are the colours of rays with all splats.
     """
 
     def __init__(
@@ -83,6 +83,7 @@ class RaySample:
         self._step = max(math.ceil(len(views) / VALIDATION_VIEWS), 1) if few_views else 1
         self.splat_rows = np.asarray(gaussians.index)
         self.rays: list[Rays | None] = [None] * len(views)
+        self.truths: dict[int, NDArray[np.float32]] = {}  # (3, P) by view, as far as known
 
     def extend(self, views: Sequence[tuple[View, float]]) -> None:
         """Cast rays of more views, too: of all `views`, the first of which are those so far."""
