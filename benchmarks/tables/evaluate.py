@@ -209,9 +209,7 @@ def read_scene(folder: Path | str) -> Scene:
         if found is not None:
             pictures[name] = np.asarray(Image.open(found).convert("RGB"), np.float64) / 255.0
     splats = read_ply(folder / "point_cloud.ply").splats()
-    by_name = {view.name: view for view in views}
-    sets = (ViewSet(tuple(by_name[name] for name in names)) for names in (train, test))
-    return Scene(splats, *sets, pictures)
+    return Scene(splats, views.select(train), views.select(test), pictures)
 
 
 def _split(file: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:

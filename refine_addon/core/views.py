@@ -136,6 +136,17 @@ class ViewSet:
         """Views at `indices`, in that order."""
         return replace(self, views=tuple(self.views[int(index)] for index in indices))
 
+    def select(self, names: Sequence[str]) -> ViewSet:
+        """Views by name, in the order of `names`; of equal names the last.
+
+        `RefineError` if there is none of that name.
+        """
+        by_name = {view.name: view for view in self.views}
+        missing = [name for name in names if name not in by_name]
+        if missing:
+            raise RefineError(f"no view named {missing[0]!r} among {len(self)} views")
+        return replace(self, views=tuple(by_name[name] for name in names))
+
     @property
     def centers(self) -> NDArray[np.float64]:
         """Centres of projection, (V, 3), world units."""

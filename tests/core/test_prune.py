@@ -48,8 +48,7 @@ def file():
 @pytest.fixture(scope="module")
 def views():
     names = json.loads((ROOM / "split.json").read_text())["train"]
-    every = {view.name: view for view in read_cameras(ROOM / "cameras.json")}
-    return ViewSet(tuple(every[name] for name in names))
+    return read_cameras(ROOM / "cameras.json").select(names)
 
 
 @pytest.fixture(scope="module")

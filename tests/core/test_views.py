@@ -58,11 +58,13 @@ def test_a_rotation_rounded_by_a_file_becomes_exactly_orthonormal():
 
 
 def test_a_set_needs_a_view_that_counts():
-    """Weights sum to one even where their sum overflows."""
+    """Weights sum to one even where their sum overflows; an unknown name is named."""
     with pytest.raises(RefineError, match="no cameras"):
         ViewSet(())
     with pytest.raises(RefineError, match="weight 0"):
         ViewSet((view(weight=0.0),))
+    with pytest.raises(RefineError, match="no view named 'x' among 4 views"):
+        ring(4).select(["2", "x"])
     with np.errstate(all="raise"):
         np.testing.assert_allclose(ViewSet((view(weight=1e308),) * 3).weights, [1 / 3] * 3)
 
