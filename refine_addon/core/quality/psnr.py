@@ -91,7 +91,7 @@ def quality_curve(
 
     def gaining(number, rays):
         view, colors = sample.views[number][0], sample.colors(number, rays)
-        truth, gains, place_of_hit = rays.colors(colors), [], place[sample.splat_rows[rays.hit]]
+        truth, gains, place_of_hit = sample.truths[number], [], place[sample.splat_rows[rays.hit]]
         for count in merged:
             keep = place_of_hit >= count  # (u,)
             deleted = rays.keeping(keep).colors(colors)
