@@ -35,47 +35,21 @@ def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
 def _values(directions, degree):
     """List of the values of `basis`, (...) each, along directions, (3, ...), in their dtype."""
     x, y, z = directions
-    xx, yy, zz = x * x, y * y, z * z
-    root = math.sqrt(1.0 / math.pi)
-    values = [np.full_like(x, 0.5 * root)]
-    if degree >= 1:
-        c = math.sqrt(3.0) / 2 * root
-        values += [-c * y, c * z, -c * x]
-    if degree >= 2:
-        c = math.sqrt(15.0) / 2 * root
-        values += [
-            c * x * y,
-            -c * y * z,
-            math.sqrt(5.0) / 4 * root * (2 * zz - xx - yy),
-            -c * x * z,
-            c / 2 * (xx - yy),
-        ]
-    if degree >= 3:
-        a, b = math.sqrt(35.0 / 2) / 4 * root, math.sqrt(21.0 / 2) / 4 * root
-        c = math.sqrt(105.0) / 2 * root
-        values += [
-            -a * y * (3 * xx - yy),
-            c * x * y * z,
-            -b * y * (4 * zz - xx - yy),
-            math.sqrt(7.0) / 4 * root * z * (2 * zz - 3 * xx - 3 * yy),
-            -b * x * (4 * zz - xx - yy),
-            c / 2 * z * (xx - yy),
-            -a * x * (xx - 3 * yy),
-        ]
-    if degree >= 4:
-        a, b = math.sqrt(35.0) * 3 / 4 * root, math.sqrt(35.0 / 2) * 3 / 4 * root
-        c, d = math.sqrt(5.0) * 3 / 4 * root, math.sqrt(5.0 / 2) * 3 / 4 * root
-        values += [
-            a * x * y * (xx - yy),
-            -b * y * z * (3 * xx - yy),
-            c * x * y * (7 * zz - 1),
-            -d * y * z * (7 * zz - 3),
-            3 / 16 * root * (zz * (35 * zz - 30) + 3),
-            -d * x * z * (7 * zz - 3),
-            c / 2 * (xx - yy) * (7 * zz - 1),
-            -b * x * z * (xx - 3 * yy),
-            a / 4 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
-        ]
+    values: list[Any] = [None] * (degree + 1) ** 2
+    # Real and imaginary part of (x + i y)^m, and the factor of the first band that has this m.
+    cosine, sine, factor = np.ones_like(x), np.zeros_like(x), math.sqrt(0.25 / math.pi)
+    for m in range(degree + 1):
+        before, here = 0.0, factor
+        for band in range(m, degree + 1):
+            if band > m:  # the recurrence of Legendre's functions of z over (1 - z^2)^(m / 2)
+                step = math.sqrt((4 * band * band - 1) / (band * band - m * m))
+                before, here = here / step, step * (z * here - before)
+            middle = band * (band + 1)
+            values[middle + m] = here * cosine
+            if m:
+                values[middle - m] = here * sine
+        cosine, sine = x * cosine - y * sine, x * sine + y * cosine
+        factor *= -math.sqrt((2 * m + 3) / (2 * m + 2) * (1 if m else 2))
     return values
 
 
