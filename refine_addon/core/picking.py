@@ -20,9 +20,8 @@ from .merging.graph import nearest
 from .splats import Splats
 from .views import View, ViewSet
 from .visibility import projection
-from .visibility.cast import hits
+from .visibility.cast import cast, cast_visible
 from .visibility.projection import Footprints, Gaussians
-from .visibility.rays import in_front
 from .visibility.scene import Scene
 
 LIGHT_LEFT = 0.1
@@ -33,7 +32,6 @@ THICKNESS = 2.0  # a splat's standard deviations behind a surface up to which it
 RAYS = 25_000  # about how many rays find surfaces
 LEAST_STEP = 4  # pixels between two of these rays, at least
 _EMPTY = 0.1  # a ray with less alpha in all hits nothing
-_PAIRS = 1 << 17  # see `hits`
 
 Mode = Literal["SET", "ADD", "SUBTRACT", "INTERSECT"]
 """How chosen splats change a selection."""
@@ -106,17 +104,14 @@ class Sight:
 
     def surface(self, column: int, row: int) -> Surface | None:
         """The surface under a pixel; None where a ray hits less than an alpha of `_EMPTY`."""
-        pieces = list(hits(self.footprints, np.array([column]), np.array([row]), _PAIRS))
-        if not pieces:
-            return None
-        owners, _, alphas = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
-        left = np.cumprod(1.0 - alphas.astype(np.float64))  # behind each hit
+        rays = cast(self.footprints, np.array([column]), np.array([row]))
+        left = np.cumprod(1.0 - rays.alpha.astype(np.float64))  # behind each hit
         if not len(left) or left[-1] > 1.0 - _EMPTY:
             return None
-        shares = np.concatenate([[1.0], left[:-1]]) * alphas  # of the picture
+        shares = np.concatenate([[1.0], left[:-1]]) * rays.alpha  # of the picture
         shown = np.cumsum(shares)
         middle = int(np.searchsorted(shown, shown[-1] / 2.0))
-        gaussians = self.prepared.gaussians.take(self.footprints.index[owners])
+        gaussians = self.prepared.gaussians.take(rays.hit[rays.owner])
         colors = np.minimum(gaussians.colors.astype(np.float64), 1.0)
         center = self.prepared.splats.means[gaussians.index[middle]].astype(np.float64)
         view = self.view
@@ -138,21 +133,20 @@ def prepare(splats: Splats, view: View) -> Prepared:
 
 def look(prepared: Prepared, view: View) -> Sight:
     """Find where the splats lie in a view, and which are visible."""
-    gaussians = prepared.gaussians
+    gaussians, scene = prepared.gaussians, prepared.scene
     with np.errstate(under="ignore"):
-        footprints = projection.project(gaussians, prepared.scene, view)
-        centers, covariances = projection.in_camera(
-            gaussians.take(footprints.index), prepared.scene, view
-        )
+        footprints = projection.project(gaussians, scene, view)
+        depths = projection.coordinates(gaussians.means, scene, view)[2]
         step = max(LEAST_STEP, math.ceil(math.sqrt(view.width * view.height / RAYS)))
-        ends = surfaces(footprints, centers[2], view, step)
-    columns, rows = np.floor(footprints.centers).astype(np.int64)
-    across, down = (columns >= 0) & (columns < view.width), (rows >= 0) & (rows < view.height)
-    shown = np.flatnonzero(footprints.inside & across & down)
-    thick = THICKNESS * np.sqrt(np.maximum(covariances[5, shown], 0.0))
-    end = ends[rows[shown] // step, columns[shown] // step]
-    pixels, visible = np.stack([columns[shown], rows[shown]]), centers[2, shown] <= end + thick
-    centered = gaussians.take(footprints.index[shown])
+        ends = surfaces(footprints, depths, view, step)
+        pixels = np.floor(footprints.centers).astype(np.int64)
+        within = ((pixels >= 0) & (pixels < [[view.width], [view.height]])).all(axis=0)
+        shown = np.flatnonzero(footprints.inside & within)
+        pixels, rows = pixels[:, shown], footprints.index[shown]
+        centered = gaussians.take(rows)
+        _, covariances = projection.in_camera(centered, scene, view)
+    thick = THICKNESS * np.sqrt(np.maximum(covariances[5], 0.0))
+    visible = depths[rows] <= ends[pixels[1] // step, pixels[0] // step] + thick
     return Sight(prepared, view, footprints, centered, pixels, visible)
 
 
@@ -162,25 +156,17 @@ def surfaces(
     """Depths of surfaces along the view's axis, (rows, columns) float32, infinite without one.
 
     One ray for each cell of `step` pixels, whose surface is the first hit that leaves at most
-    `LIGHT_LEFT`. `footprints` are front to back, `depths`, (n,), are those of their centres.
+    `LIGHT_LEFT`. `depths`, (M,), are those of the centres of all Gaussians.
     """
     columns, rows = (
         np.minimum(np.arange(0, size, step) + step // 2, size - 1)
         for size in (view.width, view.height)
     )
-    ends = np.full(len(columns) * len(rows), np.inf, np.float32)
-    thickness = np.zeros(len(ends))  # optical, of what rays have met
-    limit = -math.log(LIGHT_LEFT)
-    pieces = hits(footprints, columns, rows, _PAIRS, lambda _, rays: np.isinf(ends[rays]))
-    for owners, rays, alphas in pieces:
-        order = np.argsort(rays, kind="stable")  # hits of a ray stay front to back
-        ray, thick = rays[order], -np.log1p(-alphas[order].astype(np.float64))
-        met, counts = np.unique(ray, return_counts=True)
-        behind = in_front(thick, counts) + thick + thickness[ray]
-        dark = np.flatnonzero(behind > limit)
-        ended, first = np.unique(ray[dark], return_index=True)
-        ends[ended] = depths[owners[order[dark[first]]]]
-        thickness[met] = behind[np.cumsum(counts) - 1]
+    rays, before = cast_visible(footprints, columns, rows)
+    ends = np.full(rays.count, np.inf, np.float32)
+    dark = np.flatnonzero(before * (1.0 - rays.alpha) < LIGHT_LEFT)
+    ended, first = np.unique(rays.ray[dark], return_index=True)
+    ends[ended] = depths[rays.hit[rays.owner[dark[first]]]]
     return ends.reshape(len(rows), len(columns))
 
 

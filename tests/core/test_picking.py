@@ -101,7 +101,7 @@ def test_surfaces_lie_where_a_ray_has_lost_its_light():
     scene = splats(np.concatenate([wall(2.0 + 0.1 * k, edge=0.5) for k in range(9)]), logit=0.0)
     shown = seen(scene)
     footprints = shown.footprints
-    depths = scene.means[shown.prepared.gaussians.index[footprints.index], 2]
+    depths = scene.means[shown.prepared.gaussians.index, 2]
     found = picking.surfaces(footprints, depths, view(), 10)
     axes = np.stack([footprints.major.T, footprints.minor.T], axis=2)
     inverse = np.linalg.inv(axes @ axes.transpose(0, 2, 1))
@@ -109,7 +109,7 @@ def test_surfaces_lie_where_a_ray_has_lost_its_light():
         away = np.array([[column * 10 + 5.5], [row * 10 + 5.5]]) - footprints.centers
         alphas = 0.5 * np.exp(-np.einsum("in,nij,jn->n", away, inverse, away) / 2)
         left = np.cumprod(1 - np.where(alphas < 1 / 255, 0.0, alphas))
-        assert found[row, column] == depths[np.argmax(left < 0.1)]
+        assert found[row, column] == depths[footprints.index[np.argmax(left < 0.1)]]
 
 
 def test_a_ball_and_a_colour_take_what_is_near_them(walls):
