@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..affine import AXES, UNKNOWN_AXES, turned
 from ..errors import RefineError
 from ..mapped import file_bytes
-from ..place import LARGEST_NUMBER, Place, refuse_pointer
+from ..place import Place, refuse_pointer
 from ..splats import Model, Splats, drawable
 from ..whole_file import Url, expanded, whole_file
 from . import by_name, compressed_ply, glb, sog, spz, streamed_sog
@@ -170,16 +170,7 @@ def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: 
     if not good.any():
         Place(path).fail(f"none of the {len(splats)} splats can be drawn: nothing to write")
     splats = (splats if good.all() else splats.take(good)).up_to_degree(form.degree)
-    if form is spz.FORMAT and file.axes == AXES[0]:
-        splats = turned(splats, AXES[0])
-    return replace(splats, sh_dc=_tame(splats.sh_dc), sh_rest=_tame(splats.sh_rest))
-
-
-def _tame(colors):
-    """Colours clipped to the largest number that is read from JSON."""
-    if not colors.size or -LARGEST_NUMBER <= colors.min() <= colors.max() <= LARGEST_NUMBER:
-        return colors
-    return np.clip(colors, -LARGEST_NUMBER, LARGEST_NUMBER)
+    return turned(splats, AXES[0]) if form is spz.FORMAT and file.axes == AXES[0] else splats
 
 
 def written_size(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError, reason_of
 from ..images import codec_for
-from ..place import Place, is_sog, named_json
+from ..place import LARGEST_NUMBER, Place, is_sog, named_json
 from ..splats import MODELS, Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from ..visibility.scene import nearby_order
 from .format import Format, codes, join_largest, new_file, pieces, split_largest
@@ -314,7 +314,7 @@ def contents(path: Path, splats: Splats) -> Iterator[tuple[str, bytes]]:
 
 def _tabulated(values):
     """Table of 256 values, half in even steps and half quantiles, and the nearest to each value."""
-    flat = np.sort(values, axis=None)
+    flat = np.sort(values, axis=None).clip(-LARGEST_NUMBER, LARGEST_NUMBER)  # which is read again
     half = _TABLE // 2
     shares = np.linspace(0.0, 1.0, half)
     even = flat[0] + (float(flat[-1]) - float(flat[0])) * shares
