@@ -93,8 +93,7 @@ def _row(level, degree):
 
 def _read_ksplat(path, data):
     refuse_short(path, _HEADER_BYTES, len(data), "the first bytes of a .ksplat file")
-    fields = _HEADER.unpack(data[: _HEADER.size].tobytes())
-    major, minor, number, announced, level, least, largest = fields
+    major, minor, number, announced, level, least, largest = _HEADER.unpack_from(data)
     if (major, minor) != (0, 1):
         Place(path).fail(f".ksplat version {major}.{minor}, expected 0.1")
     if level >= _LEVELS:
@@ -122,8 +121,7 @@ def _sections(path, data, count, level):
     for number in range(count):
         at = _HEADER_BYTES + number * _SECTION_BYTES
         place = Place(path, f"section {number}")
-        fields = _SECTION.unpack(data[at : at + _SECTION.size].tobytes())
-        section = _Section(place, start, *fields)
+        section = _Section(place, start, *_SECTION.unpack_from(data, at))
         section = section._replace(middle=section.middle or _MIDDLE)
         if section.degree >= _DEGREES:
             place.fail(f"harmonics of degree {section.degree}, expected 0 to {_DEGREES - 1}")

@@ -205,13 +205,13 @@ def _opened(path, data):
 def _chunks(path, data):
     """Chunks of a GLB by kind, the first of each."""
     refuse_short(path, HEADER.size + CHUNK.size, len(data), "the first bytes of a GLB file")
-    _, version, length = HEADER.unpack(data[: HEADER.size].tobytes())
+    _, version, length = HEADER.unpack_from(data)
     if version != VERSION:
         Place(path).fail(f"glTF version {version}, expected {VERSION}")
     refuse_short(path, length, len(data), "all chunks")
     at, chunks = HEADER.size, dict[bytes, NDArray[np.uint8]]()
     while at + CHUNK.size <= length:
-        size, kind = CHUNK.unpack(data[at : at + CHUNK.size].tobytes())
+        size, kind = CHUNK.unpack_from(data, at)
         at += CHUNK.size
         refuse_short(path, at + size, length, f"a chunk at byte {at} and what is before it")
         chunks.setdefault(kind, data[at : at + size])

@@ -154,7 +154,7 @@ def _unpacked(path, data):
 def _streams(path, data, header):
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
-    (at,) = _TABLE_AT.unpack(data[_HEADER.size : first].tobytes())
+    (at,) = _TABLE_AT.unpack_from(data, _HEADER.size)
     widths = header.widths() if header.splats else {}
     lengths = {name: header.splats * width for name, width in widths.items() if width}
     if header.streams < len(lengths):
@@ -163,7 +163,7 @@ def _streams(path, data, header):
     refuse_short(path, start, len(data), "the table of streams")
     body, filled = np.empty(header.needed(), np.uint8), 0
     for name, length in lengths.items():
-        packed, announced = _STREAM.unpack(data[at : at + _STREAM.size].tobytes())
+        packed, announced = _STREAM.unpack_from(data, at)
         at += _STREAM.size
         if announced != length:
             Place(path).fail(f"stream '{name}' announces {announced} bytes, expected {length}")
