@@ -31,6 +31,9 @@ from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, Cha
 
 HEADER_LIMIT = 1 << 20  # longest header that is read, bytes
 TEXT = "="  # stands for ASCII among byte orders: once parsed, numbers have the machine's
+FORMATS = {"<": "binary_little_endian 1.0", ">": "binary_big_endian 1.0", TEXT: "ascii 1.0"}
+"""Byte order -> format, as a header has it; PLY has no other version."""
+
 PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort"}
 PLY_TYPES |= {"i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # NumPy's names -> PLY's
 
@@ -210,7 +213,7 @@ def read_plain(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     rows = body[at].view(header.elements[vertex].dtype(header.order))
     indexing = tuple(name for name in filled if name in INDEXING)
     beside = body[: at.start], body[at.stop :]
-    return SplatFile(path, rows, header.raw, *beside, indexing, format_of(header.raw), len(data))
+    return SplatFile(path, rows, header.raw, *beside, indexing, FORMATS[header.order], len(data))
 
 
 class Header(NamedTuple):
@@ -353,7 +356,7 @@ def _text_file(header: Header, vertex: int, filled: list[str], body: bytes) -> S
     remark = f"{path.name} is text; a PLY that is written of it is binary"
     remark += f", without the elements beside its splats ({left})" if left else ""
     return SplatFile(
-        Path(path), rows, vertex_header(header.raw), format=format_of(header.raw),
+        Path(path), rows, vertex_header(header.raw), format=FORMATS[header.order],
         stored_bytes=len(header.raw) + len(body), remarks=(remark,),
     )  # fmt: skip
 
@@ -412,12 +415,6 @@ def new_header(rows: np.dtype[Any], count: int) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {PLY_TYPES[rows[name].str[1:]]} {name}" for name in rows.names or ()]
     return "\n".join([*lines, "end_header", ""]).encode()
-
-
-def format_of(raw: bytes) -> str:
-    """Format that a header announces, such as ``binary_little_endian 1.0``."""
-    words = next((words for words in map(bytes.split, _lines(raw)) if words[:1] == [b"format"]), [])
-    return b" ".join(words[1:]).decode("ascii", "replace")
 
 
 def vertex_header(raw: bytes) -> bytes:

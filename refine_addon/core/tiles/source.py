@@ -66,7 +66,7 @@ def tile_at(path: Path | str, model: Model | None = None) -> Tile:
     header, vertex = ply.splat_header(place, storage.beginning(place, ply.HEADER_LIMIT, size))
     if header.order == ply.TEXT:
         raise RefineError(
-            f"{place}: is {ply.format_of(header.raw)}, expected a plain binary PLY as a tile, "
+            f"{place}: is {ply.FORMATS[header.order]}, expected a plain binary PLY as a tile, "
             "which 'refine convert IN OUT.ply' makes of other formats"
         )
     begin = ply.row_ranges(header, size - len(header.raw))[vertex].start
