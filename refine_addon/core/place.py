@@ -59,11 +59,7 @@ class Place:
         """A list of `count` numbers."""
         if not isinstance(value, list) or len(value) != count:
             self.expected(f"a list of {count} numbers", value)
-        try:
-            return [self.number(item) for item in value]
-        except RefineError:
-            # A place for each number would take longer than the checks of all.
-            return [self.at(f"[{index}]").number(item) for index, item in enumerate(value)]
+        return [self.at(f"[{index}]").number(item) for index, item in enumerate(value)]
 
     def whole(self, value: object, least: int = 0, most: int = LARGEST_COUNT) -> int:
         """A whole number from `least` to `most`."""
