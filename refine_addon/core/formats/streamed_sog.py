@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import checkpoint
 from ..place import Place, described, named_json
 from ..splats import Splats, assign, rotation_matrices, scales
 from ..visibility.scene import nearby_order
@@ -199,8 +198,6 @@ class StreamedSog:
 
         An index that is replaced stays whole, with its folders, until the new one is in place.
         """
-        checkpoint()
-        refuse_existing(path, overwrite=overwrite)
         old, text = _folders_of(path), b""
         moved: list[Path] = []
         try:
