@@ -105,20 +105,18 @@ class Sight:
     def surface(self, column: int, row: int) -> Surface | None:
         """The surface under a pixel; None where a ray hits less than an alpha of `_EMPTY`."""
         rays = cast(self.footprints, np.array([column]), np.array([row]))
-        left = np.cumprod(1.0 - rays.alpha.astype(np.float64))  # behind each hit
-        if not len(left) or left[-1] > 1.0 - _EMPTY:
+        shown = np.cumsum(rays.weights(), dtype=np.float64)  # up to each hit, of the picture
+        if not len(shown) or shown[-1] < _EMPTY:
             return None
-        shares = np.concatenate([[1.0], left[:-1]]) * rays.alpha  # of the picture
-        shown = np.cumsum(shares)
-        middle = int(np.searchsorted(shown, shown[-1] / 2.0))
-        gaussians = self.prepared.gaussians.take(rays.hit[rays.owner])
-        colors = np.minimum(gaussians.colors.astype(np.float64), 1.0)
+        gaussians = self.prepared.gaussians.take(rays.hit)
+        color = rays.colors(np.minimum(gaussians.colors.T, np.float32(1.0)))[:, 0] / shown[-1]
+        middle = rays.owner[np.searchsorted(shown, shown[-1] / 2.0)]
         center = self.prepared.splats.means[gaussians.index[middle]].astype(np.float64)
         view = self.view
         depth = float((view.rotation @ (center - view.center))[2])
         ray = ((column + 0.5 - view.cx) / view.fx, (row + 0.5 - view.cy) / view.fy, 1.0)
         place = view.center + view.rotation.T @ ray * depth
-        return Surface(place, shares @ colors / shown[-1], view.fx / depth)
+        return Surface(place, color, view.fx / depth)
 
     def _of(self, chosen, hidden):
         mask = np.zeros(len(self.prepared.splats), np.bool_)
