@@ -283,20 +283,13 @@ def _fitted(before, after):
     extents = np.abs(before).max(axis=1) + np.abs(after).max(axis=1)
     weights = 1.0 / (extents + (np.median(extents) or 1.0))
     middle, target = (np.average(points, axis=0, weights=weights) for points in (before, after))
-    source = (before - middle) * weights[:, None]
-    left, spread, axes = np.linalg.svd(source, full_matrices=False)
-    if len(spread) < 3 or not spread[1] > _PLANAR * spread[0]:
-        return None
-    # Points in a plane leave the axis across it free: it gets their mean scale, unmirrored.
-    flat = not spread[2] > _PLANAR * spread[0]
-    inverse = np.array([1.0 / spread[0], 1.0 / spread[1], 0.0 if flat else 1.0 / spread[2]])
-    images = (inverse[:, None] * left.T) @ ((after - target) * weights[:, None])  # (3 axes, 3)
-    if flat:
-        images[2] = np.cross(images[0], images[1]) * np.linalg.det(axes)
-        length = np.linalg.norm(images[2])
-        images[2] /= np.sqrt(length) or 1.0
+    source, goal = (before - middle) * weights[:, None], (after - target) * weights[:, None]
+    linear, _, rank, _ = np.linalg.lstsq(source, goal, rcond=_PLANAR)
+    left, scales, right = np.linalg.svd(linear.T)
+    if rank == 2:  # points in a plane leave the axis across it free: their mean scale, unmirrored
+        scales[2] = np.sqrt(scales[0] * scales[1])
+        left[:, 2] *= np.linalg.det(left @ right)
     matrix = np.eye(4)
-    matrix[:3, :3] = (axes.T @ images).T
+    matrix[:3, :3] = (left * scales) @ right
     matrix[:3, 3] = target - matrix[:3, :3] @ middle
-    scales = scales_of(matrix)
-    return matrix if scales[2] > _PLANAR * scales[0] else None
+    return matrix if rank > 1 and scales[1:].min() > _PLANAR * scales[0] else None
