@@ -210,8 +210,7 @@ def touching(
     one, other = np.repeat(rows, near.shape[1]), near.ravel()
     step = points[other] - points[one]
     length = np.sqrt(np.einsum("ij,ij->i", step, step))
-    unit = (step / np.maximum(length, np.finfo(np.float64).tiny)[:, None]).T
-    x, y, z = unit
+    x, y, z = (step / np.maximum(length, np.finfo(np.float64).tiny)[:, None]).T  # of length 1
     reach = np.zeros(len(one))
     for ends in (one, other):  # by their standard deviations along the step
         xx, xy, xz, yy, yz, zz = gaussians.covariances[:, ends].astype(np.float64)
@@ -229,9 +228,8 @@ def connected(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> N
         before = labels.copy()
         for ends in (one, other):
             lower = low < labels[ends]
-            # The root of a part that touches a lower one, and the node itself, move there.
+            # The root of a part that touches a lower one moves there, and its nodes follow.
             np.minimum.at(labels, before[ends[lower]], low[lower])
-            np.minimum.at(labels, ends[lower], low[lower])
         while not np.array_equal(jumped := labels[labels], labels):
             labels = jumped
         if np.array_equal(labels, before):
