@@ -296,10 +296,7 @@ def forced(
     )
     protected = any_of(protected, protect)
     removed = any_of(removed, remove, None if keep is None else ~keep)
-    if removed is not None:
-        gone = must_go(removed, protected)
-        removed = np.zeros_like(removed) if gone is None else gone
-    return Forced(protected, removed, facts)
+    return Forced(protected, must_go(removed, protected), facts)
 
 
 def any_of(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
