@@ -18,7 +18,10 @@ LARGEST = np.float32(1e36)  # coefficient that counts: 25 of them add up to a fl
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 _LUMA = (0.2126, 0.7152, 0.0722)  # shares of red, green and blue in a grey (ITU-R BT.709)
 _GAMMA = 2.2  # of the power that the curve of sRGB is near
-_DIRECTIONS = 4096  # over which stretched harmonics are fitted; degree 4 has 25 coefficients
+
+_DIRECTIONS = np.random.default_rng(0).normal(size=(4096, 3))
+_DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
+"""Over which stretched harmonics are fitted; degree 4 has 25 coefficients."""
 
 
 def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
@@ -86,9 +89,8 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]
         return np.asarray(sh_rest * flips[1:, None].astype(np.float32))
     rotated = np.empty_like(sh_rest, np.float64)
     # A rotation maps each band to itself. Its matrix is fitted to more directions than it has rows.
-    points = np.random.default_rng(0).normal(size=(64, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    here, before = basis(points, degree), basis(points @ rotation, degree)
+    some = _DIRECTIONS[:64]
+    here, before = basis(some, degree), basis(some @ rotation, degree)
     for band in range(1, degree + 1):
         columns = slice(band * band, (band + 1) ** 2)
         matrix = np.linalg.lstsq(here[:, columns], before[:, columns], rcond=None)[0]
@@ -160,11 +162,9 @@ def stretched(
     directions d: harmonics of the same degree cannot equal it. `linear`, (3, 3), is invertible.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
-    here = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
-    here /= np.linalg.norm(here, axis=1, keepdims=True)
-    before = here @ np.linalg.inv(linear).T
+    before = _DIRECTIONS @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=1, keepdims=True)
-    matrix = np.linalg.lstsq(basis(here, degree), basis(before, degree), rcond=None)[0]
+    matrix = np.linalg.lstsq(basis(_DIRECTIONS, degree), basis(before, degree), rcond=None)[0]
     result = np.concatenate([sh_dc[:, None], sh_rest], axis=1, dtype=np.float64)
     _map(matrix, result, result)
     return result[:, 0], result[:, 1:]
