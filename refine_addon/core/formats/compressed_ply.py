@@ -91,7 +91,7 @@ def _read(path, data):
             splats.log_scales[piece] = _between(sizes, here, _SCALE)
             shares = _unpacked(rows["packed_color"], _CHANNELS)
             if colored:
-                _between(shares[:, :3], here, _COLOR)
+                shares[:, :3] = _between(shares[:, :3], here, _COLOR)
             set_colors(splats.take(piece), shares)
             turns = rows["packed_rotation"]
             others = (_unpacked(turns, _TURNS) - 0.5) * np.sqrt(2.0)
@@ -108,28 +108,22 @@ def _chunks_of(piece):
 
 def _unpacked(values, fields):
     """F bit fields of 32-bit numbers, (n,), as shares of their largest codes, (n, F)."""
-    shares = np.empty((len(values), len(fields)))
-    for index, (shift, largest) in enumerate(fields):
-        shares[:, index] = ((values >> np.uint32(shift)) & np.uint32(largest)) / largest
-    return shares
+    shifts, largest = np.array(fields, np.uint32).T
+    return ((values[:, None] >> shifts) & largest) / largest
 
 
 def _packed(shares, fields):
     """Shares (n, F) as 32-bit numbers (n,), the reverse of `_unpacked`."""
-    packed = np.zeros(len(shares), np.uint32)
-    for index, (shift, largest) in enumerate(fields):
-        code = np.rint(np.clip(shares[:, index], 0.0, 1.0) * largest).astype(np.uint32)
-        packed |= code << np.uint32(shift)
-    return packed
+    shifts, largest = np.array(fields, np.uint32).T
+    codes = np.rint(np.clip(shares, 0.0, 1.0) * largest).astype(np.uint32)
+    return np.bitwise_or.reduce(codes << shifts, axis=1)
 
 
 def _between(shares, chunks, names):
-    """Vectors, (n, 3), from shares of their chunks' ranges; the shares are overwritten."""
-    for axis, share in enumerate(shares.T):
-        ends = (chunks[name].astype(np.float64) for name in (names[axis], names[axis + 3]))
-        low, high = (np.repeat(end, SPLATS)[: len(shares)] for end in ends)
-        share[:] = low * (1.0 - share) + high * share
-    return shares
+    """Vectors, (n, 3), from shares, (n, 3), of their chunks' ranges."""
+    ends = np.stack([chunks[name] for name in names], axis=1).astype(np.float64)
+    low, high = np.hsplit(np.repeat(ends, SPLATS, axis=0)[: len(shares)], 2)
+    return low * (1.0 - shares) + high * shares
 
 
 _REST = np.concatenate([[0.0], (np.arange(1, 255) + 0.5) / 256.0, [1.0]]) * REST_RANGE - 4.0
