@@ -40,6 +40,7 @@ _ONE_TURN, _ZSTD = 2, 4  # versions with rotations as x y z, and with zstd strea
 _DEGREES = 5  # how many, from 0
 _COLOR_STEP = 0.15  # share of the codes for 1 of f_dc; they reach colours somewhat outside 0..1
 _SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
+_PLACES = np.array([30, 20, 10, 0], np.uint32)  # of bits of a rotation: largest, three components
 _BUCKETS = (8, 16)  # steps, 1 / 128 each, to which harmonics of degree 1 and above are rounded
 
 _USUAL_FRACTION, _LEAST_STEPS = 12, 18
@@ -211,13 +212,11 @@ def _rotations(block):
     """Quaternions w x y z; in the file they are x y z w."""
     if block.shape[1] == 3:
         return join_largest(np.zeros(len(block), np.intp), block / 127.5 - 1.0)
-    packed = np.ascontiguousarray(block).view("<u4")[:, 0]
-    others = np.empty((len(packed), 3))
-    for index, shift in enumerate((20, 10, 0)):
-        code = packed >> np.uint32(shift)
-        size = (code & np.uint32(511)) * (math.sqrt(0.5) / 511.0)
-        others[:, index] = np.where(code & np.uint32(512), -size, size)
-    return join_largest((packed >> np.uint32(30)).astype(np.intp), others)[:, [3, 0, 1, 2]]
+    largest, *codes = (np.ascontiguousarray(block).view("<u4") >> _PLACES).T
+    code = np.stack(codes, axis=1)
+    size = (code & np.uint32(511)) * (math.sqrt(0.5) / 511.0)
+    others = np.where(code & np.uint32(512), -size, size)
+    return join_largest(largest.astype(np.intp), others)[:, [3, 0, 1, 2]]
 
 
 def _write(stream, splats):
@@ -261,11 +260,9 @@ def _fraction(splats):
 
 def _packed_rotations(quaternions):
     largest, others = split_largest(unit_quaternions(quaternions)[:, [1, 2, 3, 0]])
-    packed = largest.astype("<u4")
-    for index in range(3):
-        size = np.rint(np.abs(others[:, index]) * (511.0 * math.sqrt(2.0))).astype(np.uint32)
-        sign = (others[:, index] < 0.0).astype(np.uint32) << np.uint32(9)
-        packed = (packed << np.uint32(10)) | sign | np.minimum(size, np.uint32(511))
+    size = np.minimum(np.rint(np.abs(others) * (511.0 * math.sqrt(2.0))), 511.0)
+    codes = np.column_stack([largest, size + 512.0 * (others < 0.0)]).astype(np.uint32)
+    packed = np.bitwise_or.reduce(codes << _PLACES, axis=1)
     return packed.astype("<u4").view(np.uint8).reshape(-1, 4)
 
 
