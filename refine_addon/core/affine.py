@@ -159,17 +159,11 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     The eigenvector of the largest eigenvalue (Bar-Itzhack 2000): as accurate for half a turn.
     """
     m = np.asarray(rotation, np.float64)
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    xy, xz = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0]
-    yz = m[..., 2, 1] + m[..., 1, 2]
-    rows = [
-        [xx + yy + zz, a, b, c],
-        [a, xx - yy - zz, xy, xz],
-        [b, xy, yy - xx - zz, yz],
-        [c, xz, yz, zz - xx - yy],
-    ]
-    symmetric = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    inverse, trace = np.swapaxes(m, -1, -2), np.trace(m, axis1=-2, axis2=-1)
+    symmetric = np.zeros((*trace.shape, 4, 4))  # its lower half
+    symmetric[..., 0, 0] = trace
+    symmetric[..., 1:, 0] = (m - inverse)[..., [2, 0, 1], [1, 2, 0]]
+    symmetric[..., 1:, 1:] = m + inverse - trace[..., None, None] * np.eye(3)
     q = np.linalg.eigh(symmetric)[1][..., -1]
     return np.where(q[..., :1] < 0.0, -q, q)
 
