@@ -36,8 +36,6 @@ _PLANAR = 1e-5  # thickness over extent up to which points count as lying in a p
 _SAMPLE, _FITTED = 2048, 16384
 """Points, evenly spread, by which candidates are compared, and to which the best is fitted."""
 
-_ROWS = 1 << 14  # points that are mapped at a time
-
 _TRIES, _DRAWN = 240, 4
 """Candidates for each map, and points that each is fitted to: the fewest that determine one."""
 
@@ -258,13 +256,9 @@ def _spread(rows, most):
 
 def _fits(matrix, before, after, *, slack=1.0):
     """Points that a map moves as they moved, up to `slack` times rounding, (N,) bool."""
-    fits = np.empty(len(before), np.bool_)
     turn, shift = np.abs(matrix[:3, :3]).T, np.abs(matrix[:3, 3])
-    for part in chunks(len(before), _ROWS):  # small enough for the caches
-        start, end = before[part], after[part]
-        allowed = slack * _NOISE * (np.abs(start) @ turn + shift + np.abs(end)).max(axis=1)
-        fits[part] = np.abs(moved(start, matrix) - end).max(axis=1) <= allowed
-    return fits
+    allowed = slack * _NOISE * (np.abs(before) @ turn + shift + np.abs(after)).max(axis=1)
+    return np.abs(moved(before, matrix) - after).max(axis=1) <= allowed
 
 
 def _fitted(before, after):
