@@ -195,13 +195,11 @@ def unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 
 def single_unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float32]:
     """Unit quaternions, (N, 4) float32, as Blender's: zero is the identity, unit ones keep bits."""
-    with np.errstate(over="ignore", under="ignore"):  # doubles beyond float32
+    with np.errstate(all="ignore"):  # doubles beyond float32, and what is not finite
         q = np.array(quaternions, np.float32)
-    finite = np.isfinite(q).all(axis=1)
-    wide = np.where(finite[:, None], q, 1.0).astype(np.float64)
-    with np.errstate(under="ignore"):
-        other = np.abs(np.einsum("ij,ij->i", wide, wide) - 1.0) > _UNIT_TOLERANCE
-    off = finite & other
+        wide = q.astype(np.float64)
+        off = np.abs(np.einsum("ij,ij->i", wide, wide) - 1.0) > _UNIT_TOLERANCE
+    off &= np.isfinite(q).all(axis=1)
     q[off] = unit_quaternions(q[off])
     return q
 
