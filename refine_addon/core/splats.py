@@ -152,17 +152,16 @@ LOG_ZERO = -104.0
 
 
 def opacity_logits(
-    opacities: NDArray[Any], margin: float = OPACITY_MARGIN, least: float | None = None
+    opacities: NDArray[Any], least: float = OPACITY_MARGIN, most: float = 1.0 - OPACITY_MARGIN
 ) -> NDArray[np.float64]:
-    """Inverse of `opacity`, (...) float64, values clipped to ``least..1 - margin``; NaN stays."""
-    low = margin if least is None else least
-    inside = np.clip(np.asarray(opacities, np.float64), low, 1.0 - margin)
+    """Inverse of `opacity`, (...) float64, values clipped to ``least..most``; NaN stays."""
+    inside = np.clip(np.asarray(opacities, np.float64), least, most)
     return np.asarray(np.log(inside) - np.log1p(-inside))
 
 
 def single_logits(opacities: NDArray[Any]) -> NDArray[np.float64]:
     """Logits (...) float64 of float32 opacities; `opacity`, rounded to float32, inverts it."""
-    return opacity_logits(opacities, SINGLE_MARGIN, math.exp(LOG_ZERO))
+    return opacity_logits(opacities, math.exp(LOG_ZERO), 1.0 - SINGLE_MARGIN)
 
 
 def scales(log_scales: NDArray[Any]) -> NDArray[np.float64]:

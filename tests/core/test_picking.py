@@ -12,8 +12,6 @@ from refine_addon.core.splats import SH_C0, Splats
 from refine_addon.core.views import View, pinhole
 
 SIZE = 100
-
-
 EVERYWHERE = np.ones((SIZE, SIZE), np.bool_)
 
 
