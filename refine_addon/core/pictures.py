@@ -137,13 +137,10 @@ class _Cut:
         self._background = None if layers.background is None else flat(layers.background)
         self._log_front = np.zeros(self._limits.shape)  # transmittance of splats in front of each
 
-    def shows(self, footprint, pixel):
-        """Pairs of splat and pixel that the layers do not hide, (p,) bool."""
-        return self._left[self._before(footprint, pixel), pixel] > 0.0
-
     def shares(self, footprint, pixel, alpha):
         """Transmittance of layers before each hit, (h,); adds the hits to what is before layers."""
-        before = self._before(footprint, pixel)
+        # Number of layers in front of each splat in its pixel.
+        before = np.count_nonzero(self._depths[footprint] >= self._limits[:, pixel], axis=0)
         log_passed = np.log1p(-alpha)
         for layer, log_front in enumerate(self._log_front):
             log_front += np.bincount(pixel, log_passed * (before <= layer), len(log_front))
@@ -158,10 +155,6 @@ class _Cut:
             image[:3] += passed * self._background
         image[3] = 1.0 - passed * self._left[-1]
 
-    def _before(self, footprint, pixel):
-        """Number of layers in front of each splat in its pixel, (p,)."""
-        return np.count_nonzero(self._depths[footprint] >= self._limits[:, pixel], axis=0)
-
 
 def _strip(footprints, colors, columns, rows, cut):
     """`draw` in C columns and R rows, ascending, (4, R * C), with colours (3, n) float64."""
@@ -169,11 +162,10 @@ def _strip(footprints, colors, columns, rows, cut):
     pixels = len(columns) * len(rows)
     log_left, image = np.zeros(pixels), np.zeros((4, pixels))  # logarithm of the transmittance
 
-    def wanted(footprint, pixel):
-        unfinished = (log_left > LOG_OPAQUE).take(pixel)
-        return unfinished if cut is None else unfinished & cut.shows(footprint, pixel)
+    def lit():
+        return log_left > LOG_OPAQUE
 
-    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, wanted):
+    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, lit):
         order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
         owner, pixel, alpha = owner[order], pixel[order], alpha[order]
         weight = _weights(pixel, alpha, log_left)

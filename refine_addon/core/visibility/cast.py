@@ -51,7 +51,7 @@ BEHIND = 1e-4
 LOG_DIM = -6.9  # of the transmittance, 1e-3, where `cast_visible` ends rays
 
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
-_FOOTPRINTS = 1 << 18  # whose boxes are held at a time
+_FOOTPRINTS = 1 << 14  # whose boxes are held at a time
 _SPLATS = 1 << 12  # whose colours are computed at a time, likewise
 _MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
@@ -240,12 +240,12 @@ def cast_visible(
     log_left = np.zeros(len(columns) * len(rows))
 
     def visible_hits():
-        for piece in hits(footprints, columns, rows, _PAIRS, wanted):
+        for piece in hits(footprints, columns, rows, _PAIRS, lit):
             yield piece
             log_left[:] += np.bincount(piece[1], np.log1p(-piece[2]), len(log_left))
 
-    def wanted(_footprint, ray):
-        return (log_left > LOG_DIM - _MARGIN).take(ray)
+    def lit():
+        return log_left > LOG_DIM - _MARGIN
 
     return _front_to_back(footprints, columns, rows, None, visible_hits()).visible(LOG_DIM)
 
@@ -277,14 +277,14 @@ def hits(
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
     limit: int,
-    wanted: Callable[[NDArray[np.int64], NDArray[np.int32]], NDArray[np.bool_]] | None = None,
+    lit: Callable[[], NDArray[np.bool_]] | None = None,
     *,
     aims: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
     """Yield hits of some footprints at a time: ascending rows of these, rays, alphas, (h,) each.
 
     Columns, rows and aims are those of `Rays`. About `limit` pairs of footprint and pixel in its
-    bounding box are held at once; `wanted` says which pairs to test, by footprints and rays, (p,).
+    bounding box are held at once; `lit` says which of all rays, (P,) bool, still want hits.
     """
     for piece in chunks(len(footprints.index), _FOOTPRINTS):
         some = footprints.part(piece)
@@ -298,15 +298,18 @@ def hits(
             across, down = (
                 (np.maximum(first - 1, 0), count + (first > 0)) for first, count in (across, down)
             )
-        boxed = np.flatnonzero(across[1] * down[1] > 0)  # (r,)
+        reached = across[1] * down[1]
+        if lit is not None:
+            reached *= _reached(lit().reshape(len(rows), len(columns)), across, down)
+        boxed = np.flatnonzero(reached > 0)  # (r,)
         ends = np.cumsum((across[1] * down[1])[boxed])
         cuts = np.searchsorted(ends, np.arange(0, int(ends[-1:].sum()), limit)).tolist()
         for start, end in pairwise([*cuts, len(boxed)]):
             checkpoint()
             owner, column, row = _boxed_pixels(boxed[start:end], across, down)
             pixel = row * np.int32(len(columns)) + column
-            if wanted is not None:
-                left = np.flatnonzero(wanted(owner + piece.start, pixel))
+            if lit is not None:
+                left = np.flatnonzero(lit().take(pixel))
                 if len(left) < len(owner):
                     owner, pixel = owner.take(left), pixel.take(left)
                     column, row = column.take(left), row.take(left)
@@ -319,6 +322,16 @@ def hits(
             owner = owner.take(inside)
             alpha = some.alphas.take(owner) * np.exp(squared.take(inside) / np.float32(-2.0))
             yield owner + piece.start, pixel.take(inside), np.minimum(alpha, np.float32(ALPHA_MAX))
+
+
+def _reached(lit, across, down):
+    """Whether boxes of footprints, (n,), hold any of the rays that are lit, (R, C)."""
+    sums = np.zeros((lit.shape[0] + 1, lit.shape[1] + 1), np.int32)
+    np.cumsum(lit, axis=0, out=sums[1:, 1:])
+    np.cumsum(sums, axis=1, out=sums)
+    (left, wide), (top, tall) = across, down
+    right, bottom = left + wide, top + tall
+    return sums[bottom, right] - sums[top, right] > sums[bottom, left] - sums[top, left]
 
 
 def _boxed_pixels(chosen, across, down):
