@@ -344,11 +344,10 @@ class _Prune:
             report(making, 0.0, "selecting")
             chosen = self._select(scores)
         keep, plain, beside = chosen
-        will_do = not refits and (  # so that merging need not be tried
+        if (  # so that merging need not be tried
             all(map(deletion_will_do, (plain, beside))) if goal is None
-            else quality_of(scores).share(goal, "merge") <= PLAIN
-        )  # fmt: skip
-        if will_do:
+            else not refits and quality_of(scores).share(goal, "merge") <= PLAIN
+        ):  # fmt: skip
             return self._deleted(scores, chosen)
         if goal is None:
             outcome = self._to_count(keep, scores, measurement, making)

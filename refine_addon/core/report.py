@@ -190,7 +190,7 @@ def deleted_note(plain: float | None, tried: float | None) -> str:
         more = "no more" if plain is not None and tried <= plain else "hardly more"
         why = f"merging reaches {in_words(tried)}, {more}"
     elif plain is not None:
-        why = "nobody would see what merging gains"
+        why = "nobody sees the difference"
     return f"rows stay as they were, the others are deleted: {why}"
 
 
