@@ -19,10 +19,7 @@ from refine_addon.core.visibility.scene import principal_axes
 from .test_occlusion import cloud, splats_of
 from .test_views import view
 
-FLOOR = {"depth": "distance", "frustum": False, "local": False}
-"""As the floor of occlusion reads it."""
-
-READINGS = [{}, {"depth": "distance"}, {"frustum": False}, {"local": False}, FLOOR]
+PRIORS = [False, True]  # the second is as the floor of occlusion reads it
 
 
 def random_scene(seed: int, count: int = 300) -> tuple[Splats, ViewSet]:
@@ -63,7 +60,7 @@ def middle_of(views: ViewSet) -> tuple[np.ndarray, float]:
     return middle, next(d for (d, _), p in zip(away, passed, strict=True) if p >= 0.5)
 
 
-def reference(splats, views, middle, depth="z", frustum=True, real=float) -> list:
+def reference(splats, views, middle, prior=False, real=float) -> list:
     """Evaluate the formulas of docs/method.md, but for neighbourhoods, splat by splat.
 
     `middle` is that of the views and their spread, `real` makes the numbers that are reckoned with.
@@ -89,7 +86,7 @@ def reference(splats, views, middle, depth="z", frustum=True, real=float) -> lis
             x, y, z = (sum(real(float(r)) * d for r, d in zip(row, step, strict=True))
                        for row in one.rotation)  # fmt: skip
             share, across = real(1), z
-            if frustum:
+            if not prior:
                 near = one.near if one.near > 0 else real("0.01") * maths.sqrt(size2)
                 half_x, half_y = real(one.width) / 2, real(one.height) / 2
                 fx, fy = real(one.fx), real(one.fy)
@@ -99,7 +96,7 @@ def reference(splats, views, middle, depth="z", frustum=True, real=float) -> lis
                 share -= (across - z) / (2 * s[2] * maths.sqrt(1 + fx * fy / (half_x * half_y)))
                 if not near <= z <= one.far or share <= 0:
                     continue
-            d2 = across * across if depth == "z" else sum(d * d for d in step)
+            d2 = sum(d * d for d in step) if prior else across * across
             total += weight * share / (d2 + eta)
         alpha = 1 / (1 + maths.exp(-real(float(splats.opacity_logits[i]))))
         total = alpha * (total or real("1e-6") / (squared[i] + eta))
@@ -144,17 +141,16 @@ def beside_their_neighbours(scores, offset, spread) -> np.ndarray:
     return changed
 
 
-@pytest.mark.parametrize("reading", READINGS)
+@pytest.mark.parametrize("prior", PRIORS)
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_scores_equal_a_plain_reference_for_every_setting(seed, reading):
+def test_scores_equal_a_plain_reference(seed, prior):
     """The stored score is float32, so 1e-5 leaves room for its rounding (6e-8) and no more."""
     splats, views = random_scene(seed)
     middle, spread = middle_of(views)
-    formula = {name: value for name, value in reading.items() if name != "local"}
-    expected = np.array(reference(splats, views, (middle, spread), **formula))
-    if reading.get("local", True):
+    expected = np.array(reference(splats, views, (middle, spread), prior))
+    if not prior:
         expected = beside_their_neighbours(expected, splats.means.astype(float) - middle, spread)
-    scores = closed_form.score(splats, views, **reading)
+    scores = closed_form.score(splats, views, prior=prior)
     np.testing.assert_allclose(scores.values, expected, rtol=1e-5)
 
 

@@ -28,7 +28,7 @@ from refine_addon.core.scoring import closed_form, occlusion
 from refine_addon.core.scoring.closed_form import lambdas
 from refine_addon.core.splats import ARRAYS, drawable
 
-from .test_closed_form import FLOOR, reference
+from .test_closed_form import beside_their_neighbours, reference
 from .test_occlusion import cloud as round_cloud
 from .test_views import view
 
@@ -41,7 +41,7 @@ METHODS = {"closed form": ClosedForm(), "occlusion": Occlusion()}
 TWO = ViewSet((view(), view([0.1, 0, 0])))
 by_method = pytest.mark.parametrize("settings", METHODS.values(), ids=METHODS)
 by_method_and_floor = pytest.mark.parametrize(
-    "settings", [*METHODS.values(), FLOOR], ids=[*METHODS, "floor"]
+    "settings", [*METHODS.values(), None], ids=[*METHODS, "floor"]
 )
 
 
@@ -59,9 +59,9 @@ def cloud(count: int = 20) -> Splats:
 
 
 def scored(splats, views=TWO, settings=METHODS["closed form"]):
-    """In this thread: NumPy's flags are raised in it alone."""
-    if isinstance(settings, dict):
-        return closed_form.score(splats, views, **settings, threads=1)
+    """In this thread: NumPy's flags are raised in it alone. None is the floor of occlusion."""
+    if settings is None:
+        return closed_form.score(splats, views, prior=True, threads=1)
     return score(splats, views, settings, threads=1)
 
 
@@ -172,7 +172,7 @@ def test_identical_splats_tie():
     for settings in METHODS.values():
         alone = scored(splats.take(slice(1)), ViewSet((view(),)), settings)
         assert alone.values == pytest.approx([1.0])
-    for settings in (METHODS["closed form"], FLOOR):
+    for settings in (METHODS["closed form"], None):
         scores = scored(splats, settings=settings)
         assert len(set(scores.values.tolist())) == 1
         assert np.flatnonzero(~select(scores, Budget(keep=30))).tolist() == list(range(20))
@@ -281,7 +281,8 @@ def test_scores_equal_fifty_digits_over_the_range(spread, steep):
     views = ViewSet(tuple(view([x, y, -1.0]) for x in (-0.5, 0.5) for y in (-0.25, 0.25)))
     middle = (0.0, 0.0, -1.0), 0.5**2 + 0.25**2
     expected = np.array([float(v) for v in reference(splats, views, middle, real=mpmath.mpf)])
-    values = scored(splats, views, {"local": False}).values
+    expected = beside_their_neighbours(expected, splats.means - np.array(middle[0]), middle[1])
+    values = scored(splats, views).values
     normal = expected > 1e-37  # below, float32 has no digits left and the floor takes over
     np.testing.assert_allclose(values[normal], expected[normal], rtol=1e-5)
     assert (values[~normal] <= 2e-37).all()

@@ -92,9 +92,9 @@ def agreement(one: Scores, other: Scores) -> list[float]:
 @pytest.mark.slow
 def test_closed_form_of_floats_keeps_the_splats_that_doubles_keep(file, views):
     splats = file.splats()
-    for form in ({}, {"depth": "distance"}, {"depth": "distance", "frustum": False}):
-        scores = closed_form.score(splats, views, **form)
-        assert agreement(scores, closed_form.score(wide(splats), views, **form)) == [1.0] * 9
+    for prior in (False, True):
+        scores = closed_form.score(splats, views, prior=prior)
+        assert agreement(scores, closed_form.score(wide(splats), views, prior=prior)) == [1.0] * 9
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,9 +89,7 @@ def score(
     splats: Splats,
     views: ViewSet,
     *,
-    depth: Literal["z", "distance"] = "z",
-    frustum: bool = True,
-    local: bool = True,
+    prior: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
@@ -100,14 +98,14 @@ def score(
     Parameters
     ----------
     splats : Splats, in the frame of the views
-    depth : d along the view's axis (the paper) or as distance to its centre (the authors' code)
-    frustum : bool, whether only views that a splat lies in, or reaches into, count for it
-    local : bool, whether a splat counts relative to those around it, see `_compare`
+    prior : bool
+        For splats that no view shows, too: d is the distance to the view's centre, every view
+        counts for every splat, and splats are not compared with those around them.
     progress, threads : see `prune`
 
     Raises
     ------
-    RefineError : no splats, none that can be drawn, or none in any frustum
+    RefineError : no splats, none that can be drawn, or, but for `prior`, none in any frustum
     Cancelled
     """
     total = len(splats)
@@ -123,22 +121,28 @@ def score(
     size = size_of(float(np.median(used, overwrite_input=True)))
     del squared, used
     eta, near = ETA_RELATIVE * size * size, NEAR_RELATIVE * size
-    counted = _Views(views, origin, near, eta, depth == "distance", frustum)
-    visibility, seen = _sum_views(columns, counted, summing, threads)
+    visibility, seen = columns.reach, np.full(total, len(views), np.int32)
+    if not prior:
+        counted = _Views(views, origin, near, eta)
+        visibility, seen = _sum_views(columns, counted, summing, threads)
     axes = principal_axes(moments) / size
-    cells = np.zeros(total if local else 0, np.int32)
+    cells = np.zeros(0 if prior else total, np.int32)
 
     def complete(piece):
         points = np.empty((3, piece.stop - piece.start))
         np.subtract(columns.means[piece].T, origin[:, None], out=points)
         alone = visibility[piece]
         with np.errstate(under="ignore"):
-            if not alone.all():
+            if prior:
+                alone[:] = 0.0
+                for center, weight in zip(views.centers - origin, views.weights, strict=True):
+                    alone += weight / (np.square(points - center[:, None]).sum(axis=0) + eta)
+            elif not alone.all():
                 away = np.einsum("in,in->n", points, points) + spread + eta
                 alone[:] = np.where(alone == 0.0, UNSEEN / away, alone)
             alone *= columns.alpha[piece]
             alone *= columns.good[piece]
-            if local:
+            if not prior:
                 cells[piece] = _cells(axes @ points)
             seen[piece] *= columns.good[piece]
             return [float(np.sum(alone * g)) for g in columns.three_g(piece)]
@@ -146,7 +150,7 @@ def score(
     sums = run_all(
         complete, chunks(total, _CHUNK), progress=completing, what="scoring", threads=threads
     )
-    if frustum and not seen.any():
+    if not seen.any():
         raise RefineError(
             f"no camera sees the splats: none of {total} lies in the frustum of any of "
             f"{len(views)} views; check that cameras and splats share their frame and unit"
@@ -164,7 +168,7 @@ def score(
             _store(values, whole, columns.good, piece)
 
     run_all(add, chunks(total, 4 * _CHUNK), progress=comparing, what="scoring", threads=threads)
-    if local:
+    if not prior:
         _compare(values, cells, columns.good, threads)
     return Scores(
         values, seen, len(views), total - good,
@@ -279,8 +283,7 @@ def _sum_views(columns, counted, progress, threads):
         np.subtract(near.T, counted.origin[:, None], out=points[:3])
         columns.reach[rows], seen[rows] = counted.sums(points, columns.reach[rows])
 
-    if counted.frustum:  # else every view counts for all, wherever they lie
-        run_all(sort, chunks(total, ROWS), threads=threads)
+    run_all(sort, chunks(total, ROWS), threads=threads)
     run_all(
         sum_views, chunks(total, 8 * _CHUNK), progress=progress, what="scoring", threads=threads
     )
@@ -324,9 +327,8 @@ def _places():
 class _Views:
     """Sums of the closed form over views."""
 
-    def __init__(self, views, origin, near, eta, by_distance, frustum):
+    def __init__(self, views, origin, near, eta):
         self.origin, self.weights, self.eta = origin, views.weights, eta
-        self.by_distance, self.frustum = by_distance, frustum
         self.frustums = Frustums(views, origin, near)
 
     def sums(self, points, reach):
@@ -335,11 +337,8 @@ class _Views:
         low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
         visibility, seen = np.empty(len(reach)), np.empty(len(reach), np.int32)
         with np.errstate(under="ignore"):
-            if self.frustum:
-                reaches = np.maximum.reduceat(reach, starts)
-                touching, whole = self.frustums.classify(low, high, reaches)
-            else:
-                touching = whole = np.ones((len(self.weights), len(starts)), np.bool_)
+            reaches = np.maximum.reduceat(reach, starts)
+            touching, whole = self.frustums.classify(low, high, reaches)
             # Views of which a run is partly outside come first, then those that see all of it.
             views = np.argsort(whole * 1 - touching * 2, axis=0, kind="stable")  # (V, runs)
             counts = np.count_nonzero(touching, axis=0).tolist()
@@ -372,15 +371,7 @@ class _Views:
                 share = 1.0 - away / limit.ravel()[index]
                 # The depth at which the image is wide enough for the centre.
                 across = np.square(depth.ravel()[index] + away)
-            if self.by_distance:  # `depth` becomes d^2
-                depth[:] = 0.0
-                for axis in range(3):
-                    step = points[axis] - self.frustums.centers[some, axis, None]
-                    depth += np.multiply(step, step, out=step)
-                if count:
-                    across = depth[view, splat]
-            else:
-                depth *= depth
+            depth *= depth
             depth += self.eta
             counted = np.divide(1.0, depth, out=depth)
             if count:

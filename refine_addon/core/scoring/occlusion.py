@@ -208,10 +208,7 @@ def measure_part(
 
 def _prior(splats, views, progress, threads):
     """The closed form's scores, which splats that no view shows have, too: no frustum test."""
-    return closed_form.score(
-        splats, views, depth="distance", frustum=False, local=False,
-        progress=progress, threads=threads,
-    ).values  # fmt: skip
+    return closed_form.score(splats, views, prior=True, progress=progress, threads=threads).values
 
 
 def _with_between(views, more):
