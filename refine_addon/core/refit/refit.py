@@ -3,8 +3,8 @@
 Rounds, each on other rays, minimize ``|G x - d|^2 + sum_p (k (D_p + m_p) + K_p) x_p^2`` (Levenberg,
 Marquardt; docs/method.md, section 12): x changes of parameters, G derivatives of colours, d
 differences of colours, D the diagonal of G'G, m its medians, K the sum of D over earlier rounds. A
-round that loses on validation rays, which nothing is learned from, is undone. Splats in files are
-refitted box by box, amid the others, which do not change.
+round that loses on validation rays, which nothing is learned from, is undone, and the last. Splats
+in files are refitted box by box, amid the others, which do not change.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ DAMPING, LEAST_DAMPING = 4.0, 0.1
 the parameters only near by."""
 
 CARRIED = 0.5  # part of the gradient G'd left by a round that counts in the next
-MORE_DAMPING = 8.0  # factor of k after a round that lost
 
 MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000, 1_500_000)
 """Default rounds, fewer after so many rays for each kept splat, but at least and at most the others
@@ -166,7 +165,6 @@ def refit_on(
         return
     yield best
     before = np.zeros((2, COUNT, count), np.float32)
-    more, undone = 1.0, False
     for number in range(1, (rounds or MAX_ROUNDS) + 1):
         start, done = done, done + (1.0 - done) / max(ahead - number + 1, 1)
         share = part(progress, start, done)
@@ -174,7 +172,7 @@ def refit_on(
         cast += linear.count
         if not rounds:
             ahead = max(min(math.ceil(enough * number / cast), MAX_ROUNDS), number)
-        damping = more * max(DAMPING * count / linear.count, LEAST_DAMPING)
+        damping = max(DAMPING * count / linear.count, LEAST_DAMPING)
         solving = part(share, _CASTING, _SOLVED)
         change = _solve(linear, movable, damping, before, progress=solving, threads=threads)
         index, learned = linear.shapes.gaussians.index, (linear.diagonal, linear.residual)
@@ -185,22 +183,19 @@ def refit_on(
         trial = in_file(_moved(best.splats, change))
         psnr = rays.psnr(trial, part(share, _SOLVED, 1.0))
         gain = psnr - best.psnr
-        if gain > 0.0:
-            changed = best.changed | change.any(axis=0)
-            best = Refitted(trial, changed, best.rounds + 1, best.psnr_before, psnr)
-            yield best
-            if gain < LEAST_GAIN or cast >= enough:
-                return
-            before = before * np.array([[[1.0]], [[CARRIED]]], np.float32)
-            for k in np.flatnonzero(moving):
-                for total, of_round in zip(before, learned, strict=True):
-                    total[k, index] += of_round[k]
-            before = in_file(before)
-            del learned, change
-        elif undone:
+        if gain <= 0.0:
             return
-        else:
-            more, undone = more * MORE_DAMPING, True
+        changed = best.changed | change.any(axis=0)
+        best = Refitted(trial, changed, best.rounds + 1, best.psnr_before, psnr)
+        yield best
+        if gain < LEAST_GAIN or cast >= enough:
+            return
+        before = before * np.array([[[1.0]], [[CARRIED]]], np.float32)
+        for k in np.flatnonzero(moving):
+            for total, of_round in zip(before, learned, strict=True):
+                total[k, index] += of_round[k]
+        before = in_file(before)
+        del learned, change
 
 
 def _solve(linear, movable, damping, before, *, progress, threads):
