@@ -5,8 +5,7 @@ form) store them too. Blender's own splats (5.3) are converted to such columns a
 from __future__ import annotations
 
 import zlib
-from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,15 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.execute import chunks
 from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.formats.registry import scene_name
 from ..core.splats import Splats, single_unit_quaternions, with_model
-from .layout import KINDS, Column, Layout, SplatObject, add_attributes, has, rest_count, splat_count
+from .layout import KINDS, Layout, SplatObject, add_attributes, has, rest_count
 
-_GROUP = 16  # Columns transposed together: float32 numbers in a cache line of 64 bytes
-_ROWS = 4096  # Rows transposed at a time: 256 kB, which fits a cache
+_TOGETHER = 16  # Columns read together: float32 numbers in a cache line of 64 bytes
+_ROWS = 4096  # Rows copied at a time: 256 kB of such columns, which fits a cache
 
 
 def file_size(checked: SplatObject) -> tuple[int, int]:
@@ -51,9 +51,11 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
     try:
         mesh.vertices.add(len(rows))
         remove_attribute(mesh, ".select_vert")  # with which Blender selects all
-        layout = add_attributes(mesh, rows.dtype, source.header)
-        for names in _groups(layout):
-            write_columns(mesh, layout, dict(zip(names, _planes(rows, names), strict=True)))
+        layout, names = add_attributes(mesh, rows.dtype, source.header), rows.dtype.names
+        for part in chunks(len(names), _TOGETHER):
+            columns = {name: np.empty_like(rows[name]) for name in names[part]}
+            _copy((columns[name], rows[name]) for name in columns)
+            write_columns(mesh, layout, columns)
     except BaseException:
         bpy.data.meshes.remove(mesh)
         raise
@@ -63,27 +65,23 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
 def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
     """Splats of an object, in its own frame. Without `sh_rest` one coefficient replaces all above
     the constant: NaN if any is not finite, else 0. Scoring needs no more (saves 0.5 GB at 3 M)."""
-    read = StoredColumns(checked)
     rest = [f"f_rest_{index}" for index in range(rest_count(checked.mesh))]
     count = len(checked)
     if sh_rest:
-        planes = read.planes(rest).reshape(3, len(rest) // 3, count)
+        planes = read_planes(checked, rest).reshape(3, len(rest) // 3, count)
         coefficients = planes.transpose(2, 1, 0)
     else:
         finite = np.ones(count, np.bool_)
-        for attribute in dict.fromkeys(read.columns[name].place.attribute for name in rest):
-            values = np.isfinite(read_attribute(checked.mesh, attribute))
-            finite &= values if values.ndim == 1 else values.all(axis=1)
+        for _, values in read_columns(checked, rest):
+            finite &= np.isfinite(values)
         coefficients = np.where(finite, 0.0, np.nan).astype(np.float32)[:, None, None]
         coefficients = np.broadcast_to(coefficients, (count, 1, 3))
-    flat = THIRD_SCALE not in read.columns
-    scales = read.planes(["scale_0", "scale_1", "scale_1" if flat else THIRD_SCALE])
     splats = Splats(
         means=read_attribute(checked.mesh, "position"),
-        log_scales=scales.T,
-        quaternions=read.planes(["rot_0", "rot_1", "rot_2", "rot_3"]).T,
-        opacity_logits=read.planes(["opacity"])[0],
-        sh_dc=read.planes(["f_dc_0", "f_dc_1", "f_dc_2"]).T,
+        log_scales=read_planes(checked, ["scale_0", "scale_1", THIRD_SCALE]).T,
+        quaternions=read_planes(checked, ["rot_0", "rot_1", "rot_2", "rot_3"]).T,
+        opacity_logits=read_planes(checked, ["opacity"])[0],
+        sh_dc=read_planes(checked, ["f_dc_0", "f_dc_1", "f_dc_2"]).T,
         sh_rest=coefficients,
     )
     return with_model(splats, checked.layout.model)
@@ -97,14 +95,13 @@ def read_for_file(
     """Read the object now; the thread-safe callable builds its PLY file, once.
     Properties in `replaced` take the values that `columns` gives then, (N,) each."""
     name, layout, count = checked.obj.name, checked.layout, len(checked)
-    read, groups = StoredColumns(checked), _groups(layout)
-    stored = deque([None if n in replaced else read[n] for n in names] for names in groups)
+    kept = {column.name for column in layout.columns} - set(replaced)
+    stored = dict(read_columns(checked, kept))
 
     def file() -> SplatFile:
-        rows, values = np.empty(count, layout.row_dtype), columns()
-        for names in groups:
-            pairs = zip(names, stored.popleft(), strict=True)  # freed once written
-            _interleave(rows, names, [values.get(name, plane) for name, plane in pairs])
+        rows, values = np.empty(count, layout.row_dtype), {**stored, **columns()}
+        stored.clear()  # freed once written
+        _copy((rows[name], values[name]) for name in rows.dtype.names)
         no_elements = np.empty(0, np.uint8)
         return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
 
@@ -119,11 +116,7 @@ def write_columns(
 ) -> None:
     """Store columns by PLY property, (M,) each, in M rows, by default all; others keep every bit.
     One attribute at a time, as allocating memory takes longest."""
-    parts: dict[str, list[Column]] = {}
-    for column in layout.columns:
-        if column.name in columns:
-            parts.setdefault(column.place.attribute, []).append(column)
-    for attribute, own in parts.items():
+    for attribute, own in layout.by_attribute(columns).items():
         kind, values = mesh.attributes[attribute].data_type, read_attribute(mesh, attribute)
         components = values.reshape(len(values), -1)
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # float64 to float32
@@ -173,9 +166,8 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
 
 def digest(checked: SplatObject) -> int:
     """Checksum of an object's splats and model; harmonics above the constant do not count."""
-    columns = (column for column in checked.layout.columns if column.name in REQUIRED)
     checksum = 0
-    for name in dict.fromkeys(column.place.attribute for column in columns):
+    for name in checked.layout.by_attribute(REQUIRED):
         checksum = zlib.crc32(read_attribute(checked.mesh, name).data, checksum)
     return zlib.crc32(checked.layout.model.encode(), checksum)
 
@@ -187,75 +179,33 @@ def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:
         mesh.attributes.remove(attribute)
 
 
-class StoredColumns:
-    """Columns of a mesh by name, read on demand; caches the last vector attribute."""
-
-    def __init__(self, checked: SplatObject) -> None:
-        self.mesh = checked.mesh
-        self.columns = {column.name: column for column in checked.layout.columns}
-        self.vectors: dict[str, NDArray[np.float32]] = {}
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        """A column with the file's values, (N,); unsigned integers by their bits.
-        Values of Blender's own splats come in float64, so that writing them back changes none."""
-        column = self.columns[name]
-        place = column.place
-        values = self.vectors.get(place.attribute)
-        if values is None:
-            values = read_attribute(self.mesh, place.attribute)
-        if values.ndim > 1:
-            self.vectors = {place.attribute: values}
-            values = values[:, place.component].copy()  # alone in memory, without the others
-        if place.coding:
-            return place.coding.to_file(values)
-        return values.view(np.uint32) if column.dtype[1:] == "u4" else values
-
-    def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
-        """Columns as float32, (len(names), N)."""
-        values = np.empty((len(names), splat_count(self.mesh)), np.float32)
-        pairs = zip(values, names, strict=True)
-        # Sorted by attribute, so that each vector attribute is read once.
-        for row, name in sorted(pairs, key=lambda pair: self.columns[pair[1]].place.attribute):
-            attribute = self.mesh.attributes[self.columns[name].place.attribute]
-            if KINDS[attribute.data_type].width == 1:
-                attribute.data.foreach_get("value", row)
-            else:
-                row[:] = self[name]
-        return values
+def read_columns(
+    checked: SplatObject, names: Collection[str]
+) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Columns of these names with the file's values, (N,) each, unsigned integers by their bits.
+    Values of Blender's own splats come in float64, so that writing them back changes none."""
+    for attribute, columns in checked.layout.by_attribute(names).items():
+        values = read_attribute(checked.mesh, attribute)
+        for column in columns:
+            coding, own = column.place.coding, values
+            if values.ndim > 1:
+                own = values[:, column.place.component].copy()  # alone in memory
+            own = coding.to_file(own) if coding else own
+            yield column.name, own.view(np.uint32) if column.dtype[1:] == "u4" else own
 
 
-def _groups(layout: Layout) -> list[list[str]]:
-    """Names of adjacent columns of one type, at most `_GROUP`, to be transposed together.
-    One by one, each would read the whole file: a row fills several cache lines."""
-    groups: list[list[str]] = []
-    dtype = ""
-    for column in layout.columns:
-        if column.dtype != dtype or len(groups[-1]) == _GROUP:
-            groups.append([])
-        groups[-1].append(column.name)
-        dtype = column.dtype
-    return groups
-
-
-def _block(rows: NDArray[Any], names: Sequence[str]) -> NDArray[Any]:
-    """View of adjacent columns of one type, (N, len(names))."""
-    first = rows[names[0]]
-    shape, strides = (len(rows), len(names)), (rows.strides[0], first.itemsize)
-    return np.lib.stride_tricks.as_strided(first, shape, strides, writeable=first.flags.writeable)
-
-
-def _planes(rows: NDArray[Any], names: Sequence[str]) -> NDArray[Any]:
-    """Adjacent columns, (len(names), N), in native byte order."""
-    block = _block(rows, names)
-    planes = np.empty(block.shape[::-1], block.dtype.newbyteorder("="))
-    for start in range(0, len(rows), _ROWS):
-        planes[:, start : start + _ROWS] = block[start : start + _ROWS].T
+def read_planes(checked: SplatObject, names: Sequence[str]) -> NDArray[np.float32]:
+    """Columns as float32, (len(names), N); 0 where the object has none."""
+    planes = np.zeros((len(names), len(checked)), np.float32)
+    for name, values in read_columns(checked, names):
+        planes[names.index(name)] = values
     return planes
 
 
-def _interleave(rows: NDArray[Any], names: Sequence[str], planes: Sequence[NDArray[Any]]) -> None:
-    """Write columns into rows; inverse of `_planes`."""
-    block = _block(rows, names)
-    for start in range(0, len(rows), _ROWS):
-        for index, plane in enumerate(planes):
-            block[start : start + _ROWS, index] = plane[start : start + _ROWS]
+def _copy(pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> None:
+    """Copy columns, (N,) each, of which some lie in the rows of a file: ``(target, source)``.
+    Piece by piece, as one by one they would each pass through the whole file."""
+    pairs = list(pairs)
+    for piece in chunks(len(pairs[0][0]), _ROWS):
+        for target, source in pairs:
+            target[piece] = source[piece]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -119,6 +119,14 @@ class Layout:
     def file_bytes(self, count: int) -> int:
         """Bytes of a file of so many splats, up to the digits of their number in the header."""
         return len(self.header) + self.row_dtype.itemsize * count
+
+    def by_attribute(self, names: Container[str]) -> dict[str, list[Column]]:
+        """The columns of these names, by the attribute that holds them."""
+        parts: dict[str, list[Column]] = {}
+        for column in self.columns:
+            if column.name in names:
+                parts.setdefault(column.place.attribute, []).append(column)
+        return parts
 
     @property
     def model(self) -> Model:

@@ -49,7 +49,7 @@ def read_to_move(
     splats = mesh_attributes.splats_from_object(checked)
     has_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
     names = {*values_by_name(splats), *(_NORMALS if has_normals else ())} - {"opacity"}
-    normals = mesh_attributes.StoredColumns(checked).planes(_NORMALS).T if has_normals else None
+    normals = mesh_attributes.read_planes(checked, _NORMALS).T if has_normals else None
     return names, partial(_moved, splats, normals, matrix, notes)
 
 

@@ -64,9 +64,8 @@ def test_splats_are_selected_hidden_and_taken_by_what_they_are(addon, quarter, k
     assert len(after("REVEAL")) == COUNT
     assert ".hide_vert" not in obj.data.attributes
 
-    columns = addon.mesh.attributes.StoredColumns(addon.mesh.layout.check(obj))
-    logits = np.asarray(columns["opacity"], np.float64)
-    logs = np.max([columns[f"scale_{axis}"] for axis in range(3)], axis=0)
+    splats = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(obj))
+    logits, logs = splats.opacity_logits.astype(np.float64), splats.log_scales.max(axis=1)
     settings = bpy.context.scene.refine
     settings.select_opacity, settings.select_size = 0.25, np.exp(np.median(logs))
     bpy.ops.refine.select_by(what="FAINT")
