@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.pictures import Layers
-from ..core.splats import MODELS, Splats
+from ..core.splats import Splats
 from ..core.views import View
 from ..viewport import shader
 from ..viewport.arrays import Eye, as_texture, colors, farthest_first, in_front, pack
@@ -37,9 +37,7 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
     projection[2, 2:] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
     projection[3, 2] = -1.0
     packed, size = pack(splats), (view.height, view.width)
-    means, covariances = np.zeros((2, len(packed), 4), np.float32)  # as `Atlas` has them
-    means[:, :3] = packed.means
-    covariances[:, :2], covariances[:, 2] = packed.covariances[:, 4:], MODELS.index(packed.model)
+    means = np.pad(packed.means, ((0, 0), (0, 1)))  # as `Atlas` has them
     eye = Eye(-matrix[2], view.center, perspective=True)
     rows, depths = in_front(packed.means, eye, near)
     rows = rows[depths < view.far]
@@ -53,7 +51,7 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
         "order": (as_texture(order), 1, "R32F"),
         "means": (as_texture(means), 4, "RGBA32F"),
         "covariances": (as_texture(packed.covariances[:, :4]), 4, "RGBA32F"),
-        "more_covariances": (as_texture(covariances), 4, "RGBA32F"),
+        "more_covariances": (as_texture(packed.covariances[:, 4:]), 4, "RGBA32F"),
         "colors": (as_texture(colors(packed)), 4, "RGBA16F"),
         "selection": (as_texture(np.zeros(len(packed), np.float32)), 1, "R32F"),
         "matrices": (matrix.astype(np.float32).reshape(1, 12), 4, "RGBA32F"),

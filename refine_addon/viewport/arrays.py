@@ -15,8 +15,8 @@ from ..core.images import srgb_of
 from ..core.spherical_harmonics import colors as colors_along
 from ..core.splats import (
     ALPHA_CUT,
+    MODELS,
     SH_C0,
-    Model,
     Splats,
     drawable,
     opacity,
@@ -57,15 +57,14 @@ _LMS_TO_RGB = np.array(
 @dataclass(frozen=True, eq=False)
 class Packed:
     """The M drawable splats of a mesh, in its order and frame.
-    `vertices`: (M,) int32 into the mesh; `covariances`: (M, 6), xx, xy, xz, yy, yz, zz;
-    `harmonics`: (M, K, 3), the constant first; `model`: "default", "antialiased" or "2dgs"."""
+    `vertices`: (M,) int32 into the mesh; `covariances`: (M, 8), xx, xy, xz, yy, yz, zz, the number
+    of the model among `MODELS`, 0; `harmonics`: (M, K, 3), the constant first."""
 
     vertices: NDArray[np.int32]
     means: NDArray[np.float32]
     covariances: NDArray[np.float32]
     opacities: NDArray[np.float32]
     harmonics: NDArray[np.float16]
-    model: Model = "default"
 
     def __len__(self) -> int:
         return len(self.means)
@@ -85,7 +84,8 @@ def pack(splats: Splats) -> Packed:
     opacities = opacity(splats.opacity_logits).astype(np.float32)  # (N,)
     shown = drawable(splats) & (opacities >= ALPHA_CUT)
     vertices = np.flatnonzero(shown).astype(np.int32)
-    covariances = np.empty((len(vertices), 6), np.float32)
+    covariances = np.zeros((len(vertices), 8), np.float32)
+    covariances[:, 6] = MODELS.index(splats.model)
     harmonics = np.empty((len(vertices), splats.sh_rest.shape[1] + 1, 3), np.float16)
     rows, columns = np.triu_indices(3)
     for chunk in pieces(len(vertices)):
@@ -94,11 +94,11 @@ def pack(splats: Splats) -> Packed:
             axes = rotation_matrices(part.quaternions)
             axes *= scales(part.log_scales)[:, None, :]
             matrices = axes @ axes.transpose(0, 2, 1)
-            covariances[chunk] = matrices[:, rows, columns]
+            covariances[chunk, :6] = matrices[:, rows, columns]
         coefficients = np.concatenate([part.sh_dc[:, None], part.sh_rest], axis=1)
         harmonics[chunk] = np.clip(coefficients, -_LARGEST_HALF, _LARGEST_HALF)
     means = np.ascontiguousarray(splats.means[vertices], np.float32)
-    return Packed(vertices, means, covariances, opacities[vertices], harmonics, splats.model)
+    return Packed(vertices, means, covariances, opacities[vertices], harmonics)
 
 
 def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> NDArray[np.int32]:

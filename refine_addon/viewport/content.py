@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import RefineError
-from ..core.splats import MODELS
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
@@ -226,13 +225,12 @@ def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:
     packs = [held[mesh].packed for _, mesh in keys]
     counts = first_of_each([len(packed) for packed in packs], MOST)
     means = np.empty((sum(counts), 4), np.float32)
-    covariances = np.zeros((sum(counts), 8), np.float32)
+    covariances = np.empty((sum(counts), 8), np.float32)
     slots, each = {}, zip(keys, packs, rows_of(counts), counts, strict=True)
     for number, (key, packed, rows, count) in enumerate(each):
         slots[key] = Slot(held[key[1]], packed, number, rows, count)
         means[rows, :3], means[rows, 3] = packed.means[:count], number
-        covariances[rows, :6] = packed.covariances[:count]
-        covariances[rows, 6] = MODELS.index(packed.model)
+        covariances[rows] = packed.covariances[:count]
     values = {"means": means, "covariances": covariances[:, :4]}
     values["more_covariances"] = covariances[:, 4:]
     textures = {n: shader.texture(as_texture(v), 4, "RGBA32F") for n, v in values.items()}

@@ -54,7 +54,7 @@ def test_what_cannot_be_drawn_is_not_packed_and_the_rest_is_of_half_precision():
     assert packed.vertices.tolist() == [0, 2, 4]
     assert [packed.harmonics[0, 1, 0], packed.harmonics[1, 2, 1]] == [65504.0, -65504.0]
     assert np.isfinite(arrays.colors(packed, _eye())).all()
-    expected = [4.0, 0.0, 0.0, 9.0, 0.0, 1.0]
+    expected = [4.0, 0.0, 0.0, 9.0, 0.0, 1.0, 0.0, 0.0]
     np.testing.assert_allclose(packed.covariances[2], expected, atol=1e-5)
 
 
