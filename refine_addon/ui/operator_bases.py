@@ -29,8 +29,10 @@ Need = Callable[[Context], str]  # Gives what an operator lacks to run, "" if no
 FAILURES = (RefineError, MemoryError)  # Exceptions reported as errors; all others are bugs
 
 
-def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
-    """Report an error to the user; CANCELLED."""
+def fail(operator: bpy.types.Operator, error: BaseException, *further: type[Exception]) -> Answer:
+    """Report one of `FAILURES` or `further` to the user; CANCELLED. Other errors are raised."""
+    if not isinstance(error, (*FAILURES, *further)):
+        raise error
     operator.report({"ERROR"}, described(error))
     return {"CANCELLED"}
 
@@ -62,12 +64,10 @@ class Worker:
         self._thread.join(PATIENCE)
 
     def result(self) -> Any:
-        """The work's result, handed over once; raises the work's error."""
-        if self.cancelled and self._thread.is_alive():
+        """The work's result; raises the work's error."""
+        if self.cancelled and not self._outcome.done():
             raise Cancelled
-        self._thread.join()
-        outcome, self._outcome = self._outcome, Future()
-        return outcome.result()
+        return self._outcome.result()
 
     def _run(self, work: Callable[[Progress], Any]) -> None:
         try:
@@ -367,10 +367,8 @@ class Job(AtOnce):
             self.put(context, group, running.job, result)
         except BaseException as error:
             running.over(context)
-            if isinstance(error, FAILURES):
-                return fail(self, error)
             if not isinstance(error, Cancelled):
-                raise
+                return fail(self, error)
             self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
             return {"CANCELLED"}
         return {"FINISHED"}

@@ -18,10 +18,9 @@ from ..core.execute import Cancelled
 from ..render import card, engine, meshes
 from ..viewport import draw as viewport_draw
 from .images import put
-from .operator_bases import FAILURES, Answer, Needing, Running, fail, idle
+from .operator_bases import Answer, Needing, Running, fail, idle
 from .wrapped import counted
 
-_ENDS = (Cancelled, *FAILURES, RuntimeError)  # Exceptions that end a render and are no bugs
 IMAGE = "Render with Splats"  # Name of the image with the last frame
 
 _NEEDS_WINDOW = bpy.app.version < (5, 0, 0)
@@ -99,7 +98,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         try:
             for step in filter(None, self._steps or ()):
                 bpy.ops.render.render(scene=step.scene, animation=step.animation)
-        except _ENDS as error:
+        except BaseException as error:
             return self._stopped(context, error)
         return self._finished(context)
 
@@ -157,11 +156,8 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
                 self._render(context, step)
         except StopIteration:
             return self._finished(context)
-        except _ENDS as error:
+        except BaseException as error:
             return self._stopped(context, error)
-        except Exception:  # a bug, which Blender prints
-            self._over(context)
-            raise
         return {"RUNNING_MODAL"}
 
     def _render(self, context: bpy.types.Context, step: meshes.Step) -> None:
@@ -212,7 +208,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     def _stopped(self, context: bpy.types.Context, error: BaseException) -> Answer:
         self._over(context)
         if not isinstance(error, Cancelled):
-            return fail(self, error)
+            return fail(self, error, RuntimeError)  # Blender's own
         self.report({"INFO"}, "Render cancelled")
         return {"CANCELLED"}
 
