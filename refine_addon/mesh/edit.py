@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from . import attributes as mesh_attributes
-from .layout import has, splat_count
+from .layout import SplatObject, has, splat_count
 
 REMOVE = "refine_remove"  # Boolean point attribute: splats that the budget removes
 PROTECT = "refine_protect"  # Boolean point attribute, set by hand: splats protected above all else
@@ -60,20 +60,20 @@ def check_deletable(obj: bpy.types.Object) -> None:
 
 
 @contextmanager
-def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
-    """Undo a block's changes to an object's data if the block fails.
-    The copy is cheap: Blender shares attributes until one changes."""
-    mesh = obj.data
-    before = mesh.copy()
+def all_or_nothing(group: Sequence[SplatObject]) -> Iterator[None]:
+    """Undo a block's changes to objects' data if the block fails.
+    The copies are cheap: Blender shares attributes until one changes."""
+    pairs = [(checked.mesh, checked.mesh.copy()) for checked in group]
     try:
         yield
     except BaseException:
-        name, before.use_fake_user = mesh.name, mesh.use_fake_user
-        mesh.user_remap(before)
-        bpy.data.batch_remove([mesh])
-        before.name = name
+        for mesh, before in pairs:
+            name, before.use_fake_user = mesh.name, mesh.use_fake_user
+            mesh.user_remap(before)
+            bpy.data.batch_remove([mesh])
+            before.name = name
         raise
-    bpy.data.batch_remove([before])
+    bpy.data.batch_remove([before for _, before in pairs])
 
 
 def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:

@@ -5,7 +5,6 @@ A function does all it says, or raises `RefineError` and changes nothing."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -239,9 +238,7 @@ def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
             )
         kept = int(np.count_nonzero(part.keep))
         outcomes.append(Outcome.of(len(part.keep), kept, *mesh_attributes.file_size(checked)))
-    with ExitStack() as stack:
-        for checked in group:
-            stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
+    with mesh_edit.all_or_nothing(group):
         for checked, part in zip(group, parts, strict=True):
             reduce_object(checked, part)
     return Outcome(*map(sum, zip(*outcomes, strict=True)))
@@ -270,7 +267,7 @@ def grade(checked: SplatObject, rows: NDArray[np.int64], matrix: NDArray[np.floa
     sh_dc, sh_rest = recolored(splats.sh_dc, splats.sh_rest, matrix)
     values = values_by_name(replace(splats, sh_dc=sh_dc, sh_rest=sh_rest))
     columns = {name: values[name] for name in values if name.startswith("f_")}
-    with mesh_edit.all_or_nothing(checked.obj):
+    with mesh_edit.all_or_nothing([checked]):
         mesh_attributes.write_columns(checked.mesh, checked.layout, columns, rows)
 
 
@@ -388,7 +385,7 @@ def prune_object(
 
     def saved(result: Result, exported: Path | None) -> None:
         (change,) = changes(frames_of([checked]), result)
-        with mesh_edit.all_or_nothing(checked.obj):
+        with mesh_edit.all_or_nothing([checked]):
             assert result.scores is not None
             mesh_scores.store([checked], result.scores, method)
             reduce_object(checked, change)

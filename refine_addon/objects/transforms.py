@@ -4,7 +4,6 @@ Each does all it says, or raises `RefineError` and changes nothing."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -125,11 +124,11 @@ def uneven_notes(checked: SplatObject, matrix: NDArray[np.float64]) -> list[str]
 
 def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) -> None:
     """Store results of `read_to_move`: in all objects or none."""
-    for checked, _ in parts:
+    group = [checked for checked, _ in parts]
+    for checked in group:
         mesh_edit.check_changeable(checked.obj)
-    with ExitStack() as stack:
+    with mesh_edit.all_or_nothing(group):
         for checked, columns in parts:
-            stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
             mesh_attributes.write_columns(checked.mesh, checked.layout, columns)
             mesh_drift.stamp(checked.mesh)
             if columns:
