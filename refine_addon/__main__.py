@@ -9,11 +9,10 @@ def main() -> int:
         # Inside the try: Ctrl-C may come while it loads.
         from . import command
 
-        code = command.main(sys.argv[1:], last=True)
+        return command.main(sys.argv[1:], last=True)
     except KeyboardInterrupt:  # before the command handles signals, or after
         print("refine: error: cancelled; nothing was left half-written", file=sys.stderr)
         return 130
-    return code
 
 
 if __name__ == "__main__":

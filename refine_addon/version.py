@@ -7,9 +7,8 @@ from pathlib import Path
 
 
 def _version() -> str:
-    package = Path(__file__).parent
     # The manifest is in the package of an installed extension, and beside it in the repository.
-    for folder in (package, package.parent):
+    for folder in Path(__file__).parents[:2]:
         manifest = folder / "blender_manifest.toml"
         if manifest.is_file():
             return str(tomllib.loads(manifest.read_text("utf-8"))["version"])

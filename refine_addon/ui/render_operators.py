@@ -7,7 +7,6 @@ import sys
 import time
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
 
 import bpy
 import numpy as np
@@ -89,14 +88,13 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         description="Render all frames of the scene, and write them",
         options={"SKIP_SAVE"},
     )
-    _steps: Any = None
     _running: Running | None = None
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Render at once."""
         self._begin(context)
         try:
-            for step in filter(None, self._steps or ()):
+            for step in filter(None, self._steps):
                 bpy.ops.render.render(scene=step.scene, animation=step.animation)
         except BaseException as error:
             return self._stopped(context, error)
@@ -146,8 +144,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         render that begins would drop an Esc that waits behind the event."""
         try:
             step, self._next = self._next, None
-            undone = step is not None and step.scene not in bpy.data.scenes
-            if self._shared.stopped or self._steps is None or undone:
+            if self._shared.stopped:
                 raise Cancelled
             if step is None:
                 self._next = next(self._steps)
@@ -162,6 +159,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _render(self, context: bpy.types.Context, step: meshes.Step) -> None:
         """Make Blender render; the first time it opens its render view, as F12 does."""
+        scene = meshes.existing(step.scene)
         number, total = len(self._shared.frames) + 1, len(self._frames)
         worker = self._running.worker
         worker.what = f"frame {number} of {total}: {step.what}" if total > 1 else step.what
@@ -174,7 +172,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             view.render_display_type = "NONE"
         shows = _NEEDS_WINDOW and step.what == "meshes"
         if shows:
-            context.window.scene = bpy.data.scenes[step.scene]
+            context.window.scene = scene
         try:
             bpy.ops.render.render("INVOKE_DEFAULT", scene=step.scene, animation=step.animation)
         finally:
@@ -214,9 +212,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _over(self, context: bpy.types.Context) -> None:
         _watched.clear()
-        if self._steps is not None:
-            self._steps.close()
-            self._steps = None
+        self._steps.close()
         if _NEEDS_WINDOW and not bpy.app.background:
             bpy.app.timers.register(_draw_whole, first_interval=_SETTLED)
         if self._running is not None:
