@@ -261,11 +261,7 @@ def check(obj: bpy.types.Object) -> SplatObject:
         )
     layout = layout_of(obj)
     attributes = obj.data.attributes
-    properties = {column.name for column in layout.columns}
-    absent = [name for name in REQUIRED if name not in properties]
-    if absent == [THIRD_SCALE]:  # discs
-        absent = []
-    absent += [c.place.attribute for c in layout.columns if c.place.attribute not in attributes]
+    absent = [c.place.attribute for c in layout.columns if c.place.attribute not in attributes]
     if absent:
         present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
         more = ", ..." if len(present) > _MOST_NAMES else ""
@@ -319,7 +315,7 @@ def _harmonics(mesh: bpy.types.Mesh) -> tuple[str, int]:
 
 
 def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
-    """Layout that the import stored, None without one or if it cannot be read."""
+    """Layout that the import stored, None without one or if it is damaged."""
     places = _native_places(mesh)
 
     def read(record: Any) -> Layout | None:
@@ -333,7 +329,8 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         rest = [n for i in range(rest_count(mesh)) if (n := f"f_rest_{i}") not in names]
         if rest:
             layout = _with_harmonics(layout, count, _floats(rest, places))
-        return layout if layout.row_dtype.itemsize > 0 else None
+        complete = set(REQUIRED) <= {*(layout.row_dtype.names or ()), THIRD_SCALE}
+        return layout if complete else None
 
     return recorded(mesh, LAYOUT, read)
 

@@ -69,7 +69,6 @@ class Stroke:
         self._painted = 0
         self._area = np.zeros((region.height, region.width), np.bool_)
         self.released, self.selected = False, None
-        self._sight: Sight | None = None
         self._surface: Surface | None = None
         self._worker = Worker(self._read(context))
 
@@ -97,14 +96,13 @@ class Stroke:
 
     def follow(self) -> bool:
         """Select what the stroke covers so far; False if the view is not computed yet."""
-        if self._sight is None:
-            if self._worker.running():
-                return False
-            _kept.clear()
-            _kept.update(self._worker.result())
-            self._sight = list(_kept.values())[-1]
+        if self._worker.running():
+            return False
+        _kept.clear()
+        _kept.update(self._worker.result())
         if self.selected is None or self.shape != "COLOR":
-            self.selected = picking.combined(self.before, self._taken(self._sight), self.mode)
+            *_, sight = _kept.values()
+            self.selected = picking.combined(self.before, self._taken(sight), self.mode)
         viewport_draw.select(self.obj.data.session_uid, self.selected)
         return True
 
