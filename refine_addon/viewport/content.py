@@ -4,7 +4,7 @@ of the object, which files, undo and scripts do not see, gets the display type *
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Container, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh import selection as mesh_selection
-from ..mesh.layout import SplatObject, check, rows_of, sh_degree
+from ..mesh.layout import SplatObject, check, looks_like_splats, rows_of, sh_degree
 from ..objects.instances import Key, Placing, placings
 from . import shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack
@@ -134,12 +134,9 @@ class Content:
         """Whether splats were packed that no view has drawn yet."""
         return any(held.future and held.future.done() for held in self._held.values())
 
-    def update(
-        self, places: Iterable[Placing], existing: Callable[[], set[Key]]
-    ) -> dict[Key, NDArray[np.float64]]:
+    def update(self, places: Iterable[Placing]) -> dict[Key, NDArray[np.float64]]:
         """Prepare placed splats; (4, 4) world matrices of those ready, by key.
-        Splats in edit mode are those of the last `read_edited`. `existing`: keys of all splats of
-        the file, whose textures are kept."""
+        Splats in edit mode are those of the last `read_edited`."""
         for held in self._held.values():  # of deleted meshes, too
             if held.future and held.future.done():
                 held.packed, held.future, held.important = held.future.result(), None, None
@@ -159,7 +156,7 @@ class Content:
             held = self._held.get(mesh)  # none in edit mode until `read_edited`
             if held and held.packed is not None:
                 wanted[key] = matrix
-        self._place(set(wanted), existing)
+        self._place(set(wanted))
         return wanted
 
     def read_edited(self, obj: bpy.types.Object) -> None:
@@ -209,16 +206,26 @@ class Content:
             held.important = most_important_first(packed, marks.ranks)
         self.changes += 1
 
-    def _place(self, wanted: set[Key], existing: Callable[[], set[Key]]) -> None:
+    def _place(self, wanted: set[Key]) -> None:
+        """Have these splats in the textures; those that are there stay while the file has them."""
         drawn = {key: slot.packed for key, slot in self.atlas.slots.items()}
         if all(drawn.get(key) is self._held[key[1]].packed for key in wanted):
             return
-        keys = sorted(wanted | (drawn.keys() & existing()))
+        keys = sorted(wanted | (drawn.keys() & _existing()))
         meshes = {mesh for _, mesh in keys}
         self._held = {
             mesh: held for mesh, held in self._held.items() if mesh in meshes or held.future
         }
         self.atlas = _atlas(keys, self._held)
+
+
+def _existing() -> set[Key]:
+    """Keys of all objects of the file, and of the instances in all windows."""
+    splats = filter(looks_like_splats, bpy.data.objects)
+    keys: set[Key] = {((obj.session_uid,), obj.data.session_uid) for obj in splats}
+    for window in bpy.context.window_manager.windows:
+        keys.update(place.key for place in placings(window.view_layer.depsgraph))
+    return keys
 
 
 def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.errors import RefineError
 from ..mesh import drift as mesh_drift
 from ..mesh.layout import changed_data, looks_like_splats, splat_count
-from ..objects.instances import Key, placings
+from ..objects.instances import placings
 from . import overlays, shader
 from .content import Content, hide_points, is_edited
 from .view import Camera, View
@@ -139,7 +139,7 @@ def _draw() -> None:
     visible = {obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)}
     refused = len(_state.content.refused)
     shown = (p for p in placings(context.view_layer.depsgraph) if p.shown_by in visible)
-    placed = _state.content.update(shown, _existing)
+    placed = _state.content.update(shown)
     if len(_state.content.refused) > refused:  # Blender is to draw these
         bpy.app.timers.register(_hide_points, first_interval=0.0)
     key = context.region.as_pointer()
@@ -153,15 +153,6 @@ def _draw() -> None:
     overlays.draw(context, mixed=view.count > 0, has_depths=view.depths is not None)
     if not view.complete and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)
-
-
-def _existing() -> set[Key]:
-    """Keys of all objects of the file, and of the instances in all windows."""
-    splats = filter(looks_like_splats, bpy.data.objects)
-    keys: set[Key] = {((obj.session_uid,), obj.data.session_uid) for obj in splats}
-    for window in bpy.context.window_manager.windows:
-        keys.update(place.key for place in placings(window.view_layer.depsgraph))
-    return keys
 
 
 def _draw_legend() -> None:

@@ -35,8 +35,7 @@ def test_splats_are_drawn_as_they_are_packed(addon, few, monkeypatch):
         content.has_changed()
         key = ((few.session_uid,), few.data.session_uid)
         places = addon.objects.instances.placings(bpy.context.evaluated_depsgraph_get())
-        found = content.update(places, lambda: {key})
-        return content.atlas.slots[key] if found else None
+        return content.atlas.slots[key] if content.update(places) else None
 
     bpy.ops.refine.score()
     assert drawn() is None
