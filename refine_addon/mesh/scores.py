@@ -40,13 +40,13 @@ def store(
     method: Method,
     *,
     origins: Sequence[dict[str, Any] | None] = (None,),
-    cameras: list[tuple[str, int]] | None = None,
     protected: NDArray[np.bool_] | None = None,
-    seconds: float | None = None,
+    **facts: Any,
 ) -> None:
     """Write scores of all splats of some objects, scored together, and a record to each mesh.
-    `origins`: of each object, see `plans.origin`. `cameras`: name and number of splats of each
-    view. `protected`: (N,) bool of all, as the quality curve has it."""
+    `origins`: of each object, see `plans.origin`. `protected`: (N,) bool of all, as the quality
+    curve has it. `facts`: what panels tell besides: `cameras`, name and number of splats of each
+    view, and `seconds` of scoring."""
     for checked in group:
         mesh_edit.check_writable(checked.obj)
     total, ranks = len(scores.values), rank(scores.values)
@@ -62,8 +62,7 @@ def store(
         "notes": scores.notes,
         "quality": scores.quality.facts() if scores.quality else None,
         "alignment": scores.alignment.facts() if scores.alignment else None,
-        "cameras": cameras,
-        "seconds": seconds,
+        **facts,
         "together": {"id": uuid.uuid4().hex, "splats": total} if len(group) > 1 else None,
     }
     for checked, origin, rows in zip(group, origins, rows_of(map(len, group)), strict=True):

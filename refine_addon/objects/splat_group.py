@@ -405,18 +405,12 @@ def prune_object(
 
 
 def score_object(
-    name: str,
-    views: ViewSet,
-    method: Method,
-    demands: Demands = NONE,
-    *,
-    output: Path,
-    **how: Any,
+    name: str, views: ViewSet, method: Method, demands: Demands = NONE, **how: Any
 ) -> dict[str, Any]:
-    """Score an object of the open scene into a PLY, the scene unchanged; see `prune_object`."""
+    """Score an object of the open scene into a PLY, the scene unchanged; see `prune_object`.
+    `how`: `output`, `overwrite`, `progress`."""
     checked = mesh_layout.check(find(name))
-    work = score_scene(views, method)
-    return run(lambda: _scene(checked, demands, None), work, output, **how).report
+    return run(lambda: _scene(checked, demands, None), score_scene(views, method), **how).report
 
 
 def _scene(checked: SplatObject, demands: Demands, harmonics: bool | None) -> Scene:

@@ -355,8 +355,7 @@ def cached(what: Hashable, compute: Callable[[], Value]) -> Value:
     A script's silent changes, such as custom properties, show after the next change."""
     scene, obj = bpy.context.scene, bpy.context.object
     settings = scene.refine
-    names = set(settings.bl_rna.properties.keys()) - {"rna_type", "name"}
-    values = repr([getattr(settings, name) for name in sorted(names)])
+    values = repr([getattr(settings, each.identifier) for each in settings.bl_rna.properties])
     key = (what, scene.session_uid, obj and obj.session_uid, values)
     if key not in _values:
         _values[key] = compute()
