@@ -19,7 +19,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
-from .operator_bases import AtOnce, OnSplats
+from .operator_bases import Acting
 from .wrapped import counted
 
 _MOST = 8  # Cameras shown
@@ -58,7 +58,7 @@ _ELEVATIONS = (15.0, 40.0)  # Degrees above the horizon of a ring's cameras, in 
 _MARGIN = 1.1  # Distance of a camera over the least that frames all
 
 
-class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_turn_cameras(Acting, bpy.types.Operator):
     """Turn the cameras that decide about the world's X axis, and drop the scores"""
 
     bl_idname = "refine.turn_cameras"
@@ -96,7 +96,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
         self.report({"INFO"}, f"Turned {counted(len(cameras), 'camera')}; score again")
 
 
-class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_add_ring(Acting, bpy.types.Operator):
     """Add cameras around the splats, taking Z as up; they decide together with the others"""
 
     bl_idname = "refine.add_ring"

@@ -24,7 +24,7 @@ from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from . import properties
-from .operator_bases import Answer, Job, OnSplats
+from .operator_bases import Answer, Job
 
 _FORMATS = (
     (".ply", ".ply", "In the layout that was imported"),
@@ -33,7 +33,7 @@ _FORMATS = (
 """Export formats as Blender lists them, with tooltips."""
 
 
-class Exporting(Job, OnSplats, ExportHelper):
+class Exporting(Job, ExportHelper):
     """An operator that writes the active object's splats, and does not change it.
     ``new_name(obj)`` is what the file browser proposes; `gather` ends the job with warnings;
     `compute` gives sentences on what was written."""

@@ -17,7 +17,7 @@ from ..cameras import SHEAR, SOURCE, create_cameras, known_turn, y_down
 from ..core.affine import AXES, QUARTER
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError, described
-from ..core.execute import Progress, part, report
+from ..core.execute import Progress, report, stages
 from ..core.formats.ply import SplatFile
 from ..core.formats.registry import INDEX_NAMES, READ_SUFFIXES, read_splats
 from ..core.formats.streamed_sog import INDEX
@@ -247,10 +247,9 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
     def compute(job: Any, progress: Progress) -> tuple[list[SplatFile], ViewSet | None, list[Any]]:
         """Files, views, and errors of unreadable ones, which stop no others."""
         (paths, cameras, how), files, views, errors = job, [], None, []
-        for index, path in enumerate(paths):
-            progress_of_file = part(progress, index / len(paths), (index + 1) / len(paths))
+        for path, stage in zip(paths, stages(progress, *[1.0] * len(paths)), strict=True):
             try:
-                files.append(_read(path, how, progress_of_file))
+                files.append(_read(path, how, stage))
             except FAILURES as error:
                 errors.append(error)
         if cameras is not None and files:

@@ -19,7 +19,7 @@ from ..mesh import selection
 from ..mesh.layout import SplatObject
 from ..objects import demands, splat_group
 from . import operator_bases, plans
-from .operator_bases import Answer, AtOnce, Job, OnSplats, idle, on_splats, tooltips
+from .operator_bases import Acting, Answer, Job, idle, on_splats, tooltips
 from .operators import chosen_views
 from .select_operators import some, taken
 
@@ -60,7 +60,7 @@ class RefineVolume(bpy.types.PropertyGroup):
     )
 
 
-class REFINE_OT_add_volume(AtOnce, bpy.types.Operator):
+class REFINE_OT_add_volume(Acting, bpy.types.Operator):
     """Add a volume to the list"""
 
     bl_idname = "refine.add_volume"
@@ -113,11 +113,12 @@ def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
     return objects
 
 
-class REFINE_OT_drop_volume(AtOnce, bpy.types.Operator):
+class REFINE_OT_drop_volume(Acting, bpy.types.Operator):
     """Remove the volume from the list; the object stays"""
 
     bl_idname = "refine.drop_volume"
     bl_label = "Remove from List"
+    needs = (idle,)
 
     index: IntProperty(name="Index", description="Place in the list", min=0)
 
@@ -136,7 +137,7 @@ _ITEMS = (
 )
 
 
-class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_protect(Acting, bpy.types.Operator):
     """Mark the selected splats to stay, or to go"""
 
     bl_idname = "refine.protect"
@@ -156,7 +157,7 @@ class REFINE_OT_protect(AtOnce, OnSplats, bpy.types.Operator):
         plans.mark_again(self, context)
 
 
-class REFINE_OT_find_floaters(Job, OnSplats, bpy.types.Operator):
+class REFINE_OT_find_floaters(Job, bpy.types.Operator):
     """Find splats that float where cameras see empty space, and ask whether to delete them"""
 
     bl_idname = "refine.find_floaters"
@@ -195,7 +196,7 @@ WHAT = (
 _WORDS = {"SELECTED": "is selected", "FLOATERS": "floats", "VOLUMES": "must go"}
 
 
-class REFINE_OT_delete(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_delete(Acting, bpy.types.Operator):
     """Delete splats now, without scores"""
 
     bl_idname = "refine.delete"

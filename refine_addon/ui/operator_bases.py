@@ -266,10 +266,11 @@ def tooltips(name: str, items: Sequence[Sequence[Any]]) -> Any:
 
 
 class Needing:
-    """An operator that can run if all its `needs` are met; Blender shows the first unmet one."""
+    """An operator that can run if all its `needs` are met; Blender shows the first unmet one.
+    Most need an active object that holds splats."""
 
     bl_options = {"REGISTER", "UNDO"}
-    needs: tuple[Need, ...] = (idle,)
+    needs: tuple[Need, ...] = (idle, on_splats, out_of_edit_mode)
 
     @classmethod
     def poll(cls, context: Context) -> bool:
@@ -285,24 +286,18 @@ class Needing:
             self.report({kind}, note)
 
 
-class OnSplats(Needing):
-    """An operator on the active object, which must hold splats."""
-
-    needs: tuple[Need, ...] = (idle, on_splats, out_of_edit_mode)
-
-
-class AtOnce(Needing):
-    """An operator that ``act(context)`` does, at once; `FAILURES` are reported as errors."""
+class Acting(Needing):
+    """An operator that ``act(context)`` does or starts; `FAILURES` are reported as errors."""
 
     def execute(self, context: Context) -> Answer:
-        """Do it, or report why not."""
+        """Act, or report why not."""
         try:
             return self.act(context) or {"FINISHED"}
         except FAILURES as error:
             return fail(self, error)
 
 
-class Job(AtOnce):
+class Job(Acting):
     """An operator on a thread, with progress bar and Esc. The window stays usable; the result is
     refused if objects changed. A class defines `doing`, its name while it runs, and
 

@@ -32,7 +32,7 @@ from ..objects.splat_group import Change, Members
 from ..viewport import draw as viewport_draw
 from . import plans
 from .images import put
-from .operator_bases import Answer, Job, OnSplats, in_object_mode, scored
+from .operator_bases import Answer, Job, in_object_mode, scored
 from .wrapped import counted
 
 _SCORED = 0.97  # Share of the time that scoring takes; the rest counts the splats in each view
@@ -55,7 +55,7 @@ def _of_objects(group: Members) -> str:
     return f" of {len(group)} objects" if len(group) > 1 else ""
 
 
-class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
+class REFINE_OT_score(Job, bpy.types.Operator):
     """Score each splat by how much the cameras would miss it (Esc cancels)"""
 
     bl_idname = "refine.score"
@@ -109,13 +109,13 @@ class REFINE_OT_score(Job, OnSplats, bpy.types.Operator):
         self.tell((*scoring_notes(scores), *modifiers, *drifts))
 
 
-class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
+class REFINE_OT_apply(Job, bpy.types.Operator):
     """Delete the splats that the budget does not keep; Merge and Refit adapt the kept ones"""
 
     bl_idname = "refine.apply"
     bl_label = "Apply"
     bl_options = {"UNDO"}
-    needs = (*OnSplats.needs, scored)
+    needs = (*Job.needs, scored)
     doing = "Pruning splats"
     partial_step = REFITTING
 
@@ -169,14 +169,14 @@ class REFINE_OT_apply(Job, OnSplats, bpy.types.Operator):
         self.tell(drifts)
 
 
-class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
+class REFINE_OT_levels(Job, bpy.types.Operator):
     """Make copies of the active object with fewer and fewer splats, hidden in a new collection"""
 
     bl_idname = "refine.levels"
     bl_label = "Make Levels"
     doing = "Making levels"
 
-    needs = (*OnSplats.needs, in_object_mode)
+    needs = (*Job.needs, in_object_mode)
 
     def gather(self, context: Context) -> tuple[Members, Any]:
         """A call of `lod`."""
@@ -204,13 +204,13 @@ class REFINE_OT_levels(Job, OnSplats, bpy.types.Operator):
         self.tell(wanted.notes({level.goal: level.remark for level in levels}))
 
 
-class REFINE_OT_compare(Job, OnSplats, bpy.types.Operator):
+class REFINE_OT_compare(Job, bpy.types.Operator):
     """Draw what the active camera sees before and after Apply, and measure the loss in dB"""
 
     bl_idname = "refine.compare"
     bl_label = "Compare"
     bl_options = {"REGISTER"}
-    needs = (*OnSplats.needs, scored)
+    needs = (*Job.needs, scored)
     doing = "Comparing"
 
     def gather(self, context: Context) -> tuple[Members, Any]:

@@ -28,7 +28,7 @@ from . import (
     wrapped,
 )
 from .marks import ROLES
-from .operator_bases import Answer, AtOnce, idle, in_object_mode, tooltips
+from .operator_bases import Acting, Answer, idle, in_object_mode, tooltips
 from .plans import cached
 from .properties import HINTS, METHODS
 from .select_operators import ACTIONS
@@ -70,7 +70,7 @@ def _instances(context: bpy.types.Context) -> str:
     return "Make the object local first: a library has it" if obj.library else ""
 
 
-class REFINE_OT_make_real(AtOnce, bpy.types.Operator):
+class REFINE_OT_make_real(Acting, bpy.types.Operator):
     """Turn the splats that the active object instances into objects, which can be scored"""
 
     bl_idname = "refine.make_real"

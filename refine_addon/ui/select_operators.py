@@ -25,7 +25,7 @@ from ..objects import splat_group
 from ..objects.demands import Demands
 from ..viewport import draw as viewport_draw
 from . import plans
-from .operator_bases import Answer, AtOnce, Job, OnSplats, tooltips
+from .operator_bases import Acting, Answer, Job, tooltips
 from .select_tools import MODES
 
 ACTIONS = (
@@ -47,7 +47,7 @@ SETS = (
 )
 
 
-class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_select(Acting, bpy.types.Operator):
     """Select or hide splats"""
 
     bl_idname = "refine.select"
@@ -72,7 +72,7 @@ class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
             selection.select(obj, wanted[self.action])
 
 
-class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_select_by(Acting, bpy.types.Operator):
     """Select splats by a property"""
 
     bl_idname = "refine.select_by"
@@ -114,7 +114,7 @@ def taken(context: Context, checked: SplatObject, what: str) -> NDArray[np.bool_
     return np.zeros(len(checked), np.bool_) if mask is None else mask
 
 
-class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
+class REFINE_OT_grow_selection(Job, bpy.types.Operator):
     """Select the neighbours of selected splats too, or deselect those at the edge (Esc cancels)"""
 
     bl_idname = "refine.grow_selection"
@@ -143,7 +143,7 @@ class REFINE_OT_grow_selection(Job, OnSplats, bpy.types.Operator):
         selection.select(group[0].obj, wanted)
 
 
-class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_separate_selected(Acting, bpy.types.Operator):
     """Move the selected splats into a new object"""
 
     bl_idname = "refine.separate_selected"
@@ -174,7 +174,7 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
         self.report({"INFO"}, f"'{apart.name}' has {mesh_layout.splat_count(apart.data):,} splats")
 
 
-class REFINE_OT_grade(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_grade(Acting, bpy.types.Operator):
     """Grade the colours of the selected splats, or of all if none is selected"""
 
     bl_idname = "refine.grade"

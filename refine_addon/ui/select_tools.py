@@ -216,13 +216,12 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
         elif event.type != "TIMER" or (stroke.selected is not None and not stroke.released):
             return {"RUNNING_MODAL"}
         try:
-            computed = stroke.follow()
             context.area.tag_redraw()
-            if computed:
+            if stroke.follow():
                 count, total = np.count_nonzero(stroke.selected), len(stroke.selected)
                 context.area.header_text_set(f"{count:,} of {total:,} splats selected")
-            if computed and stroke.released:
-                return self._over(context, kept=True)
+                if stroke.released:
+                    return self._over(context, kept=True)
         except FAILURES as error:
             self._over(context, kept=False)
             return fail(self, error)

@@ -20,18 +20,18 @@ from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject
 from ..objects import splat_group, transforms
 from . import plans, wrapped
-from .operator_bases import AtOnce, Job, OnSplats, in_object_mode
+from .operator_bases import Acting, Job, in_object_mode
 from .wrapped import counted
 
 _SOON = 0.1  # Seconds until new splats are stamped: Blender's operator is over by then
 
 
-class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_bake_transform(Acting, bpy.types.Operator):
     """Apply the transforms of selected objects to their splats: places, sizes, turns, colours"""
 
     bl_idname = "refine.bake_transform"
     bl_label = "Bake Transform"
-    needs = (*OnSplats.needs, in_object_mode)
+    needs = (*Acting.needs, in_object_mode)
 
     location: BoolProperty(
         name="Location",
@@ -47,12 +47,12 @@ class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
         self.report({"INFO"}, f"Baked the transform of {counted(len(group), 'object')}")
 
 
-class REFINE_OT_mend(Job, OnSplats, bpy.types.Operator):
+class REFINE_OT_mend(Job, bpy.types.Operator):
     """Make sizes, rotations and colours follow what Blender's own tools did to the positions"""
 
     bl_idname = "refine.mend"
     bl_label = "Mend Splats"
-    needs = (*OnSplats.needs, in_object_mode)
+    needs = (*Job.needs, in_object_mode)
     doing = "Mending splats"
 
     def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
