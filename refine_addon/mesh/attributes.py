@@ -5,7 +5,7 @@ form) store them too. Blender's own splats (5.3) are converted to such columns a
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
         layout, names = add_attributes(mesh, rows.dtype, source.header), rows.dtype.names
         for part in chunks(len(names), _TOGETHER):
             columns = {name: np.empty_like(rows[name]) for name in names[part]}
-            _copy((columns[name], rows[name]) for name in columns)
+            _copy([(columns[name], rows[name]) for name in columns])
             write_columns(mesh, layout, columns)
     except BaseException:
         bpy.data.meshes.remove(mesh)
@@ -101,7 +101,7 @@ def read_for_file(
     def file() -> SplatFile:
         rows, values = np.empty(count, layout.row_dtype), {**stored, **columns()}
         stored.clear()  # freed once written
-        _copy((rows[name], values[name]) for name in rows.dtype.names)
+        _copy([(rows[name], values[name]) for name in rows.dtype.names])
         no_elements = np.empty(0, np.uint8)
         return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
 
@@ -202,10 +202,9 @@ def read_planes(checked: SplatObject, names: Sequence[str]) -> NDArray[np.float3
     return planes
 
 
-def _copy(pairs: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> None:
+def _copy(pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]]) -> None:
     """Copy columns, (N,) each, of which some lie in the rows of a file: ``(target, source)``.
     Piece by piece, as one by one they would each pass through the whole file."""
-    pairs = list(pairs)
     for piece in chunks(len(pairs[0][0]), _ROWS):
         for target, source in pairs:
             target[piece] = source[piece]

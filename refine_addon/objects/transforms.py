@@ -39,22 +39,21 @@ def read_to_move(
     checked: SplatObject, matrix: NDArray[np.float64], *, mend: bool = False
 ) -> tuple[set[str], Callable[[], tuple[dict[str, NDArray[Any]], int]]]:
     """Read an object to move its splats by `matrix`, (4, 4) in its frame, first repaired if `mend`.
-    Gives the properties that change (maybe none), and a thread-safe callable for their values,
-    (N,), and the number mended."""
+    Gives the properties that change (maybe none, or normals that it lacks), and a thread-safe
+    callable for their values, (N,), and the number mended."""
     check_affine(matrix)
     notes = mesh_drift.disturbed(checked.mesh) if mend else None
     if notes is None and np.array_equal(matrix, np.eye(4)):
         return set(), lambda: ({}, 0)
     splats = mesh_attributes.splats_from_object(checked)
-    has_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
-    names = {*values_by_name(splats), *(_NORMALS if has_normals else ())} - {"opacity"}
-    normals = mesh_attributes.read_planes(checked, _NORMALS).T if has_normals else None
+    names = {*values_by_name(splats), *_NORMALS} - {"opacity"}
+    normals = mesh_attributes.read_planes(checked, _NORMALS).T
     return names, partial(_moved, splats, normals, matrix, notes)
 
 
 def _moved(
     splats: Splats,
-    normals: NDArray[np.float32] | None,
+    normals: NDArray[np.float32],
     matrix: NDArray[np.float64],
     notes: mesh_drift.Notes | None,
 ) -> tuple[dict[str, NDArray[Any]], int]:
@@ -73,13 +72,11 @@ def _moved(
     columns = {name: np.array(values[name]) for name in values if name != "opacity"}
     for move in all_moves:
         _move_rows(splats, columns, move)
-        if normals is not None:
-            normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
+        normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
         means = splats.means if stays else np.float32(moved(splats.means, matrix))
     columns |= dict(zip("xyz", means.T, strict=True))
-    if normals is not None:
-        columns |= dict(zip(_NORMALS, normals.T, strict=True))
+    columns |= dict(zip(_NORMALS, normals.T, strict=True))
     return columns, int(np.count_nonzero(mended))
 
 

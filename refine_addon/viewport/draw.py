@@ -165,8 +165,6 @@ def _draw_legend() -> None:
 
 
 def _tick() -> float | None:
-    if _state.mode == "OFF":
-        return None
     ready = _state.content.ready()
     for region in (region for area in areas(bpy.context) for region in area.regions):
         view = _state.views.get(region.as_pointer())

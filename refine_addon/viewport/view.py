@@ -17,6 +17,7 @@ from ..objects.instances import Key
 from . import shader
 from .arrays import (
     GOES,
+    MOST,
     Eye,
     as_texture,
     colors,
@@ -228,7 +229,7 @@ def _sort_and_color(
 ) -> _Sorted:
     """Sort splats and, if `rows` is given, colour them in a texture for that many; on the thread.
     With `few`, at most so many, in constant colours."""
-    order = _order(parts, near, mode, few)
+    order = _order(parts, near, mode, few or MOST)
     if rows is None:
         return as_texture(order), len(order), None
     painted = np.zeros((rows, 4), np.float32)
@@ -250,9 +251,8 @@ def _colored(part: _Part, mode: str, *, constant: bool) -> NDArray[np.float32]:
     return marked(rgba, forced, mode)
 
 
-def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) -> NDArray[Any]:
-    counts = [part.slot.count for part in parts]
-    counts = counts if most is None else first_of_each(counts, most)
+def _order(parts: list[_Part], near: float, mode: str, most: int) -> NDArray[Any]:
+    counts = first_of_each([part.slot.count for part in parts], most)
     rows, depths = zip(
         *(_in_view(*pair, near, mode) for pair in zip(parts, counts, strict=True)), strict=True
     )
