@@ -62,14 +62,11 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
     bl_idname = "REFINE_SPLATS"
     bl_label = "Splats"
     bl_use_preview = False
-    shared: Shared | None = None
+    shared = Shared(stopped=True)  # between renders
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
         """Draw a frame. Blender calls this."""
         shared = self.shared
-        if shared is None:
-            self.error_set("Use Render > Render with Splats, which runs this engine")
-            return
         try:
             frame = depsgraph.scene.frame_current
             before = shared.finished and np.load(shared.finished / f"{frame}.npy") / 65535.0
@@ -110,7 +107,7 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
     def _progress(self, fraction: float, what: str) -> bool:
         self.update_progress(fraction)
         self.update_stats("", f"Splats: {what}")
-        return not (self.test_break() or self.shared is None or self.shared.stopped)
+        return not (self.test_break() or self.shared.stopped)
 
 
 def _place(depsgraph, camera, size):
@@ -263,6 +260,6 @@ def _session(shared: Shared) -> Iterator[Path]:
         try:
             yield Path(folder)
         finally:
-            REFINE_engine.shared = None
+            REFINE_engine.shared = Shared(stopped=True)
             meshes.remove_all()
             bpy.utils.unregister_class(REFINE_engine)
