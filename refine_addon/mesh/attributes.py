@@ -99,9 +99,10 @@ def read_for_file(
     stored = dict(read_columns(checked, kept))
 
     def file() -> SplatFile:
-        rows, values = np.empty(count, layout.row_dtype), {**stored, **columns()}
-        stored.clear()  # freed once written
-        _copy([(rows[name], values[name]) for name in rows.dtype.names])
+        rows, names = np.empty(count, layout.row_dtype), layout.row_dtype.names
+        stored.update(columns())
+        for part in chunks(len(names), _TOGETHER):
+            _copy([(rows[name], stored.pop(name)) for name in names[part]])  # freed once written
         no_elements = np.empty(0, np.uint8)
         return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
 
