@@ -245,7 +245,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     gone = left - outcome.kept
     share, unseen = gone / left, rest & (scores.seen == 0)
     becomes: Way = way
-    if way == "merge" and (curve is None or curve.as_good(share)):
+    if way != "delete" and (curve is None or curve.as_good(share, way)):
         becomes = "delete"
     closed = record.get("method") == ClosedForm.name
     remark, seconds, views = "", {}, {}

@@ -136,10 +136,10 @@ class Quality:
     def _at(self, psnr, share):
         return float(np.interp(_log_odds(share), self._odds(), [PSNR_CAP, *psnr]))
 
-    def as_good(self, share: float) -> bool:
-        """Whether deleting a share is predicted to be about as good as merging."""
+    def as_good(self, share: float, way: Way = "merge") -> bool:
+        """Whether deleting a share is predicted to be about as good as merging or refitting."""
         plain = self.at(share)
-        return deletion_will_do(plain) or plain > self.at(share, "merge") - AS_GOOD
+        return deletion_will_do(plain) or plain > self.at(share, way) - AS_GOOD
 
     def facts(self) -> dict[str, Any]:
         """Plain JSON values; those of single views to hundredths of a dB."""
