@@ -157,6 +157,10 @@ def test_known_scores_do_not_decide_where_merging_deletes(file, budget, monkeypa
     assert (method["asked"], method["done"], later.merged) == ("merge", "occlusion", None)
     np.testing.assert_array_equal(later.keep, at_once.keep)
     assert method["seconds"] is not None
+    if budget.ratio == 0.04:  # nobody sees what refitting would gain
+        refitted = prune(*scene, Refit(4))
+        np.testing.assert_array_equal(refitted.keep, later.keep)
+        assert refitted.merged is None
     if tried:
         np.testing.assert_array_equal(later.keep, prune(*scene, Occlusion(4)).keep)
         assert "merging reaches about 27 dB" in " ".join(later.report["notes"])
