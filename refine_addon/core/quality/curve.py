@@ -136,7 +136,7 @@ class Quality:
     def _at(self, psnr, share):
         return float(np.interp(_log_odds(share), self._odds(), [PSNR_CAP, *psnr]))
 
-    def as_good(self, share: float, way: Way = "merge") -> bool:
+    def as_good(self, share: float, way: Way) -> bool:
         """Whether deleting a share is predicted to be about as good as merging or refitting."""
         plain = self.at(share)
         return deletion_will_do(plain) or plain > self.at(share, way) - AS_GOOD

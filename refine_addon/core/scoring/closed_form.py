@@ -123,9 +123,9 @@ def score(
     eta, near = ETA_RELATIVE * size * size, NEAR_RELATIVE * size
     visibility, seen = columns.reach, np.full(total, len(views), np.int32)
     if not prior:
-        counted = _Views(views, origin, near, eta)
-        visibility, seen = _sum_views(columns, counted, summing, threads)
+        _sum_views(columns, seen, _Views(views, origin, near, eta), summing, threads)
     axes = principal_axes(moments) / size
+    weighted = list(zip(views.centers - origin, views.weights, strict=True))
     cells = np.zeros(0 if prior else total, np.int32)
 
     def complete(piece):
@@ -135,7 +135,7 @@ def score(
         with np.errstate(under="ignore"):
             if prior:
                 alone[:] = 0.0
-                for center, weight in zip(views.centers - origin, views.weights, strict=True):
+                for center, weight in weighted:
                     alone += weight / (np.square(points - center[:, None]).sum(axis=0) + eta)
             elif not alone.all():
                 away = np.einsum("in,in->n", points, points) + spread + eta
@@ -148,8 +148,9 @@ def score(
             return [float(np.sum(alone * g)) for g in columns.three_g(piece)]
 
     sums = run_all(
-        complete, chunks(total, _CHUNK), progress=completing, what="scoring", threads=threads
-    )
+        complete, chunks(total, _CHUNK),
+        progress=summing if prior else completing, what="scoring", threads=threads,
+    )  # fmt: skip
     if not seen.any():
         raise RefineError(
             f"no camera sees the splats: none of {total} lies in the frustum of any of "
@@ -268,10 +269,10 @@ def _statistics(tallies):
     }
 
 
-def _sum_views(columns, counted, progress, threads):
-    """H over alpha, (N,), in the memory of `reach`, and number of views that hold each centre."""
+def _sum_views(columns, seen, counted, progress, threads):
+    """Replace `reach` by H over alpha, and `seen`, (N,), by how many views hold each centre."""
     total = len(columns.good)
-    seen, order = np.empty(total, np.int32), np.arange(total, dtype=np.int32)
+    order = np.arange(total, dtype=np.int32)
 
     def sort(rows):
         order[rows] = rows.start + _near_order(columns.means[rows])
@@ -287,7 +288,6 @@ def _sum_views(columns, counted, progress, threads):
     run_all(
         sum_views, chunks(total, 8 * _CHUNK), progress=progress, what="scoring", threads=threads
     )
-    return columns.reach, seen
 
 
 def _near_order(means):

@@ -302,7 +302,7 @@ def hits(
         if lit is not None:
             reached *= _reached(lit().reshape(len(rows), len(columns)), across, down)
         boxed = np.flatnonzero(reached > 0)  # (r,)
-        ends = np.cumsum((across[1] * down[1])[boxed])
+        ends = np.cumsum(reached[boxed])
         cuts = np.searchsorted(ends, np.arange(0, int(ends[-1:].sum()), limit)).tolist()
         for start, end in pairwise([*cuts, len(boxed)]):
             checkpoint()

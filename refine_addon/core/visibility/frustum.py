@@ -68,8 +68,7 @@ class Frustums:
     """
 
     def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:
-        self.centers = views.centers - origin
-        self._rows = _rows(views, self.centers)
+        self._rows = _rows(views, views.centers - origin)
         slopes = [[side.focal / side.half for side in image_sides(view)] for view in views]
         slope = np.minimum(np.prod(np.sqrt(slopes), axis=1, keepdims=True), _STEEPEST)
         self.beyond_per_unit = np.hypot(1.0, slope)
