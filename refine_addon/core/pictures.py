@@ -168,9 +168,9 @@ def _strip(footprints, colors, columns, rows, cut):
     for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, lit):
         order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
         owner, pixel, alpha = owner[order], pixel[order], alpha[order]
-        weight = _weights(pixel, alpha, log_left)
-        if cut is not None:
-            weight *= cut.shares(owner, pixel, alpha)
+        shares = 1.0 if cut is None else cut.shares(owner, pixel, alpha)
+        # Splats that layers hide take nothing from the background.
+        weight = shares * _weights(pixel, alpha * (shares > 0.0), log_left)
         for channel in range(3):
             light = weight * colors[channel].take(owner)
             image[channel] += np.bincount(pixel, light, pixels)

@@ -19,8 +19,6 @@ from refine_addon.core.visibility.scene import principal_axes
 from .test_occlusion import cloud, splats_of
 from .test_views import view
 
-PRIORS = [False, True]  # the second is as the floor of occlusion reads it
-
 
 def random_scene(seed: int, count: int = 300) -> tuple[Splats, ViewSet]:
     splats, rng = cloud(count, seed), np.random.default_rng(seed)
@@ -141,7 +139,7 @@ def beside_their_neighbours(scores, offset, spread) -> np.ndarray:
     return changed
 
 
-@pytest.mark.parametrize("prior", PRIORS)
+@pytest.mark.parametrize("prior", [False, True])
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_scores_equal_a_plain_reference(seed, prior):
     """The stored score is float32, so 1e-5 leaves room for its rounding (6e-8) and no more."""

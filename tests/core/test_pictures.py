@@ -160,7 +160,8 @@ def two_splats():
 def test_a_layer_hides_what_is_behind_it_by_its_alpha(alpha, depth, expected):
     """Each shows what those before it let through, (1 - .8) = .2, then .2 * .5.
 
-    The rest of 1 is seen of a white background, which counts for no alpha.
+    The rest of 1 is seen of a white background, which counts for no alpha. A correction by it is
+    seen where an opaque layer is, which hides the splats behind.
     """
     layer = in_order([layer_of(BLUE, alpha, depth)])
     lit = replace(layer, background=(1.0 - alpha) * np.ones((3, 9, 9)))
@@ -168,6 +169,9 @@ def test_a_layer_hides_what_is_behind_it_by_its_alpha(alpha, depth, expected):
     assert np.abs(picture - expected).max() < 2e-3  # a splat is not quite flat
     left = 1.0 - expected[3]
     assert np.abs(light - picture - [left, left, left, 0.0]).max() < 1e-3
+    dark = replace(layer, background=np.full((3, 9, 9), -0.1 * (alpha == 1.0)))
+    blue = draw(two_splats(), view_of(9, 9), dark)[2, 4, 4]
+    assert blue == pytest.approx(expected[2] * (1.0 - 0.1 * (alpha == 1.0)), abs=2e-3)
 
 
 @pytest.mark.parametrize("order", [1, -1])
