@@ -550,7 +550,7 @@ def merge_down(
     views: ViewSet,
     count: int,
     *,
-    scored: tuple[Scores, Measured] | None = None,
+    scored: tuple[Scores, Measured],
     began: int | None = None,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
@@ -562,8 +562,6 @@ def merge_down(
     deletion before merging, and the merge penalty, depend on the share removed since then.
     """
     total = len(splats)
-    if scored is None:
-        scored = occlusion.score(splats, views, rounds=1, few_views=True, threads=threads)
     scores, measured = scored
     views = scores.deciding or views
     began = total if began is None else began
@@ -573,17 +571,14 @@ def merge_down(
     # Undrawable splats have the lowest scores, so these go first.
     rest = select(scores, Budget(keep=total - first), protected=protected)
     # The deleted splats hid almost nothing, so the first stage need not measure again.
-    sums = np.array([measured.contribution, measured.error])
+    sums = measured[:2]
     del scored, scores, measured
     turns = itertools.count()
 
-    def measure(
-        now: Splats, expected: NDArray[np.float64], progress: Progress
-    ) -> NDArray[np.float64]:
-        measured, share = occlusion.measure_part(
-            now, views, next(turns), PARTS, progress=progress, threads=threads
+    def measure(now: Splats, expected: Measured, progress: Progress) -> Measured:
+        return occlusion.measure_part(
+            now, views, next(turns), PARTS, expected, progress=progress, threads=threads
         )
-        return np.array([measured.contribution, measured.error]) + (1.0 - share) * expected
 
     with np.errstate(under="ignore"):  # as in `score`
         return merge(

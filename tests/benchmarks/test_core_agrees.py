@@ -22,7 +22,6 @@ from refine_addon.core import Splats, View, ViewSet, read_cameras, read_splats
 from refine_addon.core.pictures import CAMERAS, compare, draw
 from refine_addon.core.splats import MODELS, rotation_matrices, scales, with_model
 from refine_addon.core.visibility import measuring, points, projection
-from refine_addon.core.visibility.measuring import Measured
 from refine_addon.viewport import arrays
 from refine_addon.viewport.arrays import Eye
 from tests.benchmarks.scenes import ROOM, round_scene
@@ -57,12 +56,11 @@ def test_cells_converge_to_the_rendered_contributions_and_removal_errors(monkeyp
     gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)), threads=1)
     errors = []
     for side in SIDES:
-        total = Measured.zero(len(gaussians))
         for name, value in (("CELL", side), ("DENSITY", 8.0)):
             monkeypatch.setattr(points, name, value)
-        total._add_view(measuring._measure_view(gaussians, frame, view)[1], 1.0)
+        total = measuring.measure(gaussians, frame, [(view, 1.0)], [range(1)])[0]
         back = np.argsort(gaussians.index)
-        pairs = ((total.contribution, exact.weight_sum), (total.error, exact.removal_error))
+        pairs = zip(total[:2], (exact.weight_sum, exact.removal_error), strict=True)
         errors.append([
             np.abs(found[back] - truth)[middle].sum() / truth[middle].sum()
             for found, truth in pairs

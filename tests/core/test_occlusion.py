@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import namedtuple
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,6 @@ from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.splats import SH_C0
 from refine_addon.core.visibility import measuring, projection
 from refine_addon.core.visibility import points as points_module
-from refine_addon.core.visibility.measuring import Measured
 
 CUT = 1.0 / 255.0
 
@@ -41,12 +41,15 @@ def splats_of(means, alphas=0.5, scales=0.05, color=0.5) -> Splats:
     )
 
 
+Measured = namedtuple("Measured", ("contribution", "error", "seen"))
+
+
 def measured(splats: Splats, *views: View) -> Measured:
     """Sums over views, in the order of the splats."""
     gaussians, frame, _ = projection.prepare(splats, ViewSet(views), threads=1)
     pairs, every = [(view, 1.0) for view in views], [range(len(views))]
     total = measuring.measure(gaussians, frame, pairs, every, threads=1)[0]
-    return total.take(np.argsort(gaussians.index))
+    return Measured(*total[:, np.argsort(gaussians.index)])
 
 
 def footprints_of(splats: Splats, view: View) -> projection.Footprints:
@@ -182,15 +185,15 @@ def test_a_splat_covers_no_more_of_a_cell_than_its_opacity(monkeypatch):
 
 def test_what_is_measured_is_the_mean_of_the_views_by_their_weights():
     """A view of weight 3 has 3/4 of two; turns of three parts make up the whole."""
-    splats, views = cloud(), ring(11)
+    splats, views, nothing = cloud(), ring(11), np.zeros((2, 300))
     third = replace(views[4], weight=3.0)
     whole, one, other, both = (
-        occlusion.measure_part(splats, ViewSet(some), 0, 1)[0].error
+        occlusion.measure_part(splats, ViewSet(some), 0, 1, nothing)[1]
         for some in (views.views, views.views[:1], (third,), (views[0], third))
     )
     mean = 0.25 * one + 0.75 * other
     np.testing.assert_allclose(both, mean, rtol=1e-3, atol=1e-3 * mean.max())
-    parts = sum(occlusion.measure_part(splats, views, turn, 3)[0].error for turn in range(3))
+    parts = sum(occlusion.measure_part(splats, views, turn, 3, nothing)[1] for turn in range(3))
     np.testing.assert_allclose(parts, whole, rtol=1e-12)
 
 

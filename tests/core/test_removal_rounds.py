@@ -16,7 +16,6 @@ from refine_addon.core.scoring.occlusion import KNOWN, _RemovalRounds
 from refine_addon.core.visibility import cast, projection
 from refine_addon.core.visibility import rays as rays_module
 from refine_addon.core.visibility.cast import RaySample
-from refine_addon.core.visibility.measuring import Measured
 from refine_addon.core.visibility.rays import Rays
 from tests.core.test_occlusion import cloud, ring
 
@@ -78,8 +77,8 @@ def scene():
     sample.cast_all(gaussians, frame, silent, None)
     count = len(gaussians)
     random = np.random.default_rng(2)
-    sums = (random.uniform(0.5, 2.0, count) for _ in range(2))
-    return sample, Measured(*sums, np.arange(count, dtype=np.int32))
+    error, contribution = (random.uniform(0.5, 2.0, count) for _ in range(2))
+    return sample, np.stack([contribution, error, np.arange(count)])
 
 
 def told(sample: RaySample, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -100,30 +99,28 @@ def told(sample: RaySample, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 def test_what_is_left_grows_as_rays_tell_and_unhit_splats_as_all_do(scene, threads):
     """Removed at once or one half after the other: the same."""
     sample, measured = scene
-    count = len(measured.seen)
+    count = measured.shape[1]
     keep = np.arange(count) % 3 > 0
     left = np.flatnonzero(keep)
     before, now = told(sample, np.ones(count, np.bool_)), told(sample, keep)
     hits = before[2][left]
     expected = []
-    for sums, first, after in zip(
-        (measured.error, measured.contribution), before, now, strict=False
-    ):
+    for sums, first, after in zip(measured[1::-1], before, now, strict=False):
         own, then, later = sums[left], first[left], after[left]
         prior = KNOWN / np.maximum(hits, 1) * own
         expected.append(own * (later + prior * later.sum() / then.sum()) / (then + prior))
     expected[0] = (hits * now[0][left] + KNOWN * expected[0]) / (hits + KNOWN)
     at_once, halves = (  # which take the rays away from their sample
-        _RemovalRounds(deepcopy(sample), measured, silent, threads) for _ in range(2)
+        _RemovalRounds(deepcopy(sample), count, silent, threads) for _ in range(2)
     )
-    found = at_once.remove_and_measure(left, silent)
-    halves.remove_and_measure(np.flatnonzero(keep | (np.arange(count) < count // 2)), silent)
-    again = halves.remove_and_measure(left, silent)
+    half = np.flatnonzero(keep | (np.arange(count) < count // 2))
+    found = at_once.remove_and_measure(left, measured[:, left], silent)
+    halves.remove_and_measure(half, measured[:, half], silent)
+    again = halves.remove_and_measure(left, measured[:, left], silent)
     assert now[0][left].sum() > 1.05 * before[0][left].sum()
-    for name, values in zip(("error", "contribution"), expected, strict=True):
-        np.testing.assert_allclose(getattr(found, name), values, rtol=1e-9)
-        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
-    np.testing.assert_array_equal(found.seen, measured.seen[left])
+    np.testing.assert_allclose(found[:2], expected[::-1], rtol=1e-9)
+    np.testing.assert_array_equal(again, found)
+    np.testing.assert_array_equal(found[2], measured[2, left])
 
 
 WIDE = replace(ring()[0], width=2000, height=1500, fx=900.0, fy=900.0, cx=1000.0, cy=750.0)

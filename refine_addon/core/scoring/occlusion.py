@@ -112,12 +112,12 @@ def score(
         gaussians, scene, ordered, view_groups(len(ordered)),
         sample=sample, ray_samples=samples, progress=looking, threads=threads,
     )  # fmt: skip
-    if not measured.contribution.any():
+    if not measured[0].any():
         raise RefineError(
             f"no camera sees the splats: none of {count} reaches into the image of any of "
             f"{len(ordered)} views; check that cameras and splats share their frame and unit"
         )
-    some, worth = measured.take(sample), prior[index[sample]]
+    some, worth = measured[:, sample], prior[index[sample]]
     folds = _folds(some, of_groups, errors, worth, part(weighing, 0.0, 0.5))
     weights, left_out = coverage.floor_weights(folds, _with_floors(some, worth))
     more = []
@@ -131,24 +131,24 @@ def score(
             gaussians, scene, every, [range(len(ordered), len(every))],
             ray_samples=samples[1:], progress=part(weighing, 0.5, 1.0), threads=threads,
         )  # fmt: skip
-        for total, sums in zip(measured[:2], of_more[:2], strict=True):
-            total *= share
-            total += sums
+        measured[:2] *= share
+        measured[:2] += of_more[:2]
     between = None
     told = views_beside(views, gaussians, scene) if more else views_between(views, BETWEEN)
     if told:
         between = RaySample(ViewSet(tuple(told)).by_distance(), gaussians, splats, "between")
         between.cast_all(gaussians, scene, casting, threads)
     del gaussians, of_groups, errors  # not needed any more where memory is highest
+    measured = execute.in_file(_for_all(measured, index, count))
     rays = samples.pop() if rounds > 1 else None
     values = _values(index, good, prior, measured, rays, weights, kept, ranking, threads)
-    everything = Measured(*map(execute.in_file, measured.for_all(index, count)))
     scores = Scores(
-        values, everything.seen, len(ordered), int(np.count_nonzero(~good)),
+        values, execute.in_file(measured[2].astype(np.int32)), len(ordered),
+        int(np.count_nonzero(~good)),
         {"floor": weights}, method="occlusion", ray_sample=samples[0], between=between,
         settled=settled, deciding=replace(views, views=(*views, *more)), views_between=len(more),
     )  # fmt: skip
-    result = scores, everything
+    result = scores, measured
     return result if job is None else note(job, stage, result)
 
 
@@ -175,8 +175,7 @@ def in_rounds(
     index, kept = np.asarray(gaussians.index), _kept_after_rounds(len(splats), ROUNDS, settled)
     del gaussians
     prior, weights = _prior(splats, views, progress, threads), scores.facts["floor"]
-    some = measured.take(index)
-    values = _values(index, good, prior, some, rays, weights, kept, progress, threads)
+    values = _values(index, good, prior, measured, rays, weights, kept, progress, threads)
     return replace(scores, values=values, settled=settled)
 
 
@@ -185,11 +184,12 @@ def measure_part(
     views: ViewSet,
     turn: int,
     parts: int,
+    expected: Measured,
     *,
     progress: Progress = silent,
     threads: int | None = None,
-) -> tuple[Measured, float]:
-    """What one of at most `parts` parts of the views sees of N splats, and its share of weights."""
+) -> Measured:
+    """What views see of N splats, measured in one of at most `parts` parts, else as `expected`."""
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.05), threads=threads
     )
@@ -201,9 +201,17 @@ def measure_part(
         gaussians, scene, ordered, groups,
         progress=part(progress, 0.05, 1.0), threads=threads,
     )  # fmt: skip
-    measured = measured.for_all(np.asarray(gaussians.index), len(splats))
     weight = math.fsum(ordered[number][1] for group in groups for number in group)
-    return measured, weight / math.fsum(weight for _, weight in ordered)
+    share = weight / math.fsum(weight for _, weight in ordered)
+    measured = _for_all(measured[: len(expected)], np.asarray(gaussians.index), len(splats))
+    return measured + (1.0 - share) * expected
+
+
+def _for_all(measured, index, count):
+    """Sums of `count` splats: those measured at `index`, (M,), 0 for all others."""
+    every = np.zeros((len(measured), count))
+    every[:, index] = measured
+    return every
 
 
 def _prior(splats, views, progress, threads):
@@ -224,27 +232,23 @@ def _with_floors(measured, prior):
 
     The error alone is that of removing one splat by itself.
     """
-    floors = coverage.floor(prior.astype(np.float64), measured.seen, 1.0 + EXPONENT)
-    return measured.error * measured.contribution**EXPONENT, floors
+    contribution, error, seen = measured
+    floors = coverage.floor(prior.astype(np.float64), seen, 1.0 + EXPONENT)
+    return error * contribution**EXPONENT, floors
 
 
 def _folds(whole, of_groups, errors, prior, progress):
     """Yield what `coverage.floor_weights` takes, with each group of views left out once."""
     for without, of_views in zip(of_groups, errors, strict=True) if len(errors) > 1 else ():
         report(progress, 0.0, "scoring")
-        others = Measured(
-            # Rounding can leave a negative difference.
-            np.maximum(whole.contribution - without.contribution, 0.0),
-            np.maximum(whole.error - without.error, 0.0),
-            whole.seen - without.seen,
-        )
-        yield *_with_floors(others, prior), of_views
+        # Rounding can leave a negative difference.
+        yield *_with_floors(np.maximum(whole - without, 0.0), prior), of_views
 
 
 def _values(index, good, prior, measured, rays, weights, kept, progress, threads):
     """Scores of N splats, `good` ones drawable; removal is in rounds if there are scoring rays."""
     loading, *of_rounds = stages(progress, len(good), *kept)
-    now = None if rays is None else _RemovalRounds(rays, measured, loading, threads)
+    now = None if rays is None else _RemovalRounds(rays, len(index), loading, threads)
     undrawn = np.setdiff1d(np.arange(len(good)), index)
     first = undrawn[np.argsort(prior[undrawn], kind="stable")]
     order = np.concatenate([first, _order(index, prior, measured, now, weights, kept, of_rounds)])
@@ -258,7 +262,9 @@ def _order(index, prior, measured, rays, weights, kept, progress):
     """Rows of the Gaussians in the order of removal, (M,); `kept` are left after each round."""
     count, left, removed = len(prior), np.arange(len(index)), []
     for stay, of_round in zip(kept, progress, strict=True):
-        now = measured if rays is None else rays.remove_and_measure(left, of_round)
+        now = measured[:, index[left]]
+        if rays is not None:
+            now = rays.remove_and_measure(left, now, of_round)
         report(of_round, 1.0, "scoring")
         worth = prior[index[left]]  # (n,)
         # How many of those left are removed when each of the shares is reached.
@@ -278,8 +284,8 @@ class _RemovalRounds:
     The rays leave their sample, so that the hits of what has gone are not kept there.
     """
 
-    def __init__(self, scoring_rays, measured, progress, threads):
-        self._measured, self._threads = measured, threads
+    def __init__(self, scoring_rays, count, progress, threads):
+        self._threads = threads
 
         def colored(number):
             rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
@@ -294,27 +300,25 @@ class _RemovalRounds:
             colored, [k for k, rays in enumerate(scoring_rays.rays) if rays is not None],
             progress=part(progress, 0.0, _LOADING), what="scoring", threads=threads,
         )  # fmt: skip
-        self._rays_hitting = np.zeros(len(measured.seen), np.int64)  # (M,), n_i
+        self._rays_hitting = np.zeros(count, np.int64)  # (M,), n_i
         for rays, _, _ in self._views:
             self._rays_hitting[rays.hit] += np.bincount(rays.owner, minlength=len(rays.hit))
-        every = np.arange(len(self._rays_hitting))
-        self._first = self._sums(every, part(progress, _LOADING, 1.0))
+        self._first = self._sums(np.arange(count), part(progress, _LOADING, 1.0))
 
-    def remove_and_measure(self, left, progress):
-        """Remove all but the ascending rows `left`, (n,); `Measured` of these now."""
+    def remove_and_measure(self, left, measured, progress):
+        """Remove all but the ascending rows `left`, (n,); what was `measured` of these, now."""
         all_left = len(left) == len(self._rays_hitting)
         now = self._first if all_left else self._sums(left, progress)
-        measured = self._measured.error[left], self._measured.contribution[left]
         count = self._rays_hitting[left]  # (n,)
-        error, contribution = (
+        contribution, error = (
             _grown(sums, before[left], after, KNOWN / np.maximum(count, 1))
-            for sums, before, after in zip(measured, self._first, now, strict=True)
+            for sums, before, after in zip(measured[:2], self._first, now, strict=True)
         )
-        error = (count * now[0] + KNOWN * error) / (count + KNOWN)
-        return Measured(contribution, error, self._measured.seen[left])
+        error = (count * now[1] + KNOWN * error) / (count + KNOWN)
+        return np.stack([contribution, error, measured[2]])
 
     def _sums(self, left, progress):
-        """Error and contribution of Gaussians that are left, (n,) each, by the rays."""
+        """Contribution and error of Gaussians that are left, (2, n), by the rays."""
         keep = np.zeros(len(self._rays_hitting), np.bool_)
         keep[left] = True
 
@@ -324,17 +328,16 @@ class _RemovalRounds:
             self._views[number] = rays, colors, area
             with np.errstate(under="ignore"):
                 error, contribution = rays.removal_errors(colors)
-                return rays.hit, area * error, area * contribution
+                return rays.hit, area * np.stack([contribution, error])
 
-        error, contribution = np.zeros(len(keep)), np.zeros(len(keep))
-        for hit, errors, contributions in run(
+        sums = np.zeros((2, len(keep)))
+        for hit, of_view in run(
             removal_errors, range(len(self._views)),
             progress=progress, what="scoring", threads=self._threads,
         ):  # fmt: skip
-            error[hit] += errors
-            contribution[hit] += contributions
+            sums[:, hit] += of_view
         execute.return_freed()
-        return error[left], contribution[left]
+        return sums[:, left]
 
 
 def _grown(measured, before, now, weight):

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,41 +45,9 @@ _LEAST_LEFT = 1e-4
 _SUMMED = 1 << 20  # points summed at a time
 
 
-class Measured(NamedTuple):
-    """Sums over views, times their weights, for M Gaussians."""
-
-    contribution: NDArray[np.float64]  # (M,), px^2
-    error: NDArray[np.float64]  # (M,), px^2
-    seen: NDArray[np.int32]  # (M,), views that hold the centre
-
-    @classmethod
-    def zero(cls, count: int) -> Measured:
-        """Sums of no views."""
-        return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
-
-    def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
-        """Sums of `count` splats: these at `index`, (M,), 0 for all others."""
-        every = Measured.zero(count)
-        for name in self._fields:
-            getattr(every, name)[index] = getattr(self, name)
-        return every
-
-    def take(self, rows: NDArray[np.int64]) -> Measured:
-        """Sums of some Gaussians."""
-        return Measured(self.contribution[rows], self.error[rows], self.seen[rows])
-
-    def add(self, other: Measured) -> None:
-        """Add the sums of other views."""
-        for name in self._fields:
-            getattr(self, name)[:] += getattr(other, name)
-
-    def _add_view(self, measured, weight):
-        """Add what one view sees (`_measure_view`), times its weight."""
-        rows, inside, contribution, error = measured
-        self.seen[rows[inside]] += 1  # no row is there twice
-        with np.errstate(under="ignore"):
-            self.contribution[rows] += weight * contribution
-            self.error[rows] += weight * error
+Measured = NDArray[np.float64]
+"""Sums over views, times their weights, for M Gaussians or splats, (3, M): contribution and error,
+px^2, and the number of views that hold the centre."""
 
 
 def view_groups(count: int) -> list[range]:
@@ -106,7 +73,7 @@ def measure(
     over all groups, those of the rows `sample` over each group, and for each group the errors of
     the sample in each view, (views, m).
     """
-    rows, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
+    chosen, numbers = np.asarray(sample, np.int64), [n for group in groups for n in group]
     lacking = [[rays for rays in ray_samples if rays.wants(n)] for n in numbers]
     measured = run(
         partial(_measure_and_cast, gaussians, scene, views),
@@ -114,18 +81,22 @@ def measure(
         cost=SECONDS * len(gaussians) * len(numbers),
         progress=progress, what="scoring", threads=threads,
     )  # fmt: skip
-    total, of_groups, errors = Measured.zero(len(gaussians)), [], []
+    total, of_groups, errors = np.zeros((3, len(gaussians))), [], []
     each = zip(measured, lacking, strict=True)
     for group in groups:
-        sums, of_views = Measured.zero(len(gaussians)), []
+        sums, of_views = np.zeros_like(total), []
         for number, ((measurement, cast), some) in zip(group, each, strict=False):
-            before = sums.error[rows]  # (m,)
-            sums._add_view(measurement, views[number][1])
-            of_views.append(sums.error[rows] - before)
+            (rows, inside, contribution, error), weight = measurement, views[number][1]
+            before = sums[1, chosen]  # (m,)
+            with np.errstate(under="ignore"):
+                sums[0, rows] += weight * contribution
+                sums[1, rows] += weight * error
+            sums[2, rows[inside]] += 1.0  # no row is there twice
+            of_views.append(sums[1, chosen] - before)
             for ray_sample, rays in zip(some, cast, strict=True):
                 ray_sample.rays[number] = rays
-        total.add(sums)
-        of_groups.append(sums.take(rows))
+        total += sums
+        of_groups.append(sums[:, chosen])
         errors.append(np.array(of_views))
     next(each, None)  # so that `run` ends
     return total, of_groups, errors
