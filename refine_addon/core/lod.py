@@ -199,7 +199,7 @@ def lod(
             if origin is None:
                 assert result.scores is not None
                 rest = splats if gone is None else splats.take(~gone)
-                origin = Origin(rest, result.scores.ray_sample, result.scores.between, None)
+                origin = Origin(rest, result.scores)
             origin, whole = replace(origin, psnr=result.report["estimated_psnr"]), result
         kept = int(np.count_nonzero(result.keep))
         if kept < fewest:

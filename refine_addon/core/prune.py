@@ -9,9 +9,10 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,6 @@ from .visibility.cast import validation_rays
 from .visibility.measuring import Measured
 from .volumes import Forced, must_go
 
-TRIES = 3  # most times that splats are merged to reach a PSNR
 CLOSE = 0.7  # largest distance of an estimate from the PSNR of the budget, dB, else merge again
 
 FIRST = 0.1
@@ -224,17 +224,6 @@ _Chosen = tuple[NDArray[np.bool_], "float | None", "float | None"]
 """Splats that deletion keeps, (N,), and the PSNR in views that decided and between, dB."""
 
 
-class _Try(NamedTuple):
-    """Number of kept splats, and the estimated PSNR with them, dB."""
-
-    kept: int
-    psnr: float
-
-    def misses(self, goal: float) -> tuple[bool, float]:
-        """Sort key: by how much it misses a PSNR; a PSNR within `CLOSE` or above comes first."""
-        return self.psnr < goal - CLOSE, abs(self.psnr - goal)
-
-
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """Result of merging, and of refitting, if asked."""
@@ -307,17 +296,25 @@ class _Prune:
             scores = with_quality(scores, protected=self.protected, threads=self.threads)
         self.clock.lap("score_s")
         report(progress, 0.94, "selecting")
-        return self._deleted(scores, self._select(scores))
+        return self._result(scores, self._select(scores))
 
-    def _deleted(self, scores: Scores, chosen: _Chosen, tried: Estimates | None = None) -> Result:
-        """Result of deletion; `tried` are estimates of merging, if it was tried."""
+    def _result(
+        self,
+        scores: Scores,
+        chosen: _Chosen,
+        measured: Estimates | None = None,
+        outcome: Outcome | None = None,
+        tried: Estimates | None = None,
+    ) -> Result:
+        """Result of deletion, or the `outcome` of merging; `tried` if deletion was as good."""
         keep, psnr, between = chosen
         summary = reports.of_prune(
             scores, keep, self.budget, self.method, self.sizes, self.clock,
-            psnr=psnr, between=between, measured={"delete": psnr}, tried=tried,
-            timed=self.scores is None,
+            psnr=psnr, between=between, measured=measured or {"delete": psnr}, outcome=outcome,
+            tried=tried, timed=self.scores is None,
         )  # fmt: skip
-        return Result(keep, summary, scores)
+        merged = None if outcome is None or outcome.done == "delete" else outcome.final
+        return Result(keep, summary, scores, merged, getattr(outcome, "stopped", None))
 
     def merge(self, progress: Progress) -> Result:
         """Merge down to the budget, refit if asked; delete where that is as good."""
@@ -348,13 +345,16 @@ class _Prune:
             all(map(deletion_will_do, (plain, beside))) if goal is None
             else not refits and quality_of(scores).share(goal, "merge") <= PLAIN
         ):  # fmt: skip
-            return self._deleted(scores, chosen)
+            return self._result(scores, chosen)
         if goal is None:
             outcome = self._to_count(keep, scores, measurement, making)
         else:
             outcome = self._to_psnr(goal, scores, measurement, making)
         self.clock.lap("merge_s")
-        between = self._between(scores, outcome)
+        between, rays = None, self._first(scores).scores.between
+        if rays is not None and outcome.stopped is None:
+            after = outcome.final.splats
+            between = psnr_against(rays, after, self.used, threads=self.threads)
         pairs = [(plain, outcome.reached)]
         if beside is not None and between is not None:
             pairs.append((beside, between))
@@ -367,17 +367,15 @@ class _Prune:
             )  # fmt: skip
             if goal is not None:
                 scores = with_quality(scores, protected=self.protected, threads=self.threads)
-            return self._deleted(scores, self._select(scores), tried)
+            return self._result(scores, self._select(scores), tried=tried)
         # Where a PSNR is asked for, deletion keeps another number of splats.
         measured = outcome.psnr if goal is not None else {"delete": plain, **outcome.psnr}
-        final = outcome.final
-        summary = reports.of_prune(
-            scores, final.keep, self.budget, self.method, self.sizes, self.clock,
-            psnr=outcome.reached, between=between, measured=measured,
-            outcome=outcome, timed=True,
-        )  # fmt: skip
-        merged = None if outcome.done == "delete" else final
-        return Result(final.keep, summary, scores, merged, outcome.stopped)
+        chosen = outcome.merged.keep, outcome.reached, between
+        return self._result(scores, chosen, measured, outcome)
+
+    def _first(self, scores: Scores) -> Origin:
+        """The splats before any merging prune, with which results are compared."""
+        return self.origin or Origin(self.splats, scores)
 
     def _settled(self) -> int | None:
         """How many splats are needed in their final order; None for all."""
@@ -431,22 +429,16 @@ class _Prune:
 
     def _to_count(self, keep, scores: Scores, measurement: Measured, progress: Progress) -> Outcome:
         """Merge until as many are left as deletion keeps, (N,); refit if asked."""
-        origin, used, left = self.origin, self.used, int(np.count_nonzero(keep))
-        truth = scores.ray_sample if origin is None else origin.ray_sample
+        first, used, left = self._first(scores), self.used, int(np.count_nonzero(keep))
         merging_progress, comparing, refitting = stages(progress, *self._expected_seconds(left))
-
-        def estimated(splats: Splats, progress: Progress = silent) -> float | None:
-            if truth is None:
-                return None
-            return psnr_against(truth, splats, used, progress=progress, threads=self.threads)
-
+        rays: Any = first.scores.ray_sample
+        estimated = partial(psnr_against, rays, views=used, threads=self.threads)
         merged = merge_down(
             self.splats, used, left,
-            scored=(scores, measurement), protected=self.protected,
-            began=None if origin is None else len(origin.splats),
+            scored=(scores, measurement), protected=self.protected, began=len(first.splats),
             progress=merging_progress, threads=self.threads,
         )  # fmt: skip
-        psnr = estimated(merged.splats, comparing)
+        psnr = estimated(merged.splats, progress=comparing)
         if not isinstance(self.method, Refit):
             return Outcome(merged, "merge", {"merge": psnr})
         rest = copied(self.splats, np.flatnonzero(keep), self.threads)
@@ -472,21 +464,23 @@ class _Prune:
         # try keeps the PSNR and another does not, it is interpolated between the two.
         total, curve = len(self.splats), quality_of(scores)
         way: Way = "refit" if isinstance(self.method, Refit) else "merge"
-        lost = None if self.origin is None else self.origin.psnr
-        tries = stages(progress, 1.0, 1.0, 0.2)
-        gone, tried, best = curve.share(left_to_lose(goal, lost), way), list[_Try](), None
-        for number in range(TRIES):
+        gone = curve.share(left_to_lose(goal, self._first(scores).psnr), way)
+        tried, best = dict[int, float](), None  # PSNR, dB, by number of kept splats
+        for of_try in stages(progress, 1.0, 1.0, 0.2):
             count = max(total - math.floor(gone * total), 1)
-            if count in (one.kept for one in tried):
+            if count in tried:
                 break
             keep = select(scores, Budget(keep=count), protected=self.protected)
-            outcome = self._to_count(keep, scores, measurement, tries[number])
+            outcome = self._to_count(keep, scores, measurement, of_try)
             if outcome.stopped is not None:
                 return replace(best or outcome, stopped=outcome.stopped)
             if outcome.reached is None:
                 return outcome
-            tried.append(_Try(count, outcome.reached))
-            if best is None or min(tried, key=lambda one: one.misses(goal)) is tried[-1]:
+            tried[count] = outcome.reached
+            # What misses the PSNR least; one within `CLOSE` or above comes first.
+            if count == min(
+                tried, key=lambda kept: (tried[kept] < goal - CLOSE, abs(tried[kept] - goal))
+            ):
                 best = outcome
             if abs(outcome.reached - goal) <= CLOSE:
                 break
@@ -506,8 +500,7 @@ class _Prune:
         done, stopped = None, None
         try:
             for reached in refit_rounds(
-                merged.splats, self.splats if self.origin is None else self.origin.splats,
-                views, self.method.rounds,
+                merged.splats, (self.origin or self).splats, views, self.method.rounds,
                 protected=None if self.protected is None else self.protected[merged.keep],
                 progress=lambda fraction, _what: progress(fraction, REFITTING),
                 threads=self.threads,
@@ -525,23 +518,16 @@ class _Prune:
             seconds=time.perf_counter() - start, stopped=stopped,
         )  # fmt: skip
 
-    def _between(self, scores: Scores, outcome: Outcome) -> float | None:
-        """Estimated PSNR in views in between, dB; None without rays in them."""
-        rays = scores.between if self.origin is None else self.origin.between
-        if rays is None or outcome.stopped is not None:
-            return None
-        return psnr_against(rays, outcome.final.splats, self.used, threads=self.threads)
 
-
-def _share_between(tried: Sequence[_Try], goal: float, total: int) -> float | None:
+def _share_between(tried: Mapping[int, float], goal: float, total: int) -> float | None:
     """Share of `total` to remove by the tries next to a PSNR, linear in its log odds, or None."""
-    tried = [one for one in tried if one.kept < total]  # those whose odds are finite
-    above = min((one for one in tried if one.psnr >= goal), default=None)
-    below = max((one for one in tried if one.psnr < goal), default=None)
-    if above is None or below is None:
+    finite = [kept for kept in tried if kept < total]  # those whose odds are finite
+    above = min((kept for kept in finite if tried[kept] >= goal), default=0)
+    below = max((kept for kept in finite if tried[kept] < goal), default=0)
+    if not (above and below):
         return None
-    odds = np.log([total / one.kept - 1.0 for one in (below, above)])
-    place = np.interp(goal, [below.psnr, above.psnr], odds)
+    odds = np.log([total / kept - 1.0 for kept in (below, above)])
+    place = np.interp(goal, [tried[below], tried[above]], odds)
     return float(1.0 / (1.0 + np.exp(-place)))
 
 

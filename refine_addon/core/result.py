@@ -20,7 +20,6 @@ from .formats.registry import write_splats
 from .merging.merge import Merged
 from .scores import Scores
 from .splats import Splats, among_all, assign
-from .visibility.cast import RaySample
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +27,8 @@ class Origin:
     """Splats as they were before an earlier prune, which merged them."""
 
     splats: Splats
-    ray_sample: RaySample | None  # rays that hit them, with which results are compared
-    between: RaySample | None  # likewise in views in between
-    psnr: float | None  # estimated PSNR of the earlier result, dB
+    scores: Scores  # of them, with the rays by which results are compared
+    psnr: float | None = None  # estimated PSNR of the earlier result, dB
 
 
 @dataclass(frozen=True, eq=False, repr=False)
