@@ -117,7 +117,7 @@ def _drawn(splats, gaussians, scene, view, layers, progress, threads):
         rows = np.arange(piece.start, piece.stop)
         cut = None if layers is None else _Cut(layers, depths, piece)
         with np.errstate(under="ignore"):
-            strip = _strip(footprints, colors, np.arange(view.width), rows, cut)
+            strip = _strip(footprints, colors, view.width, rows, cut)
         return strip.reshape(4, len(rows), view.width)
 
     pieces = chunks(view.height, max(_PIXELS // view.width, 1))
@@ -156,16 +156,12 @@ class _Cut:
         image[3] = 1.0 - passed * self._left[-1]
 
 
-def _strip(footprints, colors, columns, rows, cut):
-    """`draw` in C columns and R rows, ascending, (4, R * C), with colours (3, n) float64."""
+def _strip(footprints, colors, width, rows, cut):
+    """`draw` in R ascending rows of a width, (4, R * width), with colours (3, n) float64."""
     # Footprints come front to back, some at a time; those behind are not computed in opaque pixels.
-    pixels = len(columns) * len(rows)
+    columns, pixels = np.arange(width), width * len(rows)
     log_left, image = np.zeros(pixels), np.zeros((4, pixels))  # logarithm of the transmittance
-
-    def lit():
-        return log_left > LOG_OPAQUE
-
-    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, lit):
+    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, log_left, LOG_OPAQUE):
         order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
         owner, pixel, alpha = owner[order], pixel[order], alpha[order]
         shares = 1.0 if cut is None else cut.shares(owner, pixel, alpha)
@@ -231,7 +227,12 @@ def compare(
             for view, each in zip(views, rest, strict=True)
         ])  # fmt: skip
     return [
-        Comparison(view, _rounded(one), _rounded(other), _psnr(other, one, view))
+        Comparison(
+            view,
+            _rounded(one),
+            _rounded(other),
+            psnr_of(other.reshape(3, -1), one.reshape(3, -1), view),
+        )
         for view, one, other in zip(views, *pictures, strict=True)
     ]
 
@@ -254,10 +255,6 @@ def fitted(view: View, scene_size: float) -> View:
 def _rounded(picture):
     """A picture (3, H, W) of 0..1 as (H, W, 3) uint8."""
     return np.ascontiguousarray(np.rint(picture * 255.0).astype(np.uint8).transpose(1, 2, 0))
-
-
-def _psnr(after, before, view):
-    return psnr_of(after.reshape(3, -1), before.reshape(3, -1), view)
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ def score(
     eta, near = ETA_RELATIVE * size * size, NEAR_RELATIVE * size
     visibility, seen = columns.reach, np.full(total, len(views), np.int32)
     if not prior:
-        _sum_views(columns, seen, _Views(views, origin, near, eta), summing, threads)
+        _sum_views(columns, seen, views, origin, near, eta, summing, threads)
     axes = principal_axes(moments) / size
     weighted = list(zip(views.centers - origin, views.weights, strict=True))
     cells = np.zeros(0 if prior else total, np.int32)
@@ -269,9 +269,9 @@ def _statistics(tallies):
     }
 
 
-def _sum_views(columns, seen, counted, progress, threads):
+def _sum_views(columns, seen, views, origin, near, eta, progress, threads):
     """Replace `reach` by H over alpha, and `seen`, (N,), by how many views hold each centre."""
-    total = len(columns.good)
+    total, frustums, weights = len(columns.good), Frustums(views, origin, near), views.weights
     order = np.arange(total, dtype=np.int32)
 
     def sort(rows):
@@ -280,9 +280,24 @@ def _sum_views(columns, seen, counted, progress, threads):
     def sum_views(piece):
         rows = order[piece]
         points = np.ones((4, len(rows)))  # x, y, z, 1
-        near = np.take(columns.means, rows, axis=0)
-        np.subtract(near.T, counted.origin[:, None], out=points[:3])
-        columns.reach[rows], seen[rows] = counted.sums(points, columns.reach[rows])
+        means, reach = np.take(columns.means, rows, axis=0), columns.reach[rows]
+        np.subtract(means.T, origin[:, None], out=points[:3])
+        starts = np.arange(0, len(rows), _RUN)
+        low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
+        with np.errstate(under="ignore"):
+            touching, whole = frustums.classify(low, high, np.maximum.reduceat(reach, starts))
+            # Views of which a run is partly outside come first, then those that see all of it.
+            order_of_views = np.argsort(
+                whole * 1 - touching * 2, axis=0, kind="stable"
+            )  # (V, runs)
+            counts = np.count_nonzero(touching, axis=0).tolist()
+            partly = np.count_nonzero(touching & ~whole, axis=0).tolist()
+            for run, start in enumerate(starts.tolist()):
+                here = slice(start, start + _RUN)
+                columns.reach[rows[here]], seen[rows[here]] = _of_run(
+                    frustums, weights, eta, points[:, here], reach[here],
+                    order_of_views[: counts[run], run], partly[run],
+                )  # fmt: skip
 
     run_all(sort, chunks(total, ROWS), threads=threads)
     run_all(
@@ -324,64 +339,38 @@ def _places():
     return places
 
 
-class _Views:
-    """Sums of the closed form over views."""
-
-    def __init__(self, views, origin, near, eta):
-        self.origin, self.weights, self.eta = origin, views.weights, eta
-        self.frustums = Frustums(views, origin, near)
-
-    def sums(self, points, reach):
-        """H over alpha, and number of views that hold the centre, of n points, (4, n)."""
-        starts = np.arange(0, len(reach), _RUN)
-        low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
-        visibility, seen = np.empty(len(reach)), np.empty(len(reach), np.int32)
-        with np.errstate(under="ignore"):
-            reaches = np.maximum.reduceat(reach, starts)
-            touching, whole = self.frustums.classify(low, high, reaches)
-            # Views of which a run is partly outside come first, then those that see all of it.
-            views = np.argsort(whole * 1 - touching * 2, axis=0, kind="stable")  # (V, runs)
-            counts = np.count_nonzero(touching, axis=0).tolist()
-            partly = np.count_nonzero(touching & ~whole, axis=0).tolist()
-            for run, start in enumerate(starts.tolist()):
-                here = slice(start, start + _RUN)
-                visibility[here], seen[here] = self._of_run(
-                    points[:, here], reach[here], views[: counts[run], run], partly[run]
-                )
-        return visibility, seen
-
-    def _of_run(self, points, reach, views, partly):
-        """The same of a run that `views`, (v,), see; the first `partly` see only part of it."""
-        total = np.zeros(len(reach))
-        seen = np.full(len(reach), len(views) - partly, np.int32)
-        for start in range(0, len(views), _VIEW_BLOCK):
-            some = views[start : start + _VIEW_BLOCK]
-            count = min(max(partly - start, 0), len(some))
-            depth, beyond, between = self.frustums.project(points, some, count)
-            if count:
-                inside = beyond <= 0.0  # (c, n)
-                inside &= between
-                # A byte can count the at most 64 views of a block.
-                seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
-                # Few pairs reach inside from outside: what follows is computed for these alone.
-                limit = reach * self.frustums.beyond_per_unit[some[:count]]  # (c, n)
-                index = np.flatnonzero((between > inside) & (beyond < limit))
-                view, splat = np.divmod(index, len(reach))
-                away = beyond.ravel()[index]
-                share = 1.0 - away / limit.ravel()[index]
-                # The depth at which the image is wide enough for the centre.
-                across = np.square(depth.ravel()[index] + away)
-            depth *= depth
-            depth += self.eta
-            counted = np.divide(1.0, depth, out=depth)
-            if count:
-                counted[:count] *= inside
-            summed = np.einsum("v,vn->n", self.weights[some], counted)
-            if count:
-                share /= across + self.eta
-                summed += np.bincount(splat, self.weights[some[view]] * share, len(reach))
-            total += summed
-        return total, seen
+def _of_run(frustums, weights, eta, points, reach, views, partly):
+    """H over alpha and `seen` of a run that `views`, (v,), see, the first `partly` only in part."""
+    total = np.zeros(len(reach))
+    seen = np.full(len(reach), len(views) - partly, np.int32)
+    for start in range(0, len(views), _VIEW_BLOCK):
+        some = views[start : start + _VIEW_BLOCK]
+        count = min(max(partly - start, 0), len(some))
+        depth, beyond, between = frustums.project(points, some, count)
+        if count:
+            inside = beyond <= 0.0  # (c, n)
+            inside &= between
+            # A byte can count the at most 64 views of a block.
+            seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
+            # Few pairs reach inside from outside: what follows is computed for these alone.
+            limit = reach * frustums.beyond_per_unit[some[:count]]  # (c, n)
+            index = np.flatnonzero((between > inside) & (beyond < limit))
+            view, splat = np.divmod(index, len(reach))
+            away = beyond.ravel()[index]
+            share = 1.0 - away / limit.ravel()[index]
+            # The depth at which the image is wide enough for the centre.
+            across = np.square(depth.ravel()[index] + away)
+        depth *= depth
+        depth += eta
+        counted = np.divide(1.0, depth, out=depth)
+        if count:
+            counted[:count] *= inside
+        summed = np.einsum("v,vn->n", weights[some], counted)
+        if count:
+            share /= across + eta
+            summed += np.bincount(splat, weights[some[view]] * share, len(reach))
+        total += summed
+    return total, seen
 
 
 def _cells(place):

@@ -7,7 +7,7 @@ by scoring rays looks too good on them, so validation rays go through other pixe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Literal
 
@@ -240,12 +240,9 @@ def cast_visible(
     log_left = np.zeros(len(columns) * len(rows))
 
     def visible_hits():
-        for piece in hits(footprints, columns, rows, _PAIRS, lit):
+        for piece in hits(footprints, columns, rows, _PAIRS, log_left, LOG_DIM - _MARGIN):
             yield piece
             log_left[:] += np.bincount(piece[1], np.log1p(-piece[2]), len(log_left))
-
-    def lit():
-        return log_left > LOG_DIM - _MARGIN
 
     return _front_to_back(footprints, columns, rows, None, visible_hits()).visible(LOG_DIM)
 
@@ -277,14 +274,15 @@ def hits(
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
     limit: int,
-    lit: Callable[[], NDArray[np.bool_]] | None = None,
+    log_left: NDArray[np.float64] | None = None,
+    least: float = 0.0,
     *,
     aims: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
     """Yield hits of some footprints at a time: ascending rows of these, rays, alphas, (h,) each.
 
     Columns, rows and aims are those of `Rays`. About `limit` pairs of footprint and pixel in its
-    bounding box are held at once; `lit` says which of all rays, (P,) bool, still want hits.
+    bounding box are held at once. Rays of which `log_left`, (P,), is at most `least` get no more.
     """
     for piece in chunks(len(footprints.index), _FOOTPRINTS):
         some = footprints.part(piece)
@@ -299,8 +297,9 @@ def hits(
                 (np.maximum(first - 1, 0), count + (first > 0)) for first, count in (across, down)
             )
         reached = across[1] * down[1]
-        if lit is not None:
-            reached *= _reached(lit().reshape(len(rows), len(columns)), across, down)
+        if log_left is not None:
+            lit = (log_left > least).reshape(len(rows), len(columns))
+            reached *= _reached(lit, across, down)
         boxed = np.flatnonzero(reached > 0)  # (r,)
         ends = np.cumsum(reached[boxed])
         cuts = np.searchsorted(ends, np.arange(0, int(ends[-1:].sum()), limit)).tolist()
@@ -308,8 +307,8 @@ def hits(
             checkpoint()
             owner, column, row = _boxed_pixels(boxed[start:end], across, down)
             pixel = row * np.int32(len(columns)) + column
-            if lit is not None:
-                left = np.flatnonzero(lit().take(pixel))
+            if log_left is not None:
+                left = np.flatnonzero((log_left > least).take(pixel))
                 if len(left) < len(owner):
                     owner, pixel = owner.take(left), pixel.take(left)
                     column, row = column.take(left), row.take(left)

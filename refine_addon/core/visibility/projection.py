@@ -178,7 +178,7 @@ def prepare(
     order = spatial_order(
         positions, lambda rows: splat_fingerprint(splats, index[rows]), threads=threads
     )
-    make = _activate if folder_of(splats) is None else _activate_on_disk
+    make = _activate if folder_of(splats) is None or not len(order) else _activate_on_disk
     later = part(progress, 0.4, 1.0)
     return make(splats, index[order], positions[order], scene, later, threads), scene, good
 
@@ -198,8 +198,6 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
                 arrays[name][0, :, : len(part)] = values
         return arrays
 
-    if not len(index):
-        return _activate(bare, index, positions, scene, progress, threads)
     parts = run(columns, chunks(len(index), CHUNK), progress=progress, what="reading",
                 threads=threads)  # fmt: skip
     folder = folder_of(splats) / f"gaussians-{secrets.token_hex(4)}"  # type: ignore[operator]
@@ -295,12 +293,12 @@ def project(
             filled += len(rows)
     checkpoint()
     order = _by_depth(arrays.pop(0)[:filled])
-    # One by one: all in both orders would be the most memory that a view takes.
-    ordered = (arrays.pop(0)[..., :filled].take(order, axis=-1) for _ in range(len(arrays)))
-    footprints = Footprints(*ordered)
     if gaussians.model == "antialiased":  # some are now too faint to be drawn
-        return footprints.take(np.flatnonzero(footprints.alphas > ALPHA_CUT))
-    return footprints
+        order = order[arrays[6].take(order) > ALPHA_CUT]
+    # One by one: all in both orders would be the most memory that a view takes.
+    return Footprints(
+        *(arrays.pop(0)[..., :filled].take(order, axis=-1) for _ in range(len(arrays)))
+    )
 
 
 def in_camera(
