@@ -272,10 +272,11 @@ def run(
 ) -> Iterator[Outcome]:
     """Call ``work(item)`` for each item, and yield the results in order, as soon as they are there.
 
-    Results must not depend on where work runs. In processes, only used if `cost`, the expected
-    seconds on one core, is above 0, changes that it makes are lost. ``progress(fraction, what)`` is
-    called in this thread between items and, on threads or if work calls `checkpoint`, ten times a
-    second. When it cancels, running items end at their next `checkpoint`, processes at once.
+    Results must not depend on where work runs. NumPy ignores what underflows in it everywhere. In
+    processes, only used if `cost`, the expected seconds on one core, is above 0, changes that it
+    makes are lost. ``progress(fraction, what)`` is called in this thread between items and, on
+    threads or if work calls `checkpoint`, ten times a second. When it cancels, running items end at
+    their next `checkpoint`, processes at once.
     """
     # Freeing one 30 MB block raises glibc's mmap threshold, so that buffers are reused instead of
     # page-faulted. No effect on other systems.
@@ -319,7 +320,7 @@ def _in_turn(work, items, tell):
             checkpoint()  # the work that this is a part of may be cancelled
             reported = -math.inf
             check()
-        with checked_by(check):
+        with checked_by(check), np.errstate(under="ignore"):
             result = work(item)
         yield result
 

@@ -116,8 +116,7 @@ def _drawn(splats, gaussians, scene, view, layers, progress, threads):
     def work(piece: slice) -> NDArray[np.float64]:
         rows = np.arange(piece.start, piece.stop)
         cut = None if layers is None else _Cut(layers, depths, piece)
-        with np.errstate(under="ignore"):
-            strip = _strip(footprints, colors, view.width, rows, cut)
+        strip = _strip(footprints, colors, view.width, rows, cut)
         return strip.reshape(4, len(rows), view.width)
 
     pieces = chunks(view.height, max(_PIXELS // view.width, 1))

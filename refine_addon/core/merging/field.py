@@ -80,12 +80,11 @@ class MeasuredField(NamedTuple):
         """Field with the bias; `scene`, (2, 2), is `seen_and_whole` of all splats that merge."""
         shares = [seen / whole if whole > 0.0 else 0.0 for seen, whole in scene.tolist()]
         unhidden = self.mass * self.field.opacity
-        with np.errstate(under="ignore"):
-            return replace(
-                self.field,
-                contribution=self.field.contribution + self.mass * shares[0] / (1.0 + self.seen),
-                error=self.field.error + unhidden * shares[1] / (1.0 + self.seen),
-            )
+        return replace(
+            self.field,
+            contribution=self.field.contribution + self.mass * shares[0] / (1.0 + self.seen),
+            error=self.field.error + unhidden * shares[1] / (1.0 + self.seen),
+        )
 
 
 def measured_field(
@@ -112,20 +111,19 @@ def measured_field(
     closest = NEAR_RELATIVE * scene.size
 
     def fill(piece: slice) -> None:
-        with np.errstate(under="ignore"):
-            some = splats.take(rows[piece])
-            means = np.ascontiguousarray(some.means, np.float64)
-            logs = np.asarray(some.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
-            axes = rotation_matrices(some.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
-            covariances = packed(axes @ np.swapaxes(axes, 1, 2))
-            direction, deviation, pixel, seen[piece] = _viewing(means, weighted, closest)
-            color = spherical_harmonics.colors(direction, some.sh_dc, some.sh_rest)
-            alpha, blur = opacity(some.opacity_logits), LOW_PASS * pixel
-            # Antialiasing keeps the mass that splats have without the low-pass.
-            wider = np.zeros(len(blur)) if splats.model == "antialiased" else blur
-            xx, xy, yy = footprint(covariances, across(direction), wider)  # (n,) each
-            # In pixels of a view, over 2 pi; a constant factor does not matter here.
-            mass[piece] = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / pixel
+        some = splats.take(rows[piece])
+        means = np.ascontiguousarray(some.means, np.float64)
+        logs = np.asarray(some.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
+        axes = rotation_matrices(some.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
+        covariances = packed(axes @ np.swapaxes(axes, 1, 2))
+        direction, deviation, pixel, seen[piece] = _viewing(means, weighted, closest)
+        color = spherical_harmonics.colors(direction, some.sh_dc, some.sh_rest)
+        alpha, blur = opacity(some.opacity_logits), LOW_PASS * pixel
+        # Antialiasing keeps the mass that splats have without the low-pass.
+        wider = np.zeros(len(blur)) if splats.model == "antialiased" else blur
+        xx, xy, yy = footprint(covariances, across(direction), wider)  # (n,) each
+        # In pixels of a view, over 2 pi; a constant factor does not matter here.
+        mass[piece] = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / pixel
         seen_from = direction, deviation, np.clip(color, 0.0, _BRIGHTEST), blur
         values = means, covariances, alpha, *sums[:, rows[piece]], *seen_from
         for item, of_piece in zip(fields(Field), values, strict=False):

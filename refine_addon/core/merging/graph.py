@@ -136,8 +136,7 @@ class MergeGraph:
             rows = edges[piece]
             first, second = self.first[rows], self.second[rows]
             least = np.minimum(self.field.error.take(first), self.field.error.take(second))
-            with np.errstate(under="ignore"):
-                cost = pricing.costs(self.field, first, second, least / self.penalty)
+            cost = pricing.costs(self.field, first, second, least / self.penalty)
             self.cost[rows] = self.penalty * cost
 
         pieces = chunks(len(edges), _CHUNK)
@@ -193,9 +192,8 @@ class MergeGraph:
         share = np.empty(len(edges))
 
         def merge(piece: slice) -> None:
-            with np.errstate(under="ignore"):
-                pairs = pricing.price(field, first[piece], second[piece])
-                field.put(into[piece], pricing.merge(field, first[piece], second[piece], pairs))
+            pairs = pricing.price(field, first[piece], second[piece])
+            field.put(into[piece], pricing.merge(field, first[piece], second[piece], pairs))
             share[piece] = np.where(swap[piece], 1.0 - pairs.color, pairs.color)
 
         run_all(merge, chunks(len(edges), _CHUNK), threads=self.threads)
@@ -316,11 +314,10 @@ def _candidates(points, window, progress, threads):
 def _nearest_of(columns, piece, candidates, count):
     """The `count` nearest of the candidates of n points, (n, count)."""
     squared = np.zeros(candidates.shape)  # (n, C)
-    with np.errstate(under="ignore"):
-        for along in columns:
-            step = along.take(candidates) - along[piece, None]
-            squared += np.multiply(step, step, out=step)
-        distance = np.minimum(squared, np.finfo(np.float32).max).astype(np.float32)
+    for along in columns:
+        step = along.take(candidates) - along[piece, None]
+        squared += np.multiply(step, step, out=step)
+    distance = np.minimum(squared, np.finfo(np.float32).max).astype(np.float32)
     # The bits of numbers >= 0 sort as they do; the index behind them decides between equal ones.
     key = (distance.view(np.uint32) >> _ROUNDED).astype(np.uint64) << np.uint64(32)
     key |= candidates.astype(np.uint64)

@@ -245,10 +245,9 @@ def _blend(splats, members, share, left, into, progress, threads):
 
     def fill(harmonic):  # one at a time, to save memory; -1 is the constant one
         name, of = ("sh_dc", ()) if harmonic < 0 else ("sh_rest", (harmonic,))
-        with np.errstate(under="ignore"):
-            weighted = getattr(splats, name)[(members, *of)] * share[:, None]  # (m, 3)
-            means = np.add.reduceat(weighted, starts).clip(-largest, largest)
-            getattr(left, name)[(into[starts], *of)] = means.astype(np.float32)
+        weighted = getattr(splats, name)[(members, *of)] * share[:, None]  # (m, 3)
+        means = np.add.reduceat(weighted, starts).clip(-largest, largest)
+        getattr(left, name)[(into[starts], *of)] = means.astype(np.float32)
 
     harmonics = range(-1, splats.sh_rest.shape[1]) if len(starts) else ()
     run_all(fill, harmonics, progress=progress, what="merging", threads=threads)
@@ -329,8 +328,7 @@ def _merge(folder, item):
     origin, stage = noted(folder, f"region-{number}")[1]
     stage = replace(stage, splats=copied(stage.splats, origin, stage.threads))
     rows, graph = noted(folder, f"graph-{number}")[1]
-    with np.errstate(under="ignore"):
-        left, keep, members, sums = stage.reduced(rows, graph, len(origin) - removals, look)
+    left, keep, members, sums = stage.reduced(rows, graph, len(origin) - removals, look)
     return origin[keep], members, sums, on_disk(folder / f"left-{number}", [left])
 
 

@@ -274,20 +274,19 @@ def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[A
 
     def fill(piece: slice) -> None:
         some = merged.take(np.arange(piece.start, piece.stop))
-        with np.errstate(under="ignore"):
-            logs, vectors = axes(some.covariances)
-            opacity = some.opacity
-            if merged.model == "2dgs":
-                vectors = vectors[:, :, [1, 2, 0]]
-                logs = np.stack([logs[:, 1], logs[:, 2], np.full(len(logs), LOG_ZERO)], axis=1)
-                plane, none = across(some.direction), np.zeros(len(logs))
-                before, after = (
-                    _area(_disc_as_drawn(footprint(each, plane, none), some.blur))
-                    for each in (some.covariances, flat(some.covariances))
-                )
-                opacity = np.minimum(opacity * before / after, ALPHA_MAX)
-            stored[0][piece], stored[1][piece] = logs, quaternion(vectors)
-            stored[2][piece] = np.log(opacity) - np.log1p(-opacity)
+        logs, vectors = axes(some.covariances)
+        opacity = some.opacity
+        if merged.model == "2dgs":
+            vectors = vectors[:, :, [1, 2, 0]]
+            logs = np.stack([logs[:, 1], logs[:, 2], np.full(len(logs), LOG_ZERO)], axis=1)
+            plane, none = across(some.direction), np.zeros(len(logs))
+            before, after = (
+                _area(_disc_as_drawn(footprint(each, plane, none), some.blur))
+                for each in (some.covariances, flat(some.covariances))
+            )
+            opacity = np.minimum(opacity * before / after, ALPHA_MAX)
+        stored[0][piece], stored[1][piece] = logs, quaternion(vectors)
+        stored[2][piece] = np.log(opacity) - np.log1p(-opacity)
 
     run_all(fill, chunks(count, _CHUNK), progress=progress, what="merging", threads=threads)
     return stored

@@ -132,20 +132,19 @@ def score(
         points = np.empty((3, piece.stop - piece.start))
         np.subtract(columns.means[piece].T, origin[:, None], out=points)
         alone = visibility[piece]
-        with np.errstate(under="ignore"):
-            if prior:
-                alone[:] = 0.0
-                for center, weight in weighted:
-                    alone += weight / (np.square(points - center[:, None]).sum(axis=0) + eta)
-            elif not alone.all():
-                away = np.einsum("in,in->n", points, points) + spread + eta
-                alone[:] = np.where(alone == 0.0, UNSEEN / away, alone)
-            alone *= columns.alpha[piece]
-            alone *= columns.good[piece]
-            if not prior:
-                cells[piece] = _cells(axes @ points)
-            seen[piece] *= columns.good[piece]
-            return [float(np.sum(alone * g)) for g in columns.three_g(piece)]
+        if prior:
+            alone[:] = 0.0
+            for center, weight in weighted:
+                alone += weight / (np.square(points - center[:, None]).sum(axis=0) + eta)
+        elif not alone.all():
+            away = np.einsum("in,in->n", points, points) + spread + eta
+            alone[:] = np.where(alone == 0.0, UNSEEN / away, alone)
+        alone *= columns.alpha[piece]
+        alone *= columns.good[piece]
+        if not prior:
+            cells[piece] = _cells(axes @ points)
+        seen[piece] *= columns.good[piece]
+        return [float(np.sum(alone * g)) for g in columns.three_g(piece)]
 
     sums = run_all(
         complete, chunks(total, _CHUNK),
@@ -163,10 +162,9 @@ def score(
     values = np.empty(total, np.float32)
 
     def add(piece):
-        with np.errstate(under="ignore"):
-            terms = zip(factors, columns.three_g(piece), strict=True)
-            whole = sum(factor * (visibility[piece] * g) for factor, g in terms)
-            _store(values, whole, columns.good, piece)
+        terms = zip(factors, columns.three_g(piece), strict=True)
+        whole = sum(factor * (visibility[piece] * g) for factor, g in terms)
+        _store(values, whole, columns.good, piece)
 
     run_all(add, chunks(total, 4 * _CHUNK), progress=comparing, what="scoring", threads=threads)
     if not prior:
@@ -217,25 +215,23 @@ def _read(splats, origin, spread, progress, threads):
 
         means = columns.means[piece] = clean(chunk.means)
         offset = means - origin  # (n, 3)
-        # Values that underflow to 0 are negligible in the sums.
-        with np.errstate(under="ignore"):
-            squared[piece] = np.einsum("ij,ij->i", offset, offset) + spread
-            alpha = columns.alpha[piece] = opacity(clean(chunk.opacity_logits, -np.inf))
-            red, green, blue = base_color(clean(chunk.sh_dc)).T
-            columns.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
-            logs = clean(chunk.log_scales).astype(np.float64)
-            if chunk.model == "2dgs":  # discs have two axes
-                logs[:, 2] = logs[:, :2].min(axis=1)
-            columns.area[piece], ratio, longest = _axes(logs)
-            columns.reach[piece] = REACH * longest
-            alpha, luma = alpha[good], columns.luma[piece][good].astype(np.float64)
-            mean = luma.sum() / max(len(luma), 1)
-            squares = np.sum(np.square(luma - mean))
-            translucency = np.sum(4.0 * alpha * (1.0 - alpha))
-            # Nearer than this, the products underflow anyway.
-            weighted = offset / np.maximum(squared[piece], _SMALLEST_SQUARE)[:, None]
-            weighted[~good] = 0.0
-            moments = np.vstack([weighted.T @ offset, weighted.sum(axis=0)])
+        squared[piece] = np.einsum("ij,ij->i", offset, offset) + spread
+        alpha = columns.alpha[piece] = opacity(clean(chunk.opacity_logits, -np.inf))
+        red, green, blue = base_color(clean(chunk.sh_dc)).T
+        columns.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+        logs = clean(chunk.log_scales).astype(np.float64)
+        if chunk.model == "2dgs":  # discs have two axes
+            logs[:, 2] = logs[:, :2].min(axis=1)
+        columns.area[piece], ratio, longest = _axes(logs)
+        columns.reach[piece] = REACH * longest
+        alpha, luma = alpha[good], columns.luma[piece][good].astype(np.float64)
+        mean = luma.sum() / max(len(luma), 1)
+        squares = np.sum(np.square(luma - mean))
+        translucency = np.sum(4.0 * alpha * (1.0 - alpha))
+        # Nearer than this, the products underflow anyway.
+        weighted = offset / np.maximum(squared[piece], _SMALLEST_SQUARE)[:, None]
+        weighted[~good] = 0.0
+        moments = np.vstack([weighted.T @ offset, weighted.sum(axis=0)])
         return (len(luma), ratio[good].sum(), translucency, mean, squares), moments
 
     results = run_all(
@@ -284,20 +280,17 @@ def _sum_views(columns, seen, views, origin, near, eta, progress, threads):
         np.subtract(means.T, origin[:, None], out=points[:3])
         starts = np.arange(0, len(rows), _RUN)
         low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
-        with np.errstate(under="ignore"):
-            touching, whole = frustums.classify(low, high, np.maximum.reduceat(reach, starts))
-            # Views of which a run is partly outside come first, then those that see all of it.
-            order_of_views = np.argsort(
-                whole * 1 - touching * 2, axis=0, kind="stable"
-            )  # (V, runs)
-            counts = np.count_nonzero(touching, axis=0).tolist()
-            partly = np.count_nonzero(touching & ~whole, axis=0).tolist()
-            for run, start in enumerate(starts.tolist()):
-                here = slice(start, start + _RUN)
-                columns.reach[rows[here]], seen[rows[here]] = _of_run(
-                    frustums, weights, eta, points[:, here], reach[here],
-                    order_of_views[: counts[run], run], partly[run],
-                )  # fmt: skip
+        touching, whole = frustums.classify(low, high, np.maximum.reduceat(reach, starts))
+        # Views of which a run is partly outside come first, then those that see all of it.
+        order_of_views = np.argsort(whole * 1 - touching * 2, axis=0, kind="stable")  # (V, runs)
+        counts = np.count_nonzero(touching, axis=0).tolist()
+        partly = np.count_nonzero(touching & ~whole, axis=0).tolist()
+        for run, start in enumerate(starts.tolist()):
+            here = slice(start, start + _RUN)
+            columns.reach[rows[here]], seen[rows[here]] = _of_run(
+                frustums, weights, eta, points[:, here], reach[here],
+                order_of_views[: counts[run], run], partly[run],
+            )  # fmt: skip
 
     run_all(sort, chunks(total, ROWS), threads=threads)
     run_all(
@@ -309,15 +302,14 @@ def _near_order(means):
     """Order of positions, (n, 3), along a Hilbert curve through 32^3 cells, stable in a cell."""
     sample = means[:: max(len(means) // _SAMPLE, 1)].astype(np.float64)
     cell = np.zeros(len(means), np.uint16)
-    with np.errstate(under="ignore"):
-        low, high = np.quantile(sample, _ENDS, axis=0)  # (3,) each
-        # Cubes: a run is about as wide as high, however flat the scene.
-        scale = (1 << _BITS) / max(float(np.max(high - low)), _LEAST_SPAN)
-        for values, least in zip(means.T, low, strict=True):
-            number = np.subtract(values, least, dtype=np.float64)  # (N,)
-            number *= scale
-            cell <<= _BITS
-            cell |= np.clip(number, 0, (1 << _BITS) - 1, out=number).astype(np.uint16)
+    low, high = np.quantile(sample, _ENDS, axis=0)  # (3,) each
+    # Cubes: a run is about as wide as high, however flat the scene.
+    scale = (1 << _BITS) / max(float(np.max(high - low)), _LEAST_SPAN)
+    for values, least in zip(means.T, low, strict=True):
+        number = np.subtract(values, least, dtype=np.float64)  # (N,)
+        number *= scale
+        cell <<= _BITS
+        cell |= np.clip(number, 0, (1 << _BITS) - 1, out=number).astype(np.uint16)
     return np.argsort(_places()[cell], kind="stable")
 
 
@@ -401,8 +393,7 @@ def _compare(values, cells, good, threads):
     def compare(piece):
         plain = values[piece].astype(np.float64)
         weight = plain / (plain + LOCAL_HALF * overall)
-        with np.errstate(under="ignore"):
-            _store(values, plain * np.exp(weight * powers[cells[piece]]), good, piece)
+        _store(values, plain * np.exp(weight * powers[cells[piece]]), good, piece)
 
     run_all(compare, chunks(len(values), 4 * _CHUNK), threads=threads)
 

@@ -290,8 +290,7 @@ class _RemovalRounds:
         def colored(number):
             rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
             scoring_rays.rays[number] = None
-            with np.errstate(under="ignore"):
-                colors = scoring_rays.colors(number, rays)
+            colors = scoring_rays.colors(number, rays)
             return rays, colors, weight * view.width * view.height / rays.count
 
         # Of each view: rays, (3, u) colours of what they hit, and the area of the image for each
@@ -326,9 +325,8 @@ class _RemovalRounds:
             rays, colors, area = self._views[number]
             rays = rays.keeping(keep.take(rays.hit))
             self._views[number] = rays, colors, area
-            with np.errstate(under="ignore"):
-                error, contribution = rays.removal_errors(colors)
-                return rays.hit, area * np.stack([contribution, error])
+            error, contribution = rays.removal_errors(colors)
+            return rays.hit, area * np.stack([contribution, error])
 
         sums = np.zeros((2, len(keep)))
         for hit, of_view in run(

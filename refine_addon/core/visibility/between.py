@@ -106,9 +106,8 @@ def transmittance(
     across /= np.linalg.norm(across)
     rotation, pixel = np.stack([across, np.cross(along, across), along]), np.zeros(1, np.int64)
     ray = View(rotation, start, _FOCAL, _FOCAL, 0.5, 0.5, 1, 1, far=length)
-    with np.errstate(under="ignore"):
-        hits = cast(projection.project(gaussians, scene, ray), pixel, pixel)
-        return float(np.exp(np.log1p(-hits.alpha).sum(dtype=np.float64)))
+    hits = cast(projection.project(gaussians, scene, ray), pixel, pixel)
+    return float(np.exp(np.log1p(-hits.alpha).sum(dtype=np.float64)))
 
 
 def _neighbours(place):

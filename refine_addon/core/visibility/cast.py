@@ -104,9 +104,8 @@ class RaySample:
         """Project all Gaussians into the views and cast the rays that are wanted."""
 
         def cast_one(number):
-            with np.errstate(under="ignore"):
-                footprints = projection.project(gaussians, scene, self.views[number][0])
-                self.rays[number] = cast_view(self.views, number, footprints, self.kind)
+            footprints = projection.project(gaussians, scene, self.views[number][0])
+            self.rays[number] = cast_view(self.views, number, footprints, self.kind)
 
         run_all(
             cast_one, filter(self.wants, range(len(self.views))),

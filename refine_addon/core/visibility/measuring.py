@@ -88,9 +88,8 @@ def measure(
         for number, ((measurement, cast), some) in zip(group, each, strict=False):
             (rows, inside, contribution, error), weight = measurement, views[number][1]
             before = sums[1, chosen]  # (m,)
-            with np.errstate(under="ignore"):
-                sums[0, rows] += weight * contribution
-                sums[1, rows] += weight * error
+            sums[0, rows] += weight * contribution
+            sums[1, rows] += weight * error
             sums[2, rows[inside]] += 1.0  # no row is there twice
             of_views.append(sums[1, chosen] - before)
             for ray_sample, rays in zip(some, cast, strict=True):
@@ -106,19 +105,17 @@ def _measure_and_cast(gaussians, scene, views, number_and_kinds):
     """What a view sees of the splats, and its scoring or validation rays, in any process."""
     number, kinds = number_and_kinds
     footprints, measurement = _measure_view(gaussians, scene, views[number][0])
-    with np.errstate(under="ignore"):
-        return measurement, [cast_view(views, number, footprints, kind) for kind in kinds]
+    return measurement, [cast_view(views, number, footprints, kind) for kind in kinds]
 
 
 def _measure_view(gaussians, scene, view):
     """Footprints in a view; rows, whether centres are inside, contributions, errors, (n,) each."""
-    with np.errstate(under="ignore"):
-        footprints = projection.project(gaussians, scene, view)
-        return_freed(mapped_only=True)
-        integrals = np.empty(0), np.empty(0)
-        if len(footprints.index):
-            points = scatter(footprints, view, cell_size(footprints, view))
-            integrals = _integrals(gaussians, footprints, points)
+    footprints = projection.project(gaussians, scene, view)
+    return_freed(mapped_only=True)
+    integrals = np.empty(0), np.empty(0)
+    if len(footprints.index):
+        points = scatter(footprints, view, cell_size(footprints, view))
+        integrals = _integrals(gaussians, footprints, points)
     return footprints, (footprints.index.astype(np.int32), footprints.inside, *integrals)
 
 

@@ -239,8 +239,7 @@ def _activate(splats, index, positions, scene, progress, threads):
         colors = SH_C0 * np.asarray(chunk.sh_dc, np.float64) + 0.5
         result.colors[piece] = colors.clip(0.0, BRIGHTEST)
 
-    with np.errstate(under="ignore"):
-        run_all(fill, chunks(count, _CHUNK), progress=progress, what="reading", threads=threads)
+    run_all(fill, chunks(count, _CHUNK), progress=progress, what="reading", threads=threads)
     return in_file(result)
 
 

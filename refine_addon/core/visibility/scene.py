@@ -57,8 +57,7 @@ class Scene:
             # At least two rows at a time: BLAS rounds the product of one otherwise.
             begin = max(min(piece.start, piece.stop - 2), 0)
             chosen = slice(begin, piece.stop) if rows is None else rows[begin : piece.stop]
-            with np.errstate(under="ignore"):
-                product = (means[chosen] - self.origin) @ turn
+            product = (means[chosen] - self.origin) @ turn
             places[piece] = product[piece.start - begin :]
 
         run_all(fill, chunks(count, _CHUNK), threads=threads)
@@ -78,10 +77,9 @@ def scene_of(
     squared = np.empty(len(means))
 
     def measure(piece):
-        with np.errstate(under="ignore"):
-            # Undrawable splats may hold any number, such as infinity.
-            offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
-            squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
+        # Undrawable splats may hold any number, such as infinity.
+        offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
+        squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
 
     run_all(measure, chunks(len(means), _CHUNK), threads=threads)
     median = float(np.median(squared[drawable])) if drawable.any() else 0.0
@@ -98,11 +96,10 @@ def scene_of(
 
 def _moments(means, scene):
     """Sums for `principal_axes`, (4, 3), weighted 1 / (1 + r^2)^2: far splats hardly matter."""
-    with np.errstate(under="ignore"):
-        positions = scene.positions(means)  # (n, 3)
-        nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
-        weighted = positions * nearness[:, None]
-        return np.vstack([weighted.T @ positions, weighted.sum(axis=0)])
+    positions = scene.positions(means)  # (n, 3)
+    nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
+    weighted = positions * nearness[:, None]
+    return np.vstack([weighted.T @ positions, weighted.sum(axis=0)])
 
 
 def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -148,8 +145,7 @@ def spatial_order(
     def fill(piece):
         place, interleaved = positions[piece], 0
         # All of space is mapped into a ball, so the resolution falls with the distance.
-        with np.errstate(under="ignore"):
-            scale = cells / 2.0 / (1.0 + np.sqrt(np.einsum("ij,ij->i", place, place)))  # (n,)
+        scale = cells / 2.0 / (1.0 + np.sqrt(np.einsum("ij,ij->i", place, place)))  # (n,)
         for axis in range(3):
             bits = (place[:, axis] * scale + cells / 2.0).clip(0.0, cells - 1.0).astype(np.int64)
             for shift, mask in _SPREAD_BITS:
