@@ -112,12 +112,27 @@ def _drawn(splats, gaussians, scene, view, layers, progress, threads):
         colors = colors_from(splats, gaussians.index[footprints.index], view.center)
         places = projection.coordinates(gaussians.means, scene, view)
         depths = scene.size * places[2, footprints.index]
+    columns = np.arange(view.width)
 
     def work(piece: slice) -> NDArray[np.float64]:
         rows = np.arange(piece.start, piece.stop)
         cut = None if layers is None else _Cut(layers, depths, piece)
-        strip = _strip(footprints, colors, view.width, rows, cut)
-        return strip.reshape(4, len(rows), view.width)
+        pixels = len(columns) * len(rows)
+        log_left, image = np.zeros(pixels), np.zeros((4, pixels))  # logarithm of the transmittance
+        # Footprints come front to back, some at a time; in opaque pixels no more are computed.
+        for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, log_left, LOG_OPAQUE):
+            order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
+            owner, pixel, alpha = owner[order], pixel[order], alpha[order]
+            shares = 1.0 if cut is None else cut.shares(owner, pixel, alpha)
+            # Splats that layers hide take nothing from the background.
+            weight = shares * _weights(pixel, alpha * (shares > 0.0), log_left)
+            for channel in range(3):
+                light = weight * colors[channel].take(owner)
+                image[channel] += np.bincount(pixel, light, pixels)
+        image[3] = 1.0 - np.exp(log_left)
+        if cut is not None:
+            cut.insert(image, log_left)
+        return image.reshape(4, len(rows), view.width)
 
     pieces = chunks(view.height, max(_PIXELS // view.width, 1))
     strips = run_all(work, pieces, progress=progress, what="drawing", threads=threads)
@@ -153,26 +168,6 @@ class _Cut:
         if self._background is not None:
             image[:3] += passed * self._background
         image[3] = 1.0 - passed * self._left[-1]
-
-
-def _strip(footprints, colors, width, rows, cut):
-    """`draw` in R ascending rows of a width, (4, R * width), with colours (3, n) float64."""
-    # Footprints come front to back, some at a time; those behind are not computed in opaque pixels.
-    columns, pixels = np.arange(width), width * len(rows)
-    log_left, image = np.zeros(pixels), np.zeros((4, pixels))  # logarithm of the transmittance
-    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, log_left, LOG_OPAQUE):
-        order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
-        owner, pixel, alpha = owner[order], pixel[order], alpha[order]
-        shares = 1.0 if cut is None else cut.shares(owner, pixel, alpha)
-        # Splats that layers hide take nothing from the background.
-        weight = shares * _weights(pixel, alpha * (shares > 0.0), log_left)
-        for channel in range(3):
-            light = weight * colors[channel].take(owner)
-            image[channel] += np.bincount(pixel, light, pixels)
-    image[3] = 1.0 - np.exp(log_left)
-    if cut is not None:
-        cut.insert(image, log_left)
-    return image
 
 
 def _weights(pixel, alpha, log_left):

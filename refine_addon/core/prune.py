@@ -445,11 +445,10 @@ class _Prune:
         gone = len(keep) - len(rest)
         deleted = Merged(rest, keep, np.zeros(len(rest), np.bool_), 0, gone)  # changes none
         plain = estimated(deleted.splats)
-        outcome = Outcome(merged, "merge", {"delete": plain, "merge": psnr})
-        if plain is not None and psnr is not None and plain > psnr:
-            outcome = replace(outcome, merged=deleted, done="delete")
-        kept = replace(outcome.merged, splats=in_file(outcome.merged.splats))
-        outcome = replace(outcome, merged=kept)
+        less = plain is not None and psnr is not None and plain > psnr
+        kept = deleted if less else merged
+        kept = replace(kept, splats=in_file(kept.splats))
+        outcome = Outcome(kept, "delete" if less else "merge", {"delete": plain, "merge": psnr})
         del merged, deleted, rest  # one of them is not needed while splats are refitted
         outcome = self._refitted(outcome, scores.deciding or used, refitting)
         if outcome.refitted is None or outcome.stopped is not None:

@@ -272,58 +272,42 @@ def nearest(
     if count <= 0:
         return np.empty((total, 0), np.int32)
     window = max((count + 1) // 2, WINDOW)
-    candidates = _candidates(points, window, part(progress, 0.0, 0.2), threads)
-    columns, near = np.ascontiguousarray(points.T), np.empty((total, count), np.int32)
-
-    def search(piece: slice) -> None:
-        near[piece] = _nearest_of(columns, piece, candidates(piece), count)
-
-    run_all(
-        search, chunks(total, _CHUNK),
-        progress=part(progress, 0.2, 1.0), what="finding neighbours", threads=threads,
-    )  # fmt: skip
-    return near
-
-
-def _candidates(points, window, progress, threads):
-    """Callable: candidates, (n, C), of a slice of n points; they repeat, and hold the point."""
-    total = len(points)
-    if total <= max(SMALL, 2 * window + 1):
-        everyone = np.arange(total, dtype=np.int32)
-        return lambda piece: np.broadcast_to(everyone, (piece.stop - piece.start, total))
-    turns = rotation_matrices(CURVES)
+    width, turns = 2 * window + 1, rotation_matrices(CURVES)
 
     def along(curve: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         order = spatial_order(points @ turns[curve].T + SHIFTS[curve]).astype(np.int32)
         place = np.empty(total, np.int32)
         place[order] = np.arange(total, dtype=np.int32)
         # At either end of a curve the window lies to one side.
-        return order, np.clip(place - window, 0, total - 1 - 2 * window)
+        return order, np.clip(place - window, 0, total - width)
 
-    what = "finding neighbours"
-    curves = run_all(along, range(len(CURVES)), progress=progress, what=what, threads=threads)
+    how: dict[str, Any] = {"what": "finding neighbours", "threads": threads}
+    if total <= max(SMALL, width):  # the window holds all
+        width, curves = total, [(np.arange(total, dtype=np.int32), np.zeros(total, np.int32))]
+    else:
+        curves = run_all(along, range(len(CURVES)), progress=part(progress, 0.0, 0.2), **how)
+    steps, columns = np.arange(width, dtype=np.int32), np.ascontiguousarray(points.T)
+    near = np.empty((total, count), np.int32)
 
-    def around(piece: slice) -> NDArray[np.int32]:
-        steps = np.arange(2 * window + 1, dtype=np.int32)
-        windows = [order.take(first[piece, None] + steps) for order, first in curves]
-        return np.concatenate(windows, axis=1)
+    def search(piece: slice) -> None:
+        # Candidates, (n, C), of n points; they repeat, and hold the point.
+        candidates = np.concatenate(
+            [order.take(first[piece, None] + steps) for order, first in curves], axis=1
+        )
+        squared = np.zeros(candidates.shape)
+        for coordinate in columns:
+            step = coordinate.take(candidates) - coordinate[piece, None]
+            squared += np.multiply(step, step, out=step)
+        distance = np.minimum(squared, np.finfo(np.float32).max).astype(np.float32)
+        # The bits of numbers >= 0 sort as they do; the index behind them decides equal ones.
+        key = (distance.view(np.uint32) >> _ROUNDED).astype(np.uint64) << np.uint64(32)
+        key |= candidates.astype(np.uint64)
+        key[candidates == np.arange(piece.start, piece.stop)[:, None]] = _NOBODY
+        key.sort(axis=1)
+        # A candidate of several curves stands there as often.
+        key[:, 1:][key[:, 1:] == key[:, :-1]] = _NOBODY
+        key.sort(axis=1)
+        near[piece] = (key[:, :count] & _INDEX).astype(np.int32)
 
-    return around
-
-
-def _nearest_of(columns, piece, candidates, count):
-    """The `count` nearest of the candidates of n points, (n, count)."""
-    squared = np.zeros(candidates.shape)  # (n, C)
-    for along in columns:
-        step = along.take(candidates) - along[piece, None]
-        squared += np.multiply(step, step, out=step)
-    distance = np.minimum(squared, np.finfo(np.float32).max).astype(np.float32)
-    # The bits of numbers >= 0 sort as they do; the index behind them decides between equal ones.
-    key = (distance.view(np.uint32) >> _ROUNDED).astype(np.uint64) << np.uint64(32)
-    key |= candidates.astype(np.uint64)
-    key[candidates == np.arange(piece.start, piece.stop)[:, None]] = _NOBODY
-    key.sort(axis=1)
-    # A candidate of several curves stands there as often.
-    key[:, 1:][key[:, 1:] == key[:, :-1]] = _NOBODY
-    key.sort(axis=1)
-    return (key[:, :count] & _INDEX).astype(np.int32)
+    run_all(search, chunks(total, _CHUNK), progress=part(progress, 0.2, 1.0), **how)
+    return near

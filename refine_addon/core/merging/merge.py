@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..execute import Progress, chunks, part, report, return_freed, run_all, seconds, silent, stages
 from ..mapped import divided, in_one, in_regions, look, new_folder, note, noted, on_disk, pieces
-from ..splats import ARRAYS, Splats, drawable
+from ..splats import ARRAYS, Splats, assign, drawable
 from ..views import ViewSet
 from ..visibility.scene import Scene, scene_of, spatial_order, splat_fingerprint
 from .field import Array, measured_field
@@ -263,14 +263,14 @@ def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) 
         values = getattr(splats, name)
         kind = values.dtype if name == "sh_rest" else np.float64
         columns[name] = np.empty((len(rows), *values.shape[1:]), kind)
+    result = replace(splats, **columns)
 
     def copy(piece: slice) -> None:
         with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
-            for name, column in columns.items():
-                column[piece] = getattr(splats, name)[rows[piece]]
+            assign(result.take(piece), splats.take(rows[piece]))
 
     run_all(copy, chunks(len(rows), _CHUNK), threads=threads)
-    return replace(splats, **columns)
+    return result
 
 
 def _by_regions(stage, keep_count, askew, progress):

@@ -117,7 +117,7 @@ def score(
             f"no camera sees the splats: none of {count} reaches into the image of any of "
             f"{len(ordered)} views; check that cameras and splats share their frame and unit"
         )
-    some, worth = measured[:, sample], prior[index[sample]]
+    some, worth = measured.take(sample, axis=1), prior[index[sample]]
     folds = _folds(some, of_groups, errors, worth, part(weighing, 0.0, 0.5))
     weights, left_out = coverage.floor_weights(folds, _with_floors(some, worth))
     more = []
@@ -248,23 +248,14 @@ def _folds(whole, of_groups, errors, prior, progress):
 def _values(index, good, prior, measured, rays, weights, kept, progress, threads):
     """Scores of N splats, `good` ones drawable; removal is in rounds if there are scoring rays."""
     loading, *of_rounds = stages(progress, len(good), *kept)
-    now = None if rays is None else _RemovalRounds(rays, len(index), loading, threads)
-    undrawn = np.setdiff1d(np.arange(len(good)), index)
-    first = undrawn[np.argsort(prior[undrawn], kind="stable")]
-    order = np.concatenate([first, _order(index, prior, measured, now, weights, kept, of_rounds)])
-    values = np.empty(len(good), np.float32)
-    values[order] = shares_gone(np.arange(1, len(good) + 1), len(good))
-    values[~good] = 0.0
-    return values
-
-
-def _order(index, prior, measured, rays, weights, kept, progress):
-    """Rows of the Gaussians in the order of removal, (M,); `kept` are left after each round."""
-    count, left, removed = len(prior), np.arange(len(index)), []
-    for stay, of_round in zip(kept, progress, strict=True):
-        now = measured[:, index[left]]
-        if rays is not None:
-            now = rays.remove_and_measure(left, now, of_round)
+    rounds = None if rays is None else _RemovalRounds(rays, len(index), loading, threads)
+    count, left = len(good), np.arange(len(index))
+    undrawn = np.setdiff1d(np.arange(count), index)
+    removed = [undrawn[np.argsort(prior[undrawn], kind="stable")]]  # rows in the order of removal
+    for stay, of_round in zip(kept, of_rounds, strict=True):  # `kept` are left after each round
+        now = measured.take(index[left], axis=1)
+        if rounds is not None:
+            now = rounds.remove_and_measure(left, now, of_round)
         report(of_round, 1.0, "scoring")
         worth = prior[index[left]]  # (n,)
         # How many of those left are removed when each of the shares is reached.
@@ -275,7 +266,10 @@ def _order(index, prior, measured, rays, weights, kept, progress):
         order = coverage.order(scores, floors, worth, weights, stops)
         removed.append(index[left[order[:go]]])
         left = np.sort(left[order[go:]])
-    return np.concatenate(removed)
+    values = np.empty(count, np.float32)
+    values[np.concatenate(removed)] = shares_gone(np.arange(1, count + 1), count)
+    values[~good] = 0.0
+    return values
 
 
 class _RemovalRounds:
@@ -335,7 +329,7 @@ class _RemovalRounds:
         ):  # fmt: skip
             sums[:, hit] += of_view
         execute.return_freed()
-        return sums[:, left]
+        return sums.take(left, axis=1)
 
 
 def _grown(measured, before, now, weight):

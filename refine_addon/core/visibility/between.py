@@ -40,17 +40,23 @@ def views_between(
     ordered = [view for view, _ in views.by_distance()]
     if most < 1 or len(ordered) < 2:
         return []
-    pairs = [
-        (ordered[one], ordered[two]) for one, two in _neighbours(ViewSet(tuple(ordered)).places())
-    ]
 
-    def halfway(pair: tuple[View, View]) -> View | None:
-        one, two = pair
-        if (one.center == two.center).all() or (view := _halfway(one, two)) is None:
+    def halfway(numbers: tuple[int, int]) -> View | None:
+        pair = [ordered[number] for number in numbers]
+        one, two = sorted(pair, key=lambda view: view.name)
+        # Singular values of the mean are 1 and the cosine of half the angle between both.
+        left, size, right = np.linalg.svd((one.rotation + two.rotation) / 2.0)
+        start, end = (view.center for view in pair)
+        if (start == end).all() or size[-1] < math.cos(WIDEST / 2.0):
+            return None  # also if one is mirrored
+        if within and transmittance(*within, start, end) < CLEAR:
             return None
-        hidden = within and transmittance(*within, one.center, two.center) < CLEAR
-        return None if hidden else view
+        return replace(
+            one, rotation=left @ right, center=(one.center + two.center) / 2.0,
+            weight=one.weight / 2.0 + two.weight / 2.0, name=f"{one.name} - {two.name}",
+        )  # fmt: skip
 
+    pairs = _neighbours(ViewSet(tuple(ordered)).places())
     found = [view for view in run_all(halfway, pairs, threads=threads) if view is not None]
     return list(ViewSet(tuple(found)).spread(most)) if found else []
 
@@ -128,19 +134,3 @@ def _neighbours(place):
 def _distances(place, here):
     """Squared distances of places from one, (V,), rounded: equal ones stay equal."""
     return np.round(np.sum((place - here) ** 2, axis=1), 9)
-
-
-def _halfway(one, other):
-    """View halfway between two; None if they look too far apart or one is mirrored."""
-    one, other = sorted((one, other), key=lambda view: view.name)
-    # Singular values of the mean are 1 and the cosine of half the angle between both.
-    left, size, right = np.linalg.svd((one.rotation + other.rotation) / 2.0)
-    if size[-1] < math.cos(WIDEST / 2.0):
-        return None
-    return replace(
-        one,
-        rotation=left @ right,
-        center=(one.center + other.center) / 2.0,
-        weight=one.weight / 2.0 + other.weight / 2.0,
-        name=f"{one.name} - {other.name}",
-    )

@@ -68,7 +68,13 @@ class Frustums:
     """
 
     def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:
-        self._rows = _rows(views, views.centers - origin)
+        # Times ``(p, 1)`` x', y' and z, (3, V, 4); p is in the image if ``|x'|, |y'| <= z``.
+        self._rows = np.empty((3, len(views), 4))
+        for index, (view, center) in enumerate(zip(views, views.centers - origin, strict=True)):
+            *axes, forward = np.column_stack([view.rotation, -view.rotation @ center])  # (4,) each
+            for row, axis, side in zip(self._rows, axes, image_sides(view), strict=False):
+                row[index] = (side.focal * axis + side.offset * forward) / side.half
+            self._rows[2, index] = forward
         slopes = [[side.focal / side.half for side in image_sides(view)] for view in views]
         slope = np.minimum(np.prod(np.sqrt(slopes), axis=1, keepdims=True), _STEEPEST)
         self.beyond_per_unit = np.hypot(1.0, slope)
@@ -152,14 +158,3 @@ def census(
 
     counts = run(count_in_views, chunks(len(points), _POINTS), progress=progress, what="counting")
     return sum(counts, np.zeros(len(views), np.int64))
-
-
-def _rows(views, centers):
-    """Rows, (3, V, 4): times ``(p, 1)`` x', y' and z; p is in the image if ``|x'|, |y'| <= z``."""
-    rows = np.empty((3, len(views), 4))
-    for index, (view, center) in enumerate(zip(views, centers, strict=True)):
-        *axes, forward = np.column_stack([view.rotation, -view.rotation @ center])  # (4,) each
-        for row, axis, side in zip(rows, axes, image_sides(view), strict=False):
-            row[index] = (side.focal * axis + side.offset * forward) / side.half
-        rows[2, index] = forward
-    return rows

@@ -95,28 +95,25 @@ def measure(
             for ray_sample, rays in zip(some, cast, strict=True):
                 ray_sample.rays[number] = rays
         total += sums
-        of_groups.append(sums[:, chosen])
+        of_groups.append(sums.take(chosen, axis=1))
         errors.append(np.array(of_views))
     next(each, None)  # so that `run` ends
     return total, of_groups, errors
 
 
 def _measure_and_cast(gaussians, scene, views, number_and_kinds):
-    """What a view sees of the splats, and its scoring or validation rays, in any process."""
-    number, kinds = number_and_kinds
-    footprints, measurement = _measure_view(gaussians, scene, views[number][0])
-    return measurement, [cast_view(views, number, footprints, kind) for kind in kinds]
-
-
-def _measure_view(gaussians, scene, view):
-    """Footprints in a view; rows, whether centres are inside, contributions, errors, (n,) each."""
+    """What a view sees, in any process: rows, whether centres are inside, contributions and errors,
+    (n,) each; and its rays of some kinds.
+    """
+    (number, kinds), view = number_and_kinds, views[number_and_kinds[0]][0]
     footprints = projection.project(gaussians, scene, view)
     return_freed(mapped_only=True)
     integrals = np.empty(0), np.empty(0)
     if len(footprints.index):
         points = scatter(footprints, view, cell_size(footprints, view))
         integrals = _integrals(gaussians, footprints, points)
-    return footprints, (footprints.index.astype(np.int32), footprints.inside, *integrals)
+    measurement = footprints.index.astype(np.int32), footprints.inside, *integrals
+    return measurement, [cast_view(views, number, footprints, kind) for kind in kinds]
 
 
 def _integrals(gaussians, footprints, points):
@@ -137,7 +134,9 @@ def _integrals(gaussians, footprints, points):
     traits[:, :3] = gaussians.colors.take(footprints.index, axis=0)
     traits[:, 3] = mass / np.float32(points.area)
     np.minimum(alphas, np.float32(ALPHA_MAX), out=traits[:, 4])
-    traits[:, 5] = _evenness(footprints, points.area)
+    # The share of each optical depth that is even over a cell, near 0 for narrow splats.
+    narrow = footprints.sigmas[1] ** 2
+    traits[:, 5] = narrow / (narrow + np.float32(points.area))
     seen = np.empty((2, len(points.owners)), np.float32)  # of visible contributions, of errors
     for cells, members in runs(points.counts):
         shares, counts = points.shares[members], points.counts[cells]
@@ -167,12 +166,6 @@ def _integrals(gaussians, footprints, points):
     mass *= np.float32(0.5) * (alphas + np.float32(ALPHA_CUT))
     error *= mass
     return visible.astype(np.float32), error.astype(np.float32)
-
-
-def _evenness(footprints, area):
-    """Share of each optical depth that is even over a cell, near 0 for narrow splats, (n,)."""
-    narrow = footprints.sigmas[1] ** 2
-    return narrow / (narrow + np.float32(area))
 
 
 def _transmittance(front, even):

@@ -98,17 +98,23 @@ class Rays:
         """
         ends = np.append(self._first_hits(), len(self.ray))
         cuts = np.unique(np.searchsorted(ends, [*range(0, len(self.ray), _PIECE), len(self.ray)]))
-        error, weight = np.empty((2, len(self.ray)), np.float32)
+        error, weights = np.empty((2, len(self.ray)), np.float32)
         owner = self.owner.astype(np.intp)
         for first, last in pairwise(cuts.tolist()):  # whole rays at a time
             checkpoint()
-            piece = slice(int(ends[first]), int(ends[last]))
-            error[piece], weight[piece] = _removal_errors(
-                self.alpha[piece], colors.take(owner[piece], axis=1),
+            piece, counts = (
+                slice(int(ends[first]), int(ends[last])),
                 np.diff(ends[first : last + 1]),
-            )  # fmt: skip
-        errors, weights = (np.bincount(owner, each, len(self.hit)) for each in (error, weight))
-        return errors.astype(float), weights.astype(float)
+            )
+            transmittance = _transmittance(self.alpha[piece], counts)
+            weight = transmittance * self.alpha[piece]  # 0 where it is hidden
+            left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))  # behind it
+            changes = contrasts(weight, left, colors.take(owner[piece], axis=1), counts)
+            error[piece] = sum(np.square(change * weight) for change in changes)
+            weights[piece] = weight
+        sums = (np.bincount(owner, each, len(self.hit)) for each in (error, weights))
+        errors, contributions = (each.astype(float) for each in sums)
+        return errors, contributions
 
     def colors_by_nearest_kept(
         self, colors: NDArray[np.float32], keep: NDArray[np.bool_]
@@ -153,19 +159,6 @@ def _transmittance(alpha, counts, opaque=LOG_OPAQUE):
     result = np.exp(log_front.astype(np.float32))
     result[log_front < opaque] = 0.0
     return result
-
-
-def _removal_errors(alpha, colors, counts):
-    """Errors and contributions of hits, (h,), 0 where hidden; see `_transmittance`."""
-    transmittance = _transmittance(alpha, counts)
-    weight = transmittance * alpha
-    left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))  # transmittance behind it
-    error = np.zeros(len(alpha), np.float32)
-    for change in contrasts(weight, left, colors, counts):
-        change *= weight
-        change *= change
-        error += change
-    return error, weight
 
 
 def paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[Any]:

@@ -84,22 +84,15 @@ def scene_of(
     run_all(measure, chunks(len(means), _CHUNK), threads=threads)
     median = float(np.median(squared[drawable])) if drawable.any() else 0.0
     unturned = Scene(origin, size_of(median), np.eye(3))
-    total = sum(
-        run_all(
-            lambda piece: _moments(means[piece][drawable[piece]], unturned),
-            chunks(len(means), _CHUNK), threads=threads,
-        ),
-        np.zeros((4, 3)),
-    )  # fmt: skip
-    return replace(unturned, axes=principal_axes(total))
 
+    def moments(piece):  # weighted 1 / (1 + r^2)^2: far splats hardly matter
+        positions = unturned.positions(means[piece][drawable[piece]])  # (n, 3)
+        nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
+        weighted = positions * nearness[:, None]
+        return np.vstack([weighted.T @ positions, weighted.sum(axis=0)])
 
-def _moments(means, scene):
-    """Sums for `principal_axes`, (4, 3), weighted 1 / (1 + r^2)^2: far splats hardly matter."""
-    positions = scene.positions(means)  # (n, 3)
-    nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
-    weighted = positions * nearness[:, None]
-    return np.vstack([weighted.T @ positions, weighted.sum(axis=0)])
+    of_pieces = run_all(moments, chunks(len(means), _CHUNK), threads=threads)
+    return replace(unturned, axes=principal_axes(sum(of_pieces, np.zeros((4, 3)))))
 
 
 def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
