@@ -90,18 +90,13 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     proper = rotation if np.linalg.det(rotation) > 0 else -rotation
     w, x, y, z = quaternion(proper)
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    sh_rest = splats.sh_rest
     with np.errstate(invalid="ignore", over="ignore"):  # of what is not finite
-        return replace(
-            splats,
-            means=means,
-            log_scales=splats.log_scales + np.float64(np.log(factor)),
-            quaternions=np.asarray(splats.quaternions, np.float64) @ product.T,
-            sh_rest=(
-                spherical_harmonics.rotate(splats.sh_rest, rotation)
-                if rotate_sh and splats.sh_degree
-                else splats.sh_rest
-            ),
-        )
+        if rotate_sh and splats.sh_degree:
+            sh_rest = spherical_harmonics.rotate(sh_rest, rotation)
+        log_scales = splats.log_scales + np.float64(np.log(factor))
+        quats = np.asarray(splats.quaternions, np.float64) @ product.T
+    return replace(splats, means=means, log_scales=log_scales, quaternions=quats, sh_rest=sh_rest)
 
 
 def turned(splats: Splats, axes: str) -> Splats:

@@ -65,9 +65,7 @@ class Result:
     @property
     def splats(self) -> Splats:
         """The kept splats with their new values, in the frame of the views."""
-        if self.merged is not None:
-            return self.merged.splats
-        return self.all_splats().take(self.keep)
+        return self.all_splats().take(self.keep) if self.merged is None else self.merged.splats
 
     def all_splats(self) -> Splats:
         """All splats as they were; `RefineError` if only scores were given."""

@@ -198,11 +198,9 @@ def _read(splats, origin, spread, progress, threads):
     """Columns, squared distances to the views, tallies of chunks, and sums for `principal_axes`."""
     count = len(splats)
     kind = splats.take(slice(0, 0)).means.dtype.newbyteorder("=")
+    drawn, lumas = np.empty(count, np.bool_), np.empty(count, np.float32)
     alphas, area, reach = np.empty((3, count))
-    lumas = np.empty(count, np.float32)
-    columns = _Columns(
-        np.empty(count, np.bool_), np.empty((count, 3), kind), alphas, area, reach, lumas
-    )
+    columns = _Columns(drawn, np.empty((count, 3), kind), alphas, area, reach, lumas)
     squared = np.empty(count)
 
     def read(piece):
@@ -382,9 +380,8 @@ def _compare(values, cells, good, threads):
     end = int(cells.max()) + 1
     powers, count = np.zeros(end), np.zeros(end, np.int64)
     for rows in chunks(len(values), ROWS):
-        sums = np.bincount(cells[rows], values[rows])
-        powers[: len(sums)] += sums
-        count[: len(sums)] += np.bincount(cells[rows][good[rows]], minlength=len(sums))
+        powers += np.bincount(cells[rows], values[rows], end)
+        count += np.bincount(cells[rows][good[rows]], minlength=end)
     overall = float(powers.sum() / count.sum())
     powers /= np.maximum(count, 1)
     powers /= overall

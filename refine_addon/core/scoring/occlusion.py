@@ -120,9 +120,8 @@ def score(
     some, worth = measured.take(sample, axis=1), prior[index[sample]]
     folds = _folds(some, of_groups, errors, worth, part(weighing, 0.0, 0.5))
     weights, left_out = coverage.floor_weights(folds, _with_floors(some, worth))
-    more = []
-    if left_out > LEFT_OUT:
-        more = with_views_between(views, most_between, gaussians, scene, threads)
+    most = most_between if left_out > LEFT_OUT else 0
+    more = with_views_between(views, most, gaussians, scene, threads)
     if more:
         share, every = _with_between(views, more)
         for scoring in samples[1:]:

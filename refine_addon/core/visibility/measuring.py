@@ -105,7 +105,8 @@ def _measure_and_cast(gaussians, scene, views, number_and_kinds):
     """What a view sees, in any process: rows, whether centres are inside, contributions and errors,
     (n,) each; and its rays of some kinds.
     """
-    (number, kinds), view = number_and_kinds, views[number_and_kinds[0]][0]
+    number, kinds = number_and_kinds
+    view = views[number][0]
     footprints = projection.project(gaussians, scene, view)
     return_freed(mapped_only=True)
     integrals = np.empty(0), np.empty(0)

@@ -102,19 +102,16 @@ class Rays:
         owner = self.owner.astype(np.intp)
         for first, last in pairwise(cuts.tolist()):  # whole rays at a time
             checkpoint()
-            piece, counts = (
-                slice(int(ends[first]), int(ends[last])),
-                np.diff(ends[first : last + 1]),
-            )
+            piece = slice(int(ends[first]), int(ends[last]))
+            counts = np.diff(ends[first : last + 1])
             transmittance = _transmittance(self.alpha[piece], counts)
             weight = transmittance * self.alpha[piece]  # 0 where it is hidden
             left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))  # behind it
             changes = contrasts(weight, left, colors.take(owner[piece], axis=1), counts)
             error[piece] = sum(np.square(change * weight) for change in changes)
             weights[piece] = weight
-        sums = (np.bincount(owner, each, len(self.hit)) for each in (error, weights))
-        errors, contributions = (each.astype(float) for each in sums)
-        return errors, contributions
+        sums = [np.bincount(owner, each, len(self.hit)) for each in (error, weights)]
+        return sums[0].astype(float), sums[1].astype(float)
 
     def colors_by_nearest_kept(
         self, colors: NDArray[np.float32], keep: NDArray[np.bool_]
