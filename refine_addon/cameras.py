@@ -29,8 +29,14 @@ SENSOR = 36.0
 FLIP = np.array([1.0, -1.0, -1.0])  # Axes of Blender's camera to those of a view, and back
 _RESIDUE = 3e-7  # Largest error of float32 in the zeros and ones of a quarter turn
 SHEAR = 1e-4  # Largest deviation of a camera's axes from orthonormal
-_SIZES = ("fx", "fy", "cx", "cy", "width", "height")
-_FIELDS = (*_SIZES, *["rotation", "center", "near", "far", "matrix", "lens", "clip", "upright"])
+_SHOWN = {
+    "matrix": ("rotation", "center"),
+    "lens": ("fx", "fy", "cx", "cy"),
+    "clip": ("near", "far"),
+}
+"""What `_shown` returns of an imported camera -> what is as in the file while that is unchanged."""
+
+_FIELDS = (*_SHOWN, *sum(_SHOWN.values(), ()), "width", "height", "upright")
 _DEFAULT_NEAR, _DEFAULT_FAR = 0.01, 1000.0
 _FEW = 16  # Cameras looked at, at most, to know whether all must be turned
 
@@ -50,27 +56,12 @@ def view_from_camera(obj: bpy.types.Object) -> View:
     size, aspect = render_size(bpy.context.scene)
     if source:
         size, aspect = (source["width"], source["height"]), 1.0
-    rotation, center = pose(obj.name, matrix)
-    view = View(
-        rotation=rotation,
-        center=center,
-        **_intrinsics(data, size, aspect),
-        near=data.clip_start,
-        far=data.clip_end,
-        weight=_weight(obj),
-        name=obj.name,
-    )
+    lens, shown = _intrinsics(data, size, aspect), _shown(data, matrix)
+    view = View(*pose(obj.name, matrix), *lens, *shown["clip"], _weight(obj), obj.name)
     if not source:
         return view
-    changes: dict[str, Any] = {}  # the file's own numbers, for all that is unchanged
-    if np.array_equal(matrix, np.array(source["matrix"])):
-        changes.update(rotation=np.array(source["rotation"]), center=np.array(source["center"]))
-    if _lens(data) == source["lens"]:
-        changes.update({name: source[name] for name in _SIZES[:4]})
-    if [data.clip_start, data.clip_end] == source["clip"]:
-        changes["near"] = source["near"]
-        changes["far"] = math.inf if source["far"] is None else source["far"]
-    return replace(view, **changes)
+    same = [name for key, names in _SHOWN.items() if shown[key] == source[key] for name in names]
+    return replace(view, **{name: source[name] for name in same})
 
 
 def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
@@ -130,12 +121,10 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     if view.weight != 1.0:
         obj[WEIGHT] = view.weight
     # The view, and Blender's float32 values of it, by which changes are noticed.
-    source = {name: getattr(view, name) for name in ("near", *_SIZES)}
+    source = vars(view) | _shown(data, snapped(np.array(obj.matrix_basis, np.float64)))
     source |= {"rotation": view.rotation.tolist(), "center": view.center.tolist()}
-    source["far"] = view.far if math.isfinite(view.far) else None
-    source["matrix"] = snapped(np.array(obj.matrix_basis, np.float64)).tolist()
-    source |= {"lens": _lens(data), "clip": [data.clip_start, data.clip_end], "upright": upright}
-    obj[SOURCE] = json.dumps(source)
+    source |= {"far": view.far if math.isfinite(view.far) else None, "upright": upright}
+    obj[SOURCE] = json.dumps({name: source[name] for name in _FIELDS})
     return obj
 
 
@@ -153,8 +142,10 @@ def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -
     return None
 
 
-def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) -> dict[str, Any]:
-    """Focal lengths and principal point in pixels, as Blender frames its renders."""
+def _intrinsics(
+    data: bpy.types.Camera, size: tuple[int, int], aspect: float
+) -> tuple[float, float, float, float, int, int]:
+    """Focal lengths, principal point and size in pixels, as Blender frames its renders."""
     width, height = size
     fit = data.sensor_fit
     if fit == "AUTO":
@@ -163,14 +154,8 @@ def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) ->
     sensor = data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width
     fitted = width if fit == "HORIZONTAL" else height * aspect
     focal = data.lens / sensor * fitted
-    return {
-        "fx": focal,
-        "fy": focal / aspect,
-        "cx": width / 2 - data.shift_x * fitted,
-        "cy": height / 2 + data.shift_y * fitted / aspect,
-        "width": width,
-        "height": height,
-    }
+    cx, cy = width / 2 - data.shift_x * fitted, height / 2 + data.shift_y * fitted / aspect
+    return focal, focal / aspect, cx, cy, width, height
 
 
 def pose(name: str, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -209,8 +194,10 @@ def snapped(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return snapped
 
 
-def _lens(data: bpy.types.Camera) -> list[Any]:
-    return [data.lens, data.sensor_fit, data.sensor_width, data.shift_x, data.shift_y]
+def _shown(data: bpy.types.Camera, matrix: NDArray[np.float64]) -> dict[str, list[Any]]:
+    """What Blender shows of a camera, by the keys of `_SHOWN`."""
+    lens = [data.lens, data.sensor_fit, data.sensor_width, data.shift_x, data.shift_y]
+    return {"matrix": matrix.tolist(), "lens": lens, "clip": [data.clip_start, data.clip_end]}
 
 
 def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
@@ -218,7 +205,8 @@ def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
         return None
     try:
         source = json.loads(obj[SOURCE])
-        return {name: source[name] for name in _FIELDS}
+        far = math.inf if source["far"] is None else source["far"]
+        return {name: source[name] for name in _FIELDS} | {"far": far}
     except (TypeError, ValueError, KeyError):
         raise RefineError(
             f"camera '{obj.name}': custom property {SOURCE} is damaged; delete it to use the "
