@@ -126,8 +126,8 @@ class Solid:
         within = (points >= low.min(axis=1)) & (points < high.max(axis=1))
         rows = np.flatnonzero(within.all(axis=1))
         places = np.array(points[rows].T, np.float64, order="C")  # (3, n)
-        turns, leader = np.zeros(len(rows)), np.arange(len(rows))
-        waiting = [(leader.copy(), np.arange(corners.shape[1]))] if len(rows) else []
+        turns = np.zeros(len(rows))
+        waiting = [(np.arange(len(rows)), np.arange(corners.shape[1]))] if len(rows) else []
         while waiting:
             group, triangles = waiting.pop()
             of_group, lows, highs = places[:, group], low[:, triangles], high[:, triangles]
@@ -135,17 +135,16 @@ class Solid:
             reach = (lows <= last[:, None]) & (highs >= first[:, None])
             above = reach[0] & reach[1] & (highs[2] >= first[2])
             triangles = triangles[above]
-            if not reach[2, above].any() or (first == last).all():  # one stands for all
-                leader[group] = group[0]
-                group = group[:1]
-            if len(group) * len(triangles) > _LEAF and len(group) > 1:
+            alike = not reach[2, above].any() or (first == last).all()  # one stands for all
+            if len(group) * len(triangles) > _LEAF and len(group) > 1 and not alike:
                 axis = int(np.argmax(last - first))
                 half = of_group[axis] <= (first + last)[axis] / 2.0
                 half &= of_group[axis] < last[axis]
                 waiting += [(group[half], triangles), (group[~half], triangles)]
             else:
-                turns[group] = self._turns(places[:, group], triangles, low, high)
-        inside[rows] = (turns != 0.0 if self.turned else turns % 2.0 == 1.0)[leader]
+                some = group[:1] if alike else group
+                turns[group] = self._turns(places[:, some], triangles, low, high)
+        inside[rows] = turns != 0.0 if self.turned else turns % 2.0 == 1.0
         return inside
 
     def _turns(self, points, triangles, low, high):
