@@ -87,11 +87,11 @@ importlib.import_module(name + ".core.execute").serve()
 
 
 class _Own(threading.local):
-    """Settings for the work of one thread."""
+    """Settings for the work of one thread, see `within`."""
 
-    check: Callable[[], None] = staticmethod(lambda: None)
-    cluster: Any = None
-    cores: int | None = None
+    check: Callable[[], None] = staticmethod(lambda: None)  # what `checkpoint` calls
+    cluster: Any = None  # a `Cluster` to which `run` sends long work without large arrays
+    cores: int | None = None  # number that work may use, if not as many as there are
 
 
 _own = _Own()
@@ -179,8 +179,8 @@ def checkpoint() -> None:
 
 
 @contextmanager
-def _with(**own: Any) -> Iterator[None]:
-    """Set attributes of `_own` within the block."""
+def within(**own: Any) -> Iterator[None]:
+    """Change settings of this thread, `check`, `cluster` or `cores`, within the block."""
     before = {name: getattr(_own, name) for name in own}
     vars(_own).update(own)
     try:
@@ -191,18 +191,7 @@ def _with(**own: Any) -> Iterator[None]:
 
 def checked_by(check: Callable[[], None]) -> AbstractContextManager[None]:
     """Make `checkpoint` call `check` in this thread, within the block."""
-    return _with(check=check)
-
-
-def on(cluster: Any) -> AbstractContextManager[None]:
-    """Make `run` in this thread send long work without large arrays to a `Cluster`, if any."""
-    return _with(cluster=cluster)
-
-
-def alone(work: Callable[[Item], Outcome], items: Iterable[Item]) -> list[Outcome]:
-    """`run_all` in this thread alone; what the work itself runs uses one core, too."""
-    with _with(cores=1):
-        return run_all(work, items, threads=1)
+    return within(check=check)
 
 
 def default_threads() -> int:

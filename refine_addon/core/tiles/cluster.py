@@ -23,7 +23,7 @@ from typing import Any
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..execute import Progress, alone, report
+from ..execute import Progress, report, run_all, within
 from ..mapped import Interrupted
 from ..whole_file import explained
 from .source import Tile, bytes_of
@@ -94,7 +94,7 @@ def _block_ctrl_c() -> None:
 
 
 class Cluster:
-    """The workers of a Dask cluster; see `execute.on`."""
+    """The workers of a Dask cluster; see `execute.within`."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
@@ -164,7 +164,8 @@ class Cluster:
 
 
 def _run(packed: bytes, items: Sequence[Any]) -> list[Any]:
-    return alone(_unpacked(packed), items)
+    with within(cores=1):
+        return run_all(_unpacked(packed), items, threads=1)
 
 
 _unpacked = functools.lru_cache(maxsize=2)(pickle.loads)

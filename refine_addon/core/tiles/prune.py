@@ -16,7 +16,7 @@ import numpy as np
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..execute import Cancelled, Progress, on, seconds, silent, stages
+from ..execute import Cancelled, Progress, seconds, silent, stages, within
 from ..mapped import Interrupted, note, noted, on_disk, once, pieces, write
 from ..methods import DEFAULT, Method
 from ..prune import prune
@@ -87,7 +87,7 @@ def prune_tiles(
             held.enter_context(new_folder(output))
             outputs = Outputs(job, tiles, output, overwrite)
         held.enter_context(_opened(job, outputs))
-        held.enter_context(on(workers))
+        held.enter_context(within(cluster=workers))
         if workers is not None:
             _check(workers, job, tiles)
         count, size = sum(tile.splats for tile in tiles), sum(tile.size for tile in tiles)
@@ -105,7 +105,6 @@ def prune_tiles(
             ]  # fmt: skip
         else:
             sizes = outputs.write(kept, writing, threads)
-            outputs.publish()
         clock.lap("write_s")
     target = None if outputs is None else str(output)
     report["files"] = {

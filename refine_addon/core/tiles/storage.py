@@ -174,5 +174,4 @@ def _split(url: Url) -> tuple[Any, str]:
     needed = "URLs need fsspec: pip install 'refine-addon[distributed]'"
     with explained(url, needed, errors=ImportError):
         from fsspec.core import url_to_fs
-    system, inner = url_to_fs(url)
-    return system, inner
+    return url_to_fs(url)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, run, seconds
+from ..execute import Progress, run_all, seconds
 from ..formats.ply import with_count, with_model, write_rows
 from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
 from ..mapped import Interrupted, Mapped, note, noted, whole
@@ -96,17 +96,15 @@ class Outputs:
         return {number: state for number, state in states if self._is_renamed(number, *state)}
 
     def write(self, kept: Kept, progress: Progress, threads: int | None) -> list[int]:
-        """Write each tile to its waiting file, unless it is in place; returns bytes of each."""
-        sizes = {number: size for number, (size, _) in self.in_place().items()}
-        numbers = [number for number in range(len(self.tiles)) if number not in sizes]
+        """Write all tiles to waiting files, then rename these; returns bytes of each.
+
+        What is in place stays. If a file is in the way, none is renamed, and `Interrupted` raised.
+        """
+        there = self.in_place()
+        numbers = [number for number in range(len(self.tiles)) if number not in there]
         work = partial(_write_tile, self.job, self.tiles, kept, self.waiting)
         cost = seconds("write", sum(self.tiles[number].splats for number in numbers))
-        new = run(work, numbers, progress=progress, what="writing", threads=threads, cost=cost)
-        sizes |= dict(zip(numbers, new, strict=True))
-        return [sizes[number] for number in range(len(self.tiles))]
-
-    def publish(self) -> None:
-        """Rename all tiles not yet in place; none, and `Interrupted`, if a file is in the way."""
+        run_all(work, numbers, progress=progress, what="writing", threads=threads, cost=cost)
         there = self.in_place()
         try:
             self._refuse_existing(there)
@@ -120,6 +118,7 @@ class Outputs:
                     storage.publish(*pair, overwrite=self.overwrite)
         except RefineError as error:
             raise Interrupted(str(error)) from error
+        return [size for size, _ in states]
 
     def discard(self) -> None:
         """Remove waiting files behind URLs."""
@@ -149,7 +148,7 @@ class Outputs:
 
 
 def _write_tile(job, tiles, kept, places, number):
-    """Write a tile's kept rows, unless an earlier run has, and upload it; returns its bytes."""
+    """Write a tile's kept rows, unless an earlier run has, and upload it."""
     waiting = waiting_in(job) / tiles[number].path.name
     if not waiting.exists():
         with whole(waiting) as stream:
@@ -158,7 +157,6 @@ def _write_tile(job, tiles, kept, places, number):
         storage.upload(waiting, places[number])
         if not waiting.exists():  # others have ended the job meanwhile: nobody will rename this
             storage.discard(places[number])
-    return waiting.stat().st_size
 
 
 def _write_rows(tiles, kept, number, stream):
