@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..splats import LOG_ZERO, Model, Splats, above_constant
 
-_NAMES = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
-REQUIRED = tuple(_NAMES.split())
+_USUAL = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+REQUIRED = tuple(_USUAL.split())
 """Properties that every splat has."""
 
 THIRD_SCALE = "scale_2"  # the only one that discs (2DGS) may lack
@@ -53,22 +53,24 @@ def other_properties(names: Iterable[str]) -> list[str]:
 
 def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
     """Rows, (count,), of a 3DGS PLY in float32, all 0, and their splats as views."""
-    rest = [f"f_rest_{index}" for index in range(3 * above_constant(degree))]
-    names = [*REQUIRED[:6], *rest, *REQUIRED[6:]]
-    rows = np.zeros(count, [(name, "<f4") for name in names])
+    rows = np.zeros(count, [(name, "<f4") for name in _names(3 * above_constant(degree))])
     return rows, splats_from_columns(rows)
 
 
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
     """Views of splats as properties, (N,) each, by name, in the order of a 3DGS PLY."""
-    coefficients = splats.sh_rest.shape[1]
-    axes = 2 if splats.model == "2dgs" else 3
-    planes = [splats.sh_rest[:, k, channel] for channel in range(3) for k in range(coefficients)]
-    rest = [f"f_rest_{index}" for index in range(len(planes))]
-    names = [*REQUIRED[:6], *rest, *REQUIRED[6 : 7 + axes], *REQUIRED[10:]]
-    first, last = [*splats.means.T, *splats.sh_dc.T], [*splats.log_scales.T[:axes]]
-    values = [*first, *planes, splats.opacity_logits, *last, *splats.quaternions.T]
-    return dict(zip(names, values, strict=True))
+    planes = [plane for channel in splats.sh_rest.transpose(2, 1, 0) for plane in channel]
+    first, last = [*splats.means.T, *splats.sh_dc.T], [*splats.log_scales.T, *splats.quaternions.T]
+    values = [*first, *planes, splats.opacity_logits, *last]
+    by_name = dict(zip(_names(len(planes)), values, strict=True))
+    if splats.model == "2dgs":
+        del by_name[THIRD_SCALE]
+    return by_name
+
+
+def _names(rest: int) -> list[str]:
+    """Names of properties in the order of a 3DGS PLY, `rest` of them harmonics."""
+    return [*REQUIRED[:6], *(f"f_rest_{index}" for index in range(rest)), *REQUIRED[6:]]
 
 
 Columns: TypeAlias = "Mapping[str, NDArray[Any]] | NDArray[Any]"
