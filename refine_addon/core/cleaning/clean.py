@@ -149,12 +149,9 @@ class Cleaned:
 
     def surety(self) -> dict[str, float | None]:
         """Mean of `sure` for each of `REASONS`; None if no splat has it, and of those outside."""
-        return {
-            name: float(self.sure[mask].mean(dtype=np.float64))
-            if name != "outside" and mask.any()
-            else None
-            for name, mask in self.by_reason.items()
-        }
+        sure = {name: self.sure[mask] for name, mask in self.by_reason.items() if mask.any()}
+        means = {name: float(values.mean(dtype=np.float64)) for name, values in sure.items()}
+        return dict.fromkeys(self.by_reason) | means | {"outside": None}
 
     def facts(self) -> dict[str, Any]:
         """Plain JSON values for reports."""

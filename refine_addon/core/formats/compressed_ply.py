@@ -67,8 +67,7 @@ def _read(path, data):
     packed = rows_of("vertex", _PACKED, "u4")
     ranges = rows_of("chunk", (*_POSITION, *_SCALE), "f4")
     colored = _COLOR[0] in (ranges.dtype.names or ())
-    if colored:
-        rows_of("chunk", _COLOR, "f4")
+    rows_of("chunk", _COLOR if colored else (), "f4")
     count, needed = len(packed), -(-len(packed) // SPLATS)
     if len(ranges) < needed:
         place.fail(f"{len(ranges)} chunks, expected {needed} for {count} splats")

@@ -136,8 +136,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         if not node.keys().isdisjoint(_MOVES):
             moves.append((node, place, frame))  # the frame is that of its parent
             frame = len(moves)
-        if "children" in node:
-            left += [(child, place, frame) for child in _listed(node, "children", place)[::-1]]
+        left += [(child, place, frame) for child in _listed(node, "children", place)[::-1]]
         if "mesh" not in node:
             continue
         mesh, where = document.item("meshes", node["mesh"], place)
