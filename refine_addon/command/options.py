@@ -17,7 +17,7 @@ from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.lod import SHARES
 from ..core.splats import MODELS
-from ..core.volumes import Role, Volume, parse
+from ..core.volumes import Role, parse
 from ..core.whole_file import Url, expanded, is_url
 from ..version import VERSION
 
@@ -193,11 +193,6 @@ def _numbers(text: str) -> tuple[float, ...]:
         raise RefineError(f"expected numbers with commas between them, got {text!r}") from None
 
 
-def _volume(text: str) -> tuple[str, Volume | None]:
-    """The text, and its volume; None if the text is the name of an object."""
-    return _name(text), parse(text)
-
-
 def _source(text: str) -> tuple[str, str | range]:
     """The source by its name in the panel, and its collection or frames."""
     kind, colon, rest = text.partition(":")
@@ -241,7 +236,8 @@ _TYPES: dict[str, Callable[[str], Any]] = {
     "R,R,...": lambda text: tuple(word.strip() for word in text.split(",")),
     **dict.fromkeys(("INPUT", "PATH"), _input),
     **dict.fromkeys(("OUT", "FILE", "DIR", "FILE.json"), _output),
-    **{"NAME": _name, "N|ADDRESS": _workers, "WHICH": _source, "VOLUME": _volume},
+    **{"NAME": _name, "N|ADDRESS": _workers, "WHICH": _source},
+    "VOLUME": lambda text: (_name(text), parse(text)),
 }
 """Placeholder in the help -> parser of the value; others take any text."""
 

@@ -85,13 +85,13 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
 def read_colmap(folder: Path, suffix: str) -> ViewSet:
     """Views of a COLMAP model, sorted by image name, as text and binary may differ in order."""
     cameras, images = (CameraPlace(folder / f"{stem}{suffix}") for stem in MODEL_FILES[:2])
-    binary = suffix == ".bin"
+    binary, text = (_binary_cameras, _binary_images), (_text_cameras, _text_images)
+    read_cameras, read_images = binary if suffix == ".bin" else text
     lenses: dict[int, tuple[Any, ...]] = {}
-    for place, camera_id, lens in (_binary_cameras if binary else _text_cameras)(cameras):
+    for place, camera_id, lens in read_cameras(cameras):
         if camera_id in lenses:
             place.fail(f"camera {camera_id} is there twice, expected each id once")
         lenses[camera_id] = lens
-    read_images = _binary_images if binary else _text_images
     registered = sorted(read_images(images), key=lambda image: image[:2])
     if not registered:
         images.fail("no registered image, expected at least one")
