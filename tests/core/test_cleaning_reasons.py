@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Cleaning, View, ViewSet, clean
-from refine_addon.core.cleaning import support
+from refine_addon.core.cleaning import search, support
 from refine_addon.core.cleaning.clean import REASONS, judge
 from refine_addon.core.cleaning.search import Search, is_slender
 from refine_addon.core.execute import silent
@@ -70,7 +70,7 @@ def test_a_giant_may_lie_at_a_surface_by_less_than_half(monkeypatch, half, expec
     """A solid square at its depth stops 25 % of the light near it; one of twice the side 89 %.
 
     In the colour of the wall it changes no pixel, and stays."""
-    monkeypatch.setattr(support, "RAYS", 600)
+    monkeypatch.setattr(search, "RAYS", 600)
     side = np.linspace(-half, half, 32)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     square = made(np.stack([x, y, np.full_like(x, 2.0)], axis=1), 0.07, 0.95, 0.5)
@@ -247,9 +247,8 @@ def test_a_splat_lies_where_it_is_densest_on_a_ray():
     gaussians, scene, _ = projection.prepare(splats, views)
     footprints = projection.project(gaussians, scene, views.views[0])
 
-    seen = support.hits_of_view(
-        gaussians, footprints, scene, (views.views[0], 0), np.zeros(1, np.bool_)
-    )
+    one = Search(gaussians, scene, list(views), 1)
+    seen = one.hits_of_view(0, footprints, np.zeros(1, np.bool_))
 
     columns = np.floor(seen.key) % 16  # rays go through all 16 x 16 pixels
     nearness = (np.floor(seen.key) + 0.999 - seen.key) / seen.scale

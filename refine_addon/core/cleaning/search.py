@@ -8,6 +8,7 @@ cluster support each other. Rays are cast once, for all rounds.
 
 from __future__ import annotations
 
+import math
 from functools import reduce
 from typing import NamedTuple
 
@@ -18,9 +19,20 @@ from ..errors import RefineError
 from ..execute import Progress, part, run_all
 from ..merging.graph import nearest
 from ..visibility import projection
+from ..visibility.cast import aimed, cast, depth_complexity, pixels
 from ..visibility.measuring import VIEW_GROUPS
 from ..visibility.projection import Gaussians
-from .support import Evidence, Hits, evidence_of, hits_of_view, own_support, share
+from ..visibility.rays import in_front
+from .support import FRACTION, REACHED, Evidence, Hits, evidence_of, own_support, share
+
+RAYS = 2500
+"""Rays of a view."""
+
+MAX_HITS = 1 << 20
+"""About the most hits of a view; dense scenes get fewer rays."""
+
+TARGET = 0.2
+"""Rays are aimed at suspects whose product of sigmas is less than this share of a ray's area."""
 
 DOUBTED = 0.4
 """Support by other splats below which a splat is suspect."""
@@ -57,6 +69,8 @@ REACH = 2.0
 APART = 0.01
 """They also touch this close: a share of the scene's size plus the distance to its middle."""
 
+_TURNS = (0.6180339887498949, 0.7548776662466927)  # spread multiples modulo 1 evenly
+_NEAREST = 0.2  # of the depth of its centre: as near as a ray may hit a splat
 _DECIDED = 0.8  # support in the first look from which a splat is not doubted in any round
 
 
@@ -134,7 +148,7 @@ class Search:
                 wide = footprints.sigmas[0] >= GIANT * max(view.width, view.height)
                 absent = np.zeros(len(self.shown), np.bool_)
                 absent[index] = wide & self.huge[index]
-                hits = hits_of_view(self.gaussians, footprints, self.scene, (view, number), absent)
+                hits = self.hits_of_view(number, footprints, absent)
                 if hits is not None:
                     sums[:2, hits.hit] += own_support(hits.without(absent), ~absent)
                     width[hits.hit] = np.maximum(width[hits.hit], hits.width)
@@ -162,8 +176,7 @@ class Search:
             for number in numbers:
                 if behind is not None:
                     footprints = projection.project(self.gaussians, self.scene, self.views[number])
-                    place = (footprints, self.scene, (self.views[number], number))
-                    self.hits[number] = hits_of_view(self.gaussians, *place, behind, absent)
+                    self.hits[number] = self.hits_of_view(number, footprints, behind, absent)
                 if (hits := self.hits[number]) is not None:
                     light = hits.without(absent)
                     sums[:2, hits.hit] += own_support(light, wanted)
@@ -172,11 +185,79 @@ class Search:
 
         return self._by_views(of_group, progress, "looking past suspects")
 
+    def hits_of_view(self, number, footprints, absent, targets=None) -> Hits | None:
+        """`Hits` of a view by its number, which sets its pixels; None if its rays hit nothing.
+
+        Gaussians that are `absent`, (M,), are hit and stop no light; rays are aimed at `targets`
+        that are small.
+        """
+        view = self.views[number]
+        count = min(RAYS, MAX_HITS / max(depth_complexity(footprints, view), 1.0))
+        columns, rows = pixels(view, number, count)
+        aims = None
+        if targets is not None:
+            cell = view.width * view.height / (len(columns) * len(rows))
+            aims = aimed(view, columns, rows, _targets(footprints, targets, number, TARGET * cell))
+        rays = cast(footprints, columns, rows, aims)
+        if not len(rays.ray):
+            return None
+        present = ~absent[rays.hit].take(rays.owner)  # (hits of the rays,)
+        _, counts = np.unique(rays.ray, return_counts=True)
+        log_front = in_front(np.log1p(-rays.alpha) * present.astype(np.float64), counts)
+        reached = np.flatnonzero(log_front > math.log(REACHED))  # (h,)
+        place = np.empty(len(self.gaussians), np.int64)
+        place[footprints.index] = np.arange(len(footprints.index))
+        footprints = footprints.take(place[rays.hit])  # of the u that are hit
+        gaussians = self.gaussians.take(rays.hit)
+        nearness = 1.0 / _depths(gaussians, footprints, self.scene, view, rays, reached)
+        scale = FRACTION / float(nearness.max())
+        key = rays.ray[reached] + np.maximum(FRACTION - scale * nearness, 0.0)
+        order = np.argsort(key, kind="stable")
+        reached = reached[order]
+        width = footprints.sigmas[0] / np.float32(max(view.width, view.height))
+        return Hits(rays.hit, width, rays.owner[reached], rays.alpha[reached], key[order], scale)
+
     def _by_views(self, work, progress, what):
         """Results of `work` for each group of numbers of views."""
         count = min(VIEW_GROUPS, len(self.views))
         groups = [range(first, len(self.views), count) for first in range(count)]
         return run_all(work, groups, progress=progress, what=what, threads=self.threads)
+
+
+def _targets(footprints, targets, number, area):
+    """Centres, (2, t) px, of targets below `area`, px^2, in an order that `number` shuffles."""
+    small = footprints.sigmas[0] * footprints.sigmas[1] < area
+    rows = np.flatnonzero(small & targets[footprints.index])
+    turn = (footprints.index[rows] * _TURNS[0] + number * _TURNS[1]) % 1.0
+    return footprints.centers[:, rows[np.argsort(turn)]]
+
+
+def _depths(gaussians, footprints, scene, view, rays, reached):
+    """Depths, scene sizes, (h,), where splats are densest on the rays that reach them.
+
+    The centre's plus ``c' C^-1 d``, the sum of ``(c.a / s^2) (d.a / s^2)`` over axes a of length s:
+    C is the covariance in the image, c that with depth, d the step from the centre.
+    """
+    in_camera = projection.in_camera(gaussians, scene, view)
+    (x, y, z), covariances = (values.astype(np.float64) for values in in_camera)
+    with_depth = (  # (u,) each: covariance of column and row with the depth
+        view.fx / z * (covariances[2] - x / z * covariances[5]),
+        view.fy / z * (covariances[4] - y / z * covariances[5]),
+    )
+    owner, ray = rays.owner[reached], rays.ray[reached]
+    step = [  # (h,) each: from the splat's centre, pixels
+        pixel + 0.5 - center.take(owner)
+        for pixel, center in zip(rays.pixels_of(ray), footprints.centers, strict=True)
+    ]
+    longest = gaussians.largest.astype(np.float64)
+    depth = z[owner]
+    for axes, sigmas in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
+        unit = axes / sigmas.astype(np.float64) ** 2  # (2, u)
+        slope = with_depth[0] * unit[0] + with_depth[1] * unit[1]  # (u,), for a step of one sigma
+        slope = slope.clip(-longest, longest)  # no splat is deeper than long
+        along = step[0] * unit[0][owner] + step[1] * unit[1][owner]  # (h,), in sigmas
+        depth = depth + slope[owner] * along
+    return np.maximum(depth, _NEAREST * z[owner])
 
 
 def is_slender(log_scales: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -15,27 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..views import View
-from ..visibility import projection
-from ..visibility.cast import aimed, cast, depth_complexity, pixels
-from ..visibility.projection import Footprints, Gaussians
 from ..visibility.rays import in_front
-from ..visibility.scene import Scene
-
-RAYS = 2500
-"""Rays of a view."""
-
-MAX_HITS = 1 << 20
-"""About the most hits of a view; dense scenes get fewer rays."""
 
 WINDOW = 0.1
 """Hits on a ray are near each other if their nearness differs by less than this share of it."""
 
 PARALLAX = 0.05
 """Or by less than this, 1 / scene size; cameras a scene size apart see more as a shift."""
-
-TARGET = 0.2
-"""Rays are aimed at suspects whose product of sigmas is less than this share of a ray's area."""
 
 REACHED = 1e-3
 """Share of the light that must reach a hit, or it is no evidence."""
@@ -49,9 +35,7 @@ SEEN = 0.1
 PAST = 0.15
 """A view sees past a splat if a lower share of the light stops near it."""
 
-_TURNS = (0.6180339887498949, 0.7548776662466927)  # spread multiples modulo 1 evenly
-_NEAREST = 0.2  # of the depth of its centre: as near as a ray may hit a splat
-_FRACTION = 0.999  # places on ray k have keys from k to k + this
+FRACTION = 0.999  # places on ray k have keys from k to k + this
 _TINY = 1e-30  # replaces 0 as a divisor
 
 
@@ -69,7 +53,7 @@ class Light(NamedTuple):
     def around(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
         """First, last and end of the hits, (r,) each: near ones up to last, then those behind."""
         key, window, ray = self.key[rows], self.window[rows], np.floor(self.key[rows])
-        end = ray + (1.0 + _FRACTION) / 2.0
+        end = ray + (1.0 + FRACTION) / 2.0
         first = np.searchsorted(self.key, np.maximum(key - window, ray))
         last = np.searchsorted(self.key, np.minimum(key + window, end), side="right")
         return first, last, np.searchsorted(self.key, end)
@@ -97,7 +81,7 @@ class Hits(NamedTuple):
         log_front = in_front(np.log1p(-alpha) * present, np.unique(ray, return_counts=True)[1])
         reached = np.flatnonzero(log_front > math.log(REACHED))  # (h,)
         key, alpha, transmittance = self.key[reached], alpha[reached], np.exp(log_front[reached])
-        nearness = (ray[reached] + _FRACTION - key) / self.scale
+        nearness = (ray[reached] + FRACTION - key) / self.scale
         window = self.scale * np.maximum(WINDOW * nearness, PARALLAX)
         weight = transmittance * alpha * present[reached]
         return Light(self.hit, self.owner[reached], alpha, transmittance, weight, key, window)
@@ -111,81 +95,6 @@ class Evidence(NamedTuple):
     contrast: NDArray[np.float64]  # `behind` times the difference of colour to what is there
     views: NDArray[np.float64]  # number of views that see what is at and behind the place
     past: NDArray[np.float64]  # number of these that see past it
-
-
-def hits_of_view(
-    gaussians: Gaussians,
-    footprints: Footprints,
-    scene: Scene,
-    numbered: tuple[View, int],
-    absent: NDArray[np.bool_],
-    targets: NDArray[np.bool_] | None = None,
-) -> Hits | None:
-    """Hits of one view; None if its rays hit nothing.
-
-    The view's number sets its pixels (`cast.pixels`). Gaussians that are `absent` are hit and stop
-    no light; rays are aimed at `targets` that are small.
-    """
-    view, number = numbered
-    count = min(RAYS, MAX_HITS / max(depth_complexity(footprints, view), 1.0))
-    columns, rows = pixels(view, number, count)
-    aims = None
-    if targets is not None:
-        cell = view.width * view.height / (len(columns) * len(rows))
-        aims = aimed(view, columns, rows, _centers(footprints, targets, number, TARGET * cell))
-    rays = cast(footprints, columns, rows, aims)
-    if not len(rays.ray):
-        return None
-    present = ~absent[rays.hit].take(rays.owner)  # (hits of the rays,)
-    _, counts = np.unique(rays.ray, return_counts=True)
-    log_front = in_front(np.log1p(-rays.alpha) * present.astype(np.float64), counts)
-    reached = np.flatnonzero(log_front > math.log(REACHED))  # (h,)
-    place = np.empty(len(gaussians), np.int64)
-    place[footprints.index] = np.arange(len(footprints.index))
-    footprints = footprints.take(place[rays.hit])  # of the u that are hit
-    nearness = 1.0 / _depths(gaussians.take(rays.hit), footprints, scene, view, rays, reached)
-    scale = _FRACTION / float(nearness.max())
-    key = rays.ray[reached] + np.maximum(_FRACTION - scale * nearness, 0.0)
-    order = np.argsort(key, kind="stable")
-    reached = reached[order]
-    width = footprints.sigmas[0] / np.float32(max(view.width, view.height))
-    return Hits(rays.hit, width, rays.owner[reached], rays.alpha[reached], key[order], scale)
-
-
-def _centers(footprints, targets, number, area):
-    """Centres, (2, t) px, of targets below `area`, px^2, in an order that `number` shuffles."""
-    small = footprints.sigmas[0] * footprints.sigmas[1] < area
-    rows = np.flatnonzero(small & targets[footprints.index])
-    turn = (footprints.index[rows] * _TURNS[0] + number * _TURNS[1]) % 1.0
-    return footprints.centers[:, rows[np.argsort(turn)]]
-
-
-def _depths(gaussians, footprints, scene, view, rays, reached):
-    """Depths, scene sizes, (h,), where splats are densest on the rays that reach them.
-
-    The centre's plus ``c' C^-1 d``, the sum of ``(c.a / s^2) (d.a / s^2)`` over axes a of length s:
-    C is the covariance in the image, c that with depth, d the step from the centre.
-    """
-    in_camera = projection.in_camera(gaussians, scene, view)
-    (x, y, z), covariances = (values.astype(np.float64) for values in in_camera)
-    with_depth = (  # (u,) each: covariance of column and row with the depth
-        view.fx / z * (covariances[2] - x / z * covariances[5]),
-        view.fy / z * (covariances[4] - y / z * covariances[5]),
-    )
-    owner, ray = rays.owner[reached], rays.ray[reached]
-    step = [  # (h,) each: from the splat's centre, pixels
-        pixel + 0.5 - center.take(owner)
-        for pixel, center in zip(rays.pixels_of(ray), footprints.centers, strict=True)
-    ]
-    longest = gaussians.largest.astype(np.float64)
-    depth = z[owner]
-    for axes, sigmas in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
-        unit = axes / sigmas.astype(np.float64) ** 2  # (2, u)
-        slope = with_depth[0] * unit[0] + with_depth[1] * unit[1]  # (u,), for a step of one sigma
-        slope = slope.clip(-longest, longest)  # no splat is deeper than long
-        along = step[0] * unit[0][owner] + step[1] * unit[1][owner]  # (h,), in sigmas
-        depth = depth + slope[owner] * along
-    return np.maximum(depth, _NEAREST * z[owner])
 
 
 def own_support(light: Light, wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
