@@ -126,10 +126,8 @@ def note(job: Path, stage: str, result: Result) -> Result:
 
 def noted(job: Path, stage: str) -> tuple[bool, Any]:
     """Whether a stage is done, and its result; not done if its files are damaged."""
-    path = job / f"{stage}.done"
-    if not path.exists():
-        return False, None
-    with explained(path, "cannot be read", Interrupted), path.open("rb") as stream:
+    path, missing = job / f"{stage}.done", contextlib.suppress(FileNotFoundError)
+    with explained(path, "cannot be read", Interrupted), missing, path.open("rb") as stream:
         # Unpickling can run code in the file, so files of other users are not read.
         if not hasattr(os, "getuid") or os.fstat(stream.fileno()).st_uid == os.getuid():
             with contextlib.suppress(Interrupted, EOFError, ValueError, pickle.PickleError):

@@ -111,8 +111,7 @@ def prune_tiles(
         "input": f"{len(tiles)} tiles", "output": target,
         "input_bytes": size, "output_bytes": sum(sizes),
     }  # fmt: skip
-    written = sum(count for count, _ in counts) if outputs else None
-    report["splats"] |= {"written": written, "left_out": 0}
+    report["splats"] |= {"written": report["splats"]["kept"] if outputs else None, "left_out": 0}
     names = ("input", "output", "before", "kept", "unseen", "input_bytes", "output_bytes")
     targets = [str(each) for each in outputs.targets] if outputs else [None] * len(tiles)
     report["tiles"] = [
