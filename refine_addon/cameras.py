@@ -142,9 +142,7 @@ def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -
     return None
 
 
-def _intrinsics(
-    data: bpy.types.Camera, size: tuple[int, int], aspect: float
-) -> tuple[float, float, float, float, int, int]:
+def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) -> tuple[Any, ...]:
     """Focal lengths, principal point and size in pixels, as Blender frames its renders."""
     width, height = size
     fit = data.sensor_fit
@@ -294,9 +292,7 @@ def create_cameras(
 
 
 def views_from_frames(
-    context: bpy.types.Context,
-    frames: range,
-    splats: bpy.types.Object | None = None,
+    context: bpy.types.Context, frames: range, splats: bpy.types.Object | None = None
 ) -> ViewSet:
     """Views of the active camera at each frame; markers switch cameras as in a render.
     Where the object `splats` moves (a turntable), the views move instead. Frame and active camera

@@ -247,10 +247,7 @@ def refuse_other(views: object) -> None:
 
 
 def pinhole(
-    matrix: NDArray[Any],
-    projection_matrix: NDArray[Any],
-    size: tuple[int, int],
-    means: NDArray[Any],
+    matrix: NDArray[Any], projection: NDArray[Any], size: tuple[int, int], means: NDArray[Any]
 ) -> View:
     """View of a camera by OpenGL's matrices, y up, z back; RefineError as of `View`.
 
@@ -260,18 +257,18 @@ def pinhole(
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)  # float32
     rotation = flip @ axes
     center = -rotation.T @ flip @ matrix[:3, 3]
-    if projection_matrix[3, 3] == 0.0:
-        return view_through(projection_matrix, (rotation, center), size)
+    if projection[3, 3] == 0.0:
+        return view_through(projection, (rotation, center), size)
     finite, middle, extent = means[np.isfinite(means).all(axis=1)], center, 1.0
     if len(finite):
         middle = np.median(finite, axis=0)
-        extent = float(max([*np.ptp(finite, axis=0), 2.0 / projection_matrix[0, 0]]))
+        extent = float(max([*np.ptp(finite, axis=0), 2.0 / projection[0, 0]]))
     depth = float((rotation @ (middle - center))[2])
-    return view_through(projection_matrix, (rotation, center), size, (depth, FAR * extent))
+    return view_through(projection, (rotation, center), size, (depth, FAR * extent))
 
 
 def view_through(
-    projection_matrix: NDArray[np.float64],
+    projection: NDArray[np.float64],
     pose: tuple[NDArray[np.float64], NDArray[np.float64]],
     size: tuple[int, int],
     parallel: tuple[float, float] = (0.0, 1.0),
@@ -281,7 +278,7 @@ def view_through(
     Without perspective `parallel` is the depth at which pixels have their exact size, and the
     distance of the view from there, world units.
     """
-    p, (width, height), (rotation, center) = projection_matrix, size, pose
+    p, (width, height), (rotation, center) = projection, size, pose
     fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0
     # The image is shifted by the third column of a matrix with perspective, else by the fourth.
     cx = (1.0 - p[0, 2] + p[0, 3]) * width / 2.0
