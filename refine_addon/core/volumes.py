@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from .affine import is_flat, moved, scales_of
 from .errors import RefineError
 
 Role = Literal["protect", "remove", "keep"]
+Mask: TypeAlias = "NDArray[np.bool_] | None"
+"""Some of N splats, (N,); None stands for none of them."""
+
 _LEAF = 1 << 14  # pairs of point and triangle below which a group is not divided further
 
 
@@ -247,8 +250,8 @@ class Zone:
 class Forced:
     """Which of N splats volumes, or the user otherwise, protect and remove."""
 
-    protected: NDArray[np.bool_] | None = None  # (N,)
-    removed: NDArray[np.bool_] | None = None  # (N,), none of the protected ones
+    protected: Mask = None
+    removed: Mask = None  # none of the protected ones
     facts: tuple[dict[str, Any], ...] = ()  # ``role``, ``name``, ``splats`` of each volume
 
     def counts(self) -> dict[str, int]:
@@ -264,10 +267,7 @@ class Forced:
 
 
 def forced(
-    zones: Sequence[Zone],
-    means: NDArray[Any],
-    protected: NDArray[np.bool_] | None = None,
-    removed: NDArray[np.bool_] | None = None,
+    zones: Sequence[Zone], means: NDArray[Any], protected: Mask = None, removed: Mask = None
 ) -> Forced:
     """Which splats volumes protect and remove, by their centres.
 
@@ -298,15 +298,13 @@ def forced(
     return Forced(protected, must_go(removed, protected), facts)
 
 
-def any_of(*masks: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+def any_of(*masks: Mask) -> Mask:
     """Splats in any mask, (N,) bool; None if all are None."""
     given = [mask for mask in masks if mask is not None]
     return np.asarray(np.any(given, axis=0)) if given else None
 
 
-def must_go(
-    removed: NDArray[np.bool_] | None, protected: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_] | None:
+def must_go(removed: Mask, protected: Mask = None) -> Mask:
     """Splats that are removed and not protected, (N,) bool; None if none, `RefineError` if all."""
     gone = removed if protected is None or removed is None else removed & ~protected
     if gone is None or not gone.any():
