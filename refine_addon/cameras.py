@@ -111,8 +111,7 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     data.clip_end = min(view.far, max(_DEFAULT_FAR, 1e5 * view.near))
     obj = bpy.data.objects.new(name, data)
     axes = (FLIP[:, None] * view.rotation).T
-    mirrored = np.linalg.det(axes) < 0.0
-    if mirrored:
+    if np.linalg.det(axes) < 0.0:  # mirrored
         axes = axes * np.array([-1.0, 1.0, 1.0])
         obj.scale = (-1.0, 1.0, 1.0)
     obj.rotation_mode = "QUATERNION"
@@ -272,8 +271,7 @@ def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
     cameras = choice.cameras(context)
     cameras = cameras[:: len(cameras) // _FEW + 1]
     try:
-        views = list(map(view_from_camera, cameras))
-        return (_turn(cameras, views, splats) if cameras else None) or 0
+        return _turn(cameras, [*map(view_from_camera, cameras)], splats) or 0
     except RefineError:  # scoring reports it
         return 0
 

@@ -35,8 +35,7 @@ REST_RANGE = 8.0  # harmonics are written between -4 and 4, in 256 steps
 
 
 def _matches(_path, head):
-    header = ply.raw_header(head) or b""
-    words = (line.split() for line in header.splitlines())
+    words = (line.split() for line in (ply.raw_header(head) or b"").splitlines())
     return any(line[:1] == [b"property"] and line[2:] == [b"packed_position"] for line in words)
 
 

@@ -323,5 +323,4 @@ def _part(document, attributes, place):
 
 def harmonics(degree: int) -> list[str]:
     """Names of all coefficients up to a degree, the constant first."""
-    bands = range(degree + 1)
-    return [f"SH_DEGREE_{band}_COEF_{n}" for band in bands for n in range(2 * band + 1)]
+    return [f"SH_DEGREE_{band}_COEF_{n}" for band in range(degree + 1) for n in range(2 * band + 1)]

@@ -106,9 +106,8 @@ def prune_tiles(
         else:
             sizes = outputs.write(kept, writing, threads)
         clock.lap("write_s")
-    target = None if outputs is None else str(output)
     report["files"] = {
-        "input": f"{len(tiles)} tiles", "output": target,
+        "input": f"{len(tiles)} tiles", "output": None if outputs is None else str(output),
         "input_bytes": size, "output_bytes": sum(sizes),
     }  # fmt: skip
     report["splats"] |= {"written": report["splats"]["kept"] if outputs else None, "left_out": 0}
@@ -156,8 +155,7 @@ def _stored(job: Path, result: Result) -> Kept:
         changed = np.flatnonzero(result.merged.changed)
         rows, merged = np.flatnonzero(result.keep)[changed], result.merged.splats
         became = on_disk(job / "became", pieces(merged, changed)) if len(changed) else None
-    arrays = write(job / "keep", [{"keep": result.keep, "changed": rows}])
-    return Kept(**arrays, became=became)
+    return Kept(**write(job / "keep", [{"keep": result.keep, "changed": rows}]), became=became)
 
 
 @contextlib.contextmanager
