@@ -123,9 +123,7 @@ class Cluster:
                 return
         raise Interrupted("the workers were lost again and again")
 
-    def run(
-        self, packed: bytes, items: Sequence[Any], progress: Progress, what: str
-    ) -> Iterator[Any]:
+    def run(self, packed: bytes, items: Sequence[Any], progress: Progress, what: str) -> Iterator:
         """Yield results of pickled work on items, in order; `Interrupted` if workers are lost."""
         from distributed import CancelledError, KilledWorker
         from distributed.comm import CommClosedError

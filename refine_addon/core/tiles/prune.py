@@ -138,7 +138,7 @@ def _decided(job, tiles, views, budget, method, clock, reading, deciding, thread
     row_bytes = max(tile.dtype.itemsize for tile in tiles)
     result = prune(
         splats, views, budget, method,
-        sizes=(row_bytes, sum(tile.fixed_bytes for tile in tiles)),
+        sizes=(row_bytes, sum(tile.size - tile.end + tile.begin for tile in tiles)),
         clock=clock, progress=deciding, threads=threads,
     )  # fmt: skip
     assert result.scores is not None

@@ -39,11 +39,6 @@ class Tile(NamedTuple):
         """Bytes up to the end of the last row."""
         return self.begin + self.splats * self.dtype.itemsize
 
-    @property
-    def fixed_bytes(self) -> int:
-        """Bytes of everything but the rows."""
-        return self.size - self.end + self.begin
-
 
 def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
     """Tiles of a scene (`tile_at`); `RefineError` also for a file twice, other models, no splat."""

@@ -7,6 +7,7 @@ All functions raise `RefineError` if a file cannot be looked for, read or writte
 from __future__ import annotations
 
 import contextlib
+import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +21,7 @@ from ..errors import RefineError, reason_of
 from ..mapped import Interrupted, status_of
 from ..whole_file import Url, expanded, explained, is_url
 
-_FLEETING = ("url", "access")
+_FLEETING = re.compile("url|access", re.IGNORECASE)
 """Parts of names of entries that change though the file does not, such as times of access."""
 
 _LOCAL = "file://"
@@ -53,11 +54,7 @@ def state(path: Path | Url) -> tuple[int, int | str]:
             raise RefineError(f"{path}: is a folder, expected a PLY file")
         if info.get("size") is None:
             raise RefineError(f"{path}: the server does not say how long it is, which a tile needs")
-        lasting = {
-            name: str(value)
-            for name, value in info.items()
-            if not any(word in name.lower() for word in _FLEETING)
-        }
+        lasting = {name: str(value) for name, value in info.items() if not _FLEETING.search(name)}
         return int(info["size"]), repr(sorted(lasting.items()))
 
 

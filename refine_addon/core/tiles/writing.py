@@ -69,12 +69,11 @@ class Outputs:
         for _, tile in alike(self.tiles, lambda tile: tile.path.name):
             raise RefineError(f"{tile.path}: another tile is called {tile.path.name} too")
         refuse_one_file(target for target in self.targets if isinstance(target, Path))
-        read = {storage.identity(tile.path) for tile in self.tiles}
-        for target in self.targets:
-            if storage.identity(target) in read:
-                raise RefineError(
-                    f"{target}: is read until all tiles are written; write to another folder"
-                )
+        paths = [*(tile.path for tile in self.tiles), *self.targets]
+        for _, target in alike(paths, storage.identity):
+            raise RefineError(
+                f"{target}: is read until all tiles are written; write to another folder"
+            )
         self._refuse_existing(self.in_place())
 
     @property
@@ -92,7 +91,7 @@ class Outputs:
 
     def in_place(self) -> dict[int, tuple[int, int | str]]:
         """`_state` of the tiles, by number, that an interrupted run has renamed."""
-        states = enumerate(noted(self.job, RENAMED)[1] or ())
+        states = (noted(self.job, RENAMED)[1] or {}).items()
         return {number: state for number, state in states if self._is_renamed(number, *state)}
 
     def write(self, kept: Kept, progress: Progress, threads: int | None) -> list[int]:
@@ -108,17 +107,15 @@ class Outputs:
         there = self.in_place()
         try:
             self._refuse_existing(there)
-            states = [
-                there[number] if number in there else _state(waiting)
-                for number, waiting in enumerate(self.waiting)
-            ]
+            pairs = enumerate(zip(self.waiting, self.targets, strict=True))
+            left = {number: pair for number, pair in pairs if number not in there}
+            states = there | {number: _state(waiting) for number, (waiting, _) in left.items()}
             note(self.job, RENAMED, states)
-            for number, pair in enumerate(zip(self.waiting, self.targets, strict=True)):
-                if number not in there:
-                    storage.publish(*pair, overwrite=self.overwrite)
+            for pair in left.values():
+                storage.publish(*pair, overwrite=self.overwrite)
         except RefineError as error:
             raise Interrupted(str(error)) from error
-        return [size for size, _ in states]
+        return [states[number][0] for number in range(len(self.tiles))]
 
     def discard(self) -> None:
         """Remove waiting files behind URLs."""
