@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from .execute import chunks
 from .images import srgb_of
 from .splats import SH_C0
+
+Harmonics: TypeAlias = "tuple[NDArray[Any], NDArray[Any]]"
+"""Coefficients of the constant harmonic, (N, 3), and of the others, (N, K, 3)."""
 
 LARGEST = np.float32(1e36)  # coefficient that counts: 25 of them add up to a float32
 
@@ -113,9 +116,7 @@ def grading(exposure: float, tint: Sequence[float], saturation: float) -> NDArra
     return np.asarray(2.0 ** (exposure / _GAMMA) * np.diag(tint) @ saturated)
 
 
-def recolored(
-    sh_dc: NDArray[Any], sh_rest: NDArray[Any], matrix: NDArray[np.float64]
-) -> tuple[NDArray[Any], NDArray[Any]]:
+def recolored(sh_dc: NDArray[Any], sh_rest: NDArray[Any], matrix: NDArray[Any]) -> Harmonics:
     """Coefficients, (N, 3) and (N, K, 3), of colours that are `matrix`, (3, 3), times the old ones.
 
     This is exact in all directions, but that `colors` are clipped later. Splats whose old or new
@@ -133,9 +134,7 @@ def recolored(
     return result[:, 0], result[:, 1:]
 
 
-def encoded(
-    sh_dc: NDArray[Any], sh_rest: NDArray[Any]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def encoded(sh_dc: NDArray[Any], sh_rest: NDArray[Any]) -> Harmonics:
     """Coefficients, (N, 3) and (N, K, 3) float64, in sRGB of those of linear colours.
 
     The constant is exact. The others are multiplied by the curve's slope there: to first order.
@@ -153,9 +152,7 @@ def _map(matrix, coefficients, result):
         result[rows] = (matrix @ planes).transpose(2, 1, 0)
 
 
-def stretched(
-    sh_dc: NDArray[Any], sh_rest: NDArray[Any], linear: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def stretched(sh_dc: NDArray[Any], sh_rest: NDArray[Any], linear: NDArray[Any]) -> Harmonics:
     """Coefficients, (N, 3) and (N, K, 3) float64, fitted to a non-uniform map.
 
     The colour along ``linear @ d`` approximates the old colour along d, by least squares over
