@@ -216,9 +216,8 @@ def clean(
             refuse_undrawable(int(np.count_nonzero(good)), len(left))
         deciding = [view for view, _ in views.spread(settings.views).by_distance()]
         slender = is_slender(left.log_scales[gaussians.index])
-        suspects = Search(gaussians, scene, deciding, threads).find(
-            slender, part(progress, 0.05, 1.0)
-        )
+        search = Search(gaussians, scene, deciding, threads)
+        suspects = search.find(slender, part(progress, 0.05, 1.0))
         shows, faint, sure = judge(gaussians, suspects, threads)
         faint &= suspects.doubted & ~suspects.large
         haze = faint & (gaussians.alphas < FAINT) & _near_any(gaussians, scene, deciding, faint)
