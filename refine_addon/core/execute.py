@@ -25,7 +25,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -189,11 +189,6 @@ def within(**own: Any) -> Iterator[None]:
         vars(_own).update(before)
 
 
-def checked_by(check: Callable[[], None]) -> AbstractContextManager[None]:
-    """Make `checkpoint` call `check` in this thread, within the block."""
-    return within(check=check)
-
-
 def default_threads() -> int:
     """Cores that this process may use, at most 8; 1 in a thread that does a cluster's work."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -309,7 +304,7 @@ def _in_turn(work, items, tell):
             checkpoint()  # the work that this is a part of may be cancelled
             reported = -math.inf
             check()
-        with checked_by(check), np.errstate(under="ignore"):
+        with within(check=check), np.errstate(under="ignore"):
             result = work(item)
         yield result
 
@@ -323,7 +318,7 @@ def _side_by_side(work, items, threads, tell, stop=lambda: None):
             raise Cancelled
 
     def checked(item):
-        with checked_by(check):
+        with within(check=check):
             return work(item)
 
     with ThreadPoolExecutor(threads) as pool:

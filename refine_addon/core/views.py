@@ -58,9 +58,7 @@ class View:
         object.__setattr__(self, "rotation", left @ right)  # exactly orthonormal again
         object.__setattr__(self, "center", center)
 
-    def turned(
-        self, rotation: NDArray[np.float64], shift: NDArray[np.float64] | float = 0.0
-    ) -> View:
+    def turned(self, rotation: NDArray[Any], shift: NDArray[Any] | float = 0.0) -> View:
         """View moved with the world: p goes to ``rotation @ p + shift``."""
         center = rotation @ self.center + shift
         return replace(self, rotation=self.rotation @ rotation.T, center=center)

@@ -20,7 +20,7 @@ from .. import main_thread
 from ..cameras import active_camera, pose
 from ..core.affine import is_flat, transformed
 from ..core.errors import RefineError
-from ..core.execute import Cancelled, checked_by, checkpoint, report
+from ..core.execute import Cancelled, checkpoint, report, within
 from ..core.images import linear_of
 from ..core.pictures import Layers, draw, seen_from
 from ..core.splats import Splats, drawable, joined
@@ -95,7 +95,7 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
         shared.splats = len(splats)
         if shared.card and not away and len(splats):
             paint = card.painter(splats, view, layers)
-            with checked_by(partial(report, self._progress, 0.5, "drawing")):
+            with within(check=partial(report, self._progress, 0.5, "drawing")):
                 picture = main_thread.call(paint)
         else:
             frame = scene_of(splats.means, drawable(splats), camera)

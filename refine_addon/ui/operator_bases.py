@@ -15,7 +15,7 @@ from bpy.types import Context
 
 from .. import main_thread
 from ..core.errors import RefineError, described
-from ..core.execute import Cancelled, Progress, TimeLeft, checked_by, in_time, silent
+from ..core.execute import Cancelled, Progress, TimeLeft, in_time, silent, within
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -71,7 +71,7 @@ class Worker:
 
     def _run(self, work: Callable[[Progress], Any]) -> None:
         try:
-            with checked_by(self._check):
+            with within(check=self._check):
                 result = work(self._progress)
             if self.what != self.partial_step:
                 self._check()  # it may have been cancelled since its last check
