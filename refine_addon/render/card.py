@@ -60,14 +60,13 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
     def paint() -> NDArray[np.float64]:
         shared = {name: shader.texture(*values) for name, values in textures.items()}
         walls = [shader.texture(limit, 1, "R32F") for limit in limits]
-        numbers = (view.near, 1.0, True, 0)
 
         def between(number: int) -> NDArray[np.float64]:
             """Splats before a wall and behind the one before it, (4, H, W), premultiplied."""
             ends = {"near_depths": walls[number - 1]} if number else {}
             ends |= {"depths": walls[number]} if walls[number:] else {}
             picture = gpu.types.GPUTexture((view.width, view.height), format="RGBA32F")
-            frame = shader.blend(picture, {**shared, **ends}, projection, numbers, len(order))
+            frame = shader.blend(picture, {**shared, **ends}, projection, near, len(order))
             values = gpu.types.Buffer("FLOAT", view.width * view.height * 4)
             frame.read_color(0, 0, view.width, view.height, 4, 0, "FLOAT", data=values)
             pixels = np.frombuffer(memoryview(values), np.float32).reshape(*size, 4)

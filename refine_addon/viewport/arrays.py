@@ -32,6 +32,7 @@ MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (0.45, 0.0, 1.0)}
 """Turquoise and violet tints. They show on white and black, and differ from the heat map, from the
 tint of the budget, and from `SELECTED`."""
 
+TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55  # Tint of splats that the budget removes, and its share
 SELECTED, SELECTED_SHARE = (1.0, 0.1, 0.75), 0.6  # Tint of selected splats, and its share
 SHARES = {"HEAT": 0.55, "GOES": 0.75}  # Share of `MARKS` in a mode, in others `SHARE`
 SHARE = 0.35
@@ -68,6 +69,16 @@ class Packed:
 
     def __len__(self) -> int:
         return len(self.means)
+
+
+class Marks(NamedTuple):
+    """Marks of a mesh's splats: arrays with a value for each splat, or None."""
+
+    ranks: NDArray[Any] | None = None
+    going: NDArray[Any] | None = None
+    forced: NDArray[Any] | None = None
+    selected: NDArray[Any] | None = None
+    hidden: NDArray[Any] | None = None
 
 
 class Eye(NamedTuple):
@@ -169,6 +180,18 @@ def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> 
     return mixed
 
 
+def colored(packed: Packed, eye: Eye | None, mode: str, marks: Marks) -> NDArray[np.float32]:
+    """Colours in a mode with opacity, (M, 4); see `colors`. `marks`: of the M splats."""
+    if mode == "HEAT" and marks.ranks is not None:
+        rgba = heat(packed, marks.ranks, ramp())
+    else:
+        rgba = colors(packed, eye)
+    if mode == "GOES":
+        goes, forced = tinted(rgba, TINT, TINT_SHARE), marks.forced
+        rgba = goes if forced is None else np.where((forced == GOES)[:, None], rgba, goes)
+    return marked(rgba, marks.forced, mode)
+
+
 def in_front(
     means: NDArray[np.float32], eye: Eye, near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
@@ -203,7 +226,7 @@ def as_texture(values: NDArray[Any]) -> NDArray[np.float32]:
     return texels
 
 
-def first_of_each(counts: list[int], most: int) -> list[int]:
+def first_of_each(counts: list[int], most: int = MOST) -> list[int]:
     """Splats drawn of each object if at most `most` are drawn in all: equal shares."""
     total = max(sum(counts), most)
     return [count * most // total for count in counts]

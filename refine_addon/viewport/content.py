@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 import gpu
@@ -22,17 +22,7 @@ from ..mesh import selection as mesh_selection
 from ..mesh.layout import SplatObject, check, looks_like_splats, rows_of, sh_degree
 from ..objects.instances import Key, Placing, placings
 from . import shader
-from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack
-
-
-class Marks(NamedTuple):
-    """Marks of a mesh's splats: arrays with a value for each splat, or None."""
-
-    ranks: NDArray[Any] | None = None
-    going: NDArray[Any] | None = None
-    forced: NDArray[Any] | None = None
-    selected: NDArray[Any] | None = None
-    hidden: NDArray[Any] | None = None
+from .arrays import MARKS, Marks, Packed, as_texture, first_of_each, most_important_first, pack
 
 
 @dataclass(eq=False)
@@ -71,11 +61,7 @@ class Atlas:
 
     slots: dict[Key, Slot]
     textures: dict[str, gpu.types.GPUTexture]
-
-    @property
-    def rows(self) -> int:
-        """Number of splats."""
-        return sum(slot.count for slot in self.slots.values())
+    rows: int  # number of splats
 
 
 class Content:
@@ -84,7 +70,7 @@ class Content:
 
     def __init__(self) -> None:
         self.pool = ThreadPoolExecutor(1, "refine-view")
-        self.atlas = Atlas({}, {})
+        self.atlas = Atlas({}, {}, 0)
         self.changes = self.selections = 0
         self._tints = True
         self._selection: tuple[object, gpu.types.GPUTexture] | None = None
@@ -230,7 +216,7 @@ def _existing() -> set[Key]:
 
 def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:
     packs = [held[mesh].packed for _, mesh in keys]
-    counts = first_of_each([len(packed) for packed in packs], MOST)
+    counts = first_of_each([len(packed) for packed in packs])
     means = np.empty((sum(counts), 4), np.float32)
     covariances = np.empty((sum(counts), 8), np.float32)
     slots, each = {}, zip(keys, packs, rows_of(counts), counts, strict=True)
@@ -241,7 +227,7 @@ def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:
     values = {"means": means, "covariances": covariances[:, :4]}
     values["more_covariances"] = covariances[:, 4:]
     textures = {n: shader.texture(as_texture(v), 4, "RGBA32F") for n, v in values.items()}
-    return Atlas(slots, textures)
+    return Atlas(slots, textures, len(means))
 
 
 def hide_points(depsgraph: bpy.types.Depsgraph | None, refused: Container[int] | None) -> None:

@@ -97,7 +97,7 @@ def stop() -> None:
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     _forget()
-    shader.forget()
+    shader.program.cache_clear()
     _hide_points()
     _redraw()
 

@@ -29,16 +29,6 @@ _CONSTANTS = f"""
 #define SELECTED_SHARE {SELECTED_SHARE}
 """
 
-_VIEW = """
-struct ViewData {
-  mat4 projection;
-  vec4 size;
-  vec4 choices;
-};
-"""
-"""size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, depth
-test, omit splats before `near_depths`, shape (0 splats, 1 their ellipses, 2 their centres)."""
-
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
 
@@ -74,25 +64,25 @@ void main()
   vec4 row_z = texelFetch(matrices, ivec2(2, object), 0);
   vec4 local = vec4(mean.xyz, 1.0);
   vec3 seen = vec3(dot(row_x, local), dot(row_y, local), dot(row_z, local));
-  bool perspective = view_data.choices.x > 0.5;
+  bool perspective = view_projection[3][3] == 0.0;
   float depth = -seen.z;
-  if (!(depth > view_data.size.z)) {
+  if (!(depth > view_data.z)) {
     return;
   }
   paint = value_at(colors, row);
   float chosen = SELECTED_SHARE * step(0.5, value_at(selection, row).r);
   paint.rgb = mix(paint.rgb, SELECTED, chosen);
   bool disc = lower.z > 1.5;
-  vec4 clip = view_data.projection * vec4(seen, 1.0);
+  vec4 clip = view_projection * vec4(seen, 1.0);
   vec3 ndc = clip.xyz / clip.w;
 
   /* Gradients of column and row, px per unit of the object; slopes are clamped as in training. */
-  vec2 scale = 0.5 * view_data.size.xy;
-  vec2 focal = vec2(view_data.projection[0][0], view_data.projection[1][1]);
+  vec2 scale = 0.5 * view_data.xy;
+  vec2 focal = vec2(view_projection[0][0], view_projection[1][1]);
   vec3 to_column = focal.x * scale.x * row_x.xyz;
   vec3 to_row = focal.y * scale.y * row_y.xyz;
   if (perspective) {
-    vec2 middle = vec2(view_data.projection[2][0], view_data.projection[2][1]);
+    vec2 middle = vec2(view_projection[2][0], view_projection[2][1]);
     vec2 most = vec2(1.0 + BEYOND);
     vec2 slope = clamp(seen.xy / depth, (middle - most) / focal, (middle + most) / focal);
     slope = disc ? seen.xy / depth : slope;
@@ -118,10 +108,10 @@ void main()
   if (!(reach > 0.0)) {
     return;
   }
-  if (view_data.choices.w > 0.5) {
+  if (view_data.w > 0.5) {
     reach = 1.0;
   }
-  if (view_data.choices.w > 1.5) {
+  if (view_data.w > 1.5) {
     disc = false;
     xx = CENTER * CENTER;
     xy = 0.0;
@@ -153,13 +143,13 @@ void main()
     plane = vec4(0.0, 0.0, 1e9, 1.0);
     if (perspective) {
       plane.xy = tilt_of(shape, seen, depth, focal * scale, row_x.xyz, row_y.xyz, row_z.xyz);
-      plane.z = depth / view_data.size.z;
+      plane.z = depth / view_data.z;
     }
     /* The box of its edge: see core/visibility/cast.py, _disc_extent. */
     vec2 tilted = vec2(dot(along, plane.xy), dot(beside, plane.xy));
     float left = 1.0 - reach * dot(tilted, tilted);
-    vec2 low = -view_data.size.xy;
-    vec2 high = view_data.size.xy;
+    vec2 low = -view_data.xy;
+    vec2 high = view_data.xy;
     if (left > CROSSING) {
       float share = reach / left;
       vec2 shift = tilted.x * along + tilted.y * beside;
@@ -179,6 +169,9 @@ void main()
 """
 
 _SPLAT_FRAGMENT = """
+#define texel_in(values) ivec2(gl_FragCoord.xy * vec2(textureSize(values, 0)) / view_data.xy)
+#define depth_in(values) texelFetch(values, texel_in(values), 0).r
+
 void main()
 {
   float square = dot(place, place);
@@ -194,20 +187,14 @@ void main()
   }
   float alpha = min(ALPHA_MAX, paint.a * exp(-0.5 * square));
   vec3 shade = paint.rgb;
-  if (view_data.choices.w > 0.5) {
+  if (view_data.w > 0.5) {
     alpha = square > 1.0 ? 0.0 : 1.0;
-    shade *= view_data.choices.w < 1.5 && square > RIM ? 0.5 : 1.0;
+    shade *= view_data.w < 1.5 && square > RIM ? 0.5 : 1.0;
   }
   if (alpha < ALPHA_CUT) {
     discard;
   }
-  ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
-  ivec2 within = min(texel, textureSize(depths, 0) - 1);
-  bool hidden = view_data.choices.y > 0.5 && gl_FragCoord.z > texelFetch(depths, within, 0).r;
-  if (view_data.choices.z > 0.5) {
-    hidden = hidden || gl_FragCoord.z <= texelFetch(near_depths, texel, 0).r;
-  }
-  if (hidden) {
+  if (gl_FragCoord.z > depth_in(depths) || gl_FragCoord.z <= depth_in(near_depths)) {
     discard;
   }
   color = vec4(shade * alpha, alpha);
@@ -217,7 +204,7 @@ void main()
 _PICTURE_VERTEX = """
 void main()
 {
-  uv = 0.5 * corner + 0.5;
+  place = 0.5 * corner + 0.5;
   gl_Position = vec4(corner, 0.0, 1.0);
 }
 """
@@ -227,7 +214,7 @@ _PICTURE_FRAGMENT = """
 void main()
 {
   ivec2 size = textureSize(picture, 0);
-  vec2 at = clamp(uv * vec2(size) - 0.5, vec2(0.0), vec2(size) - 1.0);
+  vec2 at = clamp(place * vec2(size) - 0.5, vec2(0.0), vec2(size) - 1.0);
   ivec2 low = ivec2(at);
   ivec2 high = min(low + 1, size - 1);
   vec2 share = at - vec2(low);
@@ -242,40 +229,17 @@ void main()
 """
 
 
-@cache
-def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
-    """Splat shader, and the quad drawn for each."""
-    info = gpu.types.GPUShaderCreateInfo()
-    info.typedef_source(_CONSTANTS + _VIEW)
-    info.uniform_buf(0, "ViewData", "view_data")
-    names = (
-        *("order", "means", "covariances", "more_covariances", "colors", "selection"),
-        *("matrices", "depths", "near_depths"),
-    )
-    for slot, name in enumerate(names):
-        info.sampler(slot, "FLOAT_2D", name)
-    between = gpu.types.GPUStageInterfaceInfo("refine_splat")
-    between.smooth("VEC2", "place")
-    between.flat("VEC4", "paint")
-    between.flat("VEC4", "axes")
-    between.flat("VEC4", "plane")
-    return _program(info, between, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
-
-
-@cache
-def picture() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
-    """Shader that draws a picture into a view, and the quad that covers the view."""
-    info = gpu.types.GPUShaderCreateInfo()
-    info.sampler(0, "FLOAT_2D", "picture")
-    between = gpu.types.GPUStageInterfaceInfo("refine_picture")
-    between.smooth("VEC2", "uv")
-    return _program(info, between, _PICTURE_VERTEX, _PICTURE_FRAGMENT)
-
-
-def forget() -> None:
-    """Free the shaders."""
-    splats.cache_clear()
-    picture.cache_clear()
+_PROGRAMS = {
+    "splats": (
+        "order means covariances more_covariances colors selection matrices depths near_depths",
+        "paint axes plane",
+        _SPLAT_VERTEX,
+        _SPLAT_FRAGMENT,
+    ),
+    "picture": ("picture", "", _PICTURE_VERTEX, _PICTURE_FRAGMENT),
+}
+"""Textures, what vertices give to fragments besides ``place``, and sources. "splats" draws a quad
+for each splat, "picture" one that covers the view."""
 
 
 def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.GPUTexture:
@@ -285,49 +249,55 @@ def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.
     return gpu.types.GPUTexture(size, format=kind, data=gpu.types.Buffer("FLOAT", len(flat), flat))
 
 
-def blend(
-    picture: gpu.types.GPUTexture,
-    textures: dict[str, gpu.types.GPUTexture],
-    projection: NDArray[np.float64],
-    numbers: tuple[float, float, bool, float],
-    count: int,
-) -> gpu.types.GPUFrameBuffer:
-    """Clear a picture and draw `count` splats. `textures`: inputs of the shader of `splats`, held
-    by the caller until drawn; without "depths" or "near_depths" these hide nothing. `numbers`:
-    near plane, texels of depth per pixel, perspective, shape."""
-    nothing = texture(np.ones((1, 1), np.float32), 1, "R32F")
-    hides = [name in textures for name in ("depths", "near_depths")]
-    data = np.zeros(24, np.float32)
-    data[:16], data[16:18] = projection.T.reshape(-1), (picture.width, picture.height)
-    data[18:21], data[21:23], data[23] = numbers[:3], hides, numbers[3]
-    block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(data), data))
-    frame = gpu.types.GPUFrameBuffer(color_slots=picture)
-    with frame.bind():
-        frame.clear(color=(0.0, 0.0, 0.0, 0.0))
-        if count:
-            program, quad = splats()
-            gpu.state.blend_set("ALPHA_PREMULT")
-            gpu.state.depth_test_set("NONE")
-            program.bind()
-            program.uniform_block("view_data", block)
-            for name, held in {"depths": nothing, "near_depths": nothing, **textures}.items():
-                program.uniform_sampler(name, held)
-            quad.draw_instanced(program, instance_count=count)
-            gpu.state.blend_set("NONE")
-    return frame
-
-
-def _program(
-    info: gpu.types.GPUShaderCreateInfo,
-    between: gpu.types.GPUStageInterfaceInfo,
-    vertex: str,
-    fragment: str,
-) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
+@cache
+def program(name: str) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
+    """One of `_PROGRAMS`, kept until its cache is cleared, and its quad."""
+    samplers, flat, vertex, fragment = _PROGRAMS[name]
+    info = gpu.types.GPUShaderCreateInfo()
+    info.typedef_source(_CONSTANTS)
+    info.push_constant("MAT4", "view_projection")
+    info.push_constant("VEC4", "view_data")  # pixels across, pixels up, near plane, style
+    for slot, sampler in enumerate(samplers.split()):
+        info.sampler(slot, "FLOAT_2D", sampler)
+    between = gpu.types.GPUStageInterfaceInfo(f"refine_{name}")
+    between.smooth("VEC2", "place")
+    for value in flat.split():
+        between.flat("VEC4", value)
     info.vertex_in(0, "VEC2", "corner")
     info.vertex_out(between)
     info.fragment_out(0, "VEC4", "color")
     info.vertex_source(vertex)
     info.fragment_source(fragment)
-    program = gpu.shader.create_from_info(info)
+    compiled = gpu.shader.create_from_info(info)
     corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)]
-    return program, batch_for_shader(program, "TRI_STRIP", {"corner": corners})
+    return compiled, batch_for_shader(compiled, "TRI_STRIP", {"corner": corners})
+
+
+def blend(
+    picture: gpu.types.GPUTexture,
+    textures: dict[str, gpu.types.GPUTexture],
+    projection: NDArray[np.float64],
+    near: float,
+    count: int,
+    style: int = 0,
+) -> gpu.types.GPUFrameBuffer:
+    """Clear a picture and draw `count` splats. `textures`: inputs of the shader, held by
+    the caller until drawn; without "depths" or "near_depths" these hide nothing. `near`: depth of
+    the near plane; `style`: 0 splats, 1 their ellipses, 2 their centres."""
+    ends = {"depths": 1.0, "near_depths": -1.0}  # window depths behind and before all splats
+    held = {name: texture(np.full((1, 1), end), 1, "R32F") for name, end in ends.items()} | textures
+    frame = gpu.types.GPUFrameBuffer(color_slots=picture)
+    with frame.bind():
+        frame.clear(color=(0.0, 0.0, 0.0, 0.0))
+        if count:
+            splats, quad = program("splats")
+            gpu.state.blend_set("ALPHA_PREMULT")
+            gpu.state.depth_test_set("NONE")
+            splats.bind()
+            splats.uniform_float("view_projection", projection.T.ravel())
+            splats.uniform_float("view_data", (picture.width, picture.height, near, style))
+            for name, values in held.items():
+                splats.uniform_sampler(name, values)
+            quad.draw_instanced(splats, instance_count=count)
+            gpu.state.blend_set("NONE")
+    return frame

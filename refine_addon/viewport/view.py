@@ -15,25 +15,11 @@ from numpy.typing import NDArray
 
 from ..objects.instances import Key
 from . import shader
-from .arrays import (
-    GOES,
-    MOST,
-    Eye,
-    as_texture,
-    colors,
-    farthest_first,
-    first_of_each,
-    heat,
-    in_front,
-    marked,
-    ramp,
-    tinted,
-)
-from .content import Content, Marks, Slot
+from .arrays import MOST, Eye, Marks, as_texture, colored, farthest_first, first_of_each, in_front
+from .content import Content, Slot
 
 REST = 0.2  # Seconds without a change after which a view counts as resting
-SHAPES = {"ELLIPSES": 1, "CENTERS": 2}  # The shader's shape in a mode, in others 0: splats
-TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55  # Tint of splats that the budget removes, and its share
+STYLES = {"ELLIPSES": 1, "CENTERS": 2}  # The shader's style in a mode, in others 0: splats
 
 BY_CARD, BY_PROCESSOR = (300_000, 1), (20_000, 3)
 """Splats drawn at most while a view moves, and side of a drawn pixel in pixels of the view."""
@@ -142,8 +128,8 @@ class View:
         if self._order is None or self._colors is None:
             return
         self.count = self._order.count
-        shape = SHAPES.get(mode, 0)
-        self._paint(content, shown, camera, 1 if self.complete else wide, solid, shape)
+        style = STYLES.get(mode, 0)
+        self._paint(content, shown, camera, 1 if self.complete else wide, solid, style)
         _put(self._picture)
 
     def _moves(self, key: bytes) -> bool:
@@ -187,11 +173,11 @@ class View:
             order = _order(_parts(shown, camera), camera.near, mode, most)
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
 
-    def _paint(self, content, shown, camera, pixels, solid, shape):
+    def _paint(self, content, shown, camera, pixels, solid, style):
         """Draw the splats into the picture, unless it is up to date."""
         depths = _depths(camera.size) if solid else None
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
-        look = (self._order.key, self._colors_key, self._camera_key, shape)
+        look = (self._order.key, self._colors_key, self._camera_key, style)
         wanted = (*look, size, content.selections)
         if self._picture and wanted == self._drawn and np.array_equal(depths, self.depths):
             return
@@ -210,8 +196,8 @@ class View:
         }  # referenced until drawn, which the shader does not do
         if depths is not None:
             textures["depths"] = shader.texture(depths, 1, "R32F")
-        numbers = (camera.near, camera.size[0] / size[0], camera.perspective, shape)
-        shader.blend(self._picture, textures, camera.projection, numbers, self._order.count)
+        count = self._order.count
+        shader.blend(self._picture, textures, camera.projection, camera.near, count, style)
 
 
 def _parts(shown: list[tuple[Slot, NDArray[Any]]], camera: Camera) -> list[_Part]:
@@ -224,9 +210,7 @@ def _parts(shown: list[tuple[Slot, NDArray[Any]]], camera: Camera) -> list[_Part
     return parts
 
 
-def _sort_and_color(
-    parts: list[_Part], near: float, mode: str, rows: int | None, few: int | None = None
-) -> _Sorted:
+def _sort_and_color(parts, near, mode, rows, few):
     """Sort splats and, if `rows` is given, colour them in a texture for that many; on the thread.
     With `few`, at most so many, in constant colours."""
     order = _order(parts, near, mode, few or MOST)
@@ -234,30 +218,16 @@ def _sort_and_color(
         return as_texture(order), len(order), None
     painted = np.zeros((rows, 4), np.float32)
     for part in parts:
-        rgba = _colored(part, mode, constant=few is not None)
+        rgba = colored(part.slot.packed, None if few else part.eye, mode, part.marks)
         painted[part.slot.rows] = rgba[: part.slot.count]
     return as_texture(order), len(order), as_texture(painted)
 
 
-def _colored(part: _Part, mode: str, *, constant: bool) -> NDArray[np.float32]:
-    packed, forced = part.slot.packed, part.marks.forced
-    if mode == "HEAT" and part.marks.ranks is not None:
-        rgba = heat(packed, part.marks.ranks, ramp())
-    else:
-        rgba = colors(packed, None if constant else part.eye)
-    if mode == "GOES":
-        goes = tinted(rgba, TINT, TINT_SHARE)
-        rgba = goes if forced is None else np.where((forced == GOES)[:, None], rgba, goes)
-    return marked(rgba, forced, mode)
-
-
 def _order(parts: list[_Part], near: float, mode: str, most: int) -> NDArray[Any]:
     counts = first_of_each([part.slot.count for part in parts], most)
-    rows, depths = zip(
-        *(_in_view(*pair, near, mode) for pair in zip(parts, counts, strict=True)), strict=True
-    )
-    perspective = parts[0].eye.perspective
-    return np.concatenate(rows)[farthest_first(np.concatenate(depths), perspective=perspective)]
+    found = [_in_view(*pair, near, mode) for pair in zip(parts, counts, strict=True)]
+    rows, depths = map(np.concatenate, zip(*found, strict=True))
+    return rows[farthest_first(depths, perspective=parts[0].eye.perspective)]
 
 
 def _in_view(
@@ -292,7 +262,7 @@ def _depths(size: tuple[int, int]) -> NDArray[np.float32] | None:
 
 def _put(picture: gpu.types.GPUTexture) -> None:
     """Draw a picture of splats into the view."""
-    program, quad = shader.picture()
+    program, quad = shader.program("picture")
     gpu.state.blend_set("ALPHA_PREMULT")
     gpu.state.depth_test_set("NONE")
     gpu.state.depth_mask_set(False)
