@@ -5,8 +5,8 @@ it on a thread of its own, with the data evaluated for that render."""
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -201,7 +201,15 @@ def steps(
     None: Blender may do other things first. Cleans up at the end or when closed. `write`: pictures
     go to the scene's output. `RefineError` if a step failed, `Cancelled` if one was stopped."""
     refuse(scene)
-    with _session(shared) as folder:
+    with ExitStack() as stack:  # which first drops the engine's state, then copies and files
+        folder = tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
+        folder = Path(stack.enter_context(folder))
+        meshes.remove_all()
+        bpy.utils.register_class(REFINE_engine)
+        stack.callback(bpy.utils.unregister_class, REFINE_engine)
+        stack.callback(meshes.remove_all)
+        REFINE_engine.shared = shared
+        stack.callback(setattr, REFINE_engine, "shared", Shared(stopped=True))
         others, whole = meshes.Meshes(scene, folder), _whole(scene, "whole")
         shared.engine, shared.renders = others.engine, others.renders + 1
         movie = write and scene.render.is_movie_format
@@ -213,17 +221,13 @@ def steps(
             if write and not movie and _is_there(whole, frame, *kept):
                 continue
             shared.layers = yield from others.layers(frame)
-            meshes.set_frames(whole, [frame])
-            yield meshes.Step(whole, animation=write, what="splats")
-            _check(shared, frame)
+            yield from _drawn(shared, whole, [frame], "splats", animation=write)
             if movie:
                 picture = np.rint(shared.picture * 65535.0).astype(np.uint16)
                 np.save(folder / f"{frame}.npy", picture)
         if movie:
             shared.finished = folder
-            meshes.set_frames(written, frames)
-            yield meshes.Step(written, animation=True, what="movie")
-            _check(shared, frames[-1])
+            yield from _drawn(shared, written, frames, "movie", animation=True)
 
 
 def _whole(scene: bpy.types.Scene, what: str) -> str:
@@ -235,8 +239,11 @@ def _whole(scene: bpy.types.Scene, what: str) -> str:
     return str(copy.name)
 
 
-def _check(shared: Shared, frame: int) -> None:
-    if shared.error is not None or shared.frames[-1:] != [frame]:
+def _drawn(shared, name, frames, what, *, animation):
+    """Have the engine draw frames of a copy; raises what stopped it."""
+    meshes.set_frames(name, frames)
+    yield meshes.Step(name, animation, what)
+    if shared.error is not None or shared.frames[-1:] != [frames[-1]]:
         raise shared.error or Cancelled
 
 
@@ -248,18 +255,3 @@ def _is_there(name: str, frame: int, stays: bool, placeholder: bool) -> bool:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     return stays and there
-
-
-@contextmanager
-def _session(shared: Shared) -> Iterator[Path]:
-    """Register the engine and yield a temporary folder; remove both and all copies afterwards."""
-    with tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True) as folder:
-        meshes.remove_all()
-        bpy.utils.register_class(REFINE_engine)
-        REFINE_engine.shared = shared
-        try:
-            yield Path(folder)
-        finally:
-            REFINE_engine.shared = Shared(stopped=True)
-            meshes.remove_all()
-            bpy.utils.unregister_class(REFINE_engine)

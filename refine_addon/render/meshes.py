@@ -339,30 +339,24 @@ class Pass(NamedTuple):
     depths: NDArray[np.float32]
 
 
-Blended = tuple[list[NDArray[np.float32]], Callable[[Sequence[NDArray[np.float32]]], Layers]]
-
-
-def _layers_of(files: Sequence[tuple[Path, Path]], world: Path | None, far: float) -> Blended:
+def _layers_of(files, world, far):
     """Read and remove files: of each pass those with colours and with depths, and of the world.
-    Gives the pictures, (3, H, W) float32, for the view transform, and a callable that makes layers
-    of the transformed ones. Depths from `far` on count as empty."""
+    Gives the pictures, (3, H, W) float32, for the view transform, of each pass as if opaque and of
+    all blended, and a callable that makes layers of the transformed ones. Depths from `far` on
+    count as empty."""
     passes = []
     for colors, depths in files:
         one = _read(colors)
         away = one.depths if depths == colors else _read(depths).depths
         passes.append(one._replace(depths=_filled(away, one.alphas, far)))
-    return _blended(passes, _read(world).colors if world else None)
-
-
-def _blended(passes: Sequence[Pass], world: NDArray[np.float32] | None) -> Blended:
-    """Pictures of each pass as if opaque and of all blended; see `_layers_of`."""
-    nothing = np.zeros_like(passes[0].colors if passes else world)
+    sky = _read(world).colors if world else None
+    nothing = np.zeros_like(passes[0].colors if passes else sky)
     seen = [each for each in passes if each.alphas.any()]
     passes = seen or [Pass(nothing, nothing[0], nothing[0])]
     stacked = in_order(passes)
     over, left = stacked.over_nothing(), stacked.left()[-1]
-    share = np.ones_like(left) if world is not None else 1.0 - left
-    over = over / np.maximum(share, 1e-6) if world is None else over + left * world
+    share = np.ones_like(left) if world else 1.0 - left
+    over = over + left * sky if world else over / np.maximum(share, 1e-6)
 
     def layers(shown: Sequence[NDArray[np.float32]]) -> Layers:
         """Layers that without splats give Blender's picture, by a correction in the background."""
