@@ -27,22 +27,15 @@ def name_of(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> str:
 
 def selected(obj: bpy.types.Object) -> NDArray[np.bool_]:
     """Selected splats of an object, (N,) bool."""
-    if _in_edit_mode(obj):
-        return _in_edit(obj, "select")
     name = name_of(obj.data)
-    if obj.mode == "EDIT" and name not in obj.data.attributes:
+    if obj.type != "MESH" and obj.mode == "EDIT" and name not in obj.data.attributes:
         return np.ones(splat_count(obj.data), np.bool_)  # without it Blender selects all
-    return _flags(obj.data, name)
+    return _flags(obj, name, "select")
 
 
 def hidden(obj: bpy.types.Object) -> NDArray[np.bool_]:
     """Hidden splats of an object, (N,) bool."""
-    return _in_edit(obj, "hide") if _in_edit_mode(obj) else _flags(obj.data, HIDDEN)
-
-
-def _in_edit(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
-    vertices = bmesh.from_edit_mesh(obj.data).verts
-    return np.fromiter(map(attrgetter(name), vertices), np.bool_, len(vertices))
+    return _flags(obj, HIDDEN, "hide")
 
 
 def select(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
@@ -91,7 +84,11 @@ def _in_edit_mode(obj: bpy.types.Object) -> bool:
     return obj.type == "MESH" and obj.mode == "EDIT"
 
 
-def _flags(mesh: bpy.types.Mesh | bpy.types.PointCloud, name: str) -> NDArray[np.bool_]:
-    values = mesh_attributes.attribute_if_any(mesh, name, "BOOLEAN", "FLOAT")
-    count = splat_count(mesh)
+def _flags(obj: bpy.types.Object, name: str, flag: str) -> NDArray[np.bool_]:
+    """An attribute above 0, (N,); in edit mode a flag of the vertices."""
+    if _in_edit_mode(obj):
+        vertices = bmesh.from_edit_mesh(obj.data).verts
+        return np.fromiter(map(attrgetter(flag), vertices), np.bool_, len(vertices))
+    values = mesh_attributes.attribute_if_any(obj.data, name, "BOOLEAN", "FLOAT")
+    count = splat_count(obj.data)
     return np.zeros(count, np.bool_) if values is None or len(values) != count else values > 0

@@ -6,7 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -45,15 +45,14 @@ class Worker:
         self.fraction, self.what, self.partial_step = 0.0, "", partial_step
         self.cancelled: float | None = None  # time of `cancel`
         self._outcome: Future[Any] = Future()
-        self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._run, args=(work,), name="refine", daemon=True).start()
 
     def running(self) -> bool:
         """Whether to wait for it: until it ends, or, without a partial result, `PATIENCE` after it
         was cancelled. Work that goes on after that ends at its next check; its result is dropped.
         """
         late = self.cancelled and time.monotonic() - self.cancelled > PATIENCE
-        return self._thread.is_alive() and (not late or self.what == self.partial_step)
+        return not self._outcome.done() and (not late or self.what == self.partial_step)
 
     def cancel(self) -> None:
         """Ask it to stop; `result` raises `Cancelled` then, unless the step has a partial one."""
@@ -61,7 +60,7 @@ class Worker:
 
     def end(self) -> None:
         """Wait until it has stopped, after `cancel`, or `PATIENCE` is over."""
-        self._thread.join(PATIENCE)
+        wait([self._outcome], PATIENCE)
 
     def result(self) -> Any:
         """The work's result; raises the work's error."""

@@ -17,18 +17,9 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, instances, splat_group
 from ..viewport import draw as viewport_draw
-from . import (
-    camera_operators,
-    images,
-    operator_bases,
-    operators,
-    plans,
-    render_operators,
-    transforms,
-    wrapped,
-)
+from . import camera_operators, images, operators, plans, render_operators, transforms, wrapped
 from .marks import ROLES
-from .operator_bases import Acting, Answer, idle, in_object_mode, tooltips
+from .operator_bases import Acting, Answer, idle, in_object_mode, now, tooltips
 from .plans import cached
 from .properties import HINTS, METHODS
 from .select_operators import ACTIONS
@@ -301,10 +292,10 @@ class REFINE_PT_deliver(InSidebar, bpy.types.Panel):
 def _draw_progress(layout: bpy.types.UILayout, *names: str) -> None:
     """Draw the progress if one of these operators runs. Called last in a panel, since Blender 4.3
     replaces a bar by a label that is drawn later."""
-    now = operator_bases.now()
-    if now is not None and now.operator in names:
-        layout.progress(factor=now.worker.fraction, text=now.share)
-        wrapped.label(layout, now.sentence)
+    running = now()
+    if running is not None and running.operator in names:
+        layout.progress(factor=running.worker.fraction, text=running.share)
+        wrapped.label(layout, running.sentence)
 
 
 def _draw_objects(layout: bpy.types.UILayout, objects: Sequence[bpy.types.Object]) -> None:
@@ -354,13 +345,13 @@ def _draw_plan(layout: bpy.types.UILayout, obj: Any, record: Any, plan: Any) -> 
 
 def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
     """Draw the display modes; those that need scores wait for them."""
-    now, attributes = viewport_draw.mode(), obj.data.attributes if obj else ()
+    current, attributes = viewport_draw.mode(), obj.data.attributes if obj else ()
     needs = {"HEAT": mesh_scores.RANK, "STAYS": mesh_edit.REMOVE, "GOES": mesh_edit.REMOVE}
     grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
     for mode, text, _ in viewport_draw.MODES[1:]:
         cell = grid.row(align=True)
-        cell.enabled = mode == now or mode not in needs or needs[mode] in attributes
-        button = cell.operator("refine.view", text=text, depress=mode == now)
-        button.mode = "OFF" if mode == now else mode
+        cell.enabled = mode == current or mode not in needs or needs[mode] in attributes
+        button = cell.operator("refine.view", text=text, depress=mode == current)
+        button.mode = "OFF" if mode == current else mode
     if viewport_draw.failure():
         layout.label(text=viewport_draw.failure(), icon="ERROR")

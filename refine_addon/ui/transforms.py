@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -119,10 +120,8 @@ def _stamp_soon() -> None:
 def _stamp() -> None:
     for obj in bpy.data.objects:
         if mesh_layout.looks_like_splats(obj) and _is_new(obj.data) and obj.mode != "EDIT":
-            try:
+            with contextlib.suppress(RefineError):  # it may only look like splats
                 mesh_drift.stamp(mesh_layout.check(obj).mesh)
-            except RefineError:
-                continue  # it only looks like splats
 
 
 def unregister() -> None:
