@@ -111,12 +111,6 @@ def disturbed(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Notes | None:
     return None if notes is None or notes.undisturbed else notes
 
 
-def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Note all splats anew after some were merged, unless others drifted before that."""
-    if is_stamped(mesh) and found(mesh) is None:
-        stamp(mesh)
-
-
 class Notes:
     """Notes and present values of a mesh, read once, usable on any thread."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import Any
 
 import bpy
 import numpy as np
@@ -125,16 +125,20 @@ def mark(obj: bpy.types.Object, name: str, values: NDArray[Any]) -> None:
     mesh_attributes.updated(obj.data)
 
 
-def named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Splats that an attribute or a vertex group protects, where it is above 0, (N,); or None."""
+def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     # A splat's own properties protect nothing.
     if has(obj.data, name, *MARKING) and name not in REQUIRED:
         return mesh_attributes.read_attribute(obj.data, name) > 0
     return group_weights(obj, name) > 0.0 if name in obj.vertex_groups else None
 
 
-def refuse_name(obj: bpy.types.Object, name: str) -> NoReturn:
-    """Raise `RefineError` for a name by which `named_mask` is None."""
+def named_masks(group: Sequence[SplatObject], name: str) -> list[NDArray[np.bool_] | None]:
+    """Splats of each object that an attribute or a vertex group protects, where it is above 0,
+    (N,); None in objects without one, `RefineError` if all are."""
+    masks = [_named_mask(checked.obj, name) for checked in group]
+    if any(mask is not None for mask in masks):
+        return masks
+    obj = group[-1].obj
     attribute = obj.data.attributes.get(name)
     what = f" ('{name}' is {attribute.data_type} on {attribute.domain})" if attribute else ""
     no_groups = " (a point cloud has no vertex groups)" if obj.type == "POINTCLOUD" else ""

@@ -182,9 +182,7 @@ def splat_count(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> int:
 
 def looks_like_splats(obj: bpy.types.Object | None) -> bool:
     """Whether an object seems to hold splats; cheap enough for a poll."""
-    if obj is None or obj.type not in _TYPES:
-        return False
-    return holds_splats(obj.data)
+    return obj is not None and obj.type in _TYPES and holds_splats(obj.data)
 
 
 def holds_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
@@ -229,11 +227,8 @@ def _native_places(data: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Pla
 
 def lost_base(obj: bpy.types.Object) -> bool:
     """Whether an object holds splats of Blender 5.3 whose `BASE` an older version dropped."""
-    if obj.type != "POINTCLOUD":
-        return False
-    attributes = obj.data.attributes
-    others = SCALE in attributes and ROTATION in attributes and "f_dc_0" not in attributes
-    return others and BASE not in attributes
+    there = obj.data.attributes if obj.type == "POINTCLOUD" else ()
+    return SCALE in there and ROTATION in there and "f_dc_0" not in there and BASE not in there
 
 
 def check(obj: bpy.types.Object) -> SplatObject:

@@ -201,9 +201,3 @@ def floater_mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.b
         raise RefineError(f"object '{checked.obj.name}': find floaters first: Clean")
     numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
     return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)
-
-
-def forget_floaters(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
-    """Remove floaters and their record."""
-    mesh_attributes.remove_attribute(mesh, REASON)
-    mesh.pop(FLOATERS, None)

@@ -17,22 +17,11 @@ from numpy.typing import NDArray
 from ..cameras import world_matrix
 from ..core.affine import moved
 from ..core.errors import RefineError
-from ..core.volumes import (
-    Box,
-    Forced,
-    MovedVolume,
-    Role,
-    Solid,
-    Sphere,
-    Volume,
-    Zone,
-    any_of,
-    forced,
-)
+from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Zone, any_of, forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject, recorded, rows_of, splat_count
+from ..mesh.layout import SplatObject, recorded, splat_count
 
 RECORD = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
 Masks = dict[str, NDArray[np.bool_] | None]  # Splats of all that are ``protected`` and ``removed``
@@ -62,10 +51,7 @@ class Demands:
 
     def of_each(self, group: Sequence[SplatObject]) -> list[Forced]:
         """The same for each object. A name protects in the objects that have it, at least one."""
-        by_name = [[mesh_edit.named_mask(m.obj, name) for m in group] for name in self.names]
-        for name, masks in zip(self.names, by_name, strict=True):
-            if all(mask is None for mask in masks):
-                mesh_edit.refuse_name(group[-1].obj, name)
+        by_name = [mesh_edit.named_masks(group, name) for name in self.names]
         return [self._forced(*each) for each in zip(group, *by_name, strict=True)]
 
     def _forced(self, checked: SplatObject, *named: NDArray[np.bool_] | None) -> Forced:
@@ -84,10 +70,9 @@ NONE = Demands()
 def _as_one(each: Sequence[Forced], group: Sequence[SplatObject]) -> Masks:
     masks: Masks = {}
     for name in ("protected", "removed"):
-        whole = np.zeros(sum(map(len, group)), np.bool_)
-        for one, rows in zip(each, rows_of(map(len, group)), strict=True):
-            part = getattr(one, name)
-            whole[rows] = False if part is None else part
+        pairs = zip((getattr(one, name) for one in each), group, strict=True)
+        parts = [np.zeros(len(obj), np.bool_) if mask is None else mask for mask, obj in pairs]
+        whole = np.concatenate(parts)
         masks[name] = whole if whole.any() else None
     return masks
 
@@ -127,7 +112,7 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
     """An object as a volume in the world: a mesh evaluated with modifiers, an empty as drawn.
     Whether a mesh is closed is checked when it is used."""
     label = f"object '{obj.name}'"
-    make: partial[Volume]
+    make: partial[Any]
     if obj.type == "MESH":
         local, triangles = _surface(obj)
         make = partial(Solid, moved(local, world_matrix(obj)), triangles)
@@ -229,7 +214,7 @@ class _CachedVolume:
     """A volume that caches its last answers: sliders repeat the same questions."""
 
     label: str
-    make: partial[Volume]
+    make: partial[Any]
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         digest = hashlib.blake2b(pickle.dumps(self.make), digest_size=16)

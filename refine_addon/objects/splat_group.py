@@ -181,12 +181,8 @@ def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
         mesh_edit.mark(member.obj, mesh_edit.REMOVE, ~keep[rows])
 
 
-class Frame(NamedTuple):
-    """Input of `changes` of an object: splats, degree of harmonics, matrix to the world (4, 4)."""
-
-    count: int
-    degree: int
-    matrix: NDArray[np.float64]
+Frame = tuple[int, int, NDArray[np.float64]]
+"""An object's splats, their degree of harmonics, and the (4, 4) matrix to the world."""
 
 
 class Change(NamedTuple):
@@ -200,25 +196,23 @@ class Change(NamedTuple):
 
 def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
     """Read what `changes` needs of each object."""
-    return [
-        Frame(len(member), mesh_layout.sh_degree(member.mesh), world_matrix(member.obj))
-        for member in group
-    ]
+    return [(len(one), mesh_layout.sh_degree(one.mesh), world_matrix(one.obj)) for one in group]
 
 
 def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
     """Change of each object's splats, from the result for all; arrays only."""
     parts, first, merged = [], 0, result.merged
-    for frame, rows in zip(frames, rows_of(frame.count for frame in frames), strict=True):
+    slices = rows_of(count for count, *_ in frames)
+    for (_, degree, matrix), rows in zip(frames, slices, strict=True):
         keep = result.keep[rows]
         start, first = first, first + int(np.count_nonzero(keep))
         if merged is None:
             parts.append(Change(keep))
             continue
         changing = np.flatnonzero(merged.changed[start:first])
-        splats = merged.splats.take(start + changing).up_to_degree(frame.degree)
-        if not np.array_equal(frame.matrix, np.eye(4)):
-            splats = transformed(splats, np.linalg.inv(frame.matrix))
+        splats = merged.splats.take(start + changing).up_to_degree(degree)
+        if not np.array_equal(matrix, np.eye(4)):
+            splats = transformed(splats, np.linalg.inv(matrix))
         columns = {name: np.ascontiguousarray(v) for name, v in values_by_name(splats).items()}
         parts.append(Change(keep, changing, columns))
     return parts
@@ -250,13 +244,15 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
 
 
 def reduce_object(checked: SplatObject, change: Change) -> None:
-    """Delete removed splats, store changed ones, drop the scores' record."""
+    """Delete removed splats, store changed ones, drop floaters and the scores' record."""
+    mesh = checked.mesh
     mesh_edit.delete_vertices(checked.obj, ~change.keep)
-    mesh_attributes.write_columns(checked.mesh, checked.layout, change.columns, change.rows)
-    if change.columns:
-        mesh_drift.renew(checked.mesh)
-    mesh_scores.forget_floaters(checked.mesh)
-    checked.mesh.pop(mesh_scores.RECORD, None)
+    mesh_attributes.write_columns(mesh, checked.layout, change.columns, change.rows)
+    if change.columns and mesh_drift.is_stamped(mesh) and mesh_drift.found(mesh) is None:
+        mesh_drift.stamp(mesh)  # not where others drifted before
+    mesh_attributes.remove_attribute(mesh, mesh_scores.REASON)
+    for record in (mesh_scores.FLOATERS, mesh_scores.RECORD):
+        mesh.pop(record, None)
 
 
 def grade(checked: SplatObject, rows: NDArray[np.int64], matrix: NDArray[np.float64]) -> None:
