@@ -13,16 +13,7 @@ from numpy.typing import NDArray
 from ..core.formats.format import pieces
 from ..core.images import srgb_of
 from ..core.spherical_harmonics import colors as colors_along
-from ..core.splats import (
-    ALPHA_CUT,
-    MODELS,
-    SH_C0,
-    Splats,
-    drawable,
-    opacity,
-    rotation_matrices,
-    scales,
-)
+from ..core.splats import ALPHA_CUT, MODELS, Splats, drawable, opacity, rotation_matrices, scales
 
 WIDTH = 4096  # Columns of a texture with one value for each splat, row by row
 MOST = 1 << 24  # Splats drawn at most: their order is stored as float32, exact up to this
@@ -128,13 +119,11 @@ def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
     degree 0 alone."""
     rgba = np.empty((len(packed), 4), np.float32)
     rgba[:, 3] = packed.opacities
+    harmonics = packed.harmonics if eye else packed.harmonics[:, :1]
     for chunk in pieces(len(packed)):
-        coefficients = packed.harmonics[chunk].astype(np.float32)
-        if eye is None:
-            rgb = 0.5 + SH_C0 * coefficients[:, 0]
-        else:
-            directions = _directions(packed.means[chunk], eye)
-            rgb = colors_along(directions, coefficients[:, 0], coefficients[:, 1:])
+        coefficients, means = harmonics[chunk].astype(np.float32), packed.means[chunk]
+        directions = _directions(means, eye) if eye else means
+        rgb = colors_along(directions, coefficients[:, 0], coefficients[:, 1:])
         rgba[chunk, :3] = np.clip(rgb, 0.0, _LARGEST_HALF)
     return rgba
 
@@ -182,10 +171,8 @@ def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> 
 
 def colored(packed: Packed, eye: Eye | None, mode: str, marks: Marks) -> NDArray[np.float32]:
     """Colours in a mode with opacity, (M, 4); see `colors`. `marks`: of the M splats."""
-    if mode == "HEAT" and marks.ranks is not None:
-        rgba = heat(packed, marks.ranks, ramp())
-    else:
-        rgba = colors(packed, eye)
+    heated = mode == "HEAT" and marks.ranks is not None
+    rgba = heat(packed, marks.ranks, ramp()) if heated else colors(packed, eye)
     if mode == "GOES":
         goes, forced = tinted(rgba, TINT, TINT_SHARE), marks.forced
         rgba = goes if forced is None else np.where((forced == GOES)[:, None], rgba, goes)

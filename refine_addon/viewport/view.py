@@ -63,16 +63,6 @@ class _Part(NamedTuple):
     eye: Eye
 
 
-_Sorted = tuple[NDArray[np.float32], int, NDArray[np.float32] | None]
-"""What the thread makes: order as a texture, number of splats, colours as a texture or None."""
-
-
-class _Order(NamedTuple):
-    texture: gpu.types.GPUTexture
-    count: int
-    key: tuple[Any, ...]  # first the atlas
-
-
 class View:
     """One region of a 3D view. `complete`: all splats are shown, in full; `count`: splats shown;
     `depths`: (H, W) that Blender drew, None where nothing hides splats."""
@@ -81,10 +71,12 @@ class View:
         self._picture: gpu.types.GPUTexture | None = None
         self._drawn: object = None
         self.depths: NDArray[np.float32] | None = None
-        self._order: _Order | None = None
+        self._order: gpu.types.GPUTexture | None = None
+        self._order_key: tuple[Any, ...] = (None,)  # first the atlas
+        self._ordered = 0
         self._colors: gpu.types.GPUTexture | None = None
         self._colors_key: object = None
-        self._job: tuple[tuple[Any, ...], object, Future[_Sorted]] | None = None
+        self._job: tuple[tuple[Any, ...], object, Future[Any]] | None = None
         self._camera_key = b""
         self._changed = 0.0
         self.complete = False
@@ -118,16 +110,16 @@ class View:
         self._take()
         by_card = gpu.platform.device_type_get() != "SOFTWARE"
         few, wide = BY_CARD if by_card else BY_PROCESSOR
-        if self._order is not None and self._order.key[0] is not atlas:
-            self._order, self._colors = None, None
-        if moving:
-            self._sort((*full, few), shown, camera, mode, few)
-        elif self._job is None and (self._order is None or self._order.key != full):
+        if self._order_key[0] is not atlas:
+            self._order, self._order_key, self._colors = None, (None,), None
+        if moving and self._order_key != (*full, few):
+            self._keep((*full, few), *_order(_parts(shown, camera), camera.near, mode, few))
+        elif not moving and self._job is None and self._order_key != full:
             self._start(content.pool, full, _parts(shown, camera), camera.near, mode, few)
-        self.complete = not moving and self._order is not None and self._order.key == full
+        self.complete = not moving and self._order_key == full
         if self._order is None or self._colors is None:
             return
-        self.count = self._order.count
+        self.count = self._ordered
         style = STYLES.get(mode, 0)
         self._paint(content, shown, camera, 1 if self.complete else wide, solid, style)
         _put(self._picture)
@@ -147,7 +139,7 @@ class View:
         order_key, colors_key, future = self._job
         self._job = None
         order, count, painted = future.result()
-        self._order = _Order(shader.texture(order, 1, "R32F"), count, order_key)
+        self._keep(order_key, order, count)
         if painted is not None:
             self._colors_key, self._colors = colors_key, shader.texture(painted, 4, "RGBA16F")
 
@@ -164,20 +156,18 @@ class View:
             key, colors_key = (*key, few), None
         else:
             few = None
-        work = pool.submit(_sort_and_color, parts, near, mode, rows, few)
-        self._job = (key, colors_key, work)
+        self._job = key, colors_key, pool.submit(_sort_and_color, parts, near, mode, rows, few)
 
-    def _sort(self, key, shown, camera, mode, most):
-        """Sort the `most` most important splats, unless that is done."""
-        if self._order is None or self._order.key != key:
-            order = _order(_parts(shown, camera), camera.near, mode, most)
-            self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
+    def _keep(self, key, order, count):
+        """Draw this order, a texture of so many splats, from now on."""
+        self._order, self._ordered = shader.texture(order, 1, "R32F"), count
+        self._order_key = key
 
     def _paint(self, content, shown, camera, pixels, solid, style):
         """Draw the splats into the picture, unless it is up to date."""
         depths = _depths(camera.size) if solid else None
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
-        look = (self._order.key, self._colors_key, self._camera_key, style)
+        look = (self._order_key, self._colors_key, self._camera_key, style)
         wanted = (*look, size, content.selections)
         if self._picture and wanted == self._drawn and np.array_equal(depths, self.depths):
             return
@@ -189,15 +179,14 @@ class View:
             rows[slot.number] = matrix[:3].reshape(-1)
         textures = {
             **content.atlas.textures,
-            "order": self._order.texture,
+            "order": self._order,
             "colors": self._colors,
             "selection": content.selection(),
             "matrices": shader.texture(rows, 4, "RGBA32F"),
         }  # referenced until drawn, which the shader does not do
         if depths is not None:
             textures["depths"] = shader.texture(depths, 1, "R32F")
-        count = self._order.count
-        shader.blend(self._picture, textures, camera.projection, camera.near, count, style)
+        shader.blend(self._picture, textures, camera.projection, camera.near, self.count, style)
 
 
 def _parts(shown: list[tuple[Slot, NDArray[Any]]], camera: Camera) -> list[_Part]:
@@ -212,27 +201,28 @@ def _parts(shown: list[tuple[Slot, NDArray[Any]]], camera: Camera) -> list[_Part
 
 def _sort_and_color(parts, near, mode, rows, few):
     """Sort splats and, if `rows` is given, colour them in a texture for that many; on the thread.
-    With `few`, at most so many, in constant colours."""
-    order = _order(parts, near, mode, few or MOST)
+    With `few`, at most so many, in constant colours. Gives the order as a texture, its number of
+    splats, and the colours as a texture or None."""
+    order, count = _order(parts, near, mode, few or MOST)
     if rows is None:
-        return as_texture(order), len(order), None
+        return order, count, None
     painted = np.zeros((rows, 4), np.float32)
     for part in parts:
         rgba = colored(part.slot.packed, None if few else part.eye, mode, part.marks)
         painted[part.slot.rows] = rgba[: part.slot.count]
-    return as_texture(order), len(order), as_texture(painted)
+    return order, count, as_texture(painted)
 
 
-def _order(parts: list[_Part], near: float, mode: str, most: int) -> NDArray[Any]:
+def _order(parts, near, mode, most):
+    """Rows of the most important splats, the farthest first, as a texture, and their number."""
     counts = first_of_each([part.slot.count for part in parts], most)
     found = [_in_view(*pair, near, mode) for pair in zip(parts, counts, strict=True)]
     rows, depths = map(np.concatenate, zip(*found, strict=True))
-    return rows[farthest_first(depths, perspective=parts[0].eye.perspective)]
+    order = rows[farthest_first(depths, perspective=parts[0].eye.perspective)]
+    return as_texture(order), len(order)
 
 
-def _in_view(
-    part: _Part, count: int, near: float, mode: str
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _in_view(part, count, near, mode):
     """Rows of an object's `count` most important splats that the view draws, and their depths."""
     slot, important = part.slot, part.important
     if count == slot.count:
