@@ -78,9 +78,7 @@ STORAGE |= {"i1": "INT8", "f4": "FLOAT", "f8": "FLOAT"}
 PLACES = {name: Place("position", axis, ("FLOAT_VECTOR",)) for axis, name in enumerate("xyz")}
 """Properties that are components of Blender's positions."""
 
-NORMAL_PLACES = {
-    f"n{axis}": Place("normal", index, ("FLOAT_VECTOR",)) for index, axis in enumerate("xyz")
-}
+NORMAL_PLACES = {f"n{axis}": at._replace(attribute="normal") for axis, at in PLACES.items()}
 """Where Blender's own PLY importer puts a file's normals."""
 
 _LONGEST_NAME = 63  # Bytes of Blender's longest attribute name

@@ -51,7 +51,6 @@ def store(
         mesh_edit.check_writable(checked.obj)
     total, ranks = len(scores.values), rank(scores.values)
     scored = np.ones(total, np.bool_) if scores.scored is None else scores.scored
-    protected = np.zeros(total, np.bool_) if protected is None else protected
     of_all = {
         "settings": method.facts(),
         "method": scores.method,
@@ -71,7 +70,8 @@ def store(
         mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks[rows])
         mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen[rows])
         mesh_attributes.write_attribute(mesh, SCORED, "BOOLEAN", scored[rows])
-        own = {"splats": len(checked), "origin": origin, "protected": digest(protected[rows])}
+        stay = digest(None if protected is None else protected[rows])
+        own = {"splats": len(checked), "origin": origin, "protected": stay}
         mesh[RECORD] = json.dumps(of_all | own)
         mesh_attributes.updated(mesh)
 

@@ -26,16 +26,14 @@ from ..mesh import layout as mesh_layout
 
 COPY_OF = "refine_render"  # Custom property of a copy: its original scene
 
-_RENDERED = {
-    *("MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES", "POINTCLOUD", "GREASEPENCIL"),
-    *("GPENCIL", "EMPTY"),  # an empty may stand for a collection
-}
-
 _HIDDEN_BY = "refine_out_of_sight"
 """Custom property of a hidden object: the name of the property that hides it."""
 
 _BY_RAYS = {"MESH", "CURVE", "SURFACE", "FONT", "META", "VOLUME", "CURVES"}
 """Types that can be hidden from cameras; EEVEE ignores that for instances."""
+
+_RENDERED = _BY_RAYS | {"POINTCLOUD", "GREASEPENCIL", "GPENCIL", "EMPTY"}
+"""Types that are rendered; an empty may stand for a collection."""
 
 _TILE = 128  # Largest side of a tile that Cycles renders on the processor, pixels
 _WORLD_SAMPLES = 16  # Samples for a pixel of the world, at most
@@ -175,14 +173,17 @@ class Meshes:
         return np.split(np.concatenate(bands, axis=1), len(pictures), axis=1)
 
     def _band_shown(self, band):
+        """A band, (3, h, W), after the view transform: by a 16-bit PNG, as fast as possible."""
         scene, path = existing(self._any), self._folder / "shown.png"
+        settings = scene.render.image_settings
         height, width = band.shape[1:]
         pixels = np.ones((height, width, 4), np.float32)
         pixels[..., :3] = np.moveaxis(band, 0, -1)
         image = bpy.data.images.new("REFINE", width, height, float_buffer=True)
         try:
             image.pixels.foreach_set(pixels.ravel())
-            write_png(scene)
+            _set_format(settings, "IMAGE", "PNG")
+            settings.color_mode, settings.color_depth, settings.compression = "RGB", "16", 0
             image.save_render(str(path), scene=scene)
         finally:
             bpy.data.images.remove(image)
@@ -305,13 +306,6 @@ def write_exr(scene: bpy.types.Scene, path: Path) -> None:
     render.use_file_extension = render.use_overwrite = True
     render.use_placeholder = render.use_stamp = False
     render.use_crop_to_border = True
-
-
-def write_png(scene: bpy.types.Scene) -> None:
-    """Make a copied scene save 16-bit PNG, as fast as possible."""
-    settings = scene.render.image_settings
-    _set_format(settings, "IMAGE", "PNG")
-    settings.color_mode, settings.color_depth, settings.compression = "RGB", "16", 0
 
 
 def show_as_stored(scene: bpy.types.Scene) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import bpy
 import numpy as np
@@ -33,7 +33,6 @@ from ..objects.splat_group import Outcome
 from . import images, operator_bases
 from .wrapped import counted
 
-Value = TypeVar("Value")
 REST = 0.2  # Seconds without a change after which a slider rests
 
 WAYS: dict[str, Way] = {"occlusion": "delete", "merge": "merge", "refit": "refit"}
@@ -159,9 +158,8 @@ def _can_have(obj: bpy.types.Object) -> bool:
 
 
 def _is_ours(obj: bpy.types.Object) -> bool:
-    if not mesh_layout.looks_like_splats(obj) or obj.mode == "EDIT":
-        return False
-    return not obj.data.library and not obj.library
+    ours = mesh_layout.looks_like_splats(obj) and obj.mode != "EDIT"
+    return ours and not obj.data.library and not obj.library
 
 
 def _key(obj: bpy.types.Object, settings: Any) -> Any:
@@ -350,7 +348,7 @@ def _numbers(camera: bpy.types.Object, frame: tuple[int, int, float]) -> tuple[f
     )
 
 
-def cached(what: Hashable, compute: Callable[[], Value]) -> Value:
+def cached(what: Hashable, compute: Callable[[], Any]) -> Any:
     """Value of `compute` (of the scene, active object, settings), kept until anything changes.
     A script's silent changes, such as custom properties, show after the next change."""
     scene, obj = bpy.context.scene, bpy.context.object
