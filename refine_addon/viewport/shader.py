@@ -169,9 +169,6 @@ void main()
 """
 
 _SPLAT_FRAGMENT = """
-#define texel_in(values) ivec2(gl_FragCoord.xy * vec2(textureSize(values, 0)) / view_data.xy)
-#define depth_in(values) texelFetch(values, texel_in(values), 0).r
-
 void main()
 {
   float square = dot(place, place);
@@ -194,7 +191,12 @@ void main()
   if (alpha < ALPHA_CUT) {
     discard;
   }
-  if (gl_FragCoord.z > depth_in(depths) || gl_FragCoord.z <= depth_in(near_depths)) {
+  ivec2 texel = min(ivec2(gl_FragCoord.xy * view_hides.x), textureSize(depths, 0) - 1);
+  bool hidden = view_hides.x > 0.0 && gl_FragCoord.z > texelFetch(depths, texel, 0).r;
+  if (view_hides.y > 0.0) {
+    hidden = hidden || gl_FragCoord.z <= texelFetch(near_depths, ivec2(gl_FragCoord.xy), 0).r;
+  }
+  if (hidden) {
     discard;
   }
   color = vec4(shade * alpha, alpha);
@@ -257,6 +259,7 @@ def program(name: str) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
     info.typedef_source(_CONSTANTS)
     info.push_constant("MAT4", "view_projection")
     info.push_constant("VEC4", "view_data")  # pixels across, pixels up, near plane, style
+    info.push_constant("VEC2", "view_hides")  # texels per pixel of each end's depths, 0 without
     for slot, sampler in enumerate(samplers.split()):
         info.sampler(slot, "FLOAT_2D", sampler)
     between = gpu.types.GPUStageInterfaceInfo(f"refine_{name}")
@@ -284,8 +287,8 @@ def blend(
     """Clear a picture and draw `count` splats. `textures`: inputs of the shader, held by
     the caller until drawn; without "depths" or "near_depths" these hide nothing. `near`: depth of
     the near plane; `style`: 0 splats, 1 their ellipses, 2 their centres."""
-    ends = {"depths": 1.0, "near_depths": -1.0}  # window depths behind and before all splats
-    held = {name: texture(np.full((1, 1), end), 1, "R32F") for name, end in ends.items()} | textures
+    ends = dict.fromkeys(("depths", "near_depths"), texture(np.ones((1, 1)), 1, "R32F"))
+    hides = [textures[name].width / picture.width if name in textures else 0.0 for name in ends]
     frame = gpu.types.GPUFrameBuffer(color_slots=picture)
     with frame.bind():
         frame.clear(color=(0.0, 0.0, 0.0, 0.0))
@@ -296,7 +299,8 @@ def blend(
             splats.bind()
             splats.uniform_float("view_projection", projection.T.ravel())
             splats.uniform_float("view_data", (picture.width, picture.height, near, style))
-            for name, values in held.items():
+            splats.uniform_float("view_hides", hides)
+            for name, values in (ends | textures).items():
                 splats.uniform_sampler(name, values)
             quad.draw_instanced(splats, instance_count=count)
             gpu.state.blend_set("NONE")

@@ -160,8 +160,7 @@ class View:
 
     def _keep(self, key, order, count):
         """Draw this order, a texture of so many splats, from now on."""
-        self._order, self._ordered = shader.texture(order, 1, "R32F"), count
-        self._order_key = key
+        self._order_key, self._ordered, self._order = key, count, shader.texture(order, 1, "R32F")
 
     def _paint(self, content, shown, camera, pixels, solid, style):
         """Draw the splats into the picture, unless it is up to date."""
