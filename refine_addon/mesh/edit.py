@@ -148,11 +148,6 @@ def named_masks(group: Sequence[SplatObject], name: str) -> list[NDArray[np.bool
     )
 
 
-def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Splats marked by hand with `PROTECT` or `MUST_GO`, (N,); None without the attribute."""
-    return mesh_attributes.attribute_if_any(obj.data, name, "BOOLEAN")
-
-
 def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
     """Weights of a vertex group, (N,), through geometry nodes, as Python reads one by one."""
     tree, storing = _tree("GeometryNodeStoreNamedAttribute", name, "FLOAT", "Value")

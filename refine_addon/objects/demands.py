@@ -55,11 +55,11 @@ class Demands:
         return [self._forced(*each) for each in zip(group, *by_name, strict=True)]
 
     def _forced(self, checked: SplatObject, *named: NDArray[np.bool_] | None) -> Forced:
-        protected = any_of(mesh_edit.marks(checked.obj, mesh_edit.PROTECT), *named)
-        out = mesh_edit.marks(checked.obj, mesh_edit.MUST_GO)
+        stay = mesh_attributes.attribute_if_any(checked.mesh, mesh_edit.PROTECT, "BOOLEAN")
+        out = mesh_attributes.attribute_if_any(checked.mesh, mesh_edit.MUST_GO, "BOOLEAN")
         means = world_means(checked) if self.zones else np.empty((0, 3))
         try:
-            return forced(self.zones, means, protected, out)
+            return forced(self.zones, means, any_of(stay, *named), out)
         except RefineError as error:
             raise RefineError(f"object '{checked.obj.name}': {error}") from error
 

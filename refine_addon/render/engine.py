@@ -168,16 +168,6 @@ def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.moveaxis(pixels, 0, -1)[::-1].reshape(-1, 4)
 
 
-def refuse(scene: bpy.types.Scene) -> None:
-    """Raise `RefineError` for scenes that cannot be rendered."""
-    label = f"scene '{scene.name}'"
-    active_camera(scene)
-    if not any(map(meshes.drawn_by_us, bpy.data.objects)):  # instanced ones may be in no scene
-        raise RefineError(f"{label}: has no splats to draw; import some, or use Render Image")
-    if scene.render.use_multiview:
-        raise RefineError(f"{label}: splats are not drawn in stereo; switch off Stereoscopy")
-
-
 def left_out(scene: bpy.types.Scene) -> list[str]:
     """Sentences on settings of a rendered scene that splats ignore."""
     render, sentences = scene.render, []
@@ -199,8 +189,14 @@ def steps(
 ) -> Generator[meshes.Step | None, None, None]:
     """Yield Blender's renders for some frames; the caller runs each before it takes the next.
     None: Blender may do other things first. Cleans up at the end or when closed. `write`: pictures
-    go to the scene's output. `RefineError` if a step failed, `Cancelled` if one was stopped."""
-    refuse(scene)
+    go to the scene's output. `RefineError` if the scene cannot be rendered or a step failed,
+    `Cancelled` if one was stopped."""
+    label = f"scene '{scene.name}'"
+    active_camera(scene)
+    if not any(map(meshes.drawn_by_us, bpy.data.objects)):  # instanced ones may be in no scene
+        raise RefineError(f"{label}: has no splats to draw; import some, or use Render Image")
+    if scene.render.use_multiview:
+        raise RefineError(f"{label}: splats are not drawn in stereo; switch off Stereoscopy")
     with ExitStack() as stack:  # which first drops the engine's state, then copies and files
         folder = tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
         folder = Path(stack.enter_context(folder))

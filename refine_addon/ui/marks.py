@@ -12,6 +12,7 @@ from bpy.types import Context
 
 from ..core.cleaning.clean import Cleaning, clean
 from ..core.errors import RefineError
+from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -151,7 +152,7 @@ class REFINE_OT_protect(Acting, bpy.types.Operator):
         obj = context.object
         chosen = some(obj, selection.selected(obj))
         for mark, name in _MARKS.items():
-            before = mesh_edit.marks(obj, name)
+            before = mesh_attributes.attribute_if_any(obj.data, name, "BOOLEAN")
             others = False if before is None else before
             mesh_edit.mark(obj, name, np.where(chosen, mark == self.mark, others))
         plans.mark_again(self, context)

@@ -147,8 +147,10 @@ def _draw() -> None:
     _state.views[key] = view  # the one drawn last is last
     while len(_state.views) > _VIEWS:
         del _state.views[next(iter(_state.views))]
-    solid = not overlays.is_xray(space.shading)
-    solid = solid and not all(looks_like_splats(obj) for obj in context.visible_objects)
+    shading = space.shading
+    xray = {"SOLID": shading.show_xray, "WIREFRAME": shading.show_xray_wireframe}
+    others = not all(looks_like_splats(obj) for obj in context.visible_objects)
+    solid = others and not xray.get(shading.type)  # seen through, meshes hide nothing
     view.draw(_state.content, placed, Camera.of(context), _state.mode, solid=solid)
     overlays.draw(context, mixed=view.count > 0, has_depths=view.depths is not None)
     if not view.complete and not bpy.app.timers.is_registered(_tick):

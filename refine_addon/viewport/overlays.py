@@ -36,12 +36,6 @@ _WARNING = (1.0, 0.8, 0.2, 1.0)
 _TURN = np.linspace(0.0, 2.0 * np.pi, 49)
 
 
-def is_xray(shading: bpy.types.View3DShading) -> bool:
-    """Whether a view shows all meshes see-through."""
-    switches = {"SOLID": shading.show_xray, "WIREFRAME": shading.show_xray_wireframe}
-    return bool(switches.get(shading.type))
-
-
 def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
     """Draw edges of volumes into a view, and if `mixed` see-through meshes.
     Without `has_depths` the view's depths are cleared first; see `view.View`."""
