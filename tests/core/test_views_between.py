@@ -48,7 +48,7 @@ def test_only_neighbours_have_a_view_between_them():
     walls = [splats_of([(x, 0.0, 0.0)], 0.99, [(0.01, 9.0, 9.0)]) for x in (99.0, 2.0)]
     free, shut = (projection.prepare(wall, views)[:2] for wall in walls)
     five = {view.center[0] for view in with_views_between(views, 5, *free)}
-    beside = views_beside(views, *shut, 40)
+    beside = views_beside(views, *shut, 8.0, 40)
     assert sorted(view.center[0] for view in views_between(line(0.0, 1.0, 3.0), 9)) == [0.5, 2.0]
     assert (len(five), len(beside)) == (5, 40)
     assert {2.0, 4.0, 6.0} < five < set(np.arange(9.0))

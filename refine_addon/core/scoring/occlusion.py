@@ -133,7 +133,10 @@ def score(
         measured[:2] *= share
         measured[:2] += of_more[:2]
     between = None
-    told = views_beside(views, gaussians, scene) if more else views_between(views, BETWEEN)
+    if more:
+        told = views_beside(views, gaussians, scene, left_out)
+    else:
+        told = views_between(views, BETWEEN)
     if told:
         between = RaySample(ViewSet(tuple(told)).by_distance(), gaussians, splats, "between")
         between.cast_all(gaussians, scene, casting, threads)

@@ -18,7 +18,10 @@ from .scene import Scene
 
 WIDEST = math.radians(90.0)  # views turned farther from each other get no view in between
 CLEAR = 0.5  # least transmittance between two views that stand in the same free space
-BESIDE, TURNED = 0.3, 0.35  # how far `views_beside` move at most, scene sizes, and turn, radians
+BESIDE = 0.3  # how far `views_beside` move at most, scene sizes
+FAR, TURNED = 1.0 / 8.0, 0.04
+"""Moves of `views_beside` in distances to the third view, and turns in radians, for each dB that
+views left out lose more: 2.6 to 5 of 12 or 20 cameras of a capture, 11 to 12 in houses."""
 _TRIES = 8  # places beside a view
 _CANDIDATES = 64  # nearest views of each that may be its neighbours
 _FOCAL = 1000.0  # px of `transmittance`: a ray is a thousandth of its length wide
@@ -73,10 +76,12 @@ def with_views_between(
     return found
 
 
-def views_beside(views: ViewSet, gaussians: Gaussians, scene: Scene, most: int = 48) -> list[View]:
+def views_beside(
+    views: ViewSet, gaussians: Gaussians, scene: Scene, left_out: float, most: int = 48
+) -> list[View]:
     """At most `most` views moved and turned from `views`, several each if need be, in free space.
 
-    They move about as far as the third view, see `BESIDE`, turn by `TURNED`, and face no wall near.
+    The more views left out lose, `left_out` dB, the farther (`FAR`). They face no wall near.
     """
     centers, found = views.centers, []
     starts = [view for view, _ in views.spread(most).by_distance()]
@@ -85,8 +90,8 @@ def views_beside(views: ViewSet, gaussians: Gaussians, scene: Scene, most: int =
         random = np.random.default_rng(number)
         for _ in range(_TRIES):
             step = random.normal(size=3) * (1.0, 0.4, 1.0) / math.sqrt(3.0)
-            step *= min(away[-1] if len(away) else np.inf, BESIDE * scene.size)
-            turn = 0.5 * TURNED * random.normal(size=3) * (0.4, 1.0, 0.1)
+            step *= min(FAR * left_out * away[-1] if len(away) else np.inf, BESIDE * scene.size)
+            turn = 0.5 * TURNED * left_out * random.normal(size=3) * (0.4, 1.0, 0.1)
             turned = rotation_matrices(unit_quaternions(np.array([[1.0, *turn]])))[0]
             moved = replace(
                 view, center=view.center + step @ view.rotation, name=f"beside {view.name}",
