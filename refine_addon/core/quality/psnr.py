@@ -171,8 +171,7 @@ def _of_views(sample, compare, numbers, progress, threads):
     """Results of ``compare(number, rays)`` for each of v views, (v, L)."""
 
     def compare_one(number):
-        with np.errstate(under="ignore"):
-            return compare(number, sample.rays[number])
+        return compare(number, sample.rays[number])
 
     return np.array(
         run_all(compare_one, numbers, progress=progress, what="estimating", threads=threads)

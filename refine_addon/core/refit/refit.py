@@ -408,8 +408,7 @@ def _windows(splats, total, scene, views):
     gaussians, _, _ = projection.prepare(sample, ViewSet(tuple(only)), scene, threads=1)
     boxes = {}
     for number, view in enumerate(only):
-        with np.errstate(under="ignore"):
-            footprints = projection.project(gaussians, scene, view)
+        footprints = projection.project(gaussians, scene, view)
         centers = footprints.centers[:, footprints.inside]
         if centers.shape[1]:
             boxes[number] = centers.shape[1], _box(centers, view)

@@ -226,42 +226,39 @@ def cast_truth(
     `shown` is the mean of `Truth.shown` over validation rays; None while these are cast.
     """
     window = windows[place]
-    with np.errstate(under="ignore"):
-        footprints = target.footprints(window)
-        # Casting takes memory for all hits, also faint ones, but for one view at a time.
-        share = window.hits / cast.MAX_HITS_OF_VIEW
-        predicted = cast.depth_complexity(footprints, window.part)
-        each = (share if shown is None else shown) * predicted
-        columns, rows = window.pixels(each, number)
-        rays, transmittance = cast.cast_visible(footprints, columns, rows)
-        all_hits = share * len(rays.ray)  # faint ones too, in units of `Window.hits`
-        weight = transmittance * rays.alpha
-        colors = rays.composited(weight, target.colors(rays.hit, window.view))
+    footprints = target.footprints(window)
+    # Casting takes memory for all hits, also faint ones, but for one view at a time.
+    share = window.hits / cast.MAX_HITS_OF_VIEW
+    predicted = cast.depth_complexity(footprints, window.part)
+    each = (share if shown is None else shown) * predicted
+    columns, rows = window.pixels(each, number)
+    rays, transmittance = cast.cast_visible(footprints, columns, rows)
+    all_hits = share * len(rays.ray)  # faint ones too, in units of `Window.hits`
+    weight = transmittance * rays.alpha
+    colors = rays.composited(weight, target.colors(rays.hit, window.view))
     each = max(np.count_nonzero(weight > LEAST_WEIGHT), all_hits) / max(rays.count, 1)
     return Truth(columns, rows, colors, each / max(predicted, _NOTHING))
 
 
 def _psnr(target, windows, truths, place):
     window, truth = windows[place], truths[place]
-    with np.errstate(under="ignore"):
-        footprints = target.footprints(window)
-        rays, transmittance = cast.cast_visible(footprints, truth.columns, truth.rows)
-        colors = target.colors(rays.hit, window.view)
-        seen = rays.composited(transmittance * rays.alpha, colors)
+    footprints = target.footprints(window)
+    rays, transmittance = cast.cast_visible(footprints, truth.columns, truth.rows)
+    colors = target.colors(rays.hit, window.view)
+    seen = rays.composited(transmittance * rays.alpha, colors)
     return psnr_of(seen, truth.colors, window.part)
 
 
 def _linearized(truth_of, windows, target, shapes, place):
     """How the colours of a view's rays change with the kept splats, see `LinearRays`."""
     window, truth = windows[place], truth_of(place)
-    with np.errstate(under="ignore"):
-        footprints = target.footprints(window)
-        seen: list[Any] = [*cast.cast_visible(footprints, truth.columns, truth.rows)]
-        colors = target.colors(seen[0].hit, window.view)
-        view, mine = linear_view(seen, footprints, truth.colors, colors, shapes, window.view)
-        del footprints
-        view.basis[:] *= target.splats.sh_rest.shape[1] > 0
-        return view, view.backward(view.errors), view.diagonal(mine)
+    footprints = target.footprints(window)
+    seen: list[Any] = [*cast.cast_visible(footprints, truth.columns, truth.rows)]
+    colors = target.colors(seen[0].hit, window.view)
+    view, mine = linear_view(seen, footprints, truth.colors, colors, shapes, window.view)
+    del footprints
+    view.basis[:] *= target.splats.sh_rest.shape[1] > 0
+    return view, view.backward(view.errors), view.diagonal(mine)
 
 
 class LinearRays:
@@ -290,8 +287,7 @@ class LinearRays:
 
         def of_view(number: int) -> tuple[NDArray[np.int64], Singles]:
             view = self.views[number]
-            with np.errstate(under="ignore"):
-                return view.hit, view.normal(in_scene)
+            return view.hit, view.normal(in_scene)
 
         every = range(len(self.views))
         for of_hit in run(of_view, every, progress=progress, what="refitting", threads=threads):
