@@ -102,19 +102,21 @@ def measure(
 
 
 def _measure_and_cast(gaussians, scene, views, number_and_kinds):
-    """What a view sees, in any process: rows, whether centres are inside, contributions and errors,
-    (n,) each; and its rays of some kinds.
-    """
+    """What a view sees of the splats, and its rays of some kinds, in any process."""
     number, kinds = number_and_kinds
-    view = views[number][0]
+    footprints, measurement = _measure_view(gaussians, scene, views[number][0])
+    return measurement, [cast_view(views, number, footprints, kind) for kind in kinds]
+
+
+def _measure_view(gaussians, scene, view):
+    """Footprints in a view; rows, whether centres are inside, contributions, errors, (n,) each."""
     footprints = projection.project(gaussians, scene, view)
     return_freed(mapped_only=True)
     integrals = np.empty(0), np.empty(0)
     if len(footprints.index):
         points = scatter(footprints, view, cell_size(footprints, view))
         integrals = _integrals(gaussians, footprints, points)
-    measurement = footprints.index.astype(np.int32), footprints.inside, *integrals
-    return measurement, [cast_view(views, number, footprints, kind) for kind in kinds]
+    return footprints, (footprints.index.astype(np.int32), footprints.inside, *integrals)
 
 
 def _integrals(gaussians, footprints, points):
