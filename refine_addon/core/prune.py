@@ -24,7 +24,7 @@ from .formats.ply import SplatFile
 from .merging.merge import Merged, copied, merge, stage_counts, stage_seconds
 from .methods import DEFAULT, ClosedForm, Method, Refit
 from .quality.alignment import alignment
-from .quality.curve import AS_GOOD, PLAIN, Way, deletion_will_do, left_to_lose, needed
+from .quality.curve import AS_GOOD, FARTHER, PLAIN, Way, deletion_will_do, left_to_lose, needed
 from .quality.psnr import psnr_against, psnr_kept, quality_curve
 from .refit.refit import Refitted, expected_rounds, refit_rounds
 from .report import Clock
@@ -357,7 +357,7 @@ class _Prune:
             between = psnr_against(rays, after, self.used, threads=self.threads)
         pairs = [(plain, outcome.reached)]
         if beside is not None and between is not None:
-            pairs.append((beside, between))
+            pairs.append((beside, between + FARTHER * (scores.views_between > 0)))
         if not refits and self._deletion_is_as_good(keep, outcome, *pairs):
             tried = outcome.psnr
             del outcome  # not needed where memory is highest

@@ -148,7 +148,7 @@ def of_prune(
         notes += getattr(outcome.stopped, "__notes__", ())
         plain = measured.get("delete")
         if outcome.done == "merge" and plain is not None and plain > (psnr or plain):
-            notes.append(f"plain deletion reaches more: {in_words(plain)}")
+            notes.append(f"plain deletion reaches more in these views: {in_words(plain)}")
     if method.changes and outcome is None and removed:
         notes.append(deleted_note(psnr, None if tried is None else tried["merge"]))
     deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
