@@ -54,8 +54,8 @@ lod --psnr DB,DB,...    instead of --levels: how close each stays to the origina
 --rounds N              with --method refit: number of rounds at most (default: 2 to 4, by what they
                         gain)
 --views N               use at most N views, spread out evenly; 0 uses all (default {Merge.views})
---exact                 no views between the cameras decide, too, where there are few cameras; so
-                        it is with --source frames
+--exact                 no other views decide, too, where there are few cameras; so it is with
+                        --source frames
 --clean                 first remove floaters, as clean does; the budget applies to the rest
 --reasons R,R,...       which to remove, of {", ".join(REASONS)}
                         (default {",".join(Cleaning.reasons)})

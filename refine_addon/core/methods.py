@@ -15,7 +15,7 @@ class Method:
     """Settings of all methods.
 
     At most `views` views decide, spread evenly; 0 uses all. Where there are fewer, and those left
-    out lose much more, views between them decide, too, unless `exact`, as for a locked shot.
+    out lose much more, views between and beside them decide, too, unless `exact` (a locked shot).
     """
 
     name: ClassVar[str]  # in panel, command and report
@@ -30,7 +30,7 @@ class Method:
             raise RefineError(f"views is {self.views}, expected 0 (all) or more")
 
     def between(self, used: ViewSet) -> int:
-        """Most views between those used that may decide, too: two for each."""
+        """Most views halfway between those used that may decide, too: two for each."""
         fewer = max((self.views or Method.views) - len(used), 0)
         return 0 if self.exact or used.exact else min(2 * len(used), fewer)
 

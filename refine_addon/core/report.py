@@ -70,7 +70,7 @@ def scoring_notes(scores: Scores) -> list[str]:
     """Notes on a scoring for the user, one sentence each."""
     notes = [*scores.notes, *(scores.alignment.notes() if scores.alignment else ())]
     if scores.views_between:
-        notes.append(f"few cameras: {scores.views_between} views between them decide, too")
+        notes.append(f"few cameras: {scores.views_between} views near them decide, too")
     if scores.undrawable:
         notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
     return notes

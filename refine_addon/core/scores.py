@@ -35,14 +35,14 @@ class Scores:
     notes : tuple of str, sentences for the user
     method : str, name of the method
     views_given : int, number of views from which those used were chosen
-    views_between : int, number of views between these that decide, too
+    views_between : int, number of views between and beside these that decide, too
     ray_sample : RaySample, validation rays, which estimate the PSNR of any choice of the splats
     between : RaySample, likewise for views in between
     quality : Quality, estimated PSNR by the share removed, in the order of the scores
     alignment : Alignment, whether the views fit the splats
     settled : int, number of the lowest scores that are in final order; None for all
     scored : (N,) bool, which splats were scored; None for all, see `for_all`
-    deciding : ViewSet, the views used and those between them that decide, too
+    deciding : ViewSet, the views used and those between and beside them that decide, too
     """
 
     values: NDArray[np.float32]

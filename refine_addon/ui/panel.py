@@ -335,7 +335,7 @@ def _draw_plan(layout: bpy.types.UILayout, obj: Any, record: Any, plan: Any) -> 
         return
     views = f"by {record['views_used']} of {counted(record['views_given'], 'view')}"
     if record.get("views_between"):
-        views += f" and {record['views_between']} between"
+        views += f" and {record['views_between']} near them"
     wrapped.label(layout, f"{plans.sentence(plan)}, {views}", icon="CHECKMARK")
     if plan["remark"]:
         wrapped.label(layout, plan["remark"], icon="INFO")

@@ -159,7 +159,7 @@ class RefineSettings(_Preferred, bpy.types.PropertyGroup):
     source: EnumProperty(name="Cameras", description="Cameras that decide", items=SOURCES)
     exact: BoolProperty(
         name="Exactly These",
-        description="No views between the cameras decide, too, where there are few cameras",
+        description="No other views decide, too, where there are few cameras",
     )
     collection: PointerProperty(
         name="Collection", description="The collection of the cameras", type=bpy.types.Collection

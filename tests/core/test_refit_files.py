@@ -204,5 +204,5 @@ def test_refitting_begins_with_deletion_where_that_is_better(splats, views):
     told = result.report["method"]["psnr"]
     assert result.report["refitted"]["began"] == "occlusion"
     assert result.report["merged"] == {"changed": 0, "merged": 0, "deleted": 994}
-    assert told["refit"] > told["delete"] > told["merge"] + 10.0
+    assert told["refit"] > told["delete"] > told["merge"] + 5.0
     assert any("began with plain deletion" in note for note in result.report["notes"])

@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from ..execute import Progress, part, report, run, run_all, seconds, silent, sta
 from ..mapped import folder_of, note, noted
 from ..scores import Scores, shares_gone
 from ..splats import Splats, refuse_undrawable
-from ..views import ViewSet
+from ..views import View, ViewSet
 from ..visibility import projection
 from ..visibility.between import views_beside, views_between, with_views_between
 from ..visibility.cast import RaySample
@@ -37,12 +38,12 @@ LEAST = 0.1
 EXPONENT = 0.25
 """Exponent of the contribution."""
 
-BETWEEN = 24
-"""Most views halfway between that are estimated."""
+BETWEEN, TOLD = 24, 48
+"""Most views that are estimated: halfway between, or beside few cameras."""
 
 LEFT_OUT = 2.5
-"""Views in between decide, too, if views left out lose this much more, dB: those of five scenes
-with many cameras lose 0.7 to 2.3, of nine with few cameras 2.6 to 12."""
+"""Views between and beside decide, too, if views left out lose this much more, dB: those of five
+scenes with many cameras lose 0.7 to 2.3, of nine with few cameras 2.6 to 12."""
 
 KNOWN = 10.0
 """Weight of a measured error, in rays."""
@@ -74,7 +75,7 @@ def score(
     rounds : int, how often scores are computed
     settled : int, optional, how many splats, the first to go, need their final order; else all
     few_views : bool, whether the PSNR is to be estimated in few views, see `RaySample`
-    most_between : int, most views between these that decide, too, where there are few
+    most_between : int, most views halfway between these that decide, too, where there are few
     progress, threads : see `prune`
 
     Returns
@@ -120,8 +121,13 @@ def score(
     some, worth = measured.take(sample, axis=1), prior[index[sample]]
     folds = _folds(some, of_groups, errors, worth, part(weighing, 0.0, 0.5))
     weights, left_out = coverage.floor_weights(folds, _with_floors(some, worth))
-    most = most_between if left_out > LEFT_OUT else 0
-    more = with_views_between(views, most, gaussians, scene, threads)
+    more: list[View] = []
+    told = views_between(views, BETWEEN)
+    if most_between and left_out > LEFT_OUT:
+        near = partial(views_beside, views, gaussians, scene, left_out)
+        more = with_views_between(views, most_between, gaussians, scene, threads)
+        more += near(len(views), 0)
+        told = near(TOLD, 1)
     if more:
         share, every = _with_between(views, more)
         for scoring in samples[1:]:
@@ -133,10 +139,6 @@ def score(
         measured[:2] *= share
         measured[:2] += of_more[:2]
     between = None
-    if more:
-        told = views_beside(views, gaussians, scene, left_out)
-    else:
-        told = views_between(views, BETWEEN)
     if told:
         between = RaySample(ViewSet(tuple(told)).by_distance(), gaussians, splats, "between")
         between.cast_all(gaussians, scene, casting, threads)

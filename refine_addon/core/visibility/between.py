@@ -77,7 +77,7 @@ def with_views_between(
 
 
 def views_beside(
-    views: ViewSet, gaussians: Gaussians, scene: Scene, left_out: float, most: int = 48
+    views: ViewSet, gaussians: Gaussians, scene: Scene, left_out: float, most: int, seed: int
 ) -> list[View]:
     """At most `most` views moved and turned from `views`, several each if need be, in free space.
 
@@ -87,7 +87,7 @@ def views_beside(
     starts = [view for view, _ in views.spread(most).by_distance()]
     for number, view in enumerate((starts * most)[:most]):
         away = np.sort(np.linalg.norm(centers - view.center, axis=1))[1:4]
-        random = np.random.default_rng(number)
+        random = np.random.default_rng([seed, number])
         for _ in range(_TRIES):
             step = random.normal(size=3) * (1.0, 0.4, 1.0) / math.sqrt(3.0)
             step *= min(FAR * left_out * away[-1] if len(away) else np.inf, BESIDE * scene.size)
