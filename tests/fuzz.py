@@ -37,6 +37,7 @@ sys.path.insert(0, str(ROOT))
 
 from refine_addon.command.subcommands import describe
 from refine_addon.core import RefineError, read_cameras, read_ply, read_splats, write_splats
+from refine_addon.core.execute import within
 from refine_addon.core.formats.ply_columns import empty_rows, splats_from_columns
 from refine_addon.core.formats.registry import FORMATS, SUFFIXES
 from refine_addon.core.methods import ClosedForm
@@ -252,7 +253,7 @@ def use_cameras(folder: Path) -> None:
     splats = splats_from_columns(dict(zip(splat_names(0), values.T, strict=True)))
     try:  # in this thread: NumPy's flags are raised in it alone
         first = score(splats, views, ClosedForm(), threads=1).values
-        second = occlusion.score(splats, views, rounds=1, threads=1)[0].values
+        second = within(cores=1)(occlusion.score)(splats, views, rounds=1)[0].values
     except RefineError as error:
         if "no camera sees the splats" not in str(error):
             raise

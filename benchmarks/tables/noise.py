@@ -22,7 +22,7 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from refine_addon.core.execute import silent
+from refine_addon.core.execute import silent, within
 from refine_addon.core.methods import DEFAULT
 from refine_addon.core.prune import merge_down
 from refine_addon.core.quality.psnr import psnr_against
@@ -68,7 +68,7 @@ def held_out(splats: Splats, views: ViewSet) -> RaySample:
     gaussians, scene, _ = projection.prepare(splats, views)
     sample = RaySample(views.by_distance(), gaussians, splats)
     with mock.patch.dict(cast.RAYS, validation=(RAYS, cast.RAYS["validation"][1])):
-        sample.cast_all(gaussians, scene, silent, None)
+        sample.cast_all(gaussians, scene, silent)
     return sample
 
 
@@ -79,11 +79,11 @@ def measure(folder: Path, ratios: Sequence[float], turns: int) -> None:
     sample = held_out(scene.splats, scene.test)
     found = np.zeros((turns, len(ratios)))
     for turn in range(turns):
-        with other_pixels(turn), other_cells(turn):
-            known = occlusion.score(scene.splats, used, rounds=1, threads=1)
+        with other_pixels(turn), other_cells(turn), within(cores=1):
+            known = occlusion.score(scene.splats, used, rounds=1)
             for place, ratio in enumerate(ratios):
                 left = len(scene.splats) - int(ratio * len(scene.splats))
-                made = merge_down(scene.splats, used, left, scored=known, threads=1).splats
+                made = merge_down(scene.splats, used, left, scored=known).splats
                 found[turn, place] = psnr_against(sample, made, scene.test)
         print(f"{folder.name} turn {turn}:", *(f"{x:.2f}" for x in found[turn]), flush=True)
     print(f"{folder.name} {'removed':>10} {'mean':>6} {'sd':>6} {'range':>6}")

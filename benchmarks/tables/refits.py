@@ -27,7 +27,7 @@ import numpy as np
 
 from refine_addon import core
 from refine_addon.core import ClosedForm, Merge, Method, Occlusion
-from refine_addon.core.execute import silent
+from refine_addon.core.execute import silent, within
 from refine_addon.core.refit.refit import Refitted, refit_on
 from refine_addon.core.refit.round_rays import RoundRays
 from refine_addon.core.selection import Budget
@@ -117,11 +117,12 @@ def _timed(
     """Yield seconds and result, round after round; what comparing takes is left out."""
     views = views.spread(max(round(way.views * len(views)), 1))
     began, compared = time.process_time(), 0.0
-    rays = RoundRays.of(splats, views, round(way.rays * len(left)), silent, 1)
-    for refitted in refit_on(rays, left, way.rounds, threads=1):
-        pause = time.process_time()
-        yield pause - began - compared, refitted
-        compared += time.process_time() - pause
+    with within(cores=1):
+        rays = RoundRays.of(splats, views, round(way.rays * len(left)), silent)
+        for refitted in refit_on(rays, left, way.rounds):
+            pause = time.process_time()
+            yield pause - began - compared, refitted
+            compared += time.process_time() - pause
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -180,9 +180,9 @@ def checkpoint() -> None:
 
 @contextmanager
 def within(**own: Any) -> Iterator[None]:
-    """Change settings of this thread, `check`, `cluster` or `cores`, within the block."""
+    """Change settings of this thread, those of `_Own` that are not None, within the block."""
     before = {name: getattr(_own, name) for name in own}
-    vars(_own).update(own)
+    vars(_own).update({name: value for name, value in own.items() if value is not None})
     try:
         yield
     finally:
@@ -190,7 +190,7 @@ def within(**own: Any) -> Iterator[None]:
 
 
 def default_threads() -> int:
-    """Cores that this process may use, at most 8; 1 in a thread that does a cluster's work."""
+    """Cores that work of this thread may use: those of the process, at most 8, or as `within`."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return _own.cores or min(there or 1, 8)
 
@@ -256,18 +256,21 @@ def run(
 ) -> Iterator[Outcome]:
     """Call ``work(item)`` for each item, and yield the results in order, as soon as they are there.
 
-    Results must not depend on where work runs. NumPy ignores what underflows in it everywhere. In
-    processes, only used if `cost`, the expected seconds on one core, is above 0, changes that it
-    makes are lost. ``progress(fraction, what)`` is called in this thread between items and, on
-    threads or if work calls `checkpoint`, ten times a second. When it cancels, running items end at
-    their next `checkpoint`, processes at once.
+    Results must not depend on where work runs. NumPy ignores what underflows in it everywhere. Work
+    on several `threads`, by default `default_threads`, has one core each. In processes, only used
+    if `cost`, the expected seconds on one core, is above 0, changes that it makes are lost.
+    ``progress(fraction, what)`` is called in this thread between items and, on threads or if work
+    calls `checkpoint`, ten times a second. When it cancels, running items end at their next
+    `checkpoint`, processes at once.
     """
     # Freeing one 30 MB block raises glibc's mmap threshold, so that buffers are reused instead of
     # page-faulted. No effect on other systems.
     np.empty(_HELD, np.uint8)
     todo, done, before = list(items), 0, 0
+    outer = _own.check  # the work that this is a part of may be cancelled
 
     def tell(more: int) -> None:
+        outer()
         report(progress, (before + more) / len(todo), what)
 
     cluster = _own.cluster
@@ -301,7 +304,6 @@ def _in_turn(work, items, tell):
 
     for done, item in enumerate(items):
         if done % step == 0:
-            checkpoint()  # the work that this is a part of may be cancelled
             reported = -math.inf
             check()
         with within(check=check), np.errstate(under="ignore"):
@@ -318,7 +320,7 @@ def _side_by_side(work, items, threads, tell, stop=lambda: None):
             raise Cancelled
 
     def checked(item):
-        with within(check=check):
+        with within(check=check, cores=1):
             return work(item)
 
     with ThreadPoolExecutor(threads) as pool:
@@ -342,9 +344,9 @@ def _side_by_side(work, items, threads, tell, stop=lambda: None):
             raise
 
 
-def start(cost: float, threads: int | None = None) -> None:
-    """Start the processes that `run` will use soon for work of the same `cost` and `threads`."""
-    number = default_threads() if threads is None else threads
+def start(cost: float) -> None:
+    """Start the processes that `run` will use soon for work of the same `cost`."""
+    number = default_threads()
     if _worth(cost, number):
         with suppress(_LostError), _lock:
             _fill_idle(number)
@@ -508,6 +510,7 @@ def serve() -> None:
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # so that nothing printed gets among the answers
     work: Any = None
+    _own.cores = 1
     while True:
         watch = threading.Timer(IDLE, os._exit, (0,))
         watch.daemon = True
@@ -520,7 +523,7 @@ def serve() -> None:
             watch.cancel()
         try:
             if kind == "call":
-                result = True, run_all(work, [message], threads=1)[0]
+                result = True, run_all(work, [message])[0]
             else:
                 work = None  # first, so that only the arrays of one task are in memory
                 return_freed()

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError
-from .execute import checkpoint, chunks, mapped
+from .execute import chunks, mapped
 from .splats import ARRAYS, Splats
 from .whole_file import explained
 
@@ -205,11 +205,6 @@ def divided(
         return halved(one, less) + halved(other, count - less)
 
     return halved(np.arange(len(place)), -(-len(place) // max(int(share * REGION), 1)))
-
-
-def look(_fraction: float, _what: str) -> None:
-    """Progress callback within a region: shows nothing, but the work can be cancelled."""
-    checkpoint()
 
 
 def in_one(

@@ -17,7 +17,7 @@ from .affine import AXES, UNKNOWN_AXES, is_uniform, transformed
 from .cleaning.clean import Cleaning
 from .cleaning.clean import clean as clean_splats
 from .errors import RefineError
-from .execute import Cancelled, Progress, part, report, seconds, silent, stages
+from .execute import Cancelled, Progress, part, report, seconds, silent, stages, within
 from .formats import registry
 from .formats.format import Format
 from .formats.ply import SplatFile, refuse_other_models
@@ -60,8 +60,8 @@ class Scene:
     form: Format | None = None  # of the output, None for plain PLY; `run` sets it
 
 
-Decide = Callable[[Scene, Clock, Progress, "int | None"], Result]
-"""Decides which splats of a scene stay; the last argument is the number of threads."""
+Decide = Callable[[Scene, Clock, Progress], Result]
+"""Decides which splats of a scene stay."""
 
 
 class Options(TypedDict, total=False):
@@ -129,7 +129,9 @@ def run(
     splats. `save` follows the writing.
     """
     clock, written = Clock(), None if dry_run else output
-    with contextlib.nullcontext() if pictures is None or views is None else pictures.opened(views):
+    with within(cores=threads), contextlib.ExitStack() as held:
+        if pictures is not None and views is not None:
+            held.enter_context(pictures.opened(views))
         if written is not None:
             refuse_existing(written, overwrite=overwrite)
             if source is not None:
@@ -142,7 +144,7 @@ def run(
         deciding, writing, comparing = stages(
             progress, seconds("measure", count, 64), seconds("write", count), drawing
         )
-        result = decide(scene, clock, deciding, threads)
+        result = decide(scene, clock, deciding)
         stopped = result.stopped
         if stopped is not None and save is not None:  # nothing is saved over what is unfinished
             raise stopped
@@ -180,13 +182,13 @@ def run(
                 psnr = None
                 if rays is not None and after is not None:
                     used = views.spread(result.report["settings"]["views"])
-                    psnr = psnr_against(rays, after, used, threads=threads)
+                    psnr = psnr_against(rays, after, used)
                 result.report["written_psnr"] = None if psnr is None else round(psnr, 2)
             if pictures is not None and views is not None:
                 if after is None:
                     after = replace(result, source=scene.splats).splats
                 result.report["pictures"] = pictures.write(
-                    scene.splats, after, views, progress=comparing, threads=threads
+                    scene.splats, after, views, progress=comparing
                 )
                 clock.lap("pictures_s")
         except (Cancelled, KeyboardInterrupt) as stop:
@@ -215,12 +217,12 @@ def prune_scene(
 ) -> Decide:  # fmt: skip
     """`decide` of `run` that cleans, if there is `cleaning`, and prunes the rest; see `prune`."""
 
-    def decide(scene: Scene, clock: Clock, progress: Progress, threads: int | None) -> Result:
+    def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands, splats, left = scene.demands, scene.splats, None
         if cleaning is not None:
             cleaned = clean_splats(
                 splats, views, cleaning, protected=demands.protected, removed=demands.removed,
-                progress=part(progress, 0.0, 0.3), threads=threads,
+                progress=part(progress, 0.0, 0.3),
             )  # fmt: skip
             clock.lap("clean_s")
             # The budget counts what the user removed, so that is not cleaned away.
@@ -232,9 +234,8 @@ def prune_scene(
 
         def pruned(method: Method, sizes: tuple[float, int], **more: Any) -> Result:
             return prune(
-                splats, views, budget, method, sizes=sizes, partial=True, threads=threads,
-                protected=demands.protected, removed=demands.removed, reusable=reusable or fits,
-                **more,
+                splats, views, budget, method, sizes=sizes, partial=True, reusable=reusable or fits,
+                protected=demands.protected, removed=demands.removed, **more,
             )  # fmt: skip
 
         def changed(result: Result) -> list[tuple[NDArray[np.bool_], Changes]]:
@@ -359,11 +360,11 @@ def clean_file(
 ) -> Result:
     """Clean a file of splats, and write the rest to another; see `prune_file` and `clean`."""
 
-    def decide(scene: Scene, clock: Clock, progress: Progress, threads: int | None) -> Result:
+    def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands = scene.demands
         cleaned = clean_splats(
             scene.splats, views, cleaning, protected=demands.protected, removed=demands.removed,
-            progress=progress, threads=threads,
+            progress=progress,
         )  # fmt: skip
         clock.lap("clean_s")
         report: dict[str, Any] = {
@@ -382,11 +383,11 @@ def clean_file(
 def score_scene(views: ViewSet, method: Method) -> Decide:
     """`decide` of `run` that keeps all splats, with their scores as a property."""
 
-    def decide(scene: Scene, clock: Clock, progress: Progress, threads: int | None) -> Result:
+    def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands = scene.demands
         scores = score(
             scene.splats, views, method, protected=demands.protected, removed=demands.removed,
-            progress=progress, threads=threads,
+            progress=progress,
         )  # fmt: skip
         clock.lap("score_s")
         report: dict[str, Any] = {

@@ -94,7 +94,7 @@ class Sight:
         picked = gaussians.take(np.flatnonzero(chosen[gaussians.index]))
         rows, mask = picked.index, np.zeros_like(chosen)
         if len(rows):
-            near, touch = touching(picked, np.arange(len(rows)), silent, None)
+            near, touch = touching(picked, np.arange(len(rows)))
             one, link = np.nonzero(touch)
             parts = connected(len(rows), one, near[one, link])
             away = self.prepared.splats.means[rows] - place

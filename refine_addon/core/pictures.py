@@ -82,7 +82,6 @@ def draw(
     scene: Scene | None = None,
     *,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> NDArray[np.float64]:
     """Draw splats, and layers of the image's size among them, (4, H, W) of 0..1.
 
@@ -90,10 +89,9 @@ def draw(
     to alpha. `scene` is the frame to compute in, by default that of splats and view.
     """
     gaussians, scene, _ = projection.prepare(
-        splats, ViewSet((view,)), scene, progress=part(progress, 0.0, 0.1), threads=threads
+        splats, ViewSet((view,)), scene, progress=part(progress, 0.0, 0.1)
     )
-    rest = part(progress, 0.1, 1.0)
-    return _drawn(splats, gaussians, scene, view, layers, rest, threads)
+    return _drawn(splats, gaussians, scene, view, layers, part(progress, 0.1, 1.0))
 
 
 def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
@@ -105,7 +103,7 @@ def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
     return replace(splats.up_to_degree(0), sh_dc=(colors.T - 0.5) / SH_C0)
 
 
-def _drawn(splats, gaussians, scene, view, layers, progress, threads):
+def _drawn(splats, gaussians, scene, view, layers, progress):
     """`draw` for splats prepared by `projection.prepare`."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
@@ -135,7 +133,7 @@ def _drawn(splats, gaussians, scene, view, layers, progress, threads):
         return image.reshape(4, len(rows), view.width)
 
     pieces = chunks(view.height, max(_PIXELS // view.width, 1))
-    strips = run_all(work, pieces, progress=progress, what="drawing", threads=threads)
+    strips = run_all(work, pieces, progress=progress, what="drawing")
     return np.concatenate(strips, axis=1).clip(0.0, 1.0)
 
 
@@ -200,24 +198,18 @@ class Comparison:
 
 
 def compare(
-    before: Splats,
-    after: Splats,
-    views: ViewSet,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
+    before: Splats, after: Splats, views: ViewSet, *, progress: Progress = silent
 ) -> list[Comparison]:
     """Draw two states of a scene in each view, at most `LONGEST` pixels long; see `draw`."""
     pictures: list[list[NDArray[np.float64]]] = []
     for splats, start in ((before, 0.0), (after, 0.5)):
-        gaussians, scene, _ = projection.prepare(
-            splats, views, progress=part(progress, start, start + 0.1), threads=threads
-        )
+        preparing = part(progress, start, start + 0.1)
+        gaussians, scene, _ = projection.prepare(splats, views, progress=preparing)
         if not pictures:
             views = ViewSet(tuple(fitted(view, scene.size) for view in views))
         rest = stages(part(progress, start + 0.1, start + 0.5), *[1.0] * len(views))
         pictures.append([
-            _drawn(splats, gaussians, scene, view, None, each, threads)[:3]
+            _drawn(splats, gaussians, scene, view, None, each)[:3]
             for view, each in zip(views, rest, strict=True)
         ])  # fmt: skip
     return [
@@ -268,17 +260,11 @@ class PictureFiles:
             yield
 
     def write(
-        self,
-        before: Splats,
-        after: Splats,
-        views: ViewSet,
-        *,
-        progress: Progress = silent,
-        threads: int | None = None,
+        self, before: Splats, after: Splats, views: ViewSet, *, progress: Progress = silent
     ) -> dict[str, Any]:
         """Draw and write `CAMERAS` of the views; returns PSNRs in dB and files for the report."""
         views = views.spread(CAMERAS)
-        comparisons = compare(before, after, views, progress=progress, threads=threads)
+        comparisons = compare(before, after, views, progress=progress)
         entries = []
         try:
             for pair, files in zip(comparisons, self._paths(views), strict=True):

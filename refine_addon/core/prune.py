@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from . import report as reports
 from .errors import RefineError
-from .execute import Cancelled, Progress, in_file, part, report, seconds, silent, stages
+from .execute import Cancelled, Progress, in_file, part, report, seconds, silent, stages, within
 from .formats.ply import SplatFile
 from .merging.merge import Merged, copied, merge, stage_counts, stage_seconds
 from .methods import DEFAULT, ClosedForm, Method, Refit
@@ -106,19 +106,18 @@ def score(
         progress, 1.35 * seconds(kind, count, len(used)), cast if by_formula else 0.0, cast
     )
     # Numbers that underflow to 0 are negligible in all sums.
-    with np.errstate(under="ignore"):
+    with np.errstate(under="ignore"), within(cores=threads):
         if by_formula:
-            scores = closed_form.score(splats, used, progress=scoring, threads=threads)
+            scores = closed_form.score(splats, used, progress=scoring)
             if quality:
-                rays = validation_rays(splats, used, progress=casting, threads=threads)
+                rays = validation_rays(splats, used, progress=casting)
                 scores = replace(scores, ray_sample=rays)
         else:
             scores, _ = occlusion.score(
-                splats, used, settled=settled, most_between=method.between(used),
-                progress=scoring, threads=threads,
-            )  # fmt: skip
-    scores = _with_views(scores, splats, views, used, threads)
-    return with_quality(scores, protected=protected, progress=estimating, threads=threads)
+                splats, used, settled=settled, most_between=method.between(used), progress=scoring
+            )
+        scores = _with_views(scores, splats, views, used)
+        return with_quality(scores, protected=protected, progress=estimating)
 
 
 def with_quality(
@@ -126,26 +125,23 @@ def with_quality(
     *,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Scores:
     """Scores with the curve of the estimated PSNR, if they have validation rays; see `score`."""
     if scores.ray_sample is None:
         return scores
     curve = quality_curve(
         scores.ray_sample, scores.values, protected=protected, settled=scores.settled,
-        between=scores.between if scores.tells else None, progress=progress, threads=threads,
+        between=scores.between if scores.tells else None, progress=progress,
     )  # fmt: skip
     return replace(scores, quality=curve)
 
 
-def _with_views(
-    scores: Scores, splats: Splats, views: ViewSet, used: ViewSet, threads: int | None
-) -> Scores:
+def _with_views(scores: Scores, splats: Splats, views: ViewSet, used: ViewSet) -> Scores:
     """Scores with alignment and notes on all views given, not only on those used."""
     notes = (*scores.notes, views.note) if views.note else scores.notes
     # After the closed form, measuring would take as long as scoring did.
     measured = None if scores.ray_sample is None else used
-    aligned = alignment(splats, views, measured, threads=threads)
+    aligned = alignment(splats, views, measured)
     return replace(scores, views_given=len(views), notes=notes, alignment=aligned)
 
 
@@ -202,12 +198,13 @@ def prune(
     gone = must_go(removed, protected)
     run = _Prune(
         splats, views, budget, method, protected, None if method.changes else scores,
-        sizes or (0.0, 0), origin, reusable, clock or Clock(), threads,
+        sizes or (0.0, 0), origin, reusable, clock or Clock(),
     )  # fmt: skip
     if scores is not None and gone is None:
         scores.refuse_unscored()
     run = run if gone is None else run.without(gone)
-    result = run.merge(progress) if method.changes else run.delete(progress)
+    with within(cores=threads):
+        result = run.merge(progress) if method.changes else run.delete(progress)
     if gone is not None:
         result = result.for_all(~gone)
         result.report["budget"] = {budget.kind: getattr(budget, budget.kind)}
@@ -263,7 +260,6 @@ class _Prune:
     origin: Origin | None
     reusable: bool
     clock: Clock
-    threads: int | None
 
     @property
     def used(self) -> ViewSet:
@@ -289,11 +285,11 @@ class _Prune:
             scores = score(
                 self.splats, self.views or self.used, self.method,
                 protected=self.protected, quality=self.budget.psnr is not None,
-                settled=self._settled(), progress=part(progress, 0.0, 0.94), threads=self.threads,
+                settled=self._settled(), progress=part(progress, 0.0, 0.94),
             )  # fmt: skip
         elif self.budget.psnr is not None and self.protected is not None:
             # Other splats may have been protected when these scores were made.
-            scores = with_quality(scores, protected=self.protected, threads=self.threads)
+            scores = with_quality(scores, protected=self.protected)
         self.clock.lap("score_s")
         report(progress, 0.94, "selecting")
         return self._result(scores, self._select(scores))
@@ -329,12 +325,11 @@ class _Prune:
         )
         scores, measurement = occlusion.score(
             self.splats, self.used, rounds=1, few_views=goal is None,
-            most_between=self.method.between(self.used),
-            progress=scoring, threads=self.threads,
+            most_between=self.method.between(self.used), progress=scoring,
         )  # fmt: skip
-        scores = _with_views(scores, self.splats, self.views, self.used, self.threads)
+        scores = _with_views(scores, self.splats, self.views, self.used)
         if goal is not None:
-            scores = with_quality(scores, protected=self.protected, threads=self.threads)
+            scores = with_quality(scores, protected=self.protected)
         self.clock.lap("score_s")
         chosen: _Chosen = np.ones(count, np.bool_), None, None
         if not (refits and goal is not None):
@@ -354,7 +349,7 @@ class _Prune:
         between, rays = None, self._first(scores).scores.between
         if rays is not None and outcome.stopped is None:
             after = outcome.final.splats
-            between = psnr_against(rays, after, self.used, threads=self.threads)
+            between = psnr_against(rays, after, self.used)
         pairs = [(plain, outcome.reached)]
         if beside is not None and between is not None:
             pairs.append((beside, between + FARTHER * (scores.views_between > 0)))
@@ -363,10 +358,10 @@ class _Prune:
             del outcome  # not needed where memory is highest
             scores = occlusion.in_rounds(  # up to 5 dB more than one round
                 self.splats, scores, measurement, settled=self._settled(),
-                progress=lambda *_: progress(1.0, "selecting"), threads=self.threads,
+                progress=lambda *_: progress(1.0, "selecting"),
             )  # fmt: skip
             if goal is not None:
-                scores = with_quality(scores, protected=self.protected, threads=self.threads)
+                scores = with_quality(scores, protected=self.protected)
             return self._result(scores, self._select(scores), tried=tried)
         # Where a PSNR is asked for, deletion keeps another number of splats.
         measured = outcome.psnr if goal is not None else {"delete": plain, **outcome.psnr}
@@ -394,11 +389,11 @@ class _Prune:
         )  # fmt: skip
         gone, curve, psnr, between = 1.0 - float(np.mean(keep)), scores.quality, None, None
         if scores.ray_sample is not None:
-            psnr = psnr_kept(scores.ray_sample, keep, threads=self.threads)
+            psnr = psnr_kept(scores.ray_sample, keep)
         elif curve is not None:
             psnr = curve.at(gone)
         if scores.between is not None:
-            between = psnr_kept(scores.between, keep, threads=self.threads)
+            between = psnr_kept(scores.between, keep)
         elif curve is not None:
             between = curve.at_between(gone)
         self.clock.lap("select_s")
@@ -432,16 +427,16 @@ class _Prune:
         first, used, left = self._first(scores), self.used, int(np.count_nonzero(keep))
         merging_progress, comparing, refitting = stages(progress, *self._expected_seconds(left))
         rays: Any = first.scores.ray_sample
-        estimated = partial(psnr_against, rays, views=used, threads=self.threads)
+        estimated = partial(psnr_against, rays, views=used)
         merged = merge_down(
             self.splats, used, left,
             scored=(scores, measurement), protected=self.protected, began=len(first.splats),
-            progress=merging_progress, threads=self.threads,
+            progress=merging_progress,
         )  # fmt: skip
         psnr = estimated(merged.splats, progress=comparing)
         if not isinstance(self.method, Refit):
             return Outcome(merged, "merge", {"merge": psnr})
-        rest = copied(self.splats, np.flatnonzero(keep), self.threads)
+        rest = copied(self.splats, np.flatnonzero(keep))
         gone = len(keep) - len(rest)
         deleted = Merged(rest, keep, np.zeros(len(rest), np.bool_), 0, gone)  # changes none
         plain = estimated(deleted.splats)
@@ -502,7 +497,6 @@ class _Prune:
                 merged.splats, (self.origin or self).splats, views, self.method.rounds,
                 protected=None if self.protected is None else self.protected[merged.keep],
                 progress=lambda fraction, _what: progress(fraction, REFITTING),
-                threads=self.threads,
             ):  # fmt: skip
                 done = reached
         except (Cancelled, KeyboardInterrupt) as stop:
@@ -539,7 +533,6 @@ def merge_down(
     began: int | None = None,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Merged:
     """Merge splats until `count` are left, by `views` and those between; errors as by `score`.
 
@@ -561,13 +554,11 @@ def merge_down(
     turns = itertools.count()
 
     def measure(now: Splats, expected: Measured, progress: Progress) -> Measured:
-        return occlusion.measure_part(
-            now, views, next(turns), PARTS, expected, progress=progress, threads=threads
-        )
+        return occlusion.measure_part(now, views, next(turns), PARTS, expected, progress=progress)
 
     with np.errstate(under="ignore"):  # as in `score`
         return merge(
             splats, views, sums, measure, count,
             began=began - deleted, deleted=~rest, protected=protected,
-            progress=progress, threads=threads,
+            progress=progress,
         )  # fmt: skip

@@ -215,7 +215,7 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
+def drawable(splats: Splats) -> NDArray[np.bool_]:
     """Which splats a renderer can draw, (N,) bool.
 
     Its numbers are finite, but a logit may be infinite and a log scale minus infinite. In float32
@@ -238,7 +238,7 @@ def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
                 here &= finite.reshape(len(here), -1).all(axis=1)
         good[piece] = here
 
-    run_all(fill, chunks(len(splats), _CHECKED), threads=threads)
+    run_all(fill, chunks(len(splats), _CHECKED))
     return good
 
 

@@ -53,7 +53,7 @@ def test_cells_converge_to_the_rendered_contributions_and_removal_errors(monkeyp
     view = View(np.eye(3), np.zeros(3), 100.0, 100.0, 48.0, 36.0, 96, 72, near=0.2)
     _, exact = rasterizer.render_with_statistics(splats, view)
     middle = np.abs(splats.means[:, :2] / splats.means[:, 2:]).max(axis=1) < 0.25
-    gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)), threads=1)
+    gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)))
     errors = []
     for side in SIDES:
         for name, value in (("CELL", side), ("DENSITY", 8.0)):

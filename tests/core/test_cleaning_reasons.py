@@ -108,7 +108,7 @@ def searched(name):
     splats, views = joined(wall(), SUSPECTS[name]), cameras(2 if name == "veil" else 6)
     gaussians, scene, _ = projection.prepare(splats, views)
     slender = is_slender(splats.log_scales[gaussians.index])
-    found = Search(gaussians, scene, list(views), 1).find(slender, silent)
+    found = Search(gaussians, scene, list(views)).find(slender, silent)
     return gaussians, found, int(np.flatnonzero(gaussians.index == len(splats) - 1)[0])
 
 
@@ -247,7 +247,7 @@ def test_a_splat_lies_where_it_is_densest_on_a_ray():
     gaussians, scene, _ = projection.prepare(splats, views)
     footprints = projection.project(gaussians, scene, views.views[0])
 
-    one = Search(gaussians, scene, list(views), 1)
+    one = Search(gaussians, scene, list(views))
     seen = one.hits_of_view(0, footprints, np.zeros(1, np.bool_))
 
     columns = np.floor(seen.key) % 16  # rays go through all 16 x 16 pixels

@@ -11,7 +11,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from refine_addon.core import Splats, ViewSet
+from refine_addon.core import Splats, ViewSet, execute
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.visibility.frustum import Frustums
 from refine_addon.core.visibility.scene import principal_axes
@@ -170,15 +170,15 @@ def test_chunks_threads_and_view_blocks_change_nothing(monkeypatch, chunk, threa
     partly in each view.
     """
     splats, views = random_scene(5)
-    expected = closed_form.score(splats, views, threads=1)
+    expected = execute.within(cores=1)(closed_form.score)(splats, views)
     monkeypatch.setattr(closed_form, "_CHUNK", chunk)
     monkeypatch.setattr(closed_form, "_VIEW_BLOCK", block)
     monkeypatch.setattr(closed_form, "_RUN", 1 + chunk // 5)
     monkeypatch.setattr(closed_form, "ROWS", 100)
-    scores = closed_form.score(splats, views, threads=threads)
+    scores = execute.within(cores=threads)(closed_form.score)(splats, views)
     np.testing.assert_allclose(scores.values, expected.values, rtol=1e-6)
     np.testing.assert_array_equal(scores.seen, expected.seen)
-    alone = closed_form.score(splats, views, threads=1)
+    alone = execute.within(cores=1)(closed_form.score)(splats, views)
     np.testing.assert_array_equal(scores.values, alone.values)
 
 

@@ -146,7 +146,7 @@ def test_processes_return_what_this_one_would_in_order(order, monkeypatch):
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="asks Linux what is mapped")
 def test_processes_are_kept_for_the_next_work_without_that_of_the_last():
     """A tenth of the work is then worth them. Arrays of work that is done are no longer mapped."""
-    execute.start(MUCH, 2)
+    execute.within(cores=2)(execute.start)(MUCH)
     first = where(WORTH / 2)
     found = rows(4, WORTH / 2)
     pid, _ = next(found)
@@ -238,9 +238,7 @@ def test_processes_keep_the_same_splats_as_one_thread(method, monkeypatch):
     monkeypatch.setattr(execute, "WORTH_READY", 0.0)
     splats = read_ply(ROOM / "point_cloud.ply").splats().take(np.arange(0, 39755, 20))
     views = read_cameras(ROOM / "cameras.json").spread(20)
-    one, two = (
-        prune(splats, views, Budget(ratio=0.5), method, threads=threads) for threads in (1, 2)
-    )
+    one, two = (prune(splats, views, Budget(ratio=0.5), method, threads=n) for n in (1, 2))
     assert len(execute._idle) == 2
     assert one.scores.values.tobytes() == two.scores.values.tobytes()
     assert one.keep.tobytes() == two.keep.tobytes()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from refine_addon.core.execute import within
 from refine_addon.core.merging.graph import nearest
 
 
@@ -54,5 +55,4 @@ def test_equal_points_are_neighbours_and_equal_distances_come_by_index():
 
 def test_threads_change_nothing():
     points = np.random.default_rng(3).normal(size=(20_000, 3))
-
-    np.testing.assert_array_equal(nearest(points, 8, threads=1), nearest(points, 8, threads=2))
+    np.testing.assert_array_equal(*(within(cores=n)(nearest)(points, 8) for n in (1, 2)))

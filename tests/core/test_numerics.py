@@ -20,6 +20,7 @@ from refine_addon.core import (
     RefineError,
     Splats,
     ViewSet,
+    execute,
     score,
     select,
 )
@@ -61,7 +62,7 @@ def cloud(count: int = 20) -> Splats:
 def scored(splats, views=TWO, settings=METHODS["closed form"]):
     """In this thread: NumPy's flags are raised in it alone. None is the floor of occlusion."""
     if settings is None:
-        return closed_form.score(splats, views, prior=True, threads=1)
+        return execute.within(cores=1)(closed_form.score)(splats, views, prior=True)
     return score(splats, views, settings, threads=1)
 
 
@@ -90,7 +91,7 @@ def test_one_extreme_splat_spoils_neither_itself_nor_the_others(name, settings):
     how many go in each depends on their number.
     """
     once, alone = isinstance(settings, Occlusion), cloud().take(slice(1, None))
-    one_round = partial(occlusion.score, views=TWO, rounds=1, threads=1)
+    one_round = execute.within(cores=1)(partial(occlusion.score, views=TWO, rounds=1))
     expected = (one_round(alone)[0] if once else scored(alone, settings=settings)).values
     cases = [(value, np.float32) for value in EXTREME] + [(value, np.float64) for value in DOUBLES]
     for number, (value, kind) in enumerate(cases):

@@ -46,14 +46,14 @@ Measured = namedtuple("Measured", ("contribution", "error", "seen"))
 
 def measured(splats: Splats, *views: View) -> Measured:
     """Sums over views, in the order of the splats."""
-    gaussians, frame, _ = projection.prepare(splats, ViewSet(views), threads=1)
+    gaussians, frame, _ = projection.prepare(splats, ViewSet(views))
     pairs, every = [(view, 1.0) for view in views], [range(len(views))]
-    total = measuring.measure(gaussians, frame, pairs, every, threads=1)[0]
+    total = measuring.measure(gaussians, frame, pairs, every)[0]
     return Measured(*total[:, np.argsort(gaussians.index)])
 
 
 def footprints_of(splats: Splats, view: View) -> projection.Footprints:
-    gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)), threads=1)
+    gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)))
     return projection.project(gaussians, frame, view)
 
 
@@ -251,10 +251,8 @@ def test_what_lies_behind_all_cameras_does_not_all_go():
 
 @pytest.mark.slow
 def test_threads_change_nothing_at_all():
-    alone, several = (
-        occlusion.score(cloud(), ring(11), threads=threads)[0].values for threads in (1, 3)
-    )
-    np.testing.assert_array_equal(alone, several)
+    scored = (execute.within(cores=n)(occlusion.score)(cloud(), ring(11)) for n in (1, 3))
+    np.testing.assert_array_equal(*(scores.values for scores, _ in scored))
 
 
 def test_scoring_is_cancelled_by_any_report_and_none_follows_it(monkeypatch):
@@ -263,11 +261,10 @@ def test_scoring_is_cancelled_by_any_report_and_none_follows_it(monkeypatch):
 
     def reports(last=math.inf):
         told = []
-        with contextlib.suppress(Cancelled):
+        with contextlib.suppress(Cancelled), execute.within(cores=1):
             occlusion.score(
-                cloud(60), ring(3), threads=1,
-                progress=lambda *_: told.append(1) or len(told) < last,
-            )  # fmt: skip
+                cloud(60), ring(3), progress=lambda *_: told.append(1) or len(told) < last
+            )
         return len(told)
 
     total = reports()

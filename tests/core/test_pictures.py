@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError
-from refine_addon.core.execute import Cancelled
+from refine_addon.core.execute import Cancelled, within
 from refine_addon.core.images import read_exr
 from refine_addon.core.pictures import (
     AMPLIFIED,
@@ -60,9 +60,9 @@ def test_pictures_do_not_depend_on_threads_or_on_how_many_pairs_are_drawn_at_a_t
     """Nor on the order of splats; only sums of float64 differ. MSE of 8 bits is near."""
     splats, views = crowd(), ViewSet((view_of(120, 80, 90.0),))
     half = splats.take(np.arange(0, len(splats), 2))
-    (one,), (same,) = compare(splats, half, views, threads=1), compare(splats, splats, views)
+    (one,), (same,) = (within(cores=1)(compare)(splats, each, views) for each in (half, splats))
     monkeypatch.setattr("refine_addon.core.pictures._PAIRS", 1000)
-    (other,) = compare(splats.take(slice(None, None, -1)), half, views, threads=3)
+    (other,) = within(cores=3)(compare)(splats.take(slice(None, None, -1)), half, views)
     assert abs(one.psnr - other.psnr) < 1e-9
     assert np.abs(one.before.astype(int) - other.before).max() <= 1  # a half rounds either way
     error = np.mean((one.after / 255.0 - one.before / 255.0) ** 2)

@@ -21,6 +21,7 @@ from refine_addon.core import (
     Scores,
     Splats,
     ViewSet,
+    execute,
     prune,
     prune_file,
     read_cameras,
@@ -112,7 +113,7 @@ def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     gaussians, frame, _ = projection.prepare(wide(file.splats()), some)
     assert projection.project(gaussians, frame, some[0]).centers.dtype == np.float64
     # Other processes have floats.
-    expected = occlusion.score(wide(file.splats()), some, rounds=rounds, threads=1)[0]
+    expected = execute.within(cores=1)(occlusion.score)(wide(file.splats()), some, rounds=rounds)[0]
     assert min(agreement(scores, expected)) >= 0.999
 
 

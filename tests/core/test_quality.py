@@ -18,6 +18,7 @@ from refine_addon.core import (
     RefineError,
     Scores,
     ViewSet,
+    execute,
     prune,
     read_cameras,
     read_splats,
@@ -311,7 +312,7 @@ def test_a_signalling_nan_is_no_place_and_makes_no_warning():
     quiet = np.where(np.isnan(means), np.nan, means)
     loud, silent = (replace(cloud(), means=each, log_scales=each) for each in (means, quiet))
     with np.errstate(all="raise"):
-        found = alignment(loud, within(), within(), threads=1)
+        found = execute.within(cores=1)(alignment)(loud, within(), within())
     assert found == alignment(silent, within(), within())
 
 

@@ -102,14 +102,14 @@ def test_threads_files_and_processes_change_no_bit(monkeypatch, how):
     """Derivatives of views lie in a file, as far as it has room; in processes views are cast."""
     splats, here = cloud(300), []
     kept = splats.take(np.arange(100))
-    expected = refit.refit(kept, splats, ring(), 2, threads=2)
+    expected = execute.within(cores=2)(refit.refit)(kept, splats, ring(), 2)
     if how == "processes":
         for name in ("WORTH", "WORTH_READY"):
             monkeypatch.setattr(execute, name, 0.0)
         monkeypatch.setattr(casting, "cast_visible", lambda *some: here.append(some))
     threads = int(how[0]) if "thread" in how else 2
     with files_of_at_most(600_000) if how == "full disk" else contextlib.nullcontext():
-        found = refit.refit(kept, splats, ring(), 2, threads=threads)
+        found = execute.within(cores=threads)(refit.refit)(kept, splats, ring(), 2)
     assert not here
     assert (found.psnr, found.rounds) == (expected.psnr, 2)
     for name in ARRAYS:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import ViewSet
-from refine_addon.core.execute import silent
+from refine_addon.core.execute import silent, within
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.scoring.occlusion import KNOWN, _RemovalRounds
 from refine_addon.core.visibility import cast, projection
@@ -74,7 +74,7 @@ def scene():
     splats = cloud()
     gaussians, frame, _ = projection.prepare(splats, views)
     sample = RaySample(views.by_distance(), gaussians, splats, "scoring")
-    sample.cast_all(gaussians, frame, silent, None)
+    sample.cast_all(gaussians, frame, silent)
     count = len(gaussians)
     random = np.random.default_rng(2)
     error, contribution = (random.uniform(0.5, 2.0, count) for _ in range(2))
@@ -110,13 +110,12 @@ def test_what_is_left_grows_as_rays_tell_and_unhit_splats_as_all_do(scene, threa
         prior = KNOWN / np.maximum(hits, 1) * own
         expected.append(own * (later + prior * later.sum() / then.sum()) / (then + prior))
     expected[0] = (hits * now[0][left] + KNOWN * expected[0]) / (hits + KNOWN)
-    at_once, halves = (  # which take the rays away from their sample
-        _RemovalRounds(deepcopy(sample), count, silent, threads) for _ in range(2)
-    )
     half = np.flatnonzero(keep | (np.arange(count) < count // 2))
-    found = at_once.remove_and_measure(left, measured[:, left], silent)
-    halves.remove_and_measure(half, measured[:, half], silent)
-    again = halves.remove_and_measure(left, measured[:, left], silent)
+    with within(cores=threads):  # they take the rays away from their sample
+        at_once, halves = (_RemovalRounds(deepcopy(sample), count, silent) for _ in range(2))
+        found = at_once.remove_and_measure(left, measured[:, left], silent)
+        halves.remove_and_measure(half, measured[:, half], silent)
+        again = halves.remove_and_measure(left, measured[:, left], silent)
     assert now[0][left].sum() > 1.05 * before[0][left].sum()
     np.testing.assert_allclose(found[:2], expected[::-1], rtol=1e-9)
     np.testing.assert_array_equal(again, found)
@@ -171,7 +170,7 @@ def test_large_pictures_full_of_vast_splats_take_bounded_memory(monkeypatch):
         opacity_logits=np.full(500, -3.0, np.float32),
     )
     tracemalloc.start()
-    occlusion.score(splats, views, threads=2)
+    within(cores=2)(occlusion.score)(splats, views)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 60e6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from refine_addon.core import View, ViewSet
+from refine_addon.core import View, ViewSet, execute
 from refine_addon.core.visibility import scene
 from refine_addon.core.visibility.scene import scene_of
 
@@ -25,9 +25,10 @@ def test_places_and_their_order_do_not_depend_on_chunks_and_threads(monkeypatch)
     places = (means - whole.origin) @ (whole.axes.T / whole.size)
     order = scene.spatial_order(places)
     monkeypatch.setattr(scene, "_CHUNK", 64)
-    one, three = (scene_of(means, drawn, VIEWS, threads=threads) for threads in (1, 3))
+    one, three = (execute.within(cores=n)(scene_of)(means, drawn, VIEWS) for n in (1, 3))
     assert one.size == three.size == whole.size
     np.testing.assert_array_equal(three.axes, one.axes)
-    np.testing.assert_array_equal(whole.positions(means, threads=3), places)
-    np.testing.assert_array_equal(whole.positions(means, rows[::2], threads=3), places[::2])
-    np.testing.assert_array_equal(scene.spatial_order(places, threads=3), order)
+    with execute.within(cores=3):
+        np.testing.assert_array_equal(whole.positions(means), places)
+        np.testing.assert_array_equal(whole.positions(means, rows[::2]), places[::2])
+        np.testing.assert_array_equal(scene.spatial_order(places), order)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, part, silent
+from ..execute import Progress, part, silent, within
 from ..splats import Splats, refuse_undrawable
 from ..views import ViewSet
 from ..visibility import projection
@@ -208,17 +208,16 @@ def clean(
     gone = must_go(removed, protected)
     rest = np.ones(len(splats), np.bool_) if gone is None else ~gone
     left = splats if gone is None else splats.take(rest)
-    with np.errstate(under="ignore"):
-        gaussians, scene, good = projection.prepare(
-            left, views, progress=part(progress, 0.0, 0.05), threads=threads
-        )
+    with np.errstate(under="ignore"), within(cores=threads):
+        earlier = part(progress, 0.0, 0.05)
+        gaussians, scene, good = projection.prepare(left, views, progress=earlier)
         if len(left):
             refuse_undrawable(int(np.count_nonzero(good)), len(left))
         deciding = [view for view, _ in views.spread(settings.views).by_distance()]
         slender = is_slender(left.log_scales[gaussians.index])
-        search = Search(gaussians, scene, deciding, threads)
+        search = Search(gaussians, scene, deciding)
         suspects = search.find(slender, part(progress, 0.05, 1.0))
-        shows, faint, sure = judge(gaussians, suspects, threads)
+        shows, faint, sure = judge(gaussians, suspects)
         faint &= suspects.doubted & ~suspects.large
         haze = faint & (gaussians.alphas < FAINT) & _near_any(gaussians, scene, deciding, faint)
         unused = [view for view in views if view not in deciding]
@@ -271,7 +270,7 @@ def _outside(gaussians, scene, shown, unused):
 
 
 def judge(
-    gaussians: Gaussians, suspects: Suspects, threads: int | None = None
+    gaussians: Gaussians, suspects: Suspects
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
     """Suspects that float, others that would if they were less faint, and `Cleaned.sure`, (M,).
 
@@ -286,7 +285,7 @@ def judge(
     may = suspects.every & (support < most) & (large | (past >= AGREE * seen))
     may &= (past >= FEW) | (giant & (passed >= FEW))
     rows = np.flatnonzero(suspects.every)
-    near, touch = touching(gaussians, rows, silent, threads)
+    near, touch = touching(gaussians, rows)
     behind = np.where(evidence.behind > 0.0, evidence.behind, 1.0)
     change = np.minimum(gaussians.alphas * (evidence.contrast / behind), GLARING)
     in_clumps = _clumps(gaussians, suspects, change, rows, near, touch)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, part, run_all
+from ..execute import Progress, part, run_all, silent
 from ..merging.graph import nearest
 from ..visibility import projection
 from ..visibility.cast import aimed, cast, depth_complexity, pixels
@@ -101,8 +101,8 @@ class Suspects(NamedTuple):
 class Search:
     """The search for suspects among M Gaussians, by a list of views."""
 
-    def __init__(self, gaussians, scene, views, threads):
-        self.gaussians, self.scene, self.views, self.threads = gaussians, scene, views, threads
+    def __init__(self, gaussians, scene, views):
+        self.gaussians, self.scene, self.views = gaussians, scene, views
         self.shown = np.zeros(len(gaussians), np.bool_)
         self.huge = gaussians.largest >= HUGE
         self.hits: list[Hits | None] = [None] * len(views)
@@ -118,7 +118,7 @@ class Search:
         for number, (start, end) in enumerate(ROUNDS):
             doubted = doubted | new
             joining = part(progress, start, start + 0.02)
-            small = small | small_clusters(self.gaussians, ~doubted & ~giant, joining, self.threads)
+            small = small | small_clusters(self.gaussians, ~doubted & ~giant, joining)
             absent = doubted | giant | needle | small
             wanted = open_ & ~absent
             behind = None if number else absent | open_
@@ -221,7 +221,7 @@ class Search:
         """Results of `work` for each group of numbers of views."""
         count = min(VIEW_GROUPS, len(self.views))
         groups = [range(first, len(self.views), count) for first in range(count)]
-        return run_all(work, groups, progress=progress, what=what, threads=self.threads)
+        return run_all(work, groups, progress=progress, what=what)
 
 
 def _targets(footprints, targets, number, area):
@@ -268,14 +268,14 @@ def is_slender(log_scales: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def small_clusters(
-    gaussians: Gaussians, solid: NDArray[np.bool_], progress: Progress, threads: int | None
+    gaussians: Gaussians, solid: NDArray[np.bool_], progress: Progress
 ) -> NDArray[np.bool_]:
     """Which of the Gaussians `solid`, (M,), are in a small cluster, linked by touch, (M,)."""
     small = np.zeros(len(solid), np.bool_)
     for number, least in enumerate(SOLID):
         rows = np.flatnonzero(solid & (gaussians.alphas >= least))
         half = part(progress, number / len(SOLID), (number + 1) / len(SOLID))
-        near, touch = touching(gaussians.take(rows), np.arange(len(rows)), half, threads)
+        near, touch = touching(gaussians.take(rows), np.arange(len(rows)), half)
         one, other = np.nonzero(touch)
         labels = connected(len(rows), one, near[one, other])
         small[rows[np.bincount(labels, minlength=len(rows))[labels] < SMALL]] = True
@@ -283,11 +283,11 @@ def small_clusters(
 
 
 def touching(
-    gaussians: Gaussians, rows: NDArray[np.int64], progress: Progress, threads: int | None
+    gaussians: Gaussians, rows: NDArray[np.int64], progress: Progress = silent
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Near neighbours of the splats `rows`, (r,), and which of these each touches, (r, k) each."""
     points = gaussians.means.T.astype(np.float64)  # (M, 3)
-    near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)[rows].astype(np.int64)
+    near = nearest(points, NEIGHBOURS, progress=progress)[rows].astype(np.int64)
     one, other = np.repeat(rows, near.shape[1]), near.ravel()
     step = points[other] - points[one]
     length = np.sqrt(np.einsum("ij,ij->i", step, step))

@@ -95,7 +95,6 @@ def measured_field(
     sums: Array,
     *,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> MeasuredField:
     """Some drawable splats as merging needs them; `sums` are contribution and error, (2, N), px^2.
 
@@ -129,7 +128,7 @@ def measured_field(
         for item, of_piece in zip(fields(Field), values, strict=False):
             getattr(result, item.name)[piece] = of_piece
 
-    run_all(fill, chunks(count, _CHUNK), progress=progress, what="merging", threads=threads)
+    run_all(fill, chunks(count, _CHUNK), progress=progress, what="merging")
     return MeasuredField(result, mass, seen)
 
 

@@ -60,10 +60,8 @@ class MergeGraph:
     `merge.merge_penalty`; for discs it is multiplied by `DISC_PENALTY`.
     """
 
-    def __init__(
-        self, field: Field, scene: Scene, penalty: float, *, threads: int | None = None
-    ) -> None:
-        self.field, self.scene, self.threads = field, scene, threads
+    def __init__(self, field: Field, scene: Scene, penalty: float) -> None:
+        self.field, self.scene = field, scene
         self.penalty = penalty * (DISC_PENALTY if field.model == "2dgs" else 1.0)
         # A splat of unknown error is not merged: without contribution it gets no pairs.
         field.contribution[~np.isfinite(field.error)] = 0.0
@@ -108,10 +106,8 @@ class MergeGraph:
     def _neighbours(self, progress: Progress) -> tuple[Rows, Rows]:
         """Rows of pairs of neighbouring splats, (E,) each."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
-        place = self.scene.positions(self.field.means, rows, threads=self.threads)  # (R, 3)
-        near = nearest(
-            place, NEIGHBOURS, progress=part(progress, 0.0, 0.8), threads=self.threads
-        )  # (R, k)
+        place = self.scene.positions(self.field.means, rows)  # (R, 3)
+        near = nearest(place, NEIGHBOURS, progress=part(progress, 0.0, 0.8))  # (R, k)
         del place
 
         def pairs(piece: slice) -> tuple[Rows, Rows]:
@@ -123,7 +119,7 @@ class MergeGraph:
 
         edges = run_all(
             pairs, chunks(max(len(rows), 1), _CHUNK),
-            progress=part(progress, 0.8, 1.0), what="merging", threads=self.threads,
+            progress=part(progress, 0.8, 1.0), what="merging",
         )  # fmt: skip
         # int32 takes half the memory of int64, and no file holds two billion splats.
         first, second = map(np.concatenate, zip(*edges, strict=True))
@@ -140,7 +136,7 @@ class MergeGraph:
             self.cost[rows] = self.penalty * cost
 
         pieces = chunks(len(edges), _CHUNK)
-        run_all(price, pieces, progress=progress, what="merging", threads=self.threads)
+        run_all(price, pieces, progress=progress, what="merging")
 
     def _round(self, quota: int, progress: Progress = silent) -> int:
         """Carry out the cheapest operations that share no splat; their number is 1 to `quota`.
@@ -196,7 +192,7 @@ class MergeGraph:
             field.put(into[piece], pricing.merge(field, first[piece], second[piece], pairs))
             share[piece] = np.where(swap[piece], 1.0 - pairs.color, pairs.color)
 
-        run_all(merge, chunks(len(edges), _CHUNK), threads=self.threads)
+        run_all(merge, chunks(len(edges), _CHUNK))
         self.merges.append((into, gone, share))
         self.alive[doomed] = self.alive[gone] = False
         self.deleted += len(doomed)
@@ -209,7 +205,7 @@ class MergeGraph:
 
         # Few pairs are concerned; the rest are not looked at again.
         pieces = chunks(max(len(self.first), 1), _SCANNED)
-        concerned = np.concatenate(run_all(concerning, pieces, threads=self.threads))  # (e,)
+        concerned = np.concatenate(run_all(concerning, pieces))  # (e,)
         # Pairs of a splat that went into another become pairs of that one.
         now = np.arange(len(self.alive), dtype=np.int32)  # (N,)
         now[gone] = into
@@ -221,8 +217,7 @@ class MergeGraph:
         valid[concerned[~remain]] = False
 
         def left(values: NDArray[Any]) -> NDArray[Any]:
-            some = run_all(lambda piece: values[piece][valid[piece]], pieces, threads=self.threads)
-            return np.concatenate(some)
+            return np.concatenate(run_all(lambda piece: values[piece][valid[piece]], pieces))
 
         self.first = left(self.first)  # one at a time, to save memory
         self.second = left(self.second)
@@ -260,11 +255,7 @@ def _disjoint(first: Index, second: Index) -> Index:
 
 
 def nearest(
-    points: NDArray[np.float64],
-    count: int,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
+    points: NDArray[np.float64], count: int, *, progress: Progress = silent
 ) -> NDArray[np.int32]:
     """Neighbours of N points, most of them the nearest, (N, min(count, N - 1)), nearest first."""
     total = len(points)
@@ -281,11 +272,11 @@ def nearest(
         # At either end of a curve the window lies to one side.
         return order, np.clip(place - window, 0, total - width)
 
-    how: dict[str, Any] = {"what": "finding neighbours", "threads": threads}
+    what = "finding neighbours"
     if total <= max(SMALL, width):  # the window holds all
         width, curves = total, [(np.arange(total, dtype=np.int32), np.zeros(total, np.int32))]
     else:
-        curves = run_all(along, range(len(CURVES)), progress=part(progress, 0.0, 0.2), **how)
+        curves = run_all(along, range(len(CURVES)), progress=part(progress, 0.0, 0.2), what=what)
     steps, columns = np.arange(width, dtype=np.int32), np.ascontiguousarray(points.T)
     near = np.empty((total, count), np.int32)
 
@@ -309,5 +300,5 @@ def nearest(
         key.sort(axis=1)
         near[piece] = (key[:, :count] & _INDEX).astype(np.int32)
 
-    run_all(search, chunks(total, _CHUNK), progress=part(progress, 0.2, 1.0), **how)
+    run_all(search, chunks(total, _CHUNK), progress=part(progress, 0.2, 1.0), what=what)
     return near

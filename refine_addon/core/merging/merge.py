@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..execute import Progress, chunks, part, report, return_freed, run_all, seconds, silent, stages
-from ..mapped import divided, in_one, in_regions, look, new_folder, note, noted, on_disk, pieces
+from ..mapped import divided, in_one, in_regions, new_folder, note, noted, on_disk, pieces
 from ..splats import ARRAYS, Splats, assign, drawable
 from ..views import ViewSet
 from ..visibility.scene import Scene, scene_of, spatial_order, splat_fingerprint
@@ -89,7 +89,6 @@ def merge(
     deleted: NDArray[np.bool_] | None = None,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Merged:
     """Reduce splats to a number at the least cost to the pictures (docs/method.md, section 7).
 
@@ -108,20 +107,18 @@ def merge(
     counts = stage_counts(len(rows), goal, ALONE_BY_REGIONS if regions else ALONE)
     penalty = merge_penalty(1.0 - goal / max(began or len(rows), 1))
     return_freed()  # what scoring took: twice as much as is left of it
-    drawn = drawable(splats, threads=threads)
+    drawn = drawable(splats)
     # By regions those that were deleted count for the frame, too.
     counting = np.arange(total) if regions else rows
-    scene = scene_of(splats.means[counting], drawn[counting], views, threads=threads)
+    scene = scene_of(splats.means[counting], drawn[counting], views)
     del rows, drawn, counting
     steps = iter(stages(progress, *stage_seconds(total, counts, len(views))))
     for number, count in enumerate(counts):
         measuring, merging = next(steps), next(steps)
         if left is not splats:
             sums = measure(left.up_to_degree(0), sums, measuring)
-        stage = _Stage(
-            left, members, np.asarray(sums, np.float64), spared[origin], views, scene, penalty,
-            threads,
-        )  # fmt: skip
+        sums = np.asarray(sums, np.float64)
+        stage = _Stage(left, members, sums, spared[origin], views, scene, penalty)
         if in_regions(left, int(np.count_nonzero(members))):
             left, keep, members, sums = _by_regions(stage, count, number % 2 == 1, merging)
         else:
@@ -131,7 +128,7 @@ def merge(
         return_freed()  # views are measured next, by processes that need memory of their own
     if left is splats:
         origin = np.flatnonzero(members)
-        left, members = copied(splats, origin, threads), members[origin]
+        left, members = copied(splats, origin), members[origin]
     report(progress, 1.0, "merging")
     kept = np.zeros(total, np.bool_)
     kept[origin] = True
@@ -173,7 +170,6 @@ class _Stage:
     views: ViewSet
     scene: Scene
     penalty: float
-    threads: int | None
 
     def at_once(self, keep_count, progress):
         rows, measured = self.measured(part(progress, 0.0, 0.3))
@@ -184,27 +180,22 @@ class _Stage:
 
     def measured(self, progress):
         """Rows that may merge, (M,), and their field, in spatial order: ties ignore file order."""
-        splats, threads = self.splats, self.threads
-        excluded = self.protected | (self.members == 0)
-        rows = np.flatnonzero(drawable(splats, threads=threads) & ~excluded)
-        place = self.scene.positions(splats.means, rows, threads=threads)
-        order = spatial_order(
-            place, lambda tied: splat_fingerprint(splats, rows[tied]), threads=threads
-        )
-        rows = rows[order]
+        splats, excluded = self.splats, self.protected | (self.members == 0)
+        rows = np.flatnonzero(drawable(splats) & ~excluded)
+        place = self.scene.positions(splats.means, rows)
+        rows = rows[spatial_order(place, lambda tied: splat_fingerprint(splats, rows[tied]))]
         report(progress, 0.0, "merging")
         return rows, measured_field(
-            splats, rows, self.views, self.scene, self.sums, progress=progress, threads=threads
+            splats, rows, self.views, self.scene, self.sums, progress=progress
         )
 
     def graph(self, measured, whole):
         """Graph of measured splats; `whole` is `MeasuredField.seen_and_whole` of all splats."""
-        return MergeGraph(measured.with_bias(whole), self.scene, self.penalty, threads=self.threads)
+        return MergeGraph(measured.with_bias(whole), self.scene, self.penalty)
 
     def reduced(self, rows, graph, keep_count, progress):
         """Kept splats, at least `keep_count`; which they are, (N,); members; predicted sums."""
-        splats, threads = self.splats, self.threads
-        keep = self.members > 0
+        splats, keep = self.splats, self.members > 0
         excess = max(int(np.count_nonzero(keep)) - keep_count, 0)
         others = keep & ~self.protected
         others[rows] = False
@@ -223,15 +214,14 @@ class _Stage:
         # Drop the rest of the field before the kept splats are copied, to save memory.
         field = graph.field = graph.field.take(np.flatnonzero(changed))
         kept = np.flatnonzero(keep)
-        left, target = copied(splats, kept, threads), np.searchsorted(kept, rows[changed])
-        shapes = as_splats(field, part(progress, 0.95, 0.97), threads)
+        left, target = copied(splats, kept), np.searchsorted(kept, rows[changed])
+        shapes = as_splats(field, part(progress, 0.95, 0.97))
         for name, values in zip(ARRAYS, (field.means, *shapes), strict=False):
             getattr(left, name)[target] = values
         inside = np.flatnonzero(changed[owner])
         order = inside[np.argsort(owner[inside], kind="stable")]
         into = np.searchsorted(kept, rows[owner[order]])
-        blended = part(progress, 0.97, 1.0)
-        _blend(splats, rows[order], share[order], left, into, blended, threads)
+        _blend(splats, rows[order], share[order], left, into, part(progress, 0.97, 1.0))
         members = self.members.copy()
         members[rows] = np.bincount(owner, members[rows], len(rows))
         expected = self.sums[:, keep]
@@ -239,7 +229,7 @@ class _Stage:
         return left, keep, members[keep], expected
 
 
-def _blend(splats, members, share, left, into, progress, threads):
+def _blend(splats, members, share, left, into, progress):
     """Write means of members' harmonics into rows `into` of `left`, float32: tiles equal files."""
     starts, largest = np.flatnonzero(np.diff(into, prepend=-1)), np.finfo(np.float32).max
 
@@ -250,10 +240,10 @@ def _blend(splats, members, share, left, into, progress, threads):
         getattr(left, name)[(into[starts], *of)] = means.astype(np.float32)
 
     harmonics = range(-1, splats.sh_rest.shape[1]) if len(starts) else ()
-    run_all(fill, harmonics, progress=progress, what="merging", threads=threads)
+    run_all(fill, harmonics, progress=progress, what="merging")
 
 
-def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) -> Splats:
+def copied(splats: Splats, rows: NDArray[np.int64]) -> Splats:
     """Copies of some splats in float64, but `sh_rest`; of more than a region, on disk."""
     if in_regions(splats, len(rows)):
         some = pieces(splats, rows)
@@ -269,7 +259,7 @@ def copied(splats: Splats, rows: NDArray[np.int64], threads: int | None = None) 
         with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
             assign(result.take(piece), splats.take(rows[piece]))
 
-    run_all(copy, chunks(len(rows), _CHUNK), threads=threads)
+    run_all(copy, chunks(len(rows), _CHUNK))
     return result
 
 
@@ -302,8 +292,8 @@ def _by_regions(stage, keep_count, askew, progress):
 
 def _measure(folder, number):
     rows, stage = noted(folder, f"region-{number}")[1]
-    stage = replace(stage, splats=copied(stage.splats, rows, stage.threads))
-    measured = note(folder, f"measured-{number}", stage.measured(look))[1]
+    stage = replace(stage, splats=copied(stage.splats, rows))
+    measured = note(folder, f"measured-{number}", stage.measured(silent))[1]
     return measured.seen_and_whole()
 
 
@@ -312,7 +302,7 @@ def _price(folder, whole, number):
     _, stage = noted(folder, f"region-{number}")[1]
     rows, measured = noted(folder, f"measured-{number}")[1]
     graph = stage.graph(measured, whole)
-    graph.connect(look)
+    graph.connect()
     best, merges = graph.best()
     note(folder, f"graph-{number}", (rows, graph))
     costs = np.full(len(stage.members), -1.0)  # what cannot be drawn goes first
@@ -326,9 +316,9 @@ def _merge(folder, item):
     """Kept rows of a region after its removals, their members, sums and splats."""
     number, removals = item
     origin, stage = noted(folder, f"region-{number}")[1]
-    stage = replace(stage, splats=copied(stage.splats, origin, stage.threads))
+    stage = replace(stage, splats=copied(stage.splats, origin))
     rows, graph = noted(folder, f"graph-{number}")[1]
-    left, keep, members, sums = stage.reduced(rows, graph, len(origin) - removals, look)
+    left, keep, members, sums = stage.reduced(rows, graph, len(origin) - removals, silent)
     return origin[keep], members, sums, on_disk(folder / f"left-{number}", [left])
 
 

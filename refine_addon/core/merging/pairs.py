@@ -267,7 +267,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     )
 
 
-def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[Array, Array, Array]:
+def as_splats(merged: Field, progress: Progress) -> tuple[Array, Array, Array]:
     """Stored log scales, of discs with `LOG_ZERO`, quaternions w x y z, and opacity logits."""
     count = len(merged.opacity)
     stored = np.empty((count, 3)), np.empty((count, 4)), np.empty(count)
@@ -288,7 +288,7 @@ def as_splats(merged: Field, progress: Progress, threads: int | None) -> tuple[A
         stored[0][piece], stored[1][piece] = logs, quaternion(vectors)
         stored[2][piece] = np.log(opacity) - np.log1p(-opacity)
 
-    run_all(fill, chunks(count, _CHUNK), progress=progress, what="merging", threads=threads)
+    run_all(fill, chunks(count, _CHUNK), progress=progress, what="merging")
     return stored
 
 

@@ -121,13 +121,7 @@ class Alignment:
         return cls(turn if whole else 0, known, fineness, far)
 
 
-def alignment(
-    splats: Splats,
-    views: ViewSet,
-    used: ViewSet | None = None,
-    *,
-    threads: int | None = None,
-) -> Alignment:
+def alignment(splats: Splats, views: ViewSet, used: ViewSet | None = None) -> Alignment:
     """Whether views are to be turned, by some of `used`, and which are far (docs/method.md, 10)."""
     with np.errstate(under="ignore", invalid="ignore"):  # signalling NaN
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
@@ -139,7 +133,7 @@ def alignment(
         in_pictures = sum(points.shape[1] for _, points in seen)
         if used is None or one_way or in_pictures >= WHOLE * (len(means) * len(seen)):
             return unturned
-        fineness = _fineness(splats, used.spread(VIEWS), threads)
+        fineness = _fineness(splats, used.spread(VIEWS))
     best = list(QUARTERS)[int(np.argmax(fineness))]
     turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
     return replace(unturned, turn=turn, fineness=fineness)
@@ -167,14 +161,14 @@ def _is_far(points, view):
     return (widths * (view.fx / view.width, view.fy / view.height)).max() < SMALL
 
 
-def _fineness(splats, views, threads):
+def _fineness(splats, views):
     """Fineness of the pictures of views, turned by each of `QUARTERS`."""
     rows = _spread_rows(splats, SAMPLE)
     stand_for = len(splats) / len(rows)
     sample = splats.take(rows)
     larger = np.asarray(sample.log_scales, np.float64) + 0.5 * np.log(stand_for)
     sample = replace(sample, log_scales=larger, sh_rest=sample.sh_rest[:, :0])
-    gaussians, scene, _ = projection.prepare(sample, views, threads=threads)
+    gaussians, scene, _ = projection.prepare(sample, views)
     ordered = [view for view, _ in views.by_distance()]
     near = NEAR * views.middle()[1] ** 0.5 / scene.size
 
@@ -194,5 +188,5 @@ def _fineness(splats, views, threads):
             return float(fine.sum()) / rays.count
 
     turned = itertools.product(QUARTERS.values(), enumerate(ordered))
-    fineness = run_all(of_turned, turned, threads=threads)
+    fineness = run_all(of_turned, turned)
     return tuple(np.reshape(fineness, (len(QUARTERS), -1)).mean(axis=1).tolist())

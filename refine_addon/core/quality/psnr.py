@@ -44,15 +44,13 @@ def psnr_of(colors: NDArray[Any], truth: NDArray[Any], view: View) -> float:
     return min(-10.0 * math.log10(mean) - 5.0 / math.log(10.0) * relative, PSNR_CAP)
 
 
-def psnr_kept(
-    sample: RaySample, keep: NDArray[np.bool_], *, threads: int | None = None
-) -> float | None:
+def psnr_kept(sample: RaySample, keep: NDArray[np.bool_]) -> float | None:
     """Mean PSNR of all views, dB, if only splats `keep`, (N,), stay; None if too little is seen."""
     if not _enough(sample):
         return None
     views = sample.seeing()
     removing = _removing(sample, keep.astype(np.int64)[sample.splat_rows], [1])
-    return float(_mean(sample, _of_views(sample, removing, views, silent, threads), views)[0])
+    return float(_mean(sample, _of_views(sample, removing, views, silent), views)[0])
 
 
 def quality_curve(
@@ -63,7 +61,6 @@ def quality_curve(
     settled: int | None = None,
     between: RaySample | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Quality | None:
     """Estimated PSNR at each of `curve.SHARES`; None if too little is seen.
 
@@ -87,7 +84,7 @@ def quality_curve(
 
     def removing(rays_of, progress):
         compare = _removing(rays_of, place[rays_of.splat_rows], removed)
-        return _of_views(rays_of, compare, rays_of.seeing(), progress, threads)
+        return _of_views(rays_of, compare, rays_of.seeing(), progress)
 
     def gaining(number, rays):
         view, colors = sample.views[number][0], sample.colors(number, rays)
@@ -101,7 +98,7 @@ def quality_curve(
 
     of_views, seeing = removing(sample, part(progress, 0.0, 0.5)), sample.seeing()
     validating = sample.validating()
-    gains = _of_views(sample, gaining, validating, part(progress, 0.5, 1.0), threads)
+    gains = _of_views(sample, gaining, validating, part(progress, 0.5, 1.0))
     psnr = np.minimum.accumulate(_mean(sample, of_views, seeing))
     names = [sample.views[number][0].name for number in seeing]
     curve = Quality(
@@ -119,17 +116,10 @@ def quality_curve(
 
 
 def psnr_against(
-    sample: RaySample,
-    splats: Splats,
-    views: ViewSet,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
+    sample: RaySample, splats: Splats, views: ViewSet, *, progress: Progress = silent
 ) -> float | None:
     """Estimated PSNR of other splats against those of a sample, dB; None if too little is seen."""
-    gaussians, scene, _ = projection.prepare(
-        splats, views, progress=part(progress, 0.0, 0.2), threads=threads
-    )
+    gaussians, scene, _ = projection.prepare(splats, views, progress=part(progress, 0.0, 0.2))
 
     def compare(number, rays):
         view = sample.views[number][0]
@@ -143,7 +133,7 @@ def psnr_against(
     if not _enough(sample):
         return None
     numbers, later = sample.validating(), part(progress, 0.2, 1.0)
-    return float(_mean(sample, _of_views(sample, compare, numbers, later, threads), numbers)[0])
+    return float(_mean(sample, _of_views(sample, compare, numbers, later), numbers)[0])
 
 
 def _enough(sample):
@@ -167,15 +157,13 @@ def _removing(sample, place, counts):
     return compare
 
 
-def _of_views(sample, compare, numbers, progress, threads):
+def _of_views(sample, compare, numbers, progress):
     """Results of ``compare(number, rays)`` for each of v views, (v, L)."""
 
     def compare_one(number):
         return compare(number, sample.rays[number])
 
-    return np.array(
-        run_all(compare_one, numbers, progress=progress, what="estimating", threads=threads)
-    )
+    return np.array(run_all(compare_one, numbers, progress=progress, what="estimating"))
 
 
 def _mean(sample, values, numbers):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import Progress, chunks, in_file, part, run_all, seconds, silent, stages
-from ..mapped import divided, folder_of, in_one, in_regions, look, new_folder, note, noted, on_disk
+from ..mapped import divided, folder_of, in_one, in_regions, new_folder, note, noted, on_disk
 from ..spherical_harmonics import LARGEST
 from ..splats import Splats, rotation_matrices, unit_quaternions
 from ..views import View, ViewSet
@@ -123,7 +123,6 @@ def refit_rounds(
     *,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Iterator[Refitted]:
     """Yield kept splats as they are, and after each round that gains on validation rays.
 
@@ -133,11 +132,11 @@ def refit_rounds(
     """
     check_rounds(rounds)
     if in_regions(original, len(original)) and in_regions(original, 2 * len(splats)):
-        yield from _by_regions(splats, original, views, rounds, protected, progress, threads)
+        yield from _by_regions(splats, original, views, rounds, protected, progress)
         return
-    rays = RoundRays.of(original, views, len(splats), part(progress, 0.0, 0.03), threads)
+    rays = RoundRays.of(original, views, len(splats), part(progress, 0.0, 0.03))
     later = part(progress, 0.03, 1.0)
-    yield from refit_on(rays, splats, rounds, protected=protected, progress=later, threads=threads)
+    yield from refit_on(rays, splats, rounds, protected=protected, progress=later)
 
 
 def refit_on(
@@ -147,7 +146,6 @@ def refit_on(
     *,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Iterator[Refitted]:
     """Refit as `refit_rounds` does, on given rays."""
     count = len(splats)
@@ -174,7 +172,7 @@ def refit_on(
             ahead = max(min(math.ceil(enough * number / cast), MAX_ROUNDS), number)
         damping = max(DAMPING * count / linear.count, LEAST_DAMPING)
         solving = part(share, _CASTING, _SOLVED)
-        change = _solve(linear, movable, damping, before, progress=solving, threads=threads)
+        change = _solve(linear, movable, damping, before, solving)
         index, learned = linear.shapes.gaussians.index, (linear.diagonal, linear.residual)
         del linear  # the hits, before those of the next round
         if not change.any():
@@ -198,7 +196,7 @@ def refit_on(
         del learned, change
 
 
-def _solve(linear, movable, damping, before, *, progress, threads):
+def _solve(linear, movable, damping, before, progress):
     """Change of the parameters, (22, N), by a few steps of conjugate gradients from 0.
 
     `linear.residual` becomes the gradient that is left, less the damping by K. Rows are changed one
@@ -225,7 +223,7 @@ def _solve(linear, movable, damping, before, *, progress, threads):
     for step in range(STEPS):
         if size <= 0.0:
             break
-        image = linear.normal(direction, part(progress, step / STEPS, (step + 1) / STEPS), threads)
+        image = linear.normal(direction, part(progress, step / STEPS, (step + 1) / STEPS))
         along, later = 0.0, 0.0
         for k in rows:
             image[k] *= moving[k]
@@ -322,23 +320,22 @@ def _product(quaternions: NDArray[np.float64], turns: NDArray[np.float64]) -> ND
     )
 
 
-def _by_regions(kept, original, views, rounds, protected, progress, threads):
+def _by_regions(kept, original, views, rounds, protected, progress):
     """Yield kept splats before and, if that is better, after all regions are refitted."""
     count, folder = len(kept), new_folder(original)
     cost = seconds("refit", count, len(views))
     preparing, before, refitting, after = stages(progress, 0.1 * cost, 0.1 * cost, cost, 0.1 * cost)
     if folder_of(kept) is None:
         kept = on_disk(new_folder(original), [kept])
-    rays = RoundRays.of(original, views, count, preparing, threads)
+    rays = RoundRays.of(original, views, count, preparing)
     psnr = rays.psnr(kept, before)
     yield Refitted(kept, np.zeros(count, np.bool_), 0, psnr, psnr)
     fixed = np.zeros(count, np.bool_) if protected is None else protected
     boxes = divided(kept.means[...], SHARE)
     for number, rows in enumerate(boxes):
         note(folder, f"rows-{number}", (rows, fixed[rows]))
-    work = partial(
-        _refit_region, folder, views, rounds, rays.original, rays.target(kept, silent), threads
-    )
+    every = rays.target(kept, silent)
+    work = partial(_refit_region, folder, views, rounds, rays.original, every)
     refitted = run_all(work, range(len(boxes)), progress=refitting, what="refitting", threads=1,
                        cost=cost)  # fmt: skip
     changed, numbers, regions = zip(*refitted, strict=True)
@@ -348,7 +345,7 @@ def _by_regions(kept, original, views, rounds, protected, progress, threads):
         yield Refitted(splats, np.concatenate(changed)[order], max(numbers), psnr, better)
 
 
-def _refit_region(folder, views, rounds, original, kept, threads, number):
+def _refit_region(folder, views, rounds, original, kept, number):
     """Refit the splats of a region amid all others: changed, rounds, splats."""
     rows, protected = noted(folder, f"rows-{number}")[1]
     others = np.ones(len(kept.splats), np.bool_)
@@ -358,9 +355,8 @@ def _refit_region(folder, views, rounds, original, kept, threads, number):
     windows = _windows(splats, len(others), original.scene, views.by_distance())
     if windows:
         amid = partial(_Amid.of, every=kept, others=others[kept.gaussians.index[...]])
-        rays = RoundRays(windows, original, threads, amid)
-        how: Any = {"protected": protected, "progress": look, "threads": threads}
-        *_, done = refit_on(rays, splats, rounds, **how)
+        rays = RoundRays(windows, original, amid)
+        *_, done = refit_on(rays, splats, rounds, protected=protected)
     return done.changed, done.rounds, on_disk(folder / f"region-{number}", [done.splats])
 
 
@@ -405,7 +401,7 @@ def _windows(splats, total, scene, views):
     """Windows of the views that show a region, weighted by how much of it they show."""
     sample = splats.take(slice(None, None, max(len(splats) // _SAMPLE, 1)))
     only = [view for view, _ in views]
-    gaussians, _, _ = projection.prepare(sample, ViewSet(tuple(only)), scene, threads=1)
+    gaussians, _, _ = projection.prepare(sample, ViewSet(tuple(only)), scene)
     boxes = {}
     for number, view in enumerate(only):
         footprints = projection.project(gaussians, scene, view)

@@ -138,22 +138,17 @@ class RoundRays:
         self,
         windows: Sequence[Window],
         original: Target,
-        threads: int | None,
         kind: Callable[..., Target] = Target.of,
     ) -> None:
-        self.windows, self.original, self._threads, self._kind = windows, original, threads, kind
+        self.windows, self.original, self._kind = windows, original, kind
         step = -(-len(windows) // VALIDATION_VIEWS)
         self._validating = [window.moved(0) for window in windows[::step]] if step else []
         self._validation: list[Truth] = []
 
     @classmethod
-    def of(
-        cls, original: Splats, views: ViewSet, count: int, progress: Progress, threads: int | None
-    ) -> RoundRays:
+    def of(cls, original: Splats, views: ViewSet, count: int, progress: Progress) -> RoundRays:
         """Rays of all views into `original`, as many as `limits` of `count` kept splats."""
-        gaussians, scene, _ = projection.prepare(
-            original, views, progress=progress, threads=threads
-        )
+        gaussians, scene, _ = projection.prepare(original, views, progress=progress)
         chosen = views.by_distance()
         rays, hits = (each / len(chosen) for each in limits(count))
         steps = steps_of([view for view, _ in chosen], scene)
@@ -161,7 +156,7 @@ class RoundRays:
             Window(view, number, weight, rays, hits, step=steps[number])
             for number, (view, weight) in enumerate(chosen)
         ]
-        return cls(windows, Target.of(original, gaussians, scene), threads)
+        return cls(windows, Target.of(original, gaussians, scene))
 
     def linear(self, splats: Splats, number: int, progress: Progress) -> LinearRays:
         """The rays of a round, from 1, linearized at the kept splats; call `psnr` before."""
@@ -189,15 +184,12 @@ class RoundRays:
     def target(self, splats: Splats, progress: Progress) -> Target:
         """What rays are cast into: these kept splats, and any others that `kind` adds."""
         views, scene = ViewSet(tuple(window.view for window in self.windows)), self.original.scene
-        prepared = projection.prepare(
-            splats, views, scene, progress=progress, threads=self._threads
-        )
-        return self._kind(splats, prepared[0], scene)
+        gaussians, *_ = projection.prepare(splats, views, scene, progress=progress)
+        return self._kind(splats, gaussians, scene)
 
     def _each(self, work, windows, splats, progress):
         cost = seconds("refit", len(self.original.splats) + len(splats), len(windows))
-        how = {"progress": progress, "what": "refitting", "threads": self._threads}
-        return run(work, range(len(windows)), cost=cost, **how)
+        return run(work, range(len(windows)), cost=cost, progress=progress, what="refitting")
 
 
 def limits(count: int) -> tuple[float, float]:
@@ -279,7 +271,7 @@ class LinearRays:
             return_freed()
         self.residual = shapes.by_parameter(residual)
 
-    def normal(self, change: Singles, progress: Progress, threads: int | None) -> Singles:
+    def normal(self, change: Singles, progress: Progress) -> Singles:
         """G'G times a change of the parameters, (22, M)."""
         return_freed()
         in_scene = self.shapes.in_scene(change)
@@ -290,7 +282,7 @@ class LinearRays:
             return view.hit, view.normal(in_scene)
 
         every = range(len(self.views))
-        for of_hit in run(of_view, every, progress=progress, what="refitting", threads=threads):
+        for of_hit in run(of_view, every, progress=progress, what="refitting"):
             _add(total, *of_hit)
         return self.shapes.by_parameter(total)
 

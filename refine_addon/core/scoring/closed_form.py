@@ -91,7 +91,6 @@ def score(
     *,
     prior: bool = False,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Scores:
     """Score splats, in memory or files, by the closed form; the same to the bit on any threads.
 
@@ -101,7 +100,7 @@ def score(
     prior : bool
         For splats that no view shows, too: d is the distance to the view's centre, every view
         counts for every splat, and splats are not compared with those around them.
-    progress, threads : see `prune`
+    progress : see `prune`
 
     Raises
     ------
@@ -113,7 +112,7 @@ def score(
         raise RefineError("there are no splats to score")
     reading, summing, completing, comparing = stages(progress, 0.2, 0.67, 0.08, 0.05)
     origin, spread = views.middle()
-    columns, squared, tallies, moments = _read(splats, origin, spread, reading, threads)
+    columns, squared, tallies, moments = _read(splats, origin, spread, reading)
     good = int(tallies[:, 0].sum())
     refuse_undrawable(good, total)
     # A median, so that a few far splats hardly change it.
@@ -123,7 +122,7 @@ def score(
     eta, near = ETA_RELATIVE * size * size, NEAR_RELATIVE * size
     visibility, seen = columns.reach, np.full(total, len(views), np.int32)
     if not prior:
-        _sum_views(columns, seen, views, origin, near, eta, summing, threads)
+        _sum_views(columns, seen, views, origin, near, eta, summing)
     axes = principal_axes(moments) / size
     weighted = list(zip(views.centers - origin, views.weights, strict=True))
     cells = np.zeros(0 if prior else total, np.int32)
@@ -148,7 +147,7 @@ def score(
 
     sums = run_all(
         complete, chunks(total, _CHUNK),
-        progress=summing if prior else completing, what="scoring", threads=threads,
+        progress=summing if prior else completing, what="scoring",
     )  # fmt: skip
     if not seen.any():
         raise RefineError(
@@ -166,9 +165,9 @@ def score(
         whole = sum(factor * (visibility[piece] * g) for factor, g in terms)
         _store(values, whole, columns.good, piece)
 
-    run_all(add, chunks(total, 4 * _CHUNK), progress=comparing, what="scoring", threads=threads)
+    run_all(add, chunks(total, 4 * _CHUNK), progress=comparing, what="scoring")
     if not prior:
-        _compare(values, cells, columns.good, threads)
+        _compare(values, cells, columns.good)
     return Scores(
         values, seen, len(views), total - good,
         {
@@ -194,7 +193,7 @@ def lambdas(anisotropy: float, luma_variance: float, translucency: float) -> lis
     return [term / total for term in terms] if total else [1 / 3] * 3
 
 
-def _read(splats, origin, spread, progress, threads):
+def _read(splats, origin, spread, progress):
     """Columns, squared distances to the views, tallies of chunks, and sums for `principal_axes`."""
     count = len(splats)
     kind = splats.take(slice(0, 0)).means.dtype.newbyteorder("=")
@@ -232,9 +231,7 @@ def _read(splats, origin, spread, progress, threads):
         moments = np.vstack([weighted.T @ offset, weighted.sum(axis=0)])
         return (len(luma), ratio[good].sum(), translucency, mean, squares), moments
 
-    results = run_all(
-        read, chunks(count, 4 * _CHUNK), progress=progress, what="reading", threads=threads
-    )
+    results = run_all(read, chunks(count, 4 * _CHUNK), progress=progress, what="reading")
     tallies, moments = zip(*results, strict=True)
     return columns, squared, np.array(tallies), np.sum(moments, axis=0)
 
@@ -263,7 +260,7 @@ def _statistics(tallies):
     }
 
 
-def _sum_views(columns, seen, views, origin, near, eta, progress, threads):
+def _sum_views(columns, seen, views, origin, near, eta, progress):
     """Replace `reach` by H over alpha, and `seen`, (N,), by how many views hold each centre."""
     total, frustums, weights = len(columns.good), Frustums(views, origin, near), views.weights
     order = np.arange(total, dtype=np.int32)
@@ -290,10 +287,8 @@ def _sum_views(columns, seen, views, origin, near, eta, progress, threads):
                 order_of_views[: counts[run], run], partly[run],
             )  # fmt: skip
 
-    run_all(sort, chunks(total, ROWS), threads=threads)
-    run_all(
-        sum_views, chunks(total, 8 * _CHUNK), progress=progress, what="scoring", threads=threads
-    )
+    run_all(sort, chunks(total, ROWS))
+    run_all(sum_views, chunks(total, 8 * _CHUNK), progress=progress, what="scoring")
 
 
 def _near_order(means):
@@ -371,7 +366,7 @@ def _cells(place):
     return (x * CELLS + y) * CELLS + z
 
 
-def _compare(values, cells, good, threads):
+def _compare(values, cells, good):
     """Divide each score by a power of the mean score in its cell of a coarse grid.
 
     ``D'_i = D_i / m_i^(w_i / 2)``, ``w_i = D_i / (D_i + 0.05)``, all in units of the mean: the more
@@ -392,7 +387,7 @@ def _compare(values, cells, good, threads):
         weight = plain / (plain + LOCAL_HALF * overall)
         _store(values, plain * np.exp(weight * powers[cells[piece]]), good, piece)
 
-    run_all(compare, chunks(len(values), 4 * _CHUNK), threads=threads)
+    run_all(compare, chunks(len(values), 4 * _CHUNK))
 
 
 def _store(into, values, good, piece):

@@ -61,7 +61,6 @@ def score(
     few_views: bool = False,
     most_between: int = 0,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> tuple[Scores, Measured]:
     """Score splats, in memory or files, by how much the views change without them, with occlusion.
 
@@ -76,7 +75,7 @@ def score(
     settled : int, optional, how many splats, the first to go, need their final order; else all
     few_views : bool, whether the PSNR is to be estimated in few views, see `RaySample`
     most_between : int, most views halfway between these that decide, too, where there are few
-    progress, threads : see `prune`
+    progress : see `prune`
 
     Returns
     -------
@@ -93,7 +92,7 @@ def score(
     count = len(splats)
     if not count:
         raise RefineError("there are no splats to score")
-    execute.start(SECONDS * count * len(views), threads)
+    execute.start(SECONDS * count * len(views))
     kept = _kept_after_rounds(count, rounds, settled)
     preparing, closed, looking, weighing, casting, ranking = stages(
         progress, seconds("read", count), seconds("closed form", count, len(views)),
@@ -101,9 +100,9 @@ def score(
         seconds("cast", count, min(BETWEEN, len(views))),
         sum(seconds("order", left, len(views)) for left in (count, *kept)),
     )  # fmt: skip
-    gaussians, scene, good = projection.prepare(splats, views, progress=preparing, threads=threads)
+    gaussians, scene, good = projection.prepare(splats, views, progress=preparing)
     refuse_undrawable(int(np.count_nonzero(good)), count)
-    prior = _prior(splats, views, closed, threads)
+    prior = _prior(splats, views, closed)
     ordered = views.by_distance()
     samples = [RaySample(ordered, gaussians, splats, few_views=few_views)]
     if rounds > 1:
@@ -111,7 +110,7 @@ def score(
     sample, index = coverage.sample(gaussians), np.asarray(gaussians.index)
     measured, of_groups, errors = measure(
         gaussians, scene, ordered, view_groups(len(ordered)),
-        sample=sample, ray_samples=samples, progress=looking, threads=threads,
+        sample=sample, ray_samples=samples, progress=looking,
     )  # fmt: skip
     if not measured[0].any():
         raise RefineError(
@@ -125,7 +124,7 @@ def score(
     told = views_between(views, BETWEEN)
     if most_between and left_out > LEFT_OUT:
         near = partial(views_beside, views, gaussians, scene, left_out)
-        more = with_views_between(views, most_between, gaussians, scene, threads)
+        more = with_views_between(views, most_between, gaussians, scene)
         more += near(len(views), 0)
         told = near(TOLD, 1)
     if more:
@@ -134,18 +133,18 @@ def score(
             scoring.extend(every)
         of_more, *_ = measure(
             gaussians, scene, every, [range(len(ordered), len(every))],
-            ray_samples=samples[1:], progress=part(weighing, 0.5, 1.0), threads=threads,
+            ray_samples=samples[1:], progress=part(weighing, 0.5, 1.0),
         )  # fmt: skip
         measured[:2] *= share
         measured[:2] += of_more[:2]
     between = None
     if told:
         between = RaySample(ViewSet(tuple(told)).by_distance(), gaussians, splats, "between")
-        between.cast_all(gaussians, scene, casting, threads)
+        between.cast_all(gaussians, scene, casting)
     del gaussians, of_groups, errors  # not needed any more where memory is highest
     measured = execute.in_file(_for_all(measured, index, count))
     rays = samples.pop() if rounds > 1 else None
-    values = _values(index, good, prior, measured, rays, weights, kept, ranking, threads)
+    values = _values(index, good, prior, measured, rays, weights, kept, ranking)
     scores = Scores(
         values, execute.in_file(measured[2].astype(np.int32)), len(ordered),
         int(np.count_nonzero(~good)),
@@ -164,22 +163,21 @@ def in_rounds(
     *,
     settled: int | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Scores:
     """`score` by what one round of it gave, not measuring again; each step reports 0 to 1."""
     deciding = scores.deciding
     assert deciding is not None
     own = len(deciding) - scores.views_between
     views, more = replace(deciding, views=deciding.views[:own]), deciding.views[own:]
-    gaussians, scene, good = projection.prepare(splats, views, progress=progress, threads=threads)
+    gaussians, scene, good = projection.prepare(splats, views, progress=progress)
     rays = RaySample((), gaussians, splats, "scoring")
     for some in (views.by_distance(), _with_between(views, more)[1]):  # own views get more rays
         rays.extend(some)
-        rays.cast_all(gaussians, scene, progress, threads)
+        rays.cast_all(gaussians, scene, progress)
     index, kept = np.asarray(gaussians.index), _kept_after_rounds(len(splats), ROUNDS, settled)
     del gaussians
-    prior, weights = _prior(splats, views, progress, threads), scores.facts["floor"]
-    values = _values(index, good, prior, measured, rays, weights, kept, progress, threads)
+    prior, weights = _prior(splats, views, progress), scores.facts["floor"]
+    values = _values(index, good, prior, measured, rays, weights, kept, progress)
     return replace(scores, values=values, settled=settled)
 
 
@@ -191,20 +189,15 @@ def measure_part(
     expected: Measured,
     *,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> Measured:
     """What views see of N splats, measured in one of at most `parts` parts, else as `expected`."""
-    gaussians, scene, _ = projection.prepare(
-        splats, views, progress=part(progress, 0.0, 0.05), threads=threads
-    )
+    gaussians, scene, _ = projection.prepare(splats, views, progress=part(progress, 0.0, 0.05))
     ordered = views.by_distance()
     groups = view_groups(len(ordered))
     parts = min(parts, len(groups))
     groups = groups[turn % parts :: parts]
-    measured, *_ = measure(
-        gaussians, scene, ordered, groups,
-        progress=part(progress, 0.05, 1.0), threads=threads,
-    )  # fmt: skip
+    later = part(progress, 0.05, 1.0)
+    measured, *_ = measure(gaussians, scene, ordered, groups, progress=later)
     weight = math.fsum(ordered[number][1] for group in groups for number in group)
     share = weight / math.fsum(weight for _, weight in ordered)
     measured = _for_all(measured[: len(expected)], np.asarray(gaussians.index), len(splats))
@@ -218,9 +211,9 @@ def _for_all(measured, index, count):
     return every
 
 
-def _prior(splats, views, progress, threads):
+def _prior(splats, views, progress):
     """The closed form's scores, which splats that no view shows have, too: no frustum test."""
-    return closed_form.score(splats, views, prior=True, progress=progress, threads=threads).values
+    return closed_form.score(splats, views, prior=True, progress=progress).values
 
 
 def _with_between(views, more):
@@ -249,10 +242,10 @@ def _folds(whole, of_groups, errors, prior, progress):
         yield *_with_floors(np.maximum(whole - without, 0.0), prior), of_views
 
 
-def _values(index, good, prior, measured, rays, weights, kept, progress, threads):
+def _values(index, good, prior, measured, rays, weights, kept, progress):
     """Scores of N splats, `good` ones drawable; removal is in rounds if there are scoring rays."""
     loading, *of_rounds = stages(progress, len(good), *kept)
-    rounds = None if rays is None else _RemovalRounds(rays, len(index), loading, threads)
+    rounds = None if rays is None else _RemovalRounds(rays, len(index), loading)
     count, left = len(good), np.arange(len(index))
     undrawn = np.setdiff1d(np.arange(count), index)
     removed = [undrawn[np.argsort(prior[undrawn], kind="stable")]]  # rows in the order of removal
@@ -282,9 +275,7 @@ class _RemovalRounds:
     The rays leave their sample, so that the hits of what has gone are not kept there.
     """
 
-    def __init__(self, scoring_rays, count, progress, threads):
-        self._threads = threads
-
+    def __init__(self, scoring_rays, count, progress):
         def colored(number):
             rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
             scoring_rays.rays[number] = None
@@ -295,7 +286,7 @@ class _RemovalRounds:
         # ray, px^2, times the view's weight.
         self._views = run_all(
             colored, [k for k, rays in enumerate(scoring_rays.rays) if rays is not None],
-            progress=part(progress, 0.0, _LOADING), what="scoring", threads=threads,
+            progress=part(progress, 0.0, _LOADING), what="scoring",
         )  # fmt: skip
         self._rays_hitting = np.zeros(count, np.int64)  # (M,), n_i
         for rays, _, _ in self._views:
@@ -327,10 +318,8 @@ class _RemovalRounds:
             return rays.hit, area * np.stack([contribution, error])
 
         sums = np.zeros((2, len(keep)))
-        for hit, of_view in run(
-            removal_errors, range(len(self._views)),
-            progress=progress, what="scoring", threads=self._threads,
-        ):  # fmt: skip
+        every = range(len(self._views))
+        for hit, of_view in run(removal_errors, every, progress=progress, what="scoring"):
             sums[:, hit] += of_view
         execute.return_freed()
         return sums.take(left, axis=1)

@@ -31,7 +31,6 @@ def views_between(
     views: ViewSet,
     most: int,
     within: tuple[Gaussians, Scene] | None = None,
-    threads: int | None = 1,
 ) -> list[View]:
     """At most `most` views halfway between neighbours, chosen as by `ViewSet.spread`.
 
@@ -60,17 +59,18 @@ def views_between(
         )  # fmt: skip
 
     pairs = _neighbours(ViewSet(tuple(ordered)).places())
+    threads = None if within else 1  # on one it takes little time
     found = [view for view in run_all(halfway, pairs, threads=threads) if view is not None]
     return list(ViewSet(tuple(found)).spread(most)) if found else []
 
 
 def with_views_between(
-    views: ViewSet, count: int, gaussians: Gaussians, scene: Scene, threads: int | None = 1
+    views: ViewSet, count: int, gaussians: Gaussians, scene: Scene
 ) -> list[View]:
     """Up to `count` views between neighbours in free space, between those, and so on."""
     found: list[View] = []
     while more := views_between(
-        replace(views, views=(*views, *found)), count - len(found), (gaussians, scene), threads
+        replace(views, views=(*views, *found)), count - len(found), (gaussians, scene)
     ):
         found += more
     return found

@@ -98,19 +98,15 @@ class RaySample:
         """Whether the rays of a view are wanted and not cast yet."""
         return self.rays[number] is None and number % self._step == 0
 
-    def cast_all(
-        self, gaussians: Gaussians, scene: Scene, progress: Progress, threads: int | None
-    ) -> None:
+    def cast_all(self, gaussians: Gaussians, scene: Scene, progress: Progress) -> None:
         """Project all Gaussians into the views and cast the rays that are wanted."""
 
         def cast_one(number):
             footprints = projection.project(gaussians, scene, self.views[number][0])
             self.rays[number] = cast_view(self.views, number, footprints, self.kind)
 
-        run_all(
-            cast_one, filter(self.wants, range(len(self.views))),
-            progress=progress, what="casting rays", threads=threads,
-        )  # fmt: skip
+        wanted = filter(self.wants, range(len(self.views)))
+        run_all(cast_one, wanted, progress=progress, what="casting rays")
 
     def seeing(self) -> list[int]:
         """Numbers of the views whose rays hit a splat."""
@@ -128,15 +124,11 @@ class RaySample:
         return sum(len(rays.ray) for rays in every) / max(sum(rays.count for rays in every), 1)
 
 
-def validation_rays(
-    splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
-) -> RaySample:
+def validation_rays(splats: Splats, views: ViewSet, *, progress: Progress = silent) -> RaySample:
     """Validation rays of all views into splats in their frame; `Cancelled` if progress says so."""
-    gaussians, scene, _ = projection.prepare(
-        splats, views, progress=part(progress, 0.0, 0.2), threads=threads
-    )
+    gaussians, scene, _ = projection.prepare(splats, views, progress=part(progress, 0.0, 0.2))
     sample = RaySample(views.by_distance(), gaussians, splats)
-    sample.cast_all(gaussians, scene, part(progress, 0.2, 1.0), threads)
+    sample.cast_all(gaussians, scene, part(progress, 0.2, 1.0))
     return sample
 
 

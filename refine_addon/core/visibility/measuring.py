@@ -65,7 +65,6 @@ def measure(
     sample: Sequence[int] | NDArray[np.int64] = (),
     ray_samples: Sequence[RaySample] = (),
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> tuple[Measured, list[Measured], list[NDArray[np.float64]]]:
     """Measure Gaussians in groups of views (`view_groups`), and cast rays with their footprints.
 
@@ -79,7 +78,7 @@ def measure(
         partial(_measure_and_cast, gaussians, scene, views),
         [(n, [rays.kind for rays in some]) for n, some in zip(numbers, lacking, strict=True)],
         cost=SECONDS * len(gaussians) * len(numbers),
-        progress=progress, what="scoring", threads=threads,
+        progress=progress, what="scoring",
     )  # fmt: skip
     total, of_groups, errors = np.zeros((3, len(gaussians))), [], []
     each = zip(measured, lacking, strict=True)

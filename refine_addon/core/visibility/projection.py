@@ -150,7 +150,6 @@ def prepare(
     scene: Scene | None = None,
     *,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> tuple[Gaussians, Scene, NDArray[np.bool_]]:
     """Gaussians, in the frame of a scene, of drawable splats more opaque than `ALPHA_CUT`.
 
@@ -164,31 +163,27 @@ def prepare(
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
         opaque[piece] = opacity(logits) > ALPHA_CUT
 
-    run_all(
-        classify, chunks(len(splats), 4 * _CHUNK),
-        progress=part(progress, 0.0, 0.4), what="reading", threads=threads,
-    )  # fmt: skip
-    scene = scene or scene_of(splats.means, good, views, threads=threads)
+    pieces, earlier = chunks(len(splats), 4 * _CHUNK), part(progress, 0.0, 0.4)
+    run_all(classify, pieces, progress=earlier, what="reading")
+    scene = scene or scene_of(splats.means, good, views)
     report(progress, 0.4, "reading")
     index = np.flatnonzero(opaque)
-    positions = scene.positions(splats.means, index, threads=threads)
+    positions = scene.positions(splats.means, index)
     close = np.max(np.abs(positions), axis=1, initial=0.0) <= _FARTHEST
     index, positions = index[close], positions[close]
     report(progress, 0.4, "reading")
-    order = spatial_order(
-        positions, lambda rows: splat_fingerprint(splats, index[rows]), threads=threads
-    )
+    order = spatial_order(positions, lambda rows: splat_fingerprint(splats, index[rows]))
     make = _activate if folder_of(splats) is None or not len(order) else _activate_on_disk
     later = part(progress, 0.4, 1.0)
-    return make(splats, index[order], positions[order], scene, later, threads), scene, good
+    return make(splats, index[order], positions[order], scene, later), scene, good
 
 
-def _activate_on_disk(splats, index, positions, scene, progress, threads):
+def _activate_on_disk(splats, index, positions, scene, progress):
     """Gaussians in files beside those of the splats; the files go when these Gaussians do."""
     bare = splats.up_to_degree(0)
 
     def columns(piece):
-        part = _activate(bare, index[piece], positions[piece], scene, silent, 1)
+        part = _activate(bare, index[piece], positions[piece], scene, silent)
         low, high = part.means.min(axis=1), part.means.max(axis=1)
         arrays = {name: getattr(part, name) for name in ("index", "largest", "alphas", "colors")}
         arrays["boxes"] = np.concatenate([low, high, [part.largest.max()]])[None]
@@ -198,8 +193,7 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
                 arrays[name][0, :, : len(part)] = values
         return arrays
 
-    parts = run(columns, chunks(len(index), CHUNK), progress=progress, what="reading",
-                threads=threads)  # fmt: skip
+    parts = run(columns, chunks(len(index), CHUNK), progress=progress, what="reading")
     folder = folder_of(splats) / f"gaussians-{secrets.token_hex(4)}"  # type: ignore[operator]
     arrays = write(folder, parts)
     arrays["boxes"] = arrays["boxes"][...]
@@ -208,7 +202,7 @@ def _activate_on_disk(splats, index, positions, scene, progress, threads):
     return gaussians
 
 
-def _activate(splats, index, positions, scene, progress, threads):
+def _activate(splats, index, positions, scene, progress):
     """Splats at `index`, (M,), as Gaussians; positions, (M, 3), are in the scene's frame."""
     count = len(index)
     with np.errstate(under="ignore"):
@@ -239,7 +233,7 @@ def _activate(splats, index, positions, scene, progress, threads):
         colors = SH_C0 * np.asarray(chunk.sh_dc, np.float64) + 0.5
         result.colors[piece] = colors.clip(0.0, BRIGHTEST)
 
-    run_all(fill, chunks(count, _CHUNK), progress=progress, what="reading", threads=threads)
+    run_all(fill, chunks(count, _CHUNK), progress=progress, what="reading")
     return in_file(result)
 
 

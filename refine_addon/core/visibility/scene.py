@@ -47,7 +47,7 @@ class Scene:
     axes: NDArray[np.float64]  # (3, 3), world to frame: rows are the splats' principal axes
 
     def positions(
-        self, means: NDArray[Any], rows: NDArray[np.int64] | None = None, *, threads: int | None = 1
+        self, means: NDArray[Any], rows: NDArray[np.int64] | None = None
     ) -> NDArray[np.float64]:
         """Positions in the frame, (M, 3) scene sizes, of world means (N, 3), or M of their rows."""
         count, turn = len(means) if rows is None else len(rows), self.axes.T / self.size
@@ -60,7 +60,7 @@ class Scene:
             product = (means[chosen] - self.origin) @ turn
             places[piece] = product[piece.start - begin :]
 
-        run_all(fill, chunks(count, _CHUNK), threads=threads)
+        run_all(fill, chunks(count, _CHUNK))
         return places
 
 
@@ -69,9 +69,7 @@ def size_of(median: float) -> float:
     return float(np.sqrt(median)) or 1.0
 
 
-def scene_of(
-    means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet, *, threads: int | None = 1
-) -> Scene:
+def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -> Scene:
     """Frame of views and of those splats that are drawable."""
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
@@ -81,7 +79,7 @@ def scene_of(
         offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
         squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
 
-    run_all(measure, chunks(len(means), _CHUNK), threads=threads)
+    run_all(measure, chunks(len(means), _CHUNK))
     median = float(np.median(squared[drawable])) if drawable.any() else 0.0
     unturned = Scene(origin, size_of(median), np.eye(3))
 
@@ -91,7 +89,7 @@ def scene_of(
         weighted = positions * nearness[:, None]
         return np.vstack([weighted.T @ positions, weighted.sum(axis=0)])
 
-    of_pieces = run_all(moments, chunks(len(means), _CHUNK), threads=threads)
+    of_pieces = run_all(moments, chunks(len(means), _CHUNK))
     return replace(unturned, axes=principal_axes(sum(of_pieces, np.zeros((4, 3)))))
 
 
@@ -126,8 +124,6 @@ def splat_fingerprint(splats: Splats, rows: NDArray[np.int64]) -> NDArray[np.uin
 def spatial_order(
     positions: NDArray[np.float64],
     ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
-    *,
-    threads: int | None = 1,
 ) -> NDArray[np.int64]:
     """Rows of positions, (N, 3) scene sizes, along a Z-curve (Morton, 1966): near ones are close.
 
@@ -146,7 +142,7 @@ def spatial_order(
             interleaved |= bits << axis
         code[piece] = interleaved
 
-    run_all(fill, chunks(len(positions), _CHUNK), threads=threads)
+    run_all(fill, chunks(len(positions), _CHUNK))
     order = np.argsort(code, kind="stable")
     if ties is not None and (same := np.diff(code[order]) == 0).any():  # (N - 1,)
         tied = np.flatnonzero(np.append(same, False) | np.append(False, same))
