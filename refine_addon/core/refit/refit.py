@@ -411,11 +411,11 @@ def _windows(splats, total, scene, views):
     shown = sum(count for count, _ in boxes.values())
     rays, hits = limits(total)[0] / len(views), limits(len(splats))[1]
     steps, windows = steps_of(only, scene), []
-    for number, (count, (left, top, width, height)) in boxes.items():
+    for number, (count, box) in boxes.items():
         (view, weight), share = views[number], count / shown
-        rays_here = rays * (width * height / (view.width * view.height))
+        rays_here = rays * (box[2] * box[3] / (view.width * view.height))
         counts = weight * share, rays_here, hits * share
-        windows.append(Window(view, number, *counts, left, top, width, height, steps[number]))
+        windows.append(Window(view, number, *counts, box, steps[number]))
     return windows
 
 

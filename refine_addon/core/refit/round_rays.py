@@ -62,22 +62,14 @@ class Window:
     weight: float  # in the PSNR
     rays: float  # about
     hits: float  # about, on the unpruned splats
-    left: int = 0  # px; by default all of the image
-    top: int = 0
-    width: int = 0
-    height: int = 0
-    step: float = 0.0  # about how far the view moves in a round, world units
+    box: tuple[int, int, int, int]  # left, top, width and height of the part, px
+    step: float  # about how far the view moves in a round, world units
 
     @cached_property
     def part(self) -> View:
         """The part of the image as a view of its own."""
-        view = self.view
-        if not self.width:
-            return view
-        return replace(
-            view, cx=view.cx - self.left, cy=view.cy - self.top,
-            width=self.width, height=self.height,
-        )  # fmt: skip
+        view, (left, top, width, height) = self.view, self.box
+        return replace(view, cx=view.cx - left, cy=view.cy - top, width=width, height=height)
 
     def moved(self, number: int) -> Window:
         """The same window of the view as it stands in a round, from 1."""
@@ -92,7 +84,7 @@ class Window:
         columns, rows = cast.pixels(self.part, self.number + 1 + number, count)
         if not number:
             rows = rows[::_EVERY]
-        return columns + self.left, rows + self.top
+        return columns + self.box[0], rows + self.box[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +133,7 @@ class RoundRays:
         kind: Callable[..., Target] = Target.of,
     ) -> None:
         self.windows, self.original, self._kind = windows, original, kind
-        step = -(-len(windows) // VALIDATION_VIEWS)
-        self._validating = [window.moved(0) for window in windows[::step]] if step else []
-        self._validation: list[Truth] = []
+        self._validation: list[tuple[Window, Truth]] = []
 
     @classmethod
     def of(cls, original: Splats, views: ViewSet, count: int, progress: Progress) -> RoundRays:
@@ -153,8 +143,8 @@ class RoundRays:
         rays, hits = (each / len(chosen) for each in limits(count))
         steps = steps_of([view for view, _ in chosen], scene)
         windows = [
-            Window(view, number, weight, rays, hits, step=steps[number])
-            for number, (view, weight) in enumerate(chosen)
+            Window(view, number, weight, rays, hits, (0, 0, view.width, view.height), step)
+            for number, ((view, weight), step) in enumerate(zip(chosen, steps, strict=True))
         ]
         return cls(windows, Target.of(original, gaussians, scene))
 
@@ -162,24 +152,24 @@ class RoundRays:
         """The rays of a round, from 1, linearized at the kept splats; call `psnr` before."""
         target = self.target(splats, part(progress, 0.0, 0.05))
         shapes = Shapes.of(splats, target.gaussians, target.scene)
-        windows = [window.moved(number) for window in self.windows]
-        shares = [truth.shown for truth in self._validation]
+        shares = [truth.shown for _, truth in self._validation]
         shown = float(np.mean(shares)) if shares else None
-        truth = partial(cast_truth, self.original, windows, number, shown)
-        work = partial(_linearized, truth, windows, target, shapes)
-        seen = self._each(work, windows, splats, part(progress, 0.05, 1.0))
-        return LinearRays(shapes, seen)
+        truth_of = partial(cast_truth, self.original, number, shown)
+        work = partial(_linearized, truth_of, target, shapes)
+        windows = [window.moved(number) for window in self.windows]
+        return LinearRays(shapes, self._each(work, windows, splats, part(progress, 0.05, 1.0)))
 
     def psnr(self, splats: Splats, progress: Progress) -> float:
         """Mean PSNR of kept splats on validation rays, weighted as the views are, dB."""
-        windows = self._validating
         if not self._validation:
-            truth = partial(cast_truth, self.original, windows, 0, None)
-            self._validation = [*self._each(truth, windows, splats, part(progress, 0.0, 0.5))]
-        target = self.target(splats, part(progress, 0.5, 0.6))
-        work = partial(_psnr, target, windows, self._validation)
-        psnr = [*self._each(work, windows, splats, part(progress, 0.6, 1.0))]
-        return float(np.average(psnr, weights=[window.weight for window in windows]))
+            step = -(-len(self.windows) // VALIDATION_VIEWS)
+            windows = [window.moved(0) for window in self.windows[::step]]
+            truth_of = partial(cast_truth, self.original, 0, None)
+            truths = self._each(truth_of, windows, splats, part(progress, 0.0, 0.5))
+            self._validation = [*zip(windows, truths, strict=True)]
+        work = partial(_psnr, self.target(splats, part(progress, 0.5, 0.6)))
+        psnr = [*self._each(work, self._validation, splats, part(progress, 0.6, 1.0))]
+        return float(np.average(psnr, weights=[window.weight for window, _ in self._validation]))
 
     def target(self, splats: Splats, progress: Progress) -> Target:
         """What rays are cast into: these kept splats, and any others that `kind` adds."""
@@ -187,9 +177,9 @@ class RoundRays:
         gaussians, *_ = projection.prepare(splats, views, scene, progress=progress)
         return self._kind(splats, gaussians, scene)
 
-    def _each(self, work, windows, splats, progress):
-        cost = seconds("refit", len(self.original.splats) + len(splats), len(windows))
-        return run(work, range(len(windows)), cost=cost, progress=progress, what="refitting")
+    def _each(self, work, items, splats, progress):
+        cost = seconds("refit", len(self.original.splats) + len(splats), len(items))
+        return run(work, items, cost=cost, progress=progress, what="refitting")
 
 
 def limits(count: int) -> tuple[float, float]:
@@ -210,14 +200,11 @@ def steps_of(views: Sequence[View], scene: Scene) -> list[float]:
     return steps
 
 
-def cast_truth(
-    target: Target, windows: Sequence[Window], number: int, shown: float | None, place: int
-) -> Truth:
-    """Rays of ``windows[place]`` in a round (0: validation), and the unpruned splats' colours.
+def cast_truth(target: Target, number: int, shown: float | None, window: Window) -> Truth:
+    """Rays of a window in a round (0: validation), and the unpruned splats' colours.
 
     `shown` is the mean of `Truth.shown` over validation rays; None while these are cast.
     """
-    window = windows[place]
     footprints = target.footprints(window)
     # Casting takes memory for all hits, also faint ones, but for one view at a time.
     share = window.hits / cast.MAX_HITS_OF_VIEW
@@ -232,8 +219,8 @@ def cast_truth(
     return Truth(columns, rows, colors, each / max(predicted, _NOTHING))
 
 
-def _psnr(target, windows, truths, place):
-    window, truth = windows[place], truths[place]
+def _psnr(target, window_and_truth):
+    window, truth = window_and_truth
     footprints = target.footprints(window)
     rays, transmittance = cast.cast_visible(footprints, truth.columns, truth.rows)
     colors = target.colors(rays.hit, window.view)
@@ -241,9 +228,9 @@ def _psnr(target, windows, truths, place):
     return psnr_of(seen, truth.colors, window.part)
 
 
-def _linearized(truth_of, windows, target, shapes, place):
+def _linearized(truth_of, target, shapes, window):
     """How the colours of a view's rays change with the kept splats, see `LinearRays`."""
-    window, truth = windows[place], truth_of(place)
+    truth = truth_of(window)
     footprints = target.footprints(window)
     seen: list[Any] = [*cast.cast_visible(footprints, truth.columns, truth.rows)]
     colors = target.colors(seen[0].hit, window.view)
