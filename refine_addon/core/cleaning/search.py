@@ -202,8 +202,7 @@ class Search:
         if not len(rays.ray):
             return None
         present = ~absent[rays.hit].take(rays.owner)  # (hits of the rays,)
-        _, counts = np.unique(rays.ray, return_counts=True)
-        log_front = in_front(np.log1p(-rays.alpha) * present.astype(np.float64), counts)
+        log_front = in_front(np.log1p(-rays.alpha) * present.astype(np.float64), rays.counts())
         reached = np.flatnonzero(log_front > math.log(REACHED))  # (h,)
         place = np.empty(len(self.gaussians), np.int64)
         place[footprints.index] = np.arange(len(footprints.index))

@@ -45,7 +45,7 @@ class Field:
     _: KW_ONLY
     model: Model = "default"
 
-    def put(self, rows: Index, other: Field) -> None:
+    def put(self, rows: Index | slice, other: Field) -> None:
         """Overwrite rows."""
         for item in fields(self)[:-1]:
             getattr(self, item.name)[rows] = getattr(other, item.name)
@@ -123,10 +123,8 @@ def measured_field(
         xx, xy, yy = footprint(covariances, across(direction), wider)  # (n,) each
         # In pixels of a view, over 2 pi; a constant factor does not matter here.
         mass[piece] = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / pixel
-        seen_from = direction, deviation, np.clip(color, 0.0, _BRIGHTEST), blur
-        values = means, covariances, alpha, *sums[:, rows[piece]], *seen_from
-        for item, of_piece in zip(fields(Field), values, strict=False):
-            getattr(result, item.name)[piece] = of_piece
+        rest = *sums[:, rows[piece]], direction, deviation, np.clip(color, 0.0, _BRIGHTEST), blur
+        result.put(piece, Field(means, covariances, alpha, *rest))
 
     run_all(fill, chunks(count, _CHUNK), progress=progress, what="merging")
     return MeasuredField(result, mass, seen)

@@ -68,7 +68,6 @@ class MergeGraph:
         self.alive = np.ones(len(field.means), np.bool_)  # (N,): neither deleted nor merged
         # Of each round: rows merged into, rows merged, share of the former in the colour.
         self.merges: list[tuple[Index, Index, Array]] = []
-        self.deleted = 0
         self.first = self.second = np.empty(0, np.int32)  # (E,), rows of the pairs
         self.cost = np.empty(0, np.float32)  # (E,), infinite where deleting one costs no more
         self.connected = 0  # splats alive when neighbours were last searched
@@ -195,7 +194,6 @@ class MergeGraph:
         run_all(merge, chunks(len(edges), _CHUNK))
         self.merges.append((into, gone, share))
         self.alive[doomed] = self.alive[gone] = False
-        self.deleted += len(doomed)
         changed = np.zeros(len(self.alive), np.bool_)
         changed[doomed] = changed[gone] = changed[into] = True
 
