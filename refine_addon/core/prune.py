@@ -429,9 +429,8 @@ class _Prune:
         rays: Any = first.scores.ray_sample
         estimated = partial(psnr_against, rays, views=used)
         merged = merge_down(
-            self.splats, used, left,
-            scored=(scores, measurement), protected=self.protected, began=len(first.splats),
-            progress=merging_progress,
+            self.splats, used, left, scored=(scores, measurement), protected=self.protected,
+            began=len(first.splats), progress=merging_progress,
         )  # fmt: skip
         psnr = estimated(merged.splats, progress=comparing)
         if not isinstance(self.method, Refit):
@@ -559,6 +558,5 @@ def merge_down(
     with np.errstate(under="ignore"):  # as in `score`
         return merge(
             splats, views, sums, measure, count,
-            began=began - deleted, deleted=~rest, protected=protected,
-            progress=progress,
+            began=began - deleted, deleted=~rest, protected=protected, progress=progress,
         )  # fmt: skip

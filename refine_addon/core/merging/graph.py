@@ -116,10 +116,8 @@ class MergeGraph:
             first = np.broadcast_to(of_piece, others.shape)[once]
             return rows[first].astype(np.int32), rows[others[once]].astype(np.int32)
 
-        edges = run_all(
-            pairs, chunks(max(len(rows), 1), _CHUNK),
-            progress=part(progress, 0.8, 1.0), what="merging",
-        )  # fmt: skip
+        pieces, later = chunks(max(len(rows), 1), _CHUNK), part(progress, 0.8, 1.0)
+        edges = run_all(pairs, pieces, progress=later, what="merging")
         # int32 takes half the memory of int64, and no file holds two billion splats.
         first, second = map(np.concatenate, zip(*edges, strict=True))
         return first, second

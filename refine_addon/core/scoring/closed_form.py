@@ -145,10 +145,8 @@ def score(
         seen[piece] *= columns.good[piece]
         return [float(np.sum(alone * g)) for g in columns.three_g(piece)]
 
-    sums = run_all(
-        complete, chunks(total, _CHUNK),
-        progress=summing if prior else completing, what="scoring",
-    )  # fmt: skip
+    later = summing if prior else completing
+    sums = run_all(complete, chunks(total, _CHUNK), progress=later, what="scoring")
     if not seen.any():
         raise RefineError(
             f"no camera sees the splats: none of {total} lies in the frustum of any of "

@@ -284,10 +284,9 @@ class _RemovalRounds:
 
         # Of each view: rays, (3, u) colours of what they hit, and the area of the image for each
         # ray, px^2, times the view's weight.
-        self._views = run_all(
-            colored, [k for k, rays in enumerate(scoring_rays.rays) if rays is not None],
-            progress=part(progress, 0.0, _LOADING), what="scoring",
-        )  # fmt: skip
+        numbers = [k for k, rays in enumerate(scoring_rays.rays) if rays is not None]
+        earlier = part(progress, 0.0, _LOADING)
+        self._views = run_all(colored, numbers, progress=earlier, what="scoring")
         self._rays_hitting = np.zeros(count, np.int64)  # (M,), n_i
         for rays, _, _ in self._views:
             self._rays_hitting[rays.hit] += np.bincount(rays.owner, minlength=len(rays.hit))

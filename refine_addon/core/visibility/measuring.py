@@ -77,8 +77,7 @@ def measure(
     measured = run(
         partial(_measure_and_cast, gaussians, scene, views),
         [(n, [rays.kind for rays in some]) for n, some in zip(numbers, lacking, strict=True)],
-        cost=SECONDS * len(gaussians) * len(numbers),
-        progress=progress, what="scoring",
+        cost=SECONDS * len(gaussians) * len(numbers), progress=progress, what="scoring",
     )  # fmt: skip
     total, of_groups, errors = np.zeros((3, len(gaussians))), [], []
     each = zip(measured, lacking, strict=True)
