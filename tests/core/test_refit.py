@@ -36,7 +36,7 @@ def test_splats_that_are_off_in_one_attribute_come_back(name, noise, model):
     old = getattr(splats, name)
     change = np.random.default_rng(1).normal(0.0, noise, old.shape)
     kept = replace(splats, **{name: old + change})
-    found = refit.refit(kept, splats, ring(), 2)
+    *_, found = refit.refit_rounds(kept, splats, ring(), 2)
     before, after = (
         np.median(np.abs(values(getattr(each, name)) - values(old)))
         for each in (kept, found.splats)
@@ -52,7 +52,7 @@ def test_harmonics_above_the_first_degree_stay_and_none_are_added():
     rest = np.random.default_rng(3).normal(scale=0.1, size=(200, 8, 3))
     splats = replace(cloud(200), sh_rest=rest)
     some, none = (
-        refit.refit(whole.take(np.arange(100)), splats, ring(), 1).splats.sh_rest
+        [*refit.refit_rounds(whole.take(np.arange(100)), splats, ring(), 1)][-1].splats.sh_rest
         for whole in (splats, splats.up_to_degree(0))
     )
     np.testing.assert_array_equal(some[:, 3:], rest[:100, 3:])
@@ -80,8 +80,8 @@ def test_kept_splats_come_nearer_to_what_the_views_see_but_the_protected_and_uns
     means[100:120] += 1e4  # no view sees them
     kept = replace(kept, means=means, quaternions=kept.quaternions * np.float32(3.0))
     protected = np.arange(200) < 20
-    found = refit.refit(kept, splats, ring(), protected=protected)
-    nothing = refit.refit(splats, splats, ring())
+    *_, found = refit.refit_rounds(kept, splats, ring(), protected=protected)
+    *_, nothing = refit.refit_rounds(splats, splats, ring())
     still = protected | (np.arange(200) // 20 == 5)
     assert found.psnr > found.psnr_before + 2.0
     assert not found.changed[still].any()
@@ -102,14 +102,14 @@ def test_threads_files_and_processes_change_no_bit(monkeypatch, how):
     """Derivatives of views lie in a file, as far as it has room; in processes views are cast."""
     splats, here = cloud(300), []
     kept = splats.take(np.arange(100))
-    expected = execute.within(cores=2)(refit.refit)(kept, splats, ring(), 2)
+    expected = execute.within(cores=2)(list)(refit.refit_rounds(kept, splats, ring(), 2))[-1]
     if how == "processes":
         for name in ("WORTH", "WORTH_READY"):
             monkeypatch.setattr(execute, name, 0.0)
         monkeypatch.setattr(casting, "cast_visible", lambda *some: here.append(some))
     threads = int(how[0]) if "thread" in how else 2
     with files_of_at_most(600_000) if how == "full disk" else contextlib.nullcontext():
-        found = execute.within(cores=threads)(refit.refit)(kept, splats, ring(), 2)
+        found = execute.within(cores=threads)(list)(refit.refit_rounds(kept, splats, ring(), 2))[-1]
     assert not here
     assert (found.psnr, found.rounds) == (expected.psnr, 2)
     for name in ARRAYS:
@@ -158,11 +158,11 @@ def test_colours_in_float32_are_those_in_float64(degree):
 )
 def test_units_motions_and_the_order_of_splats_change_nothing(size, turn, step):
     splats, kept = cloud(200), np.random.default_rng(5).permutation(200)[:100]
-    one = refit.refit(splats.take(np.sort(kept)), splats, ring(), 1)
+    *_, one = refit.refit_rounds(splats.take(np.sort(kept)), splats, ring(), 1)
     there, views = moved(splats, ring(), turn, np.array(step))
     there = replace(there, means=there.means * size, log_scales=there.log_scales + np.log(size))
     views = ViewSet(tuple(replace(view, center=view.center * size) for view in views))
-    other = refit.refit(there.take(kept), there.take(slice(None, None, -1)), views, 1)
+    *_, other = refit.refit_rounds(there.take(kept), there.take(slice(None, None, -1)), views, 1)
     assert one.psnr > one.psnr_before + 0.5
     assert other.psnr == pytest.approx(one.psnr, abs=0.05)
     expected = one.splats.means[np.argsort(np.argsort(kept))] @ turn.T + step
@@ -189,7 +189,7 @@ def test_extreme_splats_make_no_warning_and_nothing_worse(name, value):
     strange = replace(splats, **{name: getattr(splats, name).copy()})
     getattr(strange, name)[::2] = value
     kept = strange.take(np.arange(100))
-    found = refit.refit(kept, splats if name != "sh_rest" else strange, ring(), 2)
+    *_, found = refit.refit_rounds(kept, splats if name != "sh_rest" else strange, ring(), 2)
     assert found.psnr >= found.psnr_before
     assert np.isfinite(found.splats.sh_rest).all()
     np.testing.assert_array_equal(drawable(found.splats), drawable(kept))
@@ -201,8 +201,8 @@ def test_views_in_one_place_refit_nothing_and_the_note_says_so(count):
     splats, views = cloud(200), ViewSet((ring()[0],) * count)
     lens = {"width": 1, "height": 1, "cx": 0.5, "cy": 0.5}
     tiny = ViewSet(tuple(replace(view, **lens) for view in ring())[:2])
-    found = refit.refit(splats.take(np.arange(100)), splats, views)
-    pixel = refit.refit(splats.take(np.arange(1)), splats, tiny)
+    *_, found = refit.refit_rounds(splats.take(np.arange(100)), splats, views)
+    *_, pixel = refit.refit_rounds(splats.take(np.arange(1)), splats, tiny)
     assert (found.rounds, found.changed.any()) == (0, False)
     assert found.psnr == found.psnr_before
     assert found.note(1.0) == refit.ONE_PLACE

@@ -109,12 +109,6 @@ def _enough(count):
     return float(np.clip(ENOUGH_RAYS[0] * count, *ENOUGH_RAYS[1:]))
 
 
-def refit(*arguments: Any, **options: Any) -> Refitted:
-    """Refit as `refit_rounds` does, with its arguments; its last result."""
-    *_, last = refit_rounds(*arguments, **options)
-    return last
-
-
 def refit_rounds(
     splats: Splats,
     original: Splats,
