@@ -22,8 +22,7 @@ from .formats import registry
 from .formats.format import Format
 from .formats.ply import SplatFile, refuse_other_models
 from .formats.ply_columns import Changes, other_properties
-from .formats.registry import format_named, read_splats, write_splats
-from .formats.spz import turned_from
+from .formats.registry import format_named, read_splats, turned_from, write_splats
 from .formats.streamed_sog import INDEX
 from .methods import DEFAULT, ClosedForm, Method
 from .pictures import PictureFiles

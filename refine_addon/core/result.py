@@ -19,7 +19,7 @@ from .formats.ply_columns import ChangedColumns
 from .formats.registry import write_splats
 from .merging.merge import Merged
 from .scores import Scores
-from .splats import Splats, among_all, assign
+from .splats import Splats, among_all
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +117,6 @@ class Result:
 
 def file_of(splats: Splats, path: Path = Path("splats.ply"), stored_bytes: int = 0) -> SplatFile:
     """A plain PLY in memory, with `path` as its name, of splats that are not of one file."""
-    file, copied = new_file(
-        path, ("arranged", stored_bytes), len(splats), splats.sh_degree, splats.model
-    )
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # doubles to float32
-        assign(copied, splats)
+    read, degree = ("arranged", stored_bytes), splats.sh_degree
+    file = new_file(path, read, len(splats), degree, [splats], splats.model)
     return file.without_third_scale()

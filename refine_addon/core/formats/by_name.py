@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..place import Place
-from ..splats import above_constant, scales, unit_quaternions
-from .format import Format, color_codes, new_file, pieces, refuse_short, set_colors
+from ..splats import Splats, above_constant, scales, unit_quaternions
+from .format import Format, color_codes, from_colors, new_file, pieces, refuse_short
 
 _SPLAT = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
@@ -38,16 +38,15 @@ def _read_splat(path, data):
         where = f"splat {count} at byte {count * size}"
         Place(path).fail(f"truncated: {where} has {beyond} bytes, expected {size}")
     stored = data.view(_SPLAT)
-    file, splats = new_file(path, (".splat", len(data)), count, 0)
-    # Scales that are 0, negative or NaN become logarithms that are not finite, as in a PLY.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for piece in pieces(count):
-            rows, target = stored[piece], splats.take(piece)
-            target.means[:] = rows["mean"]
-            target.log_scales[:] = np.log(rows["scale"])
-            set_colors(target, rows["color"] / 255.0)
-            target.quaternions[:] = unit_quaternions(rows["rotation"] / _NO_TURN - 1.0)
-    return file
+
+    def parts():
+        for rows in map(stored.__getitem__, pieces(count)):
+            turns = unit_quaternions(rows["rotation"] / _NO_TURN - 1.0)
+            colors, none = from_colors(rows["color"] / 255.0), np.empty((len(rows), 0, 3))
+            # Scales that are 0, negative or NaN become logarithms that are not finite, as in a PLY.
+            yield Splats(rows["mean"], np.log(rows["scale"]), turns, *colors, none)
+
+    return new_file(path, (".splat", len(data)), count, 0, parts())
 
 
 def _write_splat(stream, splats):
@@ -103,15 +102,9 @@ def _read_ksplat(path, data):
     if count != announced:
         Place(path).fail(f"{announced} splats by byte 16, {count} by the sections")
     degree = max((section.degree for section in sections if section.splats), default=0)
-    file, splats = new_file(path, (f".ksplat level {level}", len(data)), count, degree)
     limits = np.float32(least or -_HARMONICS), np.float32(largest or _HARMONICS)
-    start = 0
-    # Files may hold any bits, such as negative scales, and ranges that are NaN.
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
-        for section in sections:
-            _fill(splats.take(slice(start, start + section.splats)), level, limits, section, data)
-            start += section.splats
-    return file
+    parts = (part for section in sections for part in _parts(level, limits, section, data))
+    return new_file(path, (f".ksplat level {level}", len(data)), count, degree, parts)
 
 
 def _sections(path, data, count, level):
@@ -134,29 +127,28 @@ def _sections(path, data, count, level):
         yield section
 
 
-def _fill(splats, level, limits, section, data):
-    """Set the splats of a section; `limits` are those of its harmonics in level 2."""
+def _parts(level, limits, section, data):
+    """Yield the splats of a section; `limits` are those of its harmonics in level 2."""
     dtype = _row(level, section.degree)
     stored = data[section.rows : section.rows + section.splats * dtype.itemsize].view(dtype)
     centers, buckets = _buckets(section, data) if level else np.empty((2, 0))
     step = section.block / 2.0 / section.middle
     for piece in pieces(section.splats):
-        rows, target = stored[piece], splats.take(piece)
-        target.means[:] = rows["mean"]
+        rows = stored[piece]
+        means, logs = rows["mean"], np.log(rows["scale"].astype(np.float64))
         if level:
-            around = (rows["mean"] - float(section.middle)) * step
-            target.means[:] = around + centers[buckets[piece]]
-        target.log_scales[:] = np.log(rows["scale"].astype(np.float64))
-        target.quaternions[:] = unit_quaternions(rows["rotation"])
-        set_colors(target, rows["color"] / 255.0)
+            means = (means - float(section.middle)) * step + centers[buckets[piece]]
         values, at = rows["rest"].astype(np.float32), 0
         if level == 2:
             values = limits[0] + values / np.float32(255.0) * (limits[1] - limits[0])
+        rest = np.empty((len(rows), values.shape[1] // 3, 3), np.float32)
         for band in range(1, section.degree + 1):  # each is red, then green, then blue
             width = 2 * band + 1
             one = values[:, 3 * at : 3 * (at + width)].reshape(-1, 3, width)
-            target.sh_rest[:, at : at + width] = one.swapaxes(1, 2)
+            rest[:, at : at + width] = one.swapaxes(1, 2)
             at += width
+        turns, colors = unit_quaternions(rows["rotation"]), from_colors(rows["color"] / 255.0)
+        yield Splats(means, logs, turns, *colors, rest)
 
 
 def _buckets(section, data):

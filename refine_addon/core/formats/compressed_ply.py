@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..place import Place
-from ..splats import MODELS, SH_C0, opacity, unit_quaternions
+from ..splats import MODELS, SH_C0, Splats, opacity, unit_quaternions
 from ..visibility.scene import nearby_order
 from . import ply
-from .format import Format, join_largest, new_file, pieces, set_colors, split_largest
+from .format import Format, from_colors, join_largest, new_file, pieces, split_largest
 from .ply_columns import REST_COUNTS
 
 NAME = "compressed PLY"
@@ -80,24 +80,23 @@ def _read(path, data):
         held = rows_of("sh", tuple(names), "u1")
         rest = np.stack([held[name] for name in names], axis=1)
     model, degree = ply.model_of(header.raw) or "default", REST_COUNTS[rest.shape[1]]
-    file, splats = new_file(path, (NAME, len(data)), count, degree, model)
-    with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite
+
+    def parts():
         for piece in pieces(count):
-            rows, here = packed[piece], ranges[_chunks_of(piece)]
-            places, sizes = (_unpacked(rows[name], _PLACES) for name in (_PACKED[0], _PACKED[2]))
-            splats.means[piece] = _between(places, here, _POSITION)
-            splats.log_scales[piece] = _between(sizes, here, _SCALE)
-            shares = _unpacked(rows["packed_color"], _CHANNELS)
+            here = ranges[_chunks_of(piece)]
+            places, turns, sizes, colors = (packed[name][piece] for name in _PACKED)
+            means = _between(_unpacked(places, _PLACES), here, _POSITION)
+            logs = _between(_unpacked(sizes, _PLACES), here, _SCALE)
+            shares = _unpacked(colors, _CHANNELS)
             if colored:
                 shares[:, :3] = _between(shares[:, :3], here, _COLOR)
-            set_colors(splats.take(piece), shares)
-            turns = rows["packed_rotation"]
             others = (_unpacked(turns, _TURNS) - 0.5) * np.sqrt(2.0)
-            largest = (turns >> np.uint32(30)).astype(np.intp)
-            splats.quaternions[piece] = join_largest(largest, others)
-            planes = _REST.take(rest[piece]).reshape(len(rows), 3, rest.shape[1] // 3)
-            splats.sh_rest[piece] = planes.transpose(0, 2, 1)
-    return file
+            quaternions = join_largest((turns >> np.uint32(30)).astype(np.intp), others)
+            planes = _REST.take(rest[piece]).reshape(len(means), 3, rest.shape[1] // 3)
+            harmonics = planes.transpose(0, 2, 1)
+            yield Splats(means, logs, quaternions, *from_colors(shares), harmonics)
+
+    return new_file(path, (NAME, len(data)), count, degree, parts(), model)
 
 
 def _chunks_of(piece):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..execute import chunks
-from ..splats import MODELS, SH_C0, Model, Splats, base_color, opacity, opacity_logits
+from ..splats import MODELS, SH_C0, Model, Splats, assign, base_color, opacity, opacity_logits
 from .ply import SplatFile, new_header, with_model
 from .ply_columns import empty_rows
 
@@ -38,12 +38,23 @@ class Format:
 
 
 def new_file(
-    path: Path, read: tuple[str, int], count: int, degree: int, model: Model = "default"
-) -> tuple[SplatFile, Splats]:
-    """Plain PLY of `count` splats, and their arrays to fill; `read`: input's format and bytes."""
+    path: Path,
+    read: tuple[str, int],
+    count: int,
+    degree: int,
+    parts: Iterable[Splats],
+    model: Model = "default",
+) -> SplatFile:
+    """Plain PLY of `count` splats, in parts of at most `degree`; `read`: input's format, bytes."""
     rows, splats = empty_rows(count, degree)
+    start = 0
+    with np.errstate(all="ignore"):  # while parts are computed, too: files may hold any numbers
+        for part in parts:
+            target = splats.take(slice(start, start + len(part)))
+            assign(target.up_to_degree(part.sh_degree), part)
+            start += len(part)
     header = with_model(new_header(rows.dtype, count), model)
-    return SplatFile(path, rows, header, format=read[0], stored_bytes=read[1]), splats
+    return SplatFile(path, rows, header, format=read[0], stored_bytes=read[1])
 
 
 def pieces(count: int) -> list[slice]:
@@ -62,10 +73,9 @@ def color_codes(splats: Splats, curve: Callable[..., Any] = np.asarray) -> NDArr
     return codes(np.column_stack([colors, opacity(splats.opacity_logits)]))
 
 
-def set_colors(splats: Splats, shares: NDArray[Any]) -> None:
-    """Set the constant harmonics and logits of splats from colours and opacities, (N, 4), 0..1."""
-    splats.sh_dc[:] = (shares[:, :3] - 0.5) / SH_C0
-    splats.opacity_logits[:] = opacity_logits(shares[:, 3])
+def from_colors(shares: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Logits, (N,), and constant harmonics, (N, 3), of colours and opacities, (N, 4), 0..1."""
+    return opacity_logits(shares[:, 3]), (shares[:, :3] - 0.5) / SH_C0
 
 
 def refuse_short(path: Path, needed: int, held: int, what: str) -> None:

@@ -23,7 +23,7 @@ from ..errors import RefineError
 from ..mapped import file_bytes
 from ..place import Place, described, is_whole
 from ..spherical_harmonics import encoded
-from ..splats import LOG_ZERO, MODELS, Model, Splats, assign, rotation_matrices, single_logits
+from ..splats import LOG_ZERO, MODELS, Model, Splats, rotation_matrices, single_logits
 from . import spz
 from .format import new_file, pieces, refuse_short
 from .ply import SplatFile
@@ -156,23 +156,25 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     model = every[0].model
     if any(part.model != model for part in every):
         document.place.fail(f"some splats are {model}, others not, expected one model")
-    file, splats = new_file(path, origin, count, degree, model)
-    start = 0
-    with np.errstate(all="ignore"):  # files may hold any numbers
-        frames = _frames(moves)
-        for part, frame, place in shown:
-            for piece in pieces(part.splats):
-                target = splats.take(slice(start + piece.start, start + piece.stop))
-                target, turn = target.up_to_degree(part.degree), HALF_TURN @ frames[frame]
-                try:
-                    assign(target, transformed(part.take(piece), turn @ part.turn))
-                except RefineError as error:
-                    place.fail(str(error))
-                if part.linear:
-                    target.sh_dc[:], target.sh_rest[:] = encoded(target.sh_dc, target.sh_rest)
-            start += part.splats
     remarks = (f"{path.name} has {remark}" for remark in dict.fromkeys(document.remarks))
+    file = new_file(path, origin, count, degree, _placed(shown, moves), model)
     return replace(file, remarks=tuple(remarks))
+
+
+def _placed(shown, moves):
+    """Yield the splats of all parts, where their nodes put them."""
+    frames = _frames(moves)
+    for part, frame, place in shown:
+        for piece in pieces(part.splats):
+            try:
+                splats = transformed(part.take(piece), HALF_TURN @ frames[frame] @ part.turn)
+            except RefineError as error:
+                place.fail(str(error))
+            if part.linear:
+                stored = (np.asarray(each, np.float32) for each in (splats.sh_dc, splats.sh_rest))
+                dc, rest = encoded(*stored)
+                splats = replace(splats, sh_dc=dc, sh_rest=rest)
+            yield splats
 
 
 def _opened(path, data):

@@ -13,7 +13,7 @@ from ..affine import AXES, UNKNOWN_AXES, turned
 from ..errors import RefineError
 from ..mapped import file_bytes
 from ..place import Place, refuse_pointer
-from ..splats import Model, Splats, drawable
+from ..splats import Model, Splats, assign, drawable
 from ..whole_file import Url, expanded, whole_file
 from . import by_name, compressed_ply, glb, sog, spz, streamed_sog
 from .format import Format
@@ -77,8 +77,15 @@ def read_splats(
     file = file.drawn_as(model).without_third_scale()
     named = file.axes.strip(UNKNOWN_AXES)
     if named or (file.axes and axes == AXES[0]):
-        return spz.turned_from(named or AXES[0], file, "as it says" if named else "as asked")
+        return turned_from(named or AXES[0], file, "as it says" if named else "as asked")
     return replace(file, axes=axes or file.axes)
+
+
+def turned_from(axes: str, file: SplatFile, why: str) -> SplatFile:
+    """An SPZ whose axes have these letters, turned in place to those of a PLY."""
+    assign(file.splats(), turned(file.splats(), axes))  # views of the rows
+    remark = f"{file.path.name}: brought from axes {axes.upper()} to those of a PLY, RDF, {why}"
+    return replace(file, axes=AXES[0], remarks=(*file.remarks, remark))
 
 
 def format_named(path: Path | Url) -> Format | None:

@@ -25,6 +25,7 @@ from ..images import codec_for
 from ..place import LARGEST_NUMBER, Place, is_sog, named_json
 from ..splats import MODELS, Splats, above_constant, opacity, opacity_logits, unit_quaternions
 from ..visibility.scene import nearby_order
+from ..whole_file import explained
 from .format import Format, codes, join_largest, new_file, pieces, split_largest
 from .ply import SplatFile
 
@@ -124,15 +125,13 @@ class Bundle:
         file = place.at(f"files [{index}]").text(files[index])
         data = self._opened(file, 4 * self.size)
         place = Place(self.place.path, f"image {file[:80]!r}")
-        try:
+        with explained(f"{place.path}: {place.where}", "cannot be read", errors=ValueError):
             across, down = self._codec.size(data)
             if not least <= across * down <= most:
                 place.fail(f"{across} x {down} pixels, expected {least}")
             if width and across != width:
                 place.fail(f"{across} pixels wide, expected {width}")
             return self._codec.decode(data)
-        except ValueError as error:
-            place.fail(f"cannot be read ({str(error)[:100]})")
 
     def rows(self, name: str, index: int) -> NDArray[np.uint8]:
         """Pixels of all splats, (N, 4), in an image; `RefineError` if it has far more."""
@@ -142,7 +141,9 @@ class Bundle:
     def read(self) -> SplatFile:
         """Read the splats; `RefineError` if an image is missing or wrong."""
         origin = f"{NAME} version {self.version}", self.size
-        file, splats = new_file(self.place.path, origin, self.count, self.degree, self.model)
+        return new_file(self.place.path, origin, self.count, self.degree, self._parts(), self.model)
+
+    def _parts(self):
         first, axes = self.version == 1, np.arange(3)
         low, high = (self.numbers("means", key, 3) for key in ("mins", "maxs"))
         lower, upper = (self.rows("means", index) for index in (0, 1))
@@ -151,27 +152,24 @@ class Bundle:
         if wrong.any():
             place = Place(self.place.path, f"rotation of splat {np.argmax(wrong)}")
             place.fail(f"alpha {turns[wrong][0, 3]}, expected {_ROTATIONS} to 255")
-        with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in meta.json
-            scale_tables, color_tables = self.tables("scales", 3), self.tables("sh0", 3 + first)
-            palette, labels = self._harmonics() if splats.sh_degree else (None, None)
-            for piece in pieces(len(splats)):
-                code = lower[piece, :3] + upper[piece, :3] * 256.0
-                logs = low + (high - low) * (code / _COORDINATE)
-                splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
-                others = (turns[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
-                largest = (turns[piece, 3] - _ROTATIONS).astype(np.intp)
-                splats.quaternions[piece] = join_largest(largest, others)
-                splats.log_scales[piece] = scale_tables[scales[piece, :3], axes]
-                splats.sh_dc[piece] = color_tables[colors[piece, :3], axes]
-                alpha = colors[piece, 3]
-                logits = color_tables[alpha, 3] if first else opacity_logits(alpha / 255.0)
-                splats.opacity_logits[piece] = logits
-                if palette is not None and labels is not None:
-                    splats.sh_rest[piece] = palette[labels[piece]]
-        return file
+        scale_tables, color_tables = self.tables("scales", 3), self.tables("sh0", 3 + first)
+        palette, labels = self._harmonics()
+        for piece in pieces(self.count):
+            code = lower[piece, :3] + upper[piece, :3] * 256.0
+            logs = low + (high - low) * (code / _COORDINATE)
+            means = np.sign(logs) * np.expm1(np.abs(logs))
+            others = (turns[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
+            largest = (turns[piece, 3] - _ROTATIONS).astype(np.intp)
+            sizes = scale_tables[scales[piece, :3], axes]
+            alpha, dc = colors[piece, 3], color_tables[colors[piece, :3], axes]
+            logits = color_tables[alpha, 3] if first else opacity_logits(alpha / 255.0)
+            rest = palette[labels[piece]]
+            yield Splats(means, sizes, join_largest(largest, others), logits, dc, rest)
 
     def _harmonics(self):
         """Palette of harmonics, (P, K, 3), and the entry of each splat, (N,)."""
+        if "shN" not in self.meta:
+            return np.empty((1, 0, 3), np.float32), np.zeros(self.count, np.intp)
         coefficients, most = above_constant(self.degree), 1 << _LABEL_BITS
         width, (section, place) = _ACROSS * coefficients, self.section("shN")
         if self.version == VERSION:
@@ -208,10 +206,8 @@ def _held(place, label, limit, opened):
 
 def _read_archive(path, data):
     place = Place(path)
-    try:
+    with explained(path, "the archive cannot be read", errors=_BROKEN):
         archive = zipfile.ZipFile(io.BytesIO(data.tobytes()))
-    except _BROKEN as error:
-        place.fail(f"the archive cannot be read ({str(error)[:100]})")
     metas = [name for name in archive.namelist() if name.split("/")[-1] == META]
     if not metas:
         place.fail(f"no {META} in the archive, which a SOG file has")

@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..affine import AXES, UNKNOWN_AXES, turned
+from ..affine import UNKNOWN_AXES
 from ..errors import RefineError
 from ..place import GZIP, SPZ, Place, is_spz
-from ..splats import MODELS, above_constant, assign, opacity, opacity_logits, unit_quaternions
+from ..splats import MODELS, Splats, above_constant, opacity, opacity_logits, unit_quaternions
+from ..whole_file import explained
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
-from .ply import SplatFile
 
 NAME, SUFFIX = "SPZ", ".spz"
 
@@ -85,33 +85,27 @@ def _read(path, data):
         header = _parsed(path, data[: _HEADER.size].tobytes(), len(data))
         body = _streams(path, data, header) if header.version == _ZSTD else data[_HEADER.size :]
     refuse_short(path, header.needed(), len(body), f"{header.splats} splats (unpacked)")
-    widths = header.widths()
-    ends = header.splats * np.cumsum([*widths.values()])
-    parts = zip(widths.items(), np.split(body, ends), strict=False)
-    blocks = {name: part.reshape(header.splats, width) for (name, width), part in parts}
+    widths = [*header.widths().values()]
+    ends = header.splats * np.cumsum(widths)
+    pairs = zip(np.split(body, ends), widths, strict=False)
+    blocks = [block.reshape(header.splats, width) for block, width in pairs]
+
+    def parts():
+        for piece in pieces(header.splats):
+            places, alpha, color, sizes, turns, rest = (block[piece] for block in blocks)
+            means, turns = _positions(places, header.fraction), _rotations(turns)
+            logits = opacity_logits(alpha[:, 0] / 255.0)
+            colors = (color / 255.0 - 0.5) / _COLOR_STEP
+            rest = (rest.reshape(len(rest), -1, 3) - np.float32(128.0)) / np.float32(128.0)
+            yield Splats(means, sizes / _SCALE_STEPS + _LOWEST_SCALE, turns, logits, colors, rest)
+
     origin = f"{NAME} version {header.version}", len(data)
     model = MODELS[bool(header.flags & _ANTIALIASED)]  # default or antialiased
-    file, splats = new_file(path, origin, header.splats, header.degree, model)
-    for piece in pieces(header.splats):
-        stored = {name: block[piece] for name, block in blocks.items()}
-        splats.means[piece] = _positions(stored["mean"], header.fraction)
-        splats.opacity_logits[piece] = opacity_logits(stored["opacity"][:, 0] / 255.0)
-        splats.sh_dc[piece] = (stored["color"] / 255.0 - 0.5) / _COLOR_STEP
-        splats.log_scales[piece] = stored["scale"] / _SCALE_STEPS + _LOWEST_SCALE
-        splats.quaternions[piece] = _rotations(stored["rotation"])
-        rest = stored["rest"].reshape(splats.sh_rest[piece].shape)
-        splats.sh_rest[piece] = (rest - np.float32(128.0)) / np.float32(128.0)
+    file = new_file(path, origin, header.splats, header.degree, parts(), model)
     # Extensions stand in front of the streams of version 4, else behind the splats.
     held = data[:_MOST_EXTENSIONS] if header.version == _ZSTD else body[ends[-1] :]
     number = int.from_bytes(held.tobytes().partition(_NAMES_AXES)[2][:4], "little")
     return replace(file, axes=dict(enumerate(_SYSTEMS.split(), 1)).get(number, UNKNOWN_AXES))
-
-
-def turned_from(axes: str, file: SplatFile, why: str) -> SplatFile:
-    """An SPZ whose axes have these letters, turned in place to those of a PLY."""
-    assign(file.splats(), turned(file.splats(), axes))  # views of the rows
-    remark = f"{file.path.name}: brought from axes {axes.upper()} to those of a PLY, RDF, {why}"
-    return replace(file, axes=AXES[0], remarks=(*file.remarks, remark))
 
 
 def _parsed(path, head, size):
@@ -162,7 +156,7 @@ def _streams(path, data, header):
         Place(path).fail(f"byte 15: {header.streams} streams, expected {len(lengths)}")
     start = at + header.streams * _STREAM.size
     refuse_short(path, start, len(data), "the table of streams")
-    body, filled = np.empty(header.needed(), np.uint8), 0
+    body = bytearray()
     for name, length in lengths.items():
         packed, announced = _STREAM.unpack_from(data, at)
         at += _STREAM.size
@@ -170,10 +164,9 @@ def _streams(path, data, header):
             Place(path).fail(f"stream '{name}' announces {announced} bytes, expected {length}")
         end = start + packed
         refuse_short(path, end, len(data), f"stream '{name}' and what is before it")
-        content = _zstd(path, name, data[start:end].tobytes(), length)
-        body[filled : filled + length] = np.frombuffer(content, np.uint8)
-        start, filled = end, filled + length
-    return body
+        body += _zstd(path, name, data[start:end].tobytes(), length)
+        start = end
+    return np.frombuffer(body, np.uint8)
 
 
 def _zstd(path, name, packed, length):
@@ -189,11 +182,9 @@ def _zstd(path, name, packed, length):
         where = "run this in Blender, which brings one, or 'pip install zstandard'"
         Place(path).fail(f"SPZ version 4 needs a module for zstd: {where}; or write version 3")
     content = bytearray()
-    try:
+    with explained(path, f"stream '{name}' is damaged", errors=(module.ZstdError, EOFError)):
         while len(content) <= length and (piece := reader.read(_PIECE)):
             content += piece
-    except (module.ZstdError, EOFError) as error:
-        Place(path).fail(f"stream '{name}' is damaged ({error})")
     if len(content) != length:
         held = "more" if len(content) > length else str(len(content))
         Place(path).fail(f"stream '{name}' holds {held} bytes, expected {length}")
@@ -252,9 +243,8 @@ def _fraction(splats):
     most = _LARGEST_CODE.bit_length() - bits
     most -= int(np.rint(math.ldexp(farthest, most)) > _LARGEST_CODE)
     if most < 0:
-        raise RefineError(
-            f"a coordinate is {farthest:.10g}: {NAME} holds coordinates up to {_LARGEST_CODE}"
-        )
+        held = f"{NAME} holds coordinates up to {_LARGEST_CODE}"
+        raise RefineError(f"a coordinate is {farthest:.10g}: {held}")
     return min(max(_USUAL_FRACTION, _LEAST_STEPS - bits), most, _LARGEST_CODE.bit_length())
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..errors import RefineError
 from ..place import Place, described, named_json
-from ..splats import Splats, assign, rotation_matrices, scales
+from ..splats import Splats, rotation_matrices, scales
 from ..visibility.scene import nearby_order
 from ..whole_file import explained, mode_of, new_folder, refuse_existing, whole_file
 from .format import Format, new_file, pieces
@@ -65,15 +65,13 @@ def read(path: Path, data: NDArray[np.uint8], level: int = 0) -> SplatFile:
     if count > size:  # many may share their images
         place.fail(f"{count} splats, expected at most {size}, the bytes of all files together")
     degree = max(bundle.degree for bundle, _ in units)
-    file, splats = new_file(path, (f"{NAME}, level {level}", size), count, degree, model)
-    start = 0
+    return new_file(path, (f"{NAME}, level {level}", size), count, degree, _parts(units), model)
+
+
+def _parts(units):
     for bundle, spans in units:
         stored = bundle.read().splats()
-        for rows in spans:
-            target = splats.take(slice(start, start + len(rows))).up_to_degree(stored.sh_degree)
-            assign(target, stored.take(slice(rows.start, rows.stop)))
-            start += len(rows)
-    return file
+        yield from (stored.take(slice(rows.start, rows.stop)) for rows in spans)
 
 
 def _units(place: Place, meta: dict[str, Any], level: int) -> Iterator[tuple[Bundle, list[range]]]:
@@ -121,29 +119,23 @@ def _spans(place: Place, tree: Any, level: int, files: int) -> dict[int, list[ra
     return spans
 
 
-def _tree_over(means: NDArray[np.float64], width: float) -> tuple[Any, int]:
-    """Tree over positions, (N, 3), and its number of chunks: a leaf is a chunk's number.
+def _tree_over(means: NDArray[np.float64], width: float) -> Any:
+    """Tree over positions, (N, 3). A leaf is a chunk as in the index, still without rows.
 
     A branch is an axis, a value, the subtree below and that of the rest. Chunks of more than `UNIT`
     splats, or of `LEAST` and wider than `width`, are halved at the median of the longest side.
     """
-    numbers = itertools.count()
-
-    def subtree(rows):
-        here = means[rows]
-        low, high = here.min(axis=0), here.max(axis=0)
-        axis = int(np.argmax(high - low))
-        longest = high[axis] - low[axis]
-        if (len(rows) <= UNIT and (len(rows) <= LEAST or longest <= width)) or not longest:
-            return next(numbers)
-        along = here[:, axis]
-        value = np.partition(along, len(along) // 2)[len(along) // 2]
-        if value == low[axis]:  # more than half of them lie there
-            value = along[along > value].min()
-        below = along < value
-        return axis, float(value), subtree(rows[below]), subtree(rows[~below])
-
-    return subtree(np.arange(len(means))), next(numbers)
+    low, high = means.min(axis=0), means.max(axis=0)
+    axis = int(np.argmax(high - low))
+    longest = high[axis] - low[axis]
+    if (len(means) <= UNIT and (len(means) <= LEAST or longest <= width)) or not longest:
+        return {"bound": {"min": np.full(3, np.inf), "max": np.full(3, -np.inf)}, "lods": {}}
+    along = means[:, axis]
+    value = np.partition(along, len(along) // 2)[len(along) // 2]
+    if value == low[axis]:  # more than half of them lie there
+        value = along[along > value].min()
+    below = along < value
+    return axis, float(value), _tree_over(means[below], width), _tree_over(means[~below], width)
 
 
 class StreamedSog:
@@ -153,9 +145,7 @@ class StreamedSog:
     """
 
     def __init__(self, finest: NDArray[Any], width: float, folder: Path) -> None:
-        self._tree, count = _tree_over(np.asarray(finest, np.float64), width)
-        self._low, self._high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-        self._rows: list[dict[str, dict[str, int]]] = [{} for _ in range(count)]
+        self._tree = _tree_over(np.asarray(finest, np.float64), width)
         self._folder = folder
         self._levels: list[int] = []  # that of each folder
         self._counts: list[int] = []  # splats of each level
@@ -168,21 +158,21 @@ class StreamedSog:
         left = [(self._tree, np.arange(len(means)))]
         while left:
             node, rows = left.pop()
-            if not isinstance(node, int):
+            if not isinstance(node, dict):
                 axis, value, *sides = node
                 below = means[rows, axis] < value
                 left += [(sides[1], rows[~below]), (sides[0], rows[below])]
             elif len(rows):
-                rows = rows[nearby_order(splats.means[rows])]
+                rows, bound = rows[nearby_order(splats.means[rows])], node["bound"]
                 for piece in pieces(len(rows)):  # box around ellipsoids of one standard deviation
                     batch = splats.take(rows[piece])
                     turns = np.abs(rotation_matrices(batch.quaternions))
                     half = np.einsum("nij,nj->ni", turns, scales(batch.log_scales))
                     low, high = (means[rows[piece]] + side * half for side in (-1.0, 1.0))
-                    self._low[node] = np.minimum(self._low[node], low.min(axis=0))
-                    self._high[node] = np.maximum(self._high[node], high.max(axis=0))
+                    bound["min"] = np.minimum(bound["min"], low.min(axis=0))
+                    bound["max"] = np.maximum(bound["max"], high.max(axis=0))
                 place = {"file": len(self._levels), "offset": len(unit), "count": len(rows)}
-                self._rows[node][str(level)] = place
+                node["lods"][str(level)] = place
                 unit = np.concatenate([unit, rows])
             if len(unit) > (UNIT if left else 0):
                 folder = self._folder / str(len(self._levels))
@@ -205,8 +195,17 @@ class StreamedSog:
                 free = (path.parent / f"{level}_{index}" for index in itertools.count())
                 moved.append(next(there for there in free if not there.exists()))
                 (self._folder / str(number)).rename(moved[-1])
-            index = self._index([there.name for there in moved])
-            text = json.dumps(index, allow_nan=False).encode() + b"\n"
+            index = {
+                "version": VERSION,
+                "asset": {"generator": GENERATOR},
+                "count": sum(self._counts),
+                "counts": self._counts,
+                "lodLevels": len(self._counts),
+                "lodErrors": False,
+                "filenames": [f"{there.name}/{META}" for there in moved],
+                "tree": _indexed(self._tree),
+            }
+            text = json.dumps(index, allow_nan=False, default=np.ndarray.tolist).encode() + b"\n"
             with whole_file(path, overwrite=overwrite) as stream:
                 stream.write(text)
         except BaseException:
@@ -223,26 +222,15 @@ class StreamedSog:
                     (folder / file).unlink(missing_ok=True)
                 folder.rmdir()
 
-    def _index(self, names: list[str]) -> dict[str, Any]:
-        return {
-            "version": VERSION,
-            "asset": {"generator": GENERATOR},
-            "count": sum(self._counts),
-            "counts": self._counts,
-            "lodLevels": len(self._counts),
-            "lodErrors": False,
-            "filenames": [f"{name}/{META}" for name in names],
-            "tree": self._branch(self._tree),
-        }
 
-    def _branch(self, node: Any) -> dict[str, Any]:
-        if isinstance(node, int):
-            bound = {"min": self._low[node].tolist(), "max": self._high[node].tolist()}
-            return {"bound": bound, "lods": self._rows[node]}
-        children = [self._branch(side) for side in node[2:]]
-        ends = [[child["bound"][end] for child in children] for end in ("min", "max")]
-        low, high = np.min(ends[0], axis=0), np.max(ends[1], axis=0)
-        return {"bound": {"min": low.tolist(), "max": high.tolist()}, "children": children}
+def _indexed(node: Any) -> dict[str, Any]:
+    """A subtree as in the index."""
+    if isinstance(node, dict):
+        return node
+    children = [_indexed(side) for side in node[2:]]
+    low, high = ([child["bound"][end] for child in children] for end in ("min", "max"))
+    bound = {"min": np.min(low, axis=0), "max": np.max(high, axis=0)}
+    return {"bound": bound, "children": children}
 
 
 @contextlib.contextmanager
