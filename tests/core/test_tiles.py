@@ -41,7 +41,7 @@ from refine_addon.core.mapped import Interrupted
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.refit import round_rays
 from refine_addon.core.splats import joined
-from refine_addon.core.tiles import cluster, source, storage, writing
+from refine_addon.core.tiles import cluster, files, storage
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import validation_rays
 from refine_addon.core.whole_file import Url
@@ -66,9 +66,8 @@ VIEWS = read_cameras(ROOM / "cameras.json")
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Make pieces and boxes so small that 5000 splats have several of each."""
-    monkeypatch.setattr(source, "ROWS", 1000)
+    monkeypatch.setattr(files, "ROWS", 1000)
     monkeypatch.setattr(mapped, "_ROWS", 300)
-    monkeypatch.setattr(writing, "ROWS", 900)
     monkeypatch.setattr(projection, "CHUNK", 700)
 
 
@@ -526,12 +525,11 @@ def test_of_a_tile_no_more_than_its_rows_are_read(memory, monkeypatch):
         return read(self, path, start, end)
 
     monkeypatch.setattr(type(memory.system), "cat_file", noting)
-    monkeypatch.setattr(source, "ROWS", 100)
-    monkeypatch.setattr(writing, "ROWS", 100)
+    monkeypatch.setattr(files, "ROWS", 100)
 
     run(memory.tiles, "out")
 
-    tiles = [source.tile_at(url) for url in memory.tiles]
+    tiles = [files.tile_at(url) for url in memory.tiles]
     rows = sum(tile.splats * tile.dtype.itemsize for tile in tiles)
     assert sum(taken) <= 2 * rows + sum(t.size - t.end + t.begin + t.header for t in tiles)
     assert max(taken) <= max(100 * tiles[0].dtype.itemsize, tiles[1].header)
@@ -608,7 +606,7 @@ def test_a_url_is_no_path_and_has_a_name():
         ("memory://in", "is a folder, expected a PLY file"),
     ]:
         with pytest.raises(RefineError, match=rf"^{url}: .*{words}"):
-            source.tile_at(url)
+            files.tile_at(url)
 
 
 class Server(SimpleHTTPRequestHandler):
@@ -646,14 +644,14 @@ def test_a_server_sends_ranges(tmp_path, monkeypatch):
         assert store.made() == store.once()
         with pytest.raises(RefineError, match=r"^http://.*/out: cannot be written to \("):
             run(urls, f"{address}/out")
-        tile = source.tile_at(urls[0])
+        tile = files.tile_at(urls[0])
         store.put(store.tiles[0], plain_ply(130, seed=2))
         with pytest.raises(RefineError, match=r"^http://.*/a\.ply: was changed"):
-            source.rows_of(tile, 0, 1)
+            files.rows_of(tile, 0, 1)
         Path("large.ply").write_bytes(plain_ply(2000))
         monkeypatch.setattr(Server, "ranges", False)
         with pytest.raises(RefineError, match=r"large\.ply: cannot be read \(.*range requests"):
-            source.tile_at(f"{address}/large.ply")
+            files.tile_at(f"{address}/large.ply")
         server.shutdown()
     fsspec.asyn.reset_lock()
 
@@ -775,7 +773,7 @@ def test_workers_that_do_not_see_the_files_are_named(tmp_path, tiles, workers, m
     job = tmp_path / "elsewhere"
     with pytest.raises(RefineError, match=r"worker tcp://.*elsewhere is not there; workers need"):
         workers.check(job, [])
-    tile = source.tile_at(tiles[0])
+    tile = files.tile_at(tiles[0])
     tiles[0].unlink()
     (job / "tiles").mkdir(parents=True)
     with pytest.raises(RefineError, match=r"worker tcp://.*b\.ply is not there, or another"):

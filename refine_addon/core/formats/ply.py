@@ -91,20 +91,15 @@ class SplatFile:
     @property
     def model(self) -> Model:
         """How its splats are drawn, by its header; discs if they have no third scale."""
-        return stated_model(self.header, self.rows.dtype) or "default"
+        return model_drawn(self.path, self.header, self.rows.dtype, None)
 
     def drawn_as(self, model: Model | None) -> SplatFile:
         """The file with another model in its header; None keeps that of the file.
 
         `RefineError` if the model is unknown, or not "2dgs" for splats without a third scale.
         """
-        if model is None or model == self.model:
-            return self
-        if model not in MODELS:
-            raise RefineError(f"model is {model!r}, expected one of {', '.join(MODELS)}")
-        if THIRD_SCALE not in (self.rows.dtype.names or ()):
-            Place(self.path).fail(f"splats without {THIRD_SCALE} are drawn as 2dgs, got {model}")
-        return replace(self, header=with_model(self.header, model))
+        drawn = model_drawn(self.path, self.header, self.rows.dtype, model)
+        return self if drawn == self.model else replace(self, header=with_model(self.header, drawn))
 
     def without_third_scale(self) -> SplatFile:
         """Discs without a third scale; other splats unchanged."""
@@ -453,14 +448,23 @@ def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:
     return model_of(header) if THIRD_SCALE in (rows.names or ()) else "2dgs"
 
 
+def model_drawn(path: Path | Url, header: bytes, rows: np.dtype[Any], model: Model | None) -> Model:
+    """`model`, by default that of the PLY; `RefineError` unless its splats can be drawn so."""
+    stated = stated_model(header, rows) or "default"
+    if model not in (None, stated, *MODELS):
+        raise RefineError(f"model is {model!r}, expected one of {', '.join(MODELS)}")
+    if model not in (None, stated) and THIRD_SCALE not in (rows.names or ()):
+        raise RefineError(f"{path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}")
+    return model or stated
+
+
 def refuse_other_models(files: Sequence[Any]) -> None:
     """Raise `RefineError` if files, each with `path` and `model`, have not one model."""
     for file in files:
         if file.model != files[0].model:
-            raise RefineError(
-                f"{file.path}: its splats are {file.model}, those of {files[0].path} "
-                f"{files[0].model}; expected one model, or say which (--model)"
-            )
+            others = f"those of {files[0].path} {files[0].model}"
+            wanted = "expected one model, or say which (--model)"
+            raise RefineError(f"{file.path}: its splats are {file.model}, {others}; {wanted}")
 
 
 def with_model(raw: bytes, model: Model) -> bytes:

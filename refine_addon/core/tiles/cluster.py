@@ -26,8 +26,7 @@ from ..errors import RefineError
 from ..execute import Progress, report, run_all, within
 from ..mapped import Interrupted
 from ..whole_file import explained
-from .source import Tile, bytes_of
-from .writing import waiting_in
+from .files import Tile, bytes_of, waiting_in
 
 _AHEAD = 3  # groups of items for each thread that are sent ahead, whose results may wait here
 _TOGETHER = 16  # most items in a group: each group takes scheduler and coordinator about 15 ms
@@ -65,9 +64,8 @@ def cluster(workers: int | str) -> Iterator[Cluster]:
                 )  # fmt: skip
                 scheduler = held.enter_context(local)
             except Exception as error:
-                raise Interrupted(
-                    f"workers ended while they were started ({error}); try again"
-                ) from error
+                problem = f"workers ended while they were started ({error})"
+                raise Interrupted(f"{problem}; try again") from error
         problem = "no Dask scheduler answers there"
         with explained(scheduler, problem, errors=Exception):  # what answers may be misread
             client = held.enter_context(distributed.Client(scheduler, timeout=_CONNECT))
@@ -99,14 +97,17 @@ class Cluster:
     def __init__(self, client: Any) -> None:
         self._client = client
 
-    def check(self, job: Path, tiles: Sequence[Tile]) -> None:
-        """Raise `RefineError` if a worker lacks files or the version, `Interrupted` without any."""
+    def check(self, job: Path, tiles: Sequence[Tile], kind: Any = RefineError) -> None:
+        """Raise an error of a `kind` if a worker lacks files or the version, or there is none.
+
+        It is `Interrupted` if the workers do not answer.
+        """
         for _ in range(_TRIES):
             try:
                 self._client.wait_for_workers(1, timeout=_CONNECT)
                 answers = self._client.run(_answer, VERSION, job, tiles, on_error="return")
             except TimeoutError as error:
-                raise RefineError("the scheduler has no workers") from error
+                raise kind("the scheduler has no workers") from error
             except Exception as error:
                 raise Interrupted(f"the workers do not answer: {error}") from error
             # An OSError is of a worker that was lost meanwhile.
@@ -115,10 +116,8 @@ class Cluster:
                 if isinstance(answer, BaseException):
                     answer = f"it cannot run refine {VERSION}: {answer}"
                 if answer:
-                    raise RefineError(
-                        f"worker {worker}: {answer}; workers need the same files under the same "
-                        "paths"
-                    )
+                    wanted = "workers need the same files under the same paths"
+                    raise kind(f"worker {worker}: {answer}; {wanted}")
             if there:
                 return
         raise Interrupted("the workers were lost again and again")

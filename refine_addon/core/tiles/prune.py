@@ -21,15 +21,13 @@ from ..mapped import Interrupted, note, noted, on_disk, once, pieces, write
 from ..methods import DEFAULT, Method
 from ..prune import prune
 from ..report import Clock
-from ..result import Result
 from ..selection import Budget
 from ..splats import Model
 from ..views import ViewSet
 from ..whole_file import Url, explained
 from .cluster import Cluster
-from .source import Tile, copied, tiles_at
+from .files import Kept, Outputs, copied, header_of, tiles_at, waiting_in
 from .storage import identity, located, new_folder
-from .writing import Kept, Outputs, header_of, waiting_in
 
 
 def prune_tiles(
@@ -89,7 +87,9 @@ def prune_tiles(
         held.enter_context(_opened(job, outputs))
         held.enter_context(within(cluster=workers))
         if workers is not None:
-            _check(workers, job, tiles)
+            goes_on, _ = noted(job, "begun")
+            note(job, "begun", None)
+            workers.check(job, tiles, Interrupted if goes_on else RefineError)
         count, size = sum(tile.splats for tile in tiles), sum(tile.size for tile in tiles)
         scoring = seconds("measure", count, len(views.spread(method.views)))
         reading, deciding, writing = stages(
@@ -121,16 +121,6 @@ def prune_tiles(
     return report
 
 
-def _check(workers: Cluster, job: Path, tiles: Sequence[Tile]) -> None:
-    """Raise `RefineError` if a worker lacks a file; `Interrupted` if the job was begun before."""
-    goes_on = noted(job, "begun")[0]
-    note(job, "begun", None)
-    try:
-        workers.check(job, tiles)
-    except RefineError as error:
-        raise (Interrupted(str(error)) if goes_on else error) from error
-
-
 def _decided(job, tiles, views, budget, method, clock, reading, deciding, threads):
     """Kept splats, numbers of kept and unseen splats of each tile, and the report."""
     splats = once(job, "splats", lambda: copied(tiles, job / "splats", reading, threads))
@@ -146,16 +136,13 @@ def _decided(job, tiles, views, budget, method, clock, reading, deciding, thread
     masks = result.keep, result.scores.seen == 0
     counts = [[int(part.sum()) for part in np.split(mask, begins)] for mask in masks]
     result.report["splats"].pop("unseen_removed", None)
-    return _stored(job, result), [*zip(*counts, strict=True)], result.report
-
-
-def _stored(job: Path, result: Result) -> Kept:
     rows, became = np.empty(0, np.int64), None
     if result.merged is not None:
         changed = np.flatnonzero(result.merged.changed)
         rows, merged = np.flatnonzero(result.keep)[changed], result.merged.splats
         became = on_disk(job / "became", pieces(merged, changed)) if len(changed) else None
-    return Kept(**write(job / "keep", [{"keep": result.keep, "changed": rows}]), became=became)
+    kept = Kept(**write(job / "keep", [{"keep": result.keep, "changed": rows}]), became=became)
+    return kept, [*zip(*counts, strict=True)], result.report
 
 
 @contextlib.contextmanager
