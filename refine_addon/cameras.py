@@ -47,10 +47,8 @@ def view_from_camera(obj: bpy.types.Object) -> View:
     data = _evaluated(obj).data
     if data.type != "PERSP":
         kind = {"ORTHO": "orthographic", "PANO": "panoramic"}.get(data.type, data.type.lower())
-        raise RefineError(
-            f"camera '{obj.name}' is {kind}, expected a perspective one; change its lens type, or "
-            "choose cameras without it"
-        )
+        advice = "change its lens type, or choose cameras without it"
+        raise RefineError(f"camera '{obj.name}' is {kind}, expected a perspective one; {advice}")
     matrix = world_matrix(obj)
     source = _source(obj)
     size, aspect = render_size(bpy.context.scene)
@@ -81,10 +79,9 @@ def world_matrix(obj: bpy.types.Object) -> NDArray[np.float64]:
         return snapped(np.array(evaluated.matrix_world, np.float64))
     moving = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
     if moving or obj.constraints or (obj.parent and obj.parent_type != "OBJECT"):
-        raise RefineError(
-            f"object '{obj.name}': is disabled in viewports or excluded from the view layer, where "
-            "Blender evaluates no animation or constraint; enable it first"
-        )
+        problem = "is disabled in viewports or excluded from the view layer"
+        why = "where Blender evaluates no animation or constraint"
+        raise RefineError(f"object '{obj.name}': {problem}, {why}; enable it first")
     matrix = np.array(obj.matrix_basis, np.float64)
     if obj.parent:
         inverse = np.array(obj.matrix_parent_inverse, np.float64)
@@ -161,10 +158,8 @@ def pose(name: str, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     axes = matrix[:3, :3] / np.where(lengths > 0.0, lengths, 1.0)
     if lengths.min() <= 0.0 or np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:
-        raise RefineError(
-            f"camera '{name}' is sheared or flat, as under a parent that is scaled unevenly; apply "
-            "the parent's scale first"
-        )
+        problem = "is sheared or flat, as under a parent that is scaled unevenly"
+        raise RefineError(f"camera '{name}' {problem}; apply the parent's scale first")
     return FLIP[:, None] * axes.T, matrix[:3, 3]
 
 
@@ -172,10 +167,8 @@ def _weight(obj: bpy.types.Object) -> float:
     weight = obj.get(WEIGHT, 1.0)
     number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
     if not number or not 0.0 <= weight < math.inf:
-        raise RefineError(
-            f"camera '{obj.name}': custom property {WEIGHT} is {weight!r}, expected a number "
-            "of at least 0"
-        )
+        wanted = "expected a number of at least 0"
+        raise RefineError(f"camera '{obj.name}': custom property {WEIGHT} is {weight!r}, {wanted}")
     return float(weight)
 
 
@@ -205,10 +198,9 @@ def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
         far = math.inf if source["far"] is None else source["far"]
         return {name: source[name] for name in _FIELDS} | {"far": far}
     except (TypeError, ValueError, KeyError):
-        raise RefineError(
-            f"camera '{obj.name}': custom property {SOURCE} is damaged; delete it to use the "
-            "camera as Blender shows it"
-        ) from None
+        problem = f"custom property {SOURCE} is damaged"
+        advice = "delete it to use the camera as Blender shows it"
+        raise RefineError(f"camera '{obj.name}': {problem}; {advice}") from None
 
 
 @dataclass(frozen=True)
@@ -255,9 +247,8 @@ class CameraChoice:
             where = {"SELECTED": "selected", "VISIBLE": f"visible in scene '{scene.name}'"}
             if self.collection:
                 where["COLLECTION"] = f"in collection '{self.collection.name}'"
-            raise RefineError(
-                f"no cameras: none is {where[self.source]}; scoring needs at least one"
-            )
+            none = f"none is {where[self.source]}"
+            raise RefineError(f"no cameras: {none}; scoring needs at least one")
         views = tuple(map(view_from_camera, cameras))
         return ViewSet(views, turn=_turn(cameras, views, splats))
 
@@ -297,9 +288,8 @@ def views_from_frames(
     are restored. `RefineError` without frames or a camera, or if the object's scale is animated."""
     scene = context.scene
     if not len(frames):
-        raise RefineError(
-            f"no frames: the range starts at {frames.start} and ends at {frames.stop - 1}"
-        )
+        ends = f"starts at {frames.start} and ends at {frames.stop - 1}"
+        raise RefineError(f"no frames: the range {ends}")
     now = world_matrix(splats) if splats else None
     before = (scene.frame_current, scene.frame_subframe, scene.camera)
     views = []
@@ -353,9 +343,8 @@ def y_down(path: Path) -> bool | None:
 def active_camera(scene: bpy.types.Scene) -> bpy.types.Object:
     """The active camera. `RefineError` without one; Blender lets any object be it."""
     if scene.camera is None or scene.camera.type != "CAMERA":
-        raise RefineError(
-            f"no active camera at frame {scene.frame_current}: make a camera the active one"
-        )
+        problem = f"no active camera at frame {scene.frame_current}"
+        raise RefineError(f"{problem}: make a camera the active one")
     return scene.camera
 
 
@@ -367,8 +356,6 @@ def _against(
         return view
     motion = now @ np.linalg.inv(then)
     if np.abs(motion[:3, :3].T @ motion[:3, :3] - np.eye(3)).max() > SHEAR:
-        raise RefineError(
-            f"object '{obj.name}': its scale is animated; the views of different frames then "
-            "see different splats: choose one frame"
-        )
+        why = "the views of different frames then see different splats"
+        raise RefineError(f"object '{obj.name}': its scale is animated; {why}: choose one frame")
     return view.turned(motion[:3, :3], motion[:3, 3])

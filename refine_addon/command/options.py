@@ -17,8 +17,9 @@ from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.lod import SHARES
 from ..core.splats import MODELS
+from ..core.tiles.storage import located
 from ..core.volumes import Role, parse
-from ..core.whole_file import Url, expanded, is_url
+from ..core.whole_file import Url, is_url
 from ..version import VERSION
 
 _SOURCES = "visible, active, selected, collection:NAME, frames or frames:A:B:STEP"
@@ -174,8 +175,7 @@ def _output(text: str) -> Path | Url:
     """An output path, ``~`` expanded."""
     if text == "-":
         raise RefineError("nothing is written to standard output: name a file (one named - is ./-)")
-    place = _input(text)
-    return place if isinstance(place, Url) else expanded(place)
+    return located(_input(text))
 
 
 def _workers(text: str) -> int | str:
@@ -210,10 +210,8 @@ def _frames(text: str) -> range:
         first, last, step = map(int, words if words[2:] else [*words, "1"])
         if -LAST_FRAME <= first <= last <= LAST_FRAME and step >= 1:
             return range(first, last + 1, step)
-    raise RefineError(
-        f"expected A:B:STEP or A:B in whole numbers, A to B from {-LAST_FRAME} to {LAST_FRAME} and "
-        f"STEP at least 1, got {text!r}"
-    )
+    limits = f"A to B from {-LAST_FRAME} to {LAST_FRAME} and STEP at least 1"
+    raise RefineError(f"expected A:B:STEP or A:B in whole numbers, {limits}, got {text!r}")
 
 
 def _for_argparse(parse: Callable[[str], Any]) -> Callable[[str], Any]:

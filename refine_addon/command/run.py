@@ -44,7 +44,6 @@ class Run:
         files = options.inputs or [""]
         sizes = [os.path.getsize(file) if os.path.isfile(file) else 0 for file in files]
         self._sizes = [max(size, 1) for size in ([sum(sizes)] if options.together else sizes)]
-        self._left = TimeLeft()
         self._views: ViewSet | None = None
         self._cameras: dict[str, Any] = {}
 
@@ -129,13 +128,32 @@ class Run:
 
     def finish(self) -> bool:
         """Write the report if wanted; whether an input or the output failed."""
-        options, seconds = self.options, time.perf_counter() - self._started
         done = [entry for entry in self.entries if entry["status"] == "done"]
-        if options.report is not None:
-            wrote = any(options.save or entry.get("files", {}).get("output") for entry in done)
-            wrote = wrote and not options.dry_run
-            _write_report(options.report, self.entries, seconds, options.overwrite, wrote)
+        if self.options.report is not None:
+            self._write_report(done)
         return len(done) < len(self.entries) or self._failed
+
+    def _write_report(self, done: list[dict[str, Any]]) -> None:
+        """Write the report of all results; the error, if any, says whether splats were written."""
+        options, path = self.options, self.options.report
+        content = {
+            "refine": VERSION,  # first: `checks` recognizes a report by it
+            "python": sys.version.split()[0],
+            "numpy": np.__version__,
+            "seconds": time.perf_counter() - self._started,
+            "results": self.entries,
+        }
+        try:
+            with whole_file(path, overwrite=options.overwrite) as stream:
+                stream.write(json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
+        except RefineError as error:
+            # `whole_file` says that nothing was written, which is true of its own file alone.
+            cause = error.__cause__
+            why = reason_of(cause if isinstance(cause, OSError) else error)
+            wrote = any(options.save or entry.get("files", {}).get("output") for entry in done)
+            splats = "; the splats were" if wrote and not options.dry_run else ""
+            problem = f"the report was not written ({why.removeprefix(f'{path}: ')})"
+            raise RefineError(f"{path}: {problem}{splats}") from error
 
     def _named(self, name: str) -> str:
         count = len(self._sizes)
@@ -152,26 +170,6 @@ def _demands(report):
         for volume in report.get("volumes", ())
     )
     return " ".join([", ".join(parts), f"({volumes})" if volumes else ""]).strip()
-
-
-def _write_report(path, results, seconds, overwrite, wrote):
-    """Write the report of all results; the error, if any, says whether splats were written."""
-    content = {
-        "refine": VERSION,  # first: `checks` recognizes a report by it
-        "python": sys.version.split()[0],
-        "numpy": np.__version__,
-        "seconds": seconds,
-        "results": results,
-    }
-    try:
-        with whole_file(path, overwrite=overwrite) as stream:
-            stream.write(json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
-    except RefineError as error:
-        # `whole_file` says that nothing was written, which is true of its own file alone.
-        cause = error.__cause__
-        why = reason_of(cause if isinstance(cause, OSError) else error).removeprefix(f"{path}: ")
-        splats = "; the splats were" if wrote else ""
-        raise RefineError(f"{path}: the report was not written ({why}){splats}") from error
 
 
 def _is_terminal(stream: TextIO | None) -> bool:

@@ -302,8 +302,6 @@ def _zone(role: Role, text: str, volume: Volume | None, also: str = "") -> Zone:
     obj = bpy.context.scene.objects.get(text)
     if obj is None:
         fit = [o.name for o in bpy.context.scene.objects if demands.can_be_volume(o)]
-        there = ", ".join(fit[:8]) or "none"
-        raise RefineError(
-            f"no object '{text}' in the open .blend{also} (objects that can be volumes: {there})"
-        )
+        there = f"objects that can be volumes: {', '.join(fit[:8]) or 'none'}"
+        raise RefineError(f"no object '{text}' in the open .blend{also} ({there})")
     return demands.zone(role, obj)

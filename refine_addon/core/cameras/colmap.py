@@ -12,7 +12,6 @@ import contextlib
 import struct
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -98,10 +97,8 @@ def read_colmap(folder: Path, suffix: str) -> ViewSet:
     views = []
     for name, _, place, values, camera_id in registered:
         if camera_id not in lenses:
-            place.fail(
-                f"refers to camera {camera_id}, expected one of the {len(lenses)} "
-                f"in {cameras.path.name}"
-            )
+            wanted = f"one of the {len(lenses)} in {cameras.path.name}"
+            place.fail(f"refers to camera {camera_id}, expected {wanted}")
         pose = [place.at(key).number(value) for key, value in zip(POSE, values, strict=True)]
         if not any(pose[:4]):
             place.fail("expected a quaternion (w, x, y, z) of a rotation, got all zeros")
@@ -123,38 +120,36 @@ def _lens(place: CameraPlace, model: Model, size: Sequence[Any], values: Sequenc
     cx, cy, *distortion = numbers[model.focals :]
     if model.name == "EUCM":
         distortion = distortion[:1]  # with alpha = 0 it is a pinhole for every beta
-    return model if model.fisheye or any(distortion) else None, focal, (cx, cy), sides
+    return model if model.fisheye or any(distortion) else None, *focal, cx, cy, *sides
 
 
-@dataclass
-class _Binary:
+class _Binary(NamedTuple):
     """A little-endian file, read from start to end; `RefineError` where it is truncated."""
 
     file: CameraPlace
     data: mmap
-    offset: int = 0
 
     def take(self, layout: str, what: str) -> tuple[Any, ...]:
         start = self.skip(struct.calcsize(f"<{layout}"), what)
         return struct.unpack_from(f"<{layout}", self.data, start)
 
     def skip(self, count: int, what: str) -> int:
-        start = self.offset
+        start = self.data.tell()
         if count > len(self.data) - start:
             self.truncated(f"{what}: expected {count} more bytes")
-        self.offset += count
+        self.data.seek(start + count)
         return start
 
     def name(self, what: str) -> str:
-        end = self.data.find(b"\0", self.offset)
+        end = self.data.find(b"\0", self.data.tell())
         if end < 0:
             self.truncated(f"{what}: expected a zero byte after the name")
-        start = self.skip(end + 1 - self.offset, what)
+        start = self.skip(end + 1 - self.data.tell(), what)
         return self.data[start:end].decode("utf-8", "replace")
 
     def truncated(self, problem: str) -> NoReturn:
-        left = len(self.data) - self.offset
-        self.file.at(f"byte {self.offset}").fail(f"truncated: {problem}, got {left}")
+        at = self.data.tell()
+        self.file.at(f"byte {at}").fail(f"truncated: {problem}, got {len(self.data) - at}")
 
 
 def _rows(file: CameraPlace, thing: str) -> Iterator[tuple[_Binary, str, CameraPlace]]:
@@ -165,11 +160,10 @@ def _rows(file: CameraPlace, thing: str) -> Iterator[tuple[_Binary, str, CameraP
         (count,) = data.take("Q", f"number of {thing}s")
         for index in range(count):
             row = f"{thing} row {index}"
-            yield data, row, file.at(f"{row} at byte {data.offset}")
-        if left := len(data.data) - data.offset:
-            file.at(f"byte {data.offset}").fail(
-                f"expected the end of the file after {counted(count, thing)}, got {left} more bytes"
-            )
+            yield data, row, file.at(f"{row} at byte {mapped.tell()}")
+        if left := len(mapped) - mapped.tell():
+            wanted = f"the end of the file after {counted(count, thing)}"
+            file.at(f"byte {mapped.tell()}").fail(f"expected {wanted}, got {left} more bytes")
 
 
 def _binary_cameras(file: CameraPlace) -> Iterator[Any]:
@@ -214,10 +208,8 @@ def _text_cameras(file: CameraPlace) -> Iterator[Any]:
             place.fail(f"unknown camera model {name[:40]!r}, expected {', '.join(MODELS_BY_NAME)}")
         numbers = [_parsed(place, field) for field in fields[:-2]]
         if len(numbers) != 2 + model.parameters:
-            place.fail(
-                f"expected width, height and {model.parameters} parameters of {model.name}, "
-                f"got {len(numbers)} numbers"
-            )
+            wanted = f"width, height and {model.parameters} parameters of {model.name}"
+            place.fail(f"expected {wanted}, got {len(numbers)} numbers")
         yield place, _parsed(place, camera_id, int), _lens(place, model, numbers[:2], numbers[2:])
 
 
@@ -234,10 +226,9 @@ def _text_images(file: CameraPlace) -> Iterator[Any]:
             yield name, image_id, where, numbers, camera_id
             place, points = next(lines, (place, b""))
             if len(points) < SHORT_LINE and len(points.split()) % 3:
-                place.fail(
-                    f"expected the points of image row {row} as X, Y, POINT3D_ID each "
-                    "(an image takes two lines, of which the second may be empty)"
-                )
+                wanted = f"the points of image row {row} as X, Y, POINT3D_ID each"
+                rule = "an image takes two lines, of which the second may be empty"
+                place.fail(f"expected {wanted} ({rule})")
 
 
 def _parsed(place: CameraPlace, field: str, kind: Any = float) -> Any:

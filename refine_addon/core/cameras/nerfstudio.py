@@ -67,7 +67,7 @@ def _view(place, values, name, world, remarks):
     both = [focal[0] or focal[1], focal[1] or focal[0]]
     rotation, offset, scale = world
     pose = (rotation @ axes).T, scale * (rotation @ center + offset)
-    return place.view(name, pose, (both, place.principal(values, size), size))
+    return place.view(name, pose, [*both, *place.principal(values, size), *size])
 
 
 def _pose(place, value, remarks):
@@ -95,10 +95,8 @@ def _size(place: CameraPlace, values: Mapping[str, Any], name: str) -> list[int]
     sizes = (image_size(Path(f"{base}{suffix}")) for suffix in IMAGE_SUFFIXES)
     size = next(filter(None, sizes), None)
     if size is None:
-        place.fail(
-            f"missing {missing[0]!r}, expected w and h (pixels), or a PNG or JPEG image at "
-            f"{name[:80]!r}"
-        )
+        wanted = f"w and h (pixels), or a PNG or JPEG image at {name[:80]!r}"
+        place.fail(f"missing {missing[0]!r}, expected {wanted}")
     return [place.at("'file_path'").side(side) for side in size]
 
 

@@ -6,7 +6,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ SNIFFED_BYTES = 4096  # read to find out whether a file can be JSON
 
 
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
-Lens = tuple[Sequence[float], Sequence[float], Sequence[int]]
 
 
 class CameraPlace(Place):
@@ -67,18 +66,18 @@ class CameraPlace(Place):
             self.fail(f"expected an orthonormal rotation, got {np.round(matrix, 6).tolist()}")
         return matrix
 
-    def view(self, name: str, pose: Pose, lens: Lens) -> View:
+    def view(self, name: str, pose: Pose, lens: Sequence[Any]) -> View:
         """View of a camera; characters of `name` that cannot be printed become "?".
 
         The pose is the rotation, world to camera in the axes of `View`, and the centre; the lens
         two focal lengths, the principal point, and width and height, pixels.
         """
-        (rotation, center), ((fx, fy), (cx, cy), (width, height)) = pose, lens
-        if np.abs(center).max() > LARGEST_NUMBER:
-            self.fail(f"the camera's centre is farther than 1e18: {center.tolist()}")
+        if np.abs(pose[1]).max() > LARGEST_NUMBER:
+            self.fail(f"the camera's centre is farther than 1e18: {pose[1].tolist()}")
+        fx, fy, cx, cy, width, height = lens
         printable = name.encode("utf-8", "replace").decode("utf-8")
         try:
-            return View(rotation, center, fx, fy, cx, cy, width, height, name=printable)
+            return View(*pose, fx, fy, cx, cy, width, height, name=printable)
         except RefineError as error:
             self.fail(str(error))
 

@@ -106,4 +106,4 @@ def _inria_view(file: CameraPlace, index: int, item: object) -> View:
     focal = [place.at(repr(key)).focal(camera[key]) for key in ("fx", "fy")]
     center = np.array(place.at("'position'").numbers(camera["position"], 3))
     name = place.at("'img_name'").text(camera.get("img_name", str(index)))
-    return place.view(name, (axes.T, center), (focal, place.principal(camera, size), size))
+    return place.view(name, (axes.T, center), [*focal, *place.principal(camera, size), *size])
