@@ -18,8 +18,9 @@ from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.formats.registry import scene_name
 from ..core.splats import Splats, single_unit_quaternions, with_model
-from .layout import KINDS, Layout, SplatObject, add_attributes, has, rest_count
+from .layout import KINDS, Data, Layout, SplatObject, add_attributes, has, rest_count
 
+Columns = Mapping[str, NDArray[Any]]  # By PLY property, (N,) each
 _TOGETHER = 16  # Columns read together: float32 numbers in a cache line of 64 bytes
 _ROWS = 4096  # Rows copied at a time: 256 kB of such columns, which fits a cache
 
@@ -88,9 +89,7 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
 
 
 def read_for_file(
-    checked: SplatObject,
-    replaced: Collection[str] = (),
-    columns: Callable[[], Mapping[str, NDArray[Any]]] = dict,
+    checked: SplatObject, replaced: Collection[str] = (), columns: Callable[[], Columns] = dict
 ) -> Callable[[], SplatFile]:
     """Read the object now; the thread-safe callable builds its PLY file, once.
     Properties in `replaced` take the values that `columns` gives then, (N,) each."""
@@ -110,10 +109,7 @@ def read_for_file(
 
 
 def write_columns(
-    mesh: bpy.types.Mesh | bpy.types.PointCloud,
-    layout: Layout,
-    columns: Mapping[str, NDArray[Any]],
-    rows: slice | NDArray[np.int64] = slice(None),
+    mesh: Data, layout: Layout, columns: Columns, rows: slice | NDArray[np.int64] = slice(None)
 ) -> None:
     """Store columns by PLY property, (M,) each, in M rows, by default all; others keep every bit.
     One attribute at a time, as allocating memory takes longest."""
@@ -122,9 +118,9 @@ def write_columns(
         components = values.reshape(len(values), -1)
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # float64 to float32
             for column in own:
-                new, coding = columns[column.name], column.place.coding
+                new, coding = columns[column.name], column.coding
                 new = coding.to_attribute(new) if coding else new
-                components[rows, column.place.component] = new
+                components[rows, column.component] = new
         if kind == "QUATERNION":
             values[rows] = single_unit_quaternions(values[rows])
         write_attribute(mesh, attribute, kind, values)
@@ -132,7 +128,7 @@ def write_columns(
         updated(mesh)
 
 
-def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+def updated(mesh: Data) -> None:
     """Tell Blender that attributes changed."""
     if isinstance(mesh, bpy.types.PointCloud):
         mesh.update_tag()
@@ -140,13 +136,24 @@ def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
         mesh.update()
 
 
+def read_field(items: Any, field: str, dtype: type, width: int = 1) -> NDArray[Any]:
+    """A field of all items of a Blender collection, (N,), or (N, width) for vectors and colours."""
+    values: NDArray[Any] = np.empty(len(items) * width, dtype)
+    items.foreach_get(field, values)
+    return values if width == 1 else values.reshape(-1, width)
+
+
+def read_triangles(mesh: bpy.types.Mesh) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices, (V, 3), and triangles, (T, 3), of a mesh."""
+    mesh.calc_loop_triangles()
+    places = read_field(mesh.vertices, "co", np.float32, 3)
+    return places, read_field(mesh.loop_triangles, "vertices", np.int32, 3)
+
+
 def read_attribute(mesh: bpy.types.Mesh, name: str) -> NDArray[Any]:
-    """A point attribute, (N,), or (N, width) for vectors and colours."""
+    """A point attribute, as `read_field` gives it."""
     attribute = mesh.attributes[name]
-    kind = KINDS[attribute.data_type]
-    values: NDArray[Any] = np.empty(len(attribute.data) * kind.width, kind.dtype)
-    attribute.data.foreach_get(kind.field, values)
-    return values if kind.width == 1 else values.reshape(-1, kind.width)
+    return read_field(attribute.data, *KINDS[attribute.data_type])
 
 
 def attribute_if_any(mesh: bpy.types.Mesh, name: str, *kinds: str) -> NDArray[Any] | None:
@@ -161,8 +168,8 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
     if not has(mesh, name, data_type):
         remove_attribute(mesh, name)
         attribute = mesh.attributes.new(name, data_type, "POINT")
-    kind = KINDS[data_type]
-    attribute.data.foreach_set(kind.field, np.ascontiguousarray(values, kind.dtype).ravel())
+    field, dtype, _ = KINDS[data_type]
+    attribute.data.foreach_set(field, np.ascontiguousarray(values, dtype).ravel())
 
 
 def digest(checked: SplatObject) -> int:
@@ -188,9 +195,9 @@ def read_columns(
     for attribute, columns in checked.layout.by_attribute(names).items():
         values = read_attribute(checked.mesh, attribute)
         for column in columns:
-            coding, own = column.place.coding, values
+            coding, own = column.coding, values
             if values.ndim > 1:
-                own = values[:, column.place.component].copy()  # alone in memory
+                own = values[:, column.component].copy()  # alone in memory
             own = coding.to_file(own) if coding else own
             yield column.name, own.view(np.uint32) if column.dtype[1:] == "u4" else own
 

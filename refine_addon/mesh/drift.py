@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.affine import Move, affine_moves
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
-from .layout import ROTATION, SCALE, check, has, is_native, sh_degree
+from .layout import ROTATION, SCALE, Data, check, has, is_native, sh_degree
 
 HOME = "refine_home"
 """Point vector: the splat's position when its scales, rotation and harmonics were written."""
@@ -43,7 +43,7 @@ class Drift(NamedTuple):
     mendable: bool
 
 
-def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+def stamp(mesh: Data) -> None:
     """Note the present state of all splats as free of drift."""
     position = mesh_attributes.read_attribute(mesh, "position")
     mesh_attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", position)
@@ -52,12 +52,12 @@ def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     mesh_attributes.write_attribute(mesh, SHAPE, "INT", codes.view(np.int32))
 
 
-def is_stamped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
+def is_stamped(mesh: Data) -> bool:
     """Whether a mesh has notes."""
     return has(mesh, HOME, "FLOAT_VECTOR") and has(mesh, SHAPE, "INT")
 
 
-def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
+def found(mesh: Data) -> Drift | None:
     """Drift of a mesh; None without drift or notes. Counts are estimates from a sample.
     Takes 10 ms per million splats if nothing changed."""
     if (notes := disturbed(mesh)) is None:
@@ -105,7 +105,7 @@ def of(obj: bpy.types.Object) -> Drift | None:
     return known[key]
 
 
-def disturbed(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Notes | None:
+def disturbed(mesh: Data) -> Notes | None:
     """Notes of a mesh, from which drift is repaired; None without notes or if nothing changed."""
     notes = Notes(mesh) if is_stamped(mesh) else None
     return None if notes is None or notes.undisturbed else notes
@@ -114,7 +114,7 @@ def disturbed(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Notes | None:
 class Notes:
     """Notes and present values of a mesh, read once, usable on any thread."""
 
-    def __init__(self, mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+    def __init__(self, mesh: Data) -> None:
         self.home, self.position, codes = (
             mesh_attributes.read_attribute(mesh, name) for name in (HOME, "position", SHAPE)
         )
@@ -159,7 +159,7 @@ class Notes:
         return degrees if self.degree is not None else np.zeros_like(degrees)
 
 
-def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.float32]]:
+def _shapes(mesh: Data) -> list[NDArray[np.float32]]:
     """Attributes that hold scales and rotations, (N,) or (N, width) each."""
     names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
     names = [SCALE, ROTATION] if is_native(mesh) else names

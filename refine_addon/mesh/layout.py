@@ -42,43 +42,39 @@ _LOG = Coding(single_log_scales, scales)
 _LOGIT = Coding(single_logits, opacity)
 
 
-class Place(NamedTuple):
-    """Where a property is stored: attribute, vector component (0 for scalars), allowed attribute
-    types, and coding (None if stored as in the file)."""
+class Column(NamedTuple):
+    """A PLY property, its type in the file as in ``"<f4"``, and its place: attribute, vector
+    component (0 for scalars), allowed attribute types, coding (None if stored as in the file)."""
 
+    name: str
+    dtype: str
     attribute: str
     component: int
     kinds: tuple[str, ...]
     coding: Coding | None = None
 
 
-class Kind(NamedTuple):
-    """Field for `foreach_get`, element type, and numbers in an element of an attribute type."""
-
-    field: str
-    dtype: type
-    width: int
-
-
+Place = tuple[Any, ...]  # The last fields of `Column`, from `attribute`
 KINDS = {
-    "FLOAT": Kind("value", np.float32, 1),
-    "INT": Kind("value", np.int32, 1),
-    "INT8": Kind("value", np.int8, 1),
-    "BOOLEAN": Kind("value", np.bool_, 1),
-    "FLOAT_VECTOR": Kind("vector", np.float32, 3),
-    "FLOAT_COLOR": Kind("color", np.float32, 4),
-    "FLOAT4": Kind("vector", np.float32, 4),
-    "QUATERNION": Kind("value", np.float32, 4),
+    "FLOAT": ("value", np.float32, 1),
+    "INT": ("value", np.int32, 1),
+    "INT8": ("value", np.int8, 1),
+    "BOOLEAN": ("value", np.bool_, 1),
+    "FLOAT_VECTOR": ("vector", np.float32, 3),
+    "FLOAT_COLOR": ("color", np.float32, 4),
+    "FLOAT4": ("vector", np.float32, 4),
+    "QUATERNION": ("value", np.float32, 4),
 }
+"""Type of an attribute -> field for `foreach_get`, type and number of the numbers in an element."""
 
 STORAGE = dict.fromkeys(("u1", "i2", "u2", "i4", "u4"), "INT")
 STORAGE |= {"i1": "INT8", "f4": "FLOAT", "f8": "FLOAT"}
 """Type of a PLY property -> type of its attribute; u4 is stored by its bits, f8 is rounded."""
 
-PLACES = {name: Place("position", axis, ("FLOAT_VECTOR",)) for axis, name in enumerate("xyz")}
+PLACES = {name: ("position", axis, ("FLOAT_VECTOR",)) for axis, name in enumerate("xyz")}
 """Properties that are components of Blender's positions."""
 
-NORMAL_PLACES = {f"n{axis}": at._replace(attribute="normal") for axis, at in PLACES.items()}
+NORMAL_PLACES = {f"n{axis}": ("normal", *at[1:]) for axis, at in PLACES.items()}
 """Where Blender's own PLY importer puts a file's normals."""
 
 _LONGEST_NAME = 63  # Bytes of Blender's longest attribute name
@@ -91,15 +87,7 @@ VERTICAL_AXIS = re.compile(r"comment[ \t]+vertical axis:([^\r\n\\]*)(?:\r?\n|(?:
 """A comment that names a PLY's vertical axis, in a header or in JSON."""
 
 _TYPES = ("MESH", "POINTCLOUD")
-
-
-@dataclass(frozen=True)
-class Column:
-    """A PLY property, its type in the file as in ``"<f4"``, and its place in the mesh."""
-
-    name: str
-    dtype: str
-    place: Place
+Data = bpy.types.Mesh | bpy.types.PointCloud
 
 
 @dataclass(frozen=True)
@@ -123,7 +111,7 @@ class Layout:
         parts: dict[str, list[Column]] = {}
         for column in self.columns:
             if column.name in names:
-                parts.setdefault(column.place.attribute, []).append(column)
+                parts.setdefault(column.attribute, []).append(column)
         return parts
 
     @property
@@ -141,7 +129,7 @@ class SplatObject:
     layout: Layout
 
     @property
-    def mesh(self) -> bpy.types.Mesh | bpy.types.PointCloud:
+    def mesh(self) -> Data:
         """The object's data."""
         return self.obj.data
 
@@ -173,7 +161,7 @@ def has(mesh: bpy.types.ID, name: str, *kinds: str) -> bool:
     return bool(attribute and attribute.data_type in kinds and attribute.domain == "POINT")
 
 
-def splat_count(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> int:
+def splat_count(mesh: Data) -> int:
     """Splats of a mesh or a point cloud."""
     return len(mesh.points if hasattr(mesh, "points") else mesh.vertices)
 
@@ -183,19 +171,17 @@ def looks_like_splats(obj: bpy.types.Object | None) -> bool:
     return obj is not None and obj.type in _TYPES and holds_splats(obj.data)
 
 
-def holds_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
+def holds_splats(data: Data) -> bool:
     """Whether an object's data seems to hold splats."""
     attributes = data.attributes
     return ("opacity" in attributes and "f_dc_0" in attributes) or is_native(data)
 
 
-def changed_data(
-    depsgraph: bpy.types.Depsgraph | None,
-) -> Iterator[bpy.types.Mesh | bpy.types.PointCloud]:
+def changed_data(depsgraph: bpy.types.Depsgraph | None) -> Iterator[Data]:
     """Meshes and point clouds whose geometry an update of Blender's changed."""
     for update in depsgraph.updates if depsgraph else ():
         data = getattr(update.id.original, "data", update.id.original)
-        if update.is_updated_geometry and isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud)):
+        if update.is_updated_geometry and isinstance(data, Data):
             yield data
 
 
@@ -205,21 +191,21 @@ def is_native(data: bpy.types.ID) -> bool:
     return hasattr(data, "points") and BASE in attributes and SCALE in attributes
 
 
-def _native_places(data: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Place]:
+def _native_places(data: Data) -> dict[str, Place]:
     """Property -> place in a point cloud of Blender's own splats; empty for other data.
     Each ``radiance:sh_*`` holds RGB of one harmonic; a file has all of red first."""
     if not is_native(data):
         return {}
     count = rest_count(data) // 3
-    by_name = {"opacity": Place(BASE, 3, _FOUR_FLOATS, _LOGIT)}
+    by_name = {"opacity": (BASE, 3, _FOUR_FLOATS, _LOGIT)}
     for axis in range(3):  # or channel: red, green, blue
-        by_name[f"f_dc_{axis}"] = Place(BASE, axis, _FOUR_FLOATS)
-        by_name[f"scale_{axis}"] = Place(SCALE, axis, ("FLOAT_VECTOR",), _LOG)
+        by_name[f"f_dc_{axis}"] = (BASE, axis, _FOUR_FLOATS)
+        by_name[f"scale_{axis}"] = (SCALE, axis, ("FLOAT_VECTOR",), _LOG)
         for index in range(count):
-            place = Place(f"{HARMONIC}{index}", axis, ("FLOAT_VECTOR",))
+            place = f"{HARMONIC}{index}", axis, ("FLOAT_VECTOR",)
             by_name[f"f_rest_{axis * count + index}"] = place
     for index in range(4):
-        by_name[f"rot_{index}"] = Place(ROTATION, index, ("QUATERNION",))
+        by_name[f"rot_{index}"] = (ROTATION, index, ("QUATERNION",))
     return by_name
 
 
@@ -254,7 +240,7 @@ def check(obj: bpy.types.Object) -> SplatObject:
         )
     layout = layout_of(obj)
     attributes = obj.data.attributes
-    absent = [c.place.attribute for c in layout.columns if c.place.attribute not in attributes]
+    absent = [c.attribute for c in layout.columns if c.attribute not in attributes]
     if absent:
         present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
         more = ", ..." if len(present) > _MOST_NAMES else ""
@@ -265,11 +251,11 @@ def check(obj: bpy.types.Object) -> SplatObject:
             f"(it has {', '.join(present[:_MOST_NAMES])}{more})"
         )
     for column in layout.columns:
-        if not has(obj.data, column.place.attribute, *column.place.kinds):
-            attribute = attributes[column.place.attribute]
+        if not has(obj.data, column.attribute, *column.kinds):
+            attribute = attributes[column.attribute]
             raise RefineError(
                 f"{label}: attribute '{attribute.name}' is {attribute.data_type} on "
-                f"{attribute.domain}, expected {' or '.join(column.place.kinds)} on POINT"
+                f"{attribute.domain}, expected {' or '.join(column.kinds)} on POINT"
             )
     return SplatObject(obj, layout)
 
@@ -313,7 +299,7 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
 
     def read(record: Any) -> Layout | None:
         columns = tuple(
-            Column(name, dtype, places.get(name) or _plain(dtype, attribute, component))
+            Column(name, dtype, *(places.get(name) or _plain(dtype, attribute, component)))
             for name, dtype, attribute, component in record["columns"]
         )
         # Splats may have been deleted, and Join may have added harmonics of a higher degree.
@@ -334,7 +320,7 @@ def _with_harmonics(layout: Layout, count: int, rest: Sequence[Column]) -> Layou
     end = len(colors) - colors[::-1].index(True)
     columns = [*layout.columns[:end], *rest, *layout.columns[end:]]
     # All little-endian, as a header has one byte order.
-    plain = tuple(Column(c.name, c.dtype.replace(">", "<"), c.place) for c in columns)
+    plain = tuple(column._replace(dtype=column.dtype.replace(">", "<")) for column in columns)
     header = new_header(_row(plain), count)
     comments = re.findall(rb"^(?:comment|obj_info)\b[^\r\n]*", layout.header, re.MULTILINE)
     first = header.index(b"element")
@@ -343,12 +329,12 @@ def _with_harmonics(layout: Layout, count: int, rest: Sequence[Column]) -> Layou
 
 
 def _floats(names: Sequence[str], places: Mapping[str, Place]) -> list[Column]:
-    return [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
+    return [Column(name, "<f4", *(places.get(name) or _plain("<f4", name))) for name in names]
 
 
 def _plain(dtype: str, attribute: str, component: int = 0) -> Place:
     kind = "FLOAT_VECTOR" if attribute in ("position", "normal") else STORAGE[dtype[1:]]
-    return Place(attribute, component, (kind,))
+    return attribute, component, (kind,)
 
 
 def _standard(obj: bpy.types.Object) -> Layout:
@@ -369,7 +355,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
     if THIRD_SCALE not in attributes and THIRD_SCALE not in places and "scale_1" in attributes:
         names.remove(THIRD_SCALE)
     columns = _floats(names, places)
-    columns += _further_columns(obj.data, {*names, *(c.place.attribute for c in columns)})
+    columns += _further_columns(obj.data, {*names, *(c.attribute for c in columns)})
     header = new_header(_row(columns), splat_count(obj.data))
     return Layout(tuple(columns), header)
 
@@ -378,7 +364,7 @@ def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
     """Columns of other scalar point attributes, but for those of `taken` and of this add-on."""
     dtypes = {"FLOAT": "<f4", "INT": "<i4", "INT8": "<i1"}
     return [
-        Column(attribute.name, dtype, _plain(dtype, attribute.name))
+        Column(attribute.name, dtype, *_plain(dtype, attribute.name))
         for attribute in mesh.attributes
         if (dtype := dtypes.get(attribute.data_type))
         and attribute.domain == "POINT"
@@ -393,15 +379,15 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
     for name in rows.names or ():
         kind = rows[name].str
         if name in PLACES:
-            columns.append(Column(name, kind, PLACES[name]))
+            columns.append(Column(name, kind, *PLACES[name]))
             continue
         plain = name not in _TAKEN and not name.startswith((".", "refine_"))
         plain = plain and len(name.encode()) <= _LONGEST_NAME
         other = f"ply_{name}".encode()[:_LONGEST_NAME].decode(errors="ignore")
         attribute = mesh.attributes.new(name if plain else other, STORAGE[kind[1:]], "POINT")
         attribute = attribute or mesh.attributes.new(other, STORAGE[kind[1:]], "POINT")
-        columns.append(Column(name, kind, _plain(kind, attribute.name)))
-    record = [[c.name, c.dtype, c.place.attribute, c.place.component] for c in columns]
+        columns.append(Column(name, kind, *_plain(kind, attribute.name)))
+    record = [[c.name, c.dtype, c.attribute, c.component] for c in columns]
     text = vertex_header(header).decode("latin-1")
     mesh[LAYOUT] = json.dumps({"header": text, "columns": record})
     return Layout(tuple(columns), header)

@@ -20,7 +20,7 @@ from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
-from .layout import SplatObject, has, recorded, rows_of, splat_count
+from .layout import Data, SplatObject, has, recorded, rows_of, splat_count
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: score, rank from 0 (removed first) to 1, number of views with the splat."""
@@ -98,9 +98,7 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     return recorded(mesh, RECORD, lambda content: content if content.keys() >= needed else None)
 
 
-def move_origin(
-    mesh: bpy.types.Mesh, before: NDArray[np.float64], after: NDArray[np.float64]
-) -> None:
+def move_origin(mesh: Data, before: NDArray[np.float64], after: NDArray[np.float64]) -> None:
     """Keep scores valid for an object whose (4, 4) matrix changed while its splats stayed in place
     in the world."""
     scoring = record(mesh) or {}
@@ -170,9 +168,7 @@ def store_floaters(checked: SplatObject, cleaned: Cleaned) -> None:
     mesh_attributes.updated(checked.mesh)
 
 
-def floaters(
-    mesh: bpy.types.Mesh | bpy.types.PointCloud,
-) -> dict[str, tuple[int, float]] | None:
+def floaters(mesh: Data) -> dict[str, tuple[int, float]] | None:
     """Floaters for each reason, and the share of further views that see past them, 0 if unknown.
     None without a search since splats were deleted."""
 

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from . import attributes as mesh_attributes
 from .edit import mark
-from .layout import SplatObject, check, splat_count
+from .layout import Data, SplatObject, check, splat_count
 
 HIDDEN = ".hide_vert"
 
 
-def name_of(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> str:
+def name_of(mesh: Data) -> str:
     """Attribute that holds the selection."""
     return ".selection" if hasattr(mesh, "points") else ".select_vert"
 

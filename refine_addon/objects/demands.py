@@ -21,7 +21,7 @@ from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Zone, 
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject, recorded, splat_count
+from ..mesh.layout import Data, SplatObject, recorded, splat_count
 
 RECORD = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
 Masks = dict[str, NDArray[np.bool_] | None]  # Splats of all that are ``protected`` and ``removed``
@@ -112,7 +112,6 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
     """An object as a volume in the world: a mesh evaluated with modifiers, an empty as drawn.
     Whether a mesh is closed is checked when it is used."""
     label = f"object '{obj.name}'"
-    make: partial[Any]
     if obj.type == "MESH":
         local, triangles = _surface(obj)
         make = partial(Solid, moved(local, world_matrix(obj)), triangles)
@@ -170,7 +169,7 @@ def refresh(scene: bpy.types.Scene, group: Sequence[SplatObject]) -> Masks:
     return _as_one(each, group)
 
 
-def record(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
+def record(mesh: Data) -> dict[str, Any]:
     """``protected``, ``removed_by_user``, ``volumes`` (splats by label), or ``error``, as marked.
     Empty if splats came or went since."""
 
@@ -197,16 +196,10 @@ def _surface(obj: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int
             f"object '{obj.name}': is disabled in viewports or excluded from the view layer, "
             "where Blender applies no modifiers; enable it first"
         )
-    mesh = evaluated.to_mesh()
     try:
-        mesh.calc_loop_triangles()
-        vertices = np.empty(3 * len(mesh.vertices), np.float32)
-        triangles = np.empty(3 * len(mesh.loop_triangles), np.int32)
-        mesh.vertices.foreach_get("co", vertices)
-        mesh.loop_triangles.foreach_get("vertices", triangles)
+        return mesh_attributes.read_triangles(evaluated.to_mesh())
     finally:
         evaluated.to_mesh_clear()
-    return vertices.reshape(-1, 3), triangles.reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)

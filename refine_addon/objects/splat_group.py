@@ -382,7 +382,6 @@ def prune_object(
     def saved(result: Result, exported: Path | None) -> None:
         (change,) = changes(frames_of([checked]), result)
         with mesh_edit.all_or_nothing([checked]):
-            assert result.scores is not None
             mesh_scores.store([checked], result.scores, method)
             reduce_object(checked, change)
             try:

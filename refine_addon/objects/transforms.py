@@ -51,12 +51,8 @@ def read_to_move(
     return names, partial(_moved, splats, normals, matrix, notes)
 
 
-def _moved(
-    splats: Splats,
-    normals: NDArray[np.float32],
-    matrix: NDArray[np.float64],
-    notes: mesh_drift.Notes | None,
-) -> tuple[dict[str, NDArray[Any]], int]:
+def _moved(splats, normals, matrix, notes):
+    """Columns of splats and normals, repaired by notes and moved by a matrix; number repaired."""
     moves = notes.moves()[0] if notes else []
     regrouped = notes.regrouped() if notes else np.zeros(len(splats), np.int64)
     if regrouped.any():

@@ -24,6 +24,8 @@ from ..objects.instances import Key, Placing, placings
 from . import shader
 from .arrays import MARKS, Marks, Packed, as_texture, first_of_each, most_important_first, pack
 
+Places = dict[Key, NDArray[np.float64]]  # World matrices of splats, (4, 4)
+
 
 @dataclass(eq=False)
 class MeshSplats:
@@ -120,8 +122,8 @@ class Content:
         """Whether splats were packed that no view has drawn yet."""
         return any(held.future and held.future.done() for held in self._held.values())
 
-    def update(self, places: Iterable[Placing]) -> dict[Key, NDArray[np.float64]]:
-        """Prepare placed splats; (4, 4) world matrices of those ready, by key.
+    def update(self, places: Iterable[Placing]) -> Places:
+        """Prepare placed splats; the matrices of those that are ready.
         Splats in edit mode are those of the last `read_edited`."""
         for held in self._held.values():  # of deleted meshes, too
             if held.future and held.future.done():
@@ -218,14 +220,13 @@ def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:
     packs = [held[mesh].packed for _, mesh in keys]
     counts = first_of_each([len(packed) for packed in packs])
     means = np.empty((sum(counts), 4), np.float32)
-    covariances = np.empty((sum(counts), 8), np.float32)
+    shapes = np.empty((sum(counts), 8), np.float32)
     slots, each = {}, zip(keys, packs, rows_of(counts), counts, strict=True)
     for number, (key, packed, rows, count) in enumerate(each):
         slots[key] = Slot(held[key[1]], packed, number, rows, count)
         means[rows, :3], means[rows, 3] = packed.means[:count], number
-        covariances[rows] = packed.covariances[:count]
-    values = {"means": means, "covariances": covariances[:, :4]}
-    values["more_covariances"] = covariances[:, 4:]
+        shapes[rows] = packed.covariances[:count]
+    values = {"means": means, "covariances": shapes[:, :4], "more_covariances": shapes[:, 4:]}
     textures = {n: shader.texture(as_texture(v), 4, "RGBA32F") for n, v in values.items()}
     return Atlas(slots, textures, len(means))
 

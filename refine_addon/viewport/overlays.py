@@ -17,6 +17,7 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Color, Vector
 from numpy.typing import NDArray
 
+from ..mesh import attributes as mesh_attributes
 from ..mesh.layout import looks_like_splats
 from .arrays import GOES, MARKS, STAYS, ramp
 
@@ -64,23 +65,17 @@ def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
     if (colors[:, 3] >= _OPAQUE).all():
         return
     mesh = obj.evaluated_get(context.evaluated_depsgraph_get()).data
-    mesh.calc_loop_triangles()
-    count = len(mesh.loop_triangles)
-    corners, slots = np.empty(3 * count, np.int32), np.empty(count, np.int32)
-    places, normals = np.empty(3 * len(mesh.vertices), np.float32), np.empty(3 * count, np.float32)
-    mesh.loop_triangles.foreach_get("vertices", corners)
-    mesh.loop_triangles.foreach_get("material_index", slots)
-    mesh.loop_triangles.foreach_get("normal", normals)
-    mesh.vertices.foreach_get("co", places)
+    places, corners = mesh_attributes.read_triangles(mesh)
+    slots = mesh_attributes.read_field(mesh.loop_triangles, "material_index", np.int32)
+    normals = mesh_attributes.read_field(mesh.loop_triangles, "normal", np.float32, 3)
     toward = context.region_data.view_rotation @ Vector((0.0, 0.0, 1.0))
     toward = (obj.matrix_world.to_3x3().transposed() @ toward).normalized()
     paint = colors[slots.clip(0, len(colors) - 1)]
-    paint[:, :3] *= (0.4 + 0.6 * np.abs(normals.reshape(-1, 3) @ np.array(toward)))[:, None]
+    paint[:, :3] *= (0.4 + 0.6 * np.abs(normals @ np.array(toward)))[:, None]
     seen = paint[:, 3] < _OPAQUE
     if not seen.any():
         return
-    corners = corners.reshape(-1, 3)[seen].ravel()
-    shape = _shape("TRIS", places.reshape(-1, 3)[corners], np.repeat(paint[seen], 3, axis=0))
+    shape = _shape("TRIS", places[corners[seen].ravel()], np.repeat(paint[seen], 3, axis=0))
     gpu.state.depth_mask_set(True)
     with gpu.matrix.push_pop():
         gpu.matrix.multiply_matrix(obj.matrix_world)

@@ -13,10 +13,9 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
-from ..objects.instances import Key
 from . import shader
 from .arrays import MOST, Eye, Marks, as_texture, colored, farthest_first, first_of_each, in_front
-from .content import Content, Slot
+from .content import Content, Places, Slot
 
 REST = 0.2  # Seconds without a change after which a view counts as resting
 STYLES = {"ELLIPSES": 1, "CENTERS": 2}  # The shader's style in a mode, in others 0: splats
@@ -89,13 +88,7 @@ class View:
         return not self.complete and time.monotonic() - self._changed >= REST
 
     def draw(
-        self,
-        content: Content,
-        places: dict[Key, NDArray[np.float64]],
-        camera: Camera,
-        mode: str,
-        *,
-        solid: bool,
+        self, content: Content, places: Places, camera: Camera, mode: str, *, solid: bool
     ) -> None:
         """Draw splats into the view, in one of `draw.MODES`. `places`: from `Content.update`;
         `solid`: whether other objects hide splats behind them."""
