@@ -157,9 +157,7 @@ class REFINE_PT_prune(InSidebar, bpy.types.Panel):
             column.prop(settings, "max_mb_in")
         row = layout.row(align=True)
         row.operator("refine.score", icon="CAMERA_DATA")
-        apply = row.row(align=True)
-        apply.enabled = record is not None
-        apply.operator("refine.apply", icon="TRASH")
+        row.operator("refine.apply", icon="TRASH")
         _draw_plan(layout, obj, record, plan)
         layout.operator("refine.compare", icon="IMAGE_DATA")
         if record and (text := operators.measured(obj, settings)):

@@ -337,20 +337,18 @@ def _tool(shape: str, label: str, which: str, icon: str, mode: str) -> type:
     return type(f"REFINE_TOOL_{shape.lower()}_{mode.lower()}", (bpy.types.WorkSpaceTool,), body)
 
 
-_tools: list[type[bpy.types.WorkSpaceTool]] = []
+_TOOLBARS = [(_tool(*row, mode), row) for mode in ("OBJECT", "EDIT_MESH") for row in _TOOLS]
+"""Tools of object mode and mesh edit mode, and their rows of `_TOOLS`."""
 
 
 def register() -> None:
-    """Add the tools to the toolbars of object mode and mesh edit mode."""
-    for mode in ("OBJECT", "EDIT_MESH"):
-        for row in _TOOLS:
-            tool = _tool(*row, mode)
-            bpy.utils.register_tool(tool, separator=row is _TOOLS[0])
-            _tools.append(tool)
+    """Add the tools to the toolbars."""
+    for tool, row in _TOOLBARS:
+        bpy.utils.register_tool(tool, separator=row is _TOOLS[0])
 
 
 def unregister() -> None:
     """Remove the tools, and free what the last stroke saw."""
-    while _tools:
-        bpy.utils.unregister_tool(_tools.pop())
+    for tool, _ in reversed(_TOOLBARS):
+        bpy.utils.unregister_tool(tool)
     _kept.clear()
