@@ -21,10 +21,9 @@ from ..core.formats.streamed_sog import INDEX, StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from . import properties
-from .operator_bases import Answer, Job
+from .operator_bases import Answer, Job, Work
 
 _FORMATS = (
     (".ply", ".ply", "In the layout that was imported"),
@@ -35,8 +34,7 @@ _FORMATS = (
 
 class Exporting(Job, ExportHelper):
     """An operator that writes the active object's splats, and does not change it.
-    ``new_name(obj)`` is what the file browser proposes; `gather` ends the job with warnings;
-    `compute` gives sentences on what was written."""
+    ``new_name(obj)`` is what the file browser proposes."""
 
     bl_options = {"REGISTER", "PRESET"}
     apply_transform: BoolProperty(
@@ -63,11 +61,6 @@ class Exporting(Job, ExportHelper):
         files = [splat_group.read_for_export(each, apply_transform=moved) for each in group]
         notes = [splat_group.export_notes(each, apply_transform=moved) for each in group]
         return files, list(dict.fromkeys(itertools.chain(*notes)))
-
-    def put(self, _context: Context, _group: list[SplatObject], job: Any, told: Any) -> None:
-        """Report what was written, with notes."""
-        self.tell(job[-1])
-        self.tell(told, "INFO")
 
 
 class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
@@ -109,23 +102,22 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         self.settled = self.suffix
         return before != (self.filepath, self.suffix)
 
-    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """Object, path and notes; raises for what cannot be written."""
-        target = expanded(bpy.path.abspath(self.filepath))
-        refuse_existing(target, overwrite=self.overwrite)
+    def work(self, context: Context) -> Work:
+        """Write the file; say what it cannot hold."""
+        target, overwrite = expanded(bpy.path.abspath(self.filepath)), self.overwrite
+        refuse_existing(target, overwrite=overwrite)
         (read,), notes = self.read(context.object)
         axes = AXES[0] if self.spz_y_up else context.object.data.get(mesh_layout.AXES, "")
-        return [], (lambda: replace(read(), axes=axes), target, self.overwrite, notes)
 
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> list[str]:
-        """Write the file."""
-        read, target, overwrite, _ = job
-        report(progress, 0.0, target.name)
-        file, form = read(), registry.format_named(target)
-        write_splats(target, file, overwrite=overwrite)
-        _, told = losses(file, form, np.ones(len(file), np.bool_))
-        return [*told, f"Wrote the splats to {target}"]
+        def write(progress: Progress) -> list[str]:
+            report(progress, 0.0, target.name)
+            file, form = replace(read(), axes=axes), registry.format_named(target)
+            write_splats(target, file, overwrite=overwrite)
+            return losses(file, form, np.ones(len(file), np.bool_))[1]
+
+        _, told = yield [], write
+        self.tell(notes)
+        self.tell([*told, f"Wrote the splats to {target}"], "INFO")
 
 
 class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
@@ -144,30 +136,29 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
         """Name of a folder, which is made."""
         return f"{splat_group.levels_of(obj)[0].name}_levels"
 
-    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """Levels, finest first, path and notes."""
+    def work(self, context: Context) -> Work:
+        """Write the levels, finest first."""
         objects = splat_group.levels_of(mesh_layout.check(context.object).obj)
         files, notes = self.read(*objects)
         width = objects[1][splat_group.LEVEL_STATS].get("distance", np.inf)
         if not self.apply_transform:  # in the object's own unit
             width /= np.cbrt(abs(objects[0].matrix_world.to_3x3().determinant())) or 1.0
-        path = expanded(bpy.path.abspath(self.filepath))
+        path, overwrite = expanded(bpy.path.abspath(self.filepath)), self.overwrite
         target = path if path.name == INDEX else path / INDEX
-        return [], (files, float(width), target, self.overwrite, notes)
 
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> list[str]:
-        """Write the levels."""
-        files, width, target, overwrite, _ = job
-        with folder_for(target, overwrite=overwrite) as folder:
-            scene: Any = None
-            for number, file in enumerate(files):
-                report(progress, number / len(files), f"level {number}")
-                splats = registry.held_splats(target, sog.FORMAT, file(), None, {})
-                scene = scene or StreamedSog(splats.means, width, folder)
-                scene.add(splats)
-            scene.publish(target, overwrite=overwrite)
-        return [f"Wrote {len(files)} levels, the finest as it is, to {target}"]
+        def write(progress: Progress) -> None:
+            with folder_for(target, overwrite=overwrite) as folder:
+                scene: Any = None
+                for number, file in enumerate(files):
+                    report(progress, number / len(files), f"level {number}")
+                    splats = registry.held_splats(target, sog.FORMAT, file(), None, {})
+                    scene = scene or StreamedSog(splats.means, float(width), folder)
+                    scene.add(splats)
+                scene.publish(target, overwrite=overwrite)
+
+        yield [], write
+        self.tell(notes)
+        self.report({"INFO"}, f"Wrote {len(files)} levels, the finest as it is, to {target}")
 
 
 def _draw_menu(menu: bpy.types.Menu, _context: Context) -> None:

@@ -27,11 +27,9 @@ from ..core.views import ViewSet
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import layout as mesh_layout
-from ..mesh.layout import SplatObject
 from ..viewport import draw
 from . import operator_bases, properties
-from .operator_bases import FAILURES, Answer, Job, idle, in_object_mode
-from .properties import UPRIGHT_TEXT
+from .operator_bases import FAILURES, Answer, Job, Work, idle, in_object_mode
 from .wrapped import counted
 
 _ABOVE = 3  # folders above the splats in which their cameras are looked for
@@ -49,7 +47,7 @@ class _Importing(Job, ImportHelper):
         type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
     )
     directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
-    upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
+    upright: BoolProperty(name="Upright", description=properties.UPRIGHT_TEXT)
     set_resolution: BoolProperty(
         name="Set Render Size",
         description="Give the scene the image size of the first camera, and make that the active "
@@ -115,20 +113,13 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
         suggest_resolution(self, context)
         return self.invoke_popup(context)
 
-    def gather(self, _context: Context) -> tuple[list[SplatObject], Path]:
-        """The path."""
+    def work(self, context: Context) -> Work:
+        """Make camera objects of the file's views; of a COLMAP model, the whole folder's."""
         path = Path(bpy.path.abspath(self.filepath))
         if len(self.files) > 1 and path.suffix not in _OF_MODELS:
             raise RefineError(f"got {len(self.files)} files, expected one of cameras")
-        return [], path
-
-    @staticmethod
-    def compute(path: Path, _progress: Progress) -> ViewSet:
-        """The file's views; of a COLMAP model, the whole folder's."""
-        return read_cameras(path.parent if path.suffix in _OF_MODELS else path)
-
-    def put(self, context: Context, _group: list[SplatObject], _job: Any, views: ViewSet) -> None:
-        """Make camera objects."""
+        path = path.parent if path.suffix in _OF_MODELS else path
+        _, views = yield [], lambda _progress: read_cameras(path)
         collection = self.add_cameras(context, views)
         self.warn_of_turn(context)
         self.report({"INFO"}, f"Imported {counted(len(views), 'camera')} into '{collection.name}'")
@@ -237,32 +228,29 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         column.label(text=os.path.relpath(cameras, folder), icon="CAMERA_DATA")
         column.prop(self, "set_resolution")
 
-    def gather(self, _context: Context) -> tuple[list[SplatObject], Any]:
-        """The files to read, and the camera file beside them if wanted."""
-        paths = self._paths()
+    def work(self, context: Context) -> Work:
+        """Make an object of each file, and of each camera beside the first if wanted.
+        Errors of unreadable files stop no others."""
+        paths, imported = self._paths(), []
         cameras = cameras_beside(paths[0].parent) if self.cameras else None
-        return [], (paths, cameras, (self.level, AXES[0] if self.spz_y_up else None))
+        how = self.level, AXES[0] if self.spz_y_up else None
 
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> tuple[list[SplatFile], ViewSet | None, list[Any]]:
-        """Files, views, and errors of unreadable ones, which stop no others."""
-        (paths, cameras, how), files, views, errors = job, [], None, []
-        for path, stage in zip(paths, stages(progress, *[1.0] * len(paths)), strict=True):
-            try:
-                files.append(_read(path, how, stage))
-            except FAILURES as error:
-                errors.append(error)
-        if cameras is not None and files:
-            try:
-                views = read_cameras(cameras)
-                files = [by_cameras(file, views) for file in files]
-            except FAILURES as error:
-                errors.append(error)
-        return files, views, errors
+        def read(progress: Progress) -> tuple[list[SplatFile], ViewSet | None, list[Any]]:
+            files, views, errors = [], None, []
+            for path, stage in zip(paths, stages(progress, *[1.0] * len(paths)), strict=True):
+                try:
+                    files.append(_read(path, how, stage))
+                except FAILURES as error:
+                    errors.append(error)
+            if cameras is not None and files:
+                try:
+                    views = read_cameras(cameras)
+                    files = [by_cameras(file, views) for file in files]
+                except FAILURES as error:
+                    errors.append(error)
+            return files, views, errors
 
-    def put(self, context: Context, _group: list[SplatObject], job: Any, read: Any) -> None:
-        """Make an object of each file and camera."""
-        (paths, cameras, _), (files, views, errors), imported = job, read, []
+        _, (files, views, errors) = yield [], read
         for file in files:
             try:
                 imported.append(self._import(context, file))

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
 import bpy
 import numpy as np
 from bpy.props import EnumProperty, IntProperty, PointerProperty
 from bpy.types import Context
 
-from ..core.cleaning.clean import Cleaning, clean
+from ..core.cleaning.clean import Cleaned, Cleaning, clean
 from ..core.errors import RefineError
+from ..core.execute import Progress
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -20,7 +18,7 @@ from ..mesh import selection
 from ..mesh.layout import SplatObject
 from ..objects import demands, splat_group
 from . import operator_bases, plans
-from .operator_bases import Acting, Answer, Job, idle, on_splats, tooltips
+from .operator_bases import Acting, Answer, Job, Work, idle, on_splats, tooltips
 from .operators import chosen_views
 from .select_operators import some, taken
 
@@ -165,20 +163,21 @@ class REFINE_OT_find_floaters(Job, bpy.types.Operator):
     bl_label = "Find Floaters"
     doing = "Looking for floaters"
 
-    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """A call of `clean`, in the world."""
+    def work(self, context: Context) -> Work:
+        """Find the floaters; store them, show them, report them."""
         checked, settings = mesh_layout.check(context.object), context.scene.refine
         mesh_edit.check_writable(checked.obj)
         cleaning = Cleaning(settings.to_reasons(), settings.views)
         masks = demands.Demands.of_scene(context.scene).masks([checked])
-        splats, views = splat_group.gather([checked]), chosen_views(context)
-        return [checked], partial(clean, splats, views, cleaning, **masks)
+        splats, views = splat_group.gather([checked]), chosen_views(context)  # in the world
 
-    def put(self, context: Context, group: list[SplatObject], _job: Any, cleaned: Any) -> None:
-        """Store the floaters, show them, report them."""
-        mesh_scores.store_floaters(group[0], cleaned)
+        def cleaned(progress: Progress) -> Cleaned:
+            return clean(splats, views, cleaning, **masks, progress=progress)
+
+        (checked,), found = yield [checked], cleaned
+        mesh_scores.store_floaters(checked, found)
         plans.refresh(context)
-        self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")
+        self.report({"INFO"}, f"Floaters: {found.in_words()}")
 
     def modal(self, context: Context, event: bpy.types.Event) -> Answer:
         """At the end ask whether to delete them."""

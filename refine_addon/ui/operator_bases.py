@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, wait
-from functools import partial
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import bpy
@@ -25,6 +25,7 @@ from ..viewport import draw as viewport_draw
 _STEP = 0.05  # Seconds between two looks at the thread
 PATIENCE = 0.7  # Seconds that a cancelled thread has to end before it is left alone
 Answer = set[str]  # FINISHED, CANCELLED, RUNNING_MODAL or PASS_THROUGH
+Work = Generator[tuple[list[SplatObject], Callable[[Progress], Any]], Any, None]  # See `Job`
 Need = Callable[[Context], str]  # Gives what an operator lacks to run, "" if nothing
 FAILURES = (RefineError, MemoryError)  # Exceptions reported as errors; all others are bugs
 
@@ -114,7 +115,8 @@ class Running:
         group, self.job = gathered
         self._targets = [Target.of(each) for each in group]
         self._left, self._shown, self.waits = TimeLeft(), "", ""
-        self.worker = worker or Worker(partial(operator.compute, self.job), operator.partial_step)
+        # The thread gets the function alone: cancelled, it may outlast all else.
+        self.worker = worker or Worker(self.job[1], operator.partial_step)
         self._timer = context.window_manager.event_timer_add(_STEP, window=context.window)
         _now[:] = [self]
         self.tell(context)
@@ -299,20 +301,30 @@ class Acting(Needing):
 class Job(Acting):
     """An operator on a thread, with progress bar and Esc. The window stays usable; the result is
     refused if objects changed. A class defines `doing`, its name while it runs, and
-
-    - ``gather(context)``: the objects that `put` writes to, and the job, which is the input of
-      `compute`; raises one of `FAILURES`,
-    - ``put(context, group, job, result)``: write the result to the unchanged objects, all or none.
+    ``work(context)``, a generator that raises `FAILURES`. It yields the objects that it is to write
+    to, and a function of `Progress` for the thread, with arrays only. It gets back the objects, if
+    they are unchanged, and the function's result, and writes to all objects or none.
 
     `partial_step`: the step whose partial result is kept on cancel."""
 
     doing, partial_step = "", None
     by_hand = False  # Whether a user started it; `invoke` sets it, also before a file browser
 
+    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
+        """Begin `work`: the objects, and the job, which is the rest of `work` and the function."""
+        rest = self.work(context)
+        group, function = next(rest)
+        return group, (rest, function)
+
     @staticmethod
     def compute(job: Any, progress: Progress) -> Any:
-        """The result; on any thread, with arrays only. By default it calls the job."""
-        return job(progress=progress)
+        """The function's result, on any thread."""
+        return job[1](progress)
+
+    def put(self, _context: Context, group: list[SplatObject], job: Any, result: Any) -> None:
+        """Do the rest of `work`, which writes the result."""
+        with suppress(StopIteration):
+            job[0].send((group, result))
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
         """Start the work on a thread."""

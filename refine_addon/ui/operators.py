@@ -1,5 +1,5 @@
 """Operators that score, prune and compare splat objects.
-Read `REFINE_OT_apply` from `gather` to `put` to see what runs when *Apply* is clicked."""
+Read `REFINE_OT_apply.work` to see what runs when *Apply* is clicked."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from ..objects.splat_group import Change, Members
 from ..viewport import draw as viewport_draw
 from . import plans
 from .images import put
-from .operator_bases import Answer, Job, in_object_mode, scored
+from .operator_bases import Answer, Job, Work, in_object_mode, scored
 from .wrapped import counted
 
 _SCORED = 0.97  # Share of the time that scoring takes; the rest counts the splats in each view
@@ -62,8 +62,8 @@ class REFINE_OT_score(Job, bpy.types.Operator):
     bl_label = "Score"
     doing = "Scoring splats"
 
-    def gather(self, context: Context) -> tuple[Members, Any]:
-        """A call of `score`, and `plans.origin` of each object."""
+    def work(self, context: Context) -> Work:
+        """Score, count the splats in each view; store both on the meshes and report."""
         settings = context.scene.refine
         method, views = settings.to_method(), chosen_views(context)
         group = splat_group.members(context.object)
@@ -72,30 +72,22 @@ class REFINE_OT_score(Job, bpy.types.Operator):
         quality = method.name != "closed-form" or settings.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
         masks = demands.refresh(context.scene, group)  # before `origin` reads the marks
-        call = partial(score, splats, views, method, **masks, quality=quality)
-        return group, (call, [plans.origin(member.obj) for member in group])
+        removed, origins = masks["removed"], [plans.origin(member.obj) for member in group]
 
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> tuple[Scores, NDArray[np.int64], float]:
-        """Scores, splats in each view, (V,), and seconds of scoring."""
-        (call, _), start = job, time.perf_counter()
-        scores = call(progress=part(progress, 0.0, _SCORED))
-        seconds = time.perf_counter() - start
-        (splats, views, _), removed = call.args, call.keywords["removed"]
-        means = splats.means if removed is None else splats.means[~removed]
-        rest = part(progress, _SCORED, 1.0)
-        return scores, frustum.census(means, views, progress=rest), seconds
+        def measure(progress: Progress) -> tuple[Scores, NDArray[np.int64], float]:
+            start, first = time.perf_counter(), part(progress, 0.0, _SCORED)
+            scores = score(splats, views, method, **masks, quality=quality, progress=first)
+            seconds = time.perf_counter() - start
+            means = splats.means if removed is None else splats.means[~removed]
+            rest = part(progress, _SCORED, 1.0)
+            return scores, frustum.census(means, views, progress=rest), seconds
 
-    def put(self, context: Context, group: Members, job: Any, result: Any) -> None:
-        """Store the scores on the meshes and report them."""
-        (call, origins), (scores, counts, seconds) = job, result
-        (_, views, method), masks = call.args, call.keywords
+        group, (scores, counts, seconds) = yield group, measure
         pairs = zip(views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         record = {"cameras": cameras, "protected": masks["protected"], "seconds": seconds}
         mesh_scores.store(group, scores, method, origins=origins, **record)
         plans.refresh(context)
-        removed = masks["removed"]
         out = 0 if removed is None else int(np.count_nonzero(removed))
         unseen = int((scores.seen == 0).sum()) - out
         self.report(
@@ -124,26 +116,21 @@ class REFINE_OT_apply(Job, bpy.types.Operator):
         self.by_hand = context.scene.refine.to_method().changes
         return self.execute(context)
 
-    def gather(self, context: Context) -> tuple[Members, Any]:
-        """The arguments of `prune`, and the input of `changes`."""
+    def work(self, context: Context) -> Work:
+        """Prune; delete removed splats, and change kept ones."""
         group = splat_group.members(context.object)
         for member in group:
             mesh_edit.check_deletable(member.obj)
         frames, form = splat_group.frames_of(group), context.scene.refine.to_form()
         reads = [splat_group.read_for_export(member) for member in group] if form else []
-        return group, (apply_arguments(context, group), frames, form, reads)
+        arguments = apply_arguments(context, group)
 
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> tuple[Result, list[Change]]:
-        """The result, and the change of each object."""
-        arguments, frames, form, reads = job
-        arguments = splat_group.sized(arguments, form, reads) if form else arguments
-        result = prune(**arguments, partial=True, progress=progress)
-        return result, splat_group.changes(frames, result)
+        def pruned(progress: Progress) -> tuple[Result, list[Change]]:
+            sized = splat_group.sized(arguments, form, reads) if form else arguments
+            result = prune(**sized, partial=True, progress=progress)
+            return result, splat_group.changes(frames, result)
 
-    def put(self, context: Context, group: Members, job: Any, result: Any) -> None:
-        """Delete removed splats, and change kept ones."""
-        (arguments, *_), (result, changes) = job, result
+        group, (result, changes) = yield group, pruned
         context.view_layer.update()
         if arguments["method"].changes:  # volumes may have moved meanwhile
             splat_group.check_forced(context.scene, group, arguments)
@@ -178,22 +165,17 @@ class REFINE_OT_levels(Job, bpy.types.Operator):
 
     needs = (*Job.needs, in_object_mode)
 
-    def gather(self, context: Context) -> tuple[Members, Any]:
-        """A call of `lod`."""
+    def work(self, context: Context) -> Work:
+        """Make the objects, and report each level's cost."""
         group, settings = [mesh_layout.check(context.object)], context.scene.refine
-        method, levels = settings.to_method(), settings.to_levels()
+        method, wanted = settings.to_method(), settings.to_levels()
         splats = splat_group.gather(group, whole=True if method.changes else None)
-        masks = demands.Demands.of_scene(context.scene).masks(group)
-        return group, partial(lod, splats, chosen_views(context), levels, method, **masks)
+        masks, views = demands.Demands.of_scene(context.scene).masks(group), chosen_views(context)
 
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> list[Level]:
-        """The levels."""
-        return list(job(progress=progress))
+        def made(progress: Progress) -> list[Level]:
+            return list(lod(splats, views, wanted, method, **masks, progress=progress))
 
-    def put(self, _context: Context, group: Members, job: Any, levels: Any) -> None:
-        """Make the objects and report each level's cost."""
-        splats, views, wanted, _ = job.args
+        group, levels = yield group, made
         collection = splat_group.add_levels(group[0], levels, viewing_distance(splats, views))
         counts = [
             f"{level.facts()['splats']:,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
@@ -213,28 +195,23 @@ class REFINE_OT_compare(Job, bpy.types.Operator):
     needs = (*Job.needs, scored)
     doing = "Comparing"
 
-    def gather(self, context: Context) -> tuple[Members, Any]:
-        """Apply's arguments, the splats, the active camera's view, and the present plan."""
+    def work(self, context: Context) -> Work:
+        """Draw both pictures of the active camera's view; show them, and report the PSNR."""
         view = CameraChoice("ACTIVE").views(context, context.object)[0]
         group = splat_group.members(context.object)
         arguments = apply_arguments(context, group)
         splats = arguments["splats"] or splat_group.gather(group, whole=None)
         plan = plans.stored(context.object, context.scene.refine)
-        return [], (arguments, splats, ViewSet((replace(view, weight=1.0),)), plan)
 
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> tuple[Comparison, float | None]:
-        """Both pictures of the kept splats; the estimated PSNR, dB."""
-        arguments, splats, view, _ = job
-        pruned = 0.6 if arguments["method"].changes else 0.1  # share of the time that pruning takes
-        result = prune(**arguments, partial=True, progress=part(progress, 0.0, pruned))
-        kept = result.merged.splats if result.merged else splats.take(result.keep)
-        (comparison,) = compare(splats, kept, view, progress=part(progress, pruned, 1.0))
-        return comparison, result.report["estimated_psnr"]
+        def drawn(progress: Progress) -> tuple[Comparison, float | None]:
+            pruned = 0.6 if arguments["method"].changes else 0.1  # share of the time
+            result = prune(**arguments, partial=True, progress=part(progress, 0.0, pruned))
+            kept = result.merged.splats if result.merged else splats.take(result.keep)
+            views, rest = ViewSet((replace(view, weight=1.0),)), part(progress, pruned, 1.0)
+            (comparison,) = compare(splats, kept, views, progress=rest)
+            return comparison, result.report["estimated_psnr"]
 
-    def put(self, context: Context, _group: Members, job: Any, result: Any) -> None:
-        """Put the pictures into images, show them, report the PSNR."""
-        (*_, plan), (comparison, estimated) = job, result
+        _, (comparison, estimated) = yield [], drawn
         if plan is not None:
             plan["measured"] = comparison
         pixels = {kind: getattr(comparison, kind) / np.float32(255.0) for kind in KINDS}

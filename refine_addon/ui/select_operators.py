@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import bpy
 import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
@@ -25,7 +23,7 @@ from ..objects import splat_group
 from ..objects.demands import Demands
 from ..viewport import draw as viewport_draw
 from . import plans
-from .operator_bases import Acting, Answer, Job, tooltips
+from .operator_bases import Acting, Answer, Job, Work, tooltips
 from .select_tools import MODES
 
 ACTIONS = (
@@ -123,24 +121,19 @@ class REFINE_OT_grow_selection(Job, bpy.types.Operator):
 
     shrink: BoolProperty(name="Shrink", description="Deselect those at the edge")
 
-    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """Positions, and the selection."""
-        checked = mesh_layout.check(context.object)
+    def work(self, context: Context) -> Work:
+        """Grow or shrink the selection."""
+        checked, shrink = mesh_layout.check(context.object), self.shrink
         mesh_edit.check_writable(checked.obj)
         chosen = some(checked.obj, selection.selected(checked.obj))
         means = mesh_attributes.read_attribute(checked.mesh, "position")
-        return [checked], (means, chosen, self.shrink)
 
-    @staticmethod
-    def compute(job: Any, progress: Progress) -> NDArray[np.bool_]:
-        """The grown or shrunk selection, (N,)."""
-        means, chosen, shrink = job
-        neighbours = picking.neighbours_of(means, progress=progress)
-        return (picking.shrunk if shrink else picking.grown)(neighbours, chosen)
+        def changed(progress: Progress) -> NDArray[np.bool_]:
+            neighbours = picking.neighbours_of(means, progress=progress)
+            return (picking.shrunk if shrink else picking.grown)(neighbours, chosen)
 
-    def put(self, _context: Context, group: list[SplatObject], _job: Any, wanted: Any) -> None:
-        """Select it."""
-        selection.select(group[0].obj, wanted)
+        (checked,), wanted = yield [checked], changed
+        selection.select(checked.obj, wanted)
 
 
 class REFINE_OT_separate_selected(Acting, bpy.types.Operator):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from functools import partial
+from operator import call
 from typing import Any
 
 import bpy
@@ -14,14 +14,13 @@ from bpy.props import BoolProperty
 from bpy.types import Context
 
 from ..core.errors import RefineError
-from ..core.execute import run_all
+from ..core.execute import Progress, run_all
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
-from ..mesh.layout import SplatObject
 from ..objects import splat_group, transforms
 from . import plans, wrapped
-from .operator_bases import Acting, Job, in_object_mode
+from .operator_bases import Acting, Job, Work, in_object_mode
 from .wrapped import counted
 
 _SOON = 0.1  # Seconds until new splats are stamped: Blender's operator is over by then
@@ -56,8 +55,8 @@ class REFINE_OT_mend(Job, bpy.types.Operator):
     needs = (*Job.needs, in_object_mode)
     doing = "Mending splats"
 
-    def gather(self, context: Context) -> tuple[list[SplatObject], Any]:
-        """Selected objects with drift, and a call that computes each one's new values."""
+    def work(self, context: Context) -> Work:
+        """Mend those of the selected objects that drifted."""
         mesh_layout.check(context.object)
         drifted = {
             obj.data: obj for obj in splat_group.chosen(context.object) if mesh_drift.of(obj)
@@ -66,12 +65,12 @@ class REFINE_OT_mend(Job, bpy.types.Operator):
         for each in group:
             mesh_edit.check_changeable(each.obj)
         moves = [transforms.read_to_move(each, np.eye(4), mend=True)[1] for each in group]
-        return group, partial(run_all, lambda move: move(), moves, threads=1)
 
-    def put(self, context: Context, group: list[SplatObject], _job: Any, mended: Any) -> None:
-        """Mend the objects."""
-        parts = [(one, columns) for one, (columns, _) in zip(group, mended, strict=True)]
-        transforms.write_moved(parts)
+        def moved(progress: Progress) -> list[Any]:
+            return run_all(call, moves, progress=progress, threads=1)
+
+        group, mended = yield group, moved
+        transforms.write_moved([(one, new) for one, (new, _) in zip(group, mended, strict=True)])
         plans.refresh(context)
         self.report({"INFO"}, f"Mended {counted(sum(count for _, count in mended), 'splat')}")
 
@@ -107,7 +106,7 @@ def _changed(*_: object) -> None:
     _stamp_soon()
 
 
-def _is_new(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
+def _is_new(data: mesh_layout.Data) -> bool:
     return mesh_layout.holds_splats(data) and not (data.library or mesh_drift.is_stamped(data))
 
 
