@@ -1,7 +1,5 @@
 """Settings for all tests."""
 
-from __future__ import annotations
-
 import hypothesis
 
 # The same examples on every run: a test that fails by chance on another's commit helps nobody.

@@ -1,7 +1,5 @@
 """Find what documents promise: examples in docstrings, and fenced blocks in Markdown."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import NamedTuple

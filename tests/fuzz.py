@@ -7,8 +7,6 @@ file, or in a result that holds together. Anything else, a warning of NumPy's, m
 of seconds among it, is a crash: the input is kept and the exit code is 1.
 """
 
-from __future__ import annotations
-
 import argparse
 import base64
 import gzip

@@ -1,7 +1,5 @@
 """What a reader must do with a file that is wrong, and ways to make one."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import sys

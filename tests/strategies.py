@@ -3,8 +3,6 @@
 Nothing here uses the code under test; a file is a concatenation of bytes whose parts are kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a user may not do, though tests may be run by the root user, who may do anything."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """A window that nobody sees: an operator works on its thread as after a click."""
 
-from __future__ import annotations
-
 import time
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Blender as a module, with the source tree enabled as an extension, and a small scene."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """While an operator works on a thread the window lives, and what it writes fits what is there."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A view taken from a Blender camera sees what Blender sees."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Which cameras decide when the command prunes an object: those of the panel, or those it names."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Examples in the docstrings of what needs Blender."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 

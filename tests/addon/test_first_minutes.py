@@ -1,7 +1,5 @@
 """What a newcomer does first: one import, cameras that fit, dialogues that know what lies there."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 from types import SimpleNamespace

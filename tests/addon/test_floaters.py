@@ -1,7 +1,5 @@
 """Floaters in the panel: what is found is what core finds, switches choose, the button deletes."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

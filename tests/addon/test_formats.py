@@ -1,7 +1,5 @@
 """Files in the panel: every format that core knows, and how their splats are drawn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Splats that stand in the scene as instances; windows test how they look."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Levels of detail in the panel: objects in a collection, the original left as it was."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Merging and refitting through the panel and the command's objects: the splats of core."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Splats survive the way into a mesh and out again."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

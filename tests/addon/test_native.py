@@ -1,7 +1,5 @@
 """Blender's own splats: point clouds with activated values, as Blender 5.3 imports 3DGS files."""
 
-from __future__ import annotations
-
 import bpy
 import mathutils
 import numpy as np

@@ -1,7 +1,5 @@
 """The buttons: what they do is what core decides, and where they fail nothing changes."""
 
-from __future__ import annotations
-
 import re
 
 import bpy

@@ -1,7 +1,5 @@
 """The panel draws in every state, and computes nothing while it does; what a budget costs."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace

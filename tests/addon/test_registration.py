@@ -1,7 +1,5 @@
 """What the extension adds to Blender; real Blenders show that it takes all of it back."""
 
-from __future__ import annotations
-
 import bpy
 
 

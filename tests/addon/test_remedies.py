@@ -1,7 +1,5 @@
 """Guard rails: what each camera's picture loses, warnings beside Apply, a ring and a turn."""
 
-from __future__ import annotations
-
 import bpy
 import mathutils
 import numpy as np

@@ -1,7 +1,5 @@
 """*Render with Splats*: what the camera sees, among meshes, and a scene that stays as it was."""
 
-from __future__ import annotations
-
 import math
 
 import bpy

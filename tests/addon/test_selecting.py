@@ -1,7 +1,5 @@
 """What operators select, hide, mark, delete and part; tools are tested in windows."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Several selected splat objects: one scene to the cameras, one budget, one undo step."""
 
-from __future__ import annotations
-
 import bpy
 import numpy as np
 import pytest

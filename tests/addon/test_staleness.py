@@ -1,7 +1,5 @@
 """Scores that are older than a change are used, and said to be."""
 
-from __future__ import annotations
-
 import bpy
 import pytest
 

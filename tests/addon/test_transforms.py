@@ -1,7 +1,5 @@
 """Transforms that splats follow as a whole, and what is noticed of Blender's own tools."""
 
-from __future__ import annotations
-
 import bpy
 import mathutils
 import numpy as np

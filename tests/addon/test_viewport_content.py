@@ -1,7 +1,5 @@
 """What is drawn of splats that change while they are drawn."""
 
-from __future__ import annotations
-
 from concurrent.futures import Future
 
 import bpy

@@ -1,7 +1,5 @@
 """What must stay and what must go: marks by hand, objects as volumes, in panel, command and API."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import tempfile

@@ -1,7 +1,5 @@
 """Operations are done whole or not at all, and keep nothing when they are over."""
 
-from __future__ import annotations
-
 import gc
 import importlib
 import shutil

@@ -1,7 +1,5 @@
 """The scenes that several tests render."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

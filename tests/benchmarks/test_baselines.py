@@ -1,7 +1,5 @@
 """Rivals: the published formula, GHAP, removal in rounds, splat-transform as a program."""
 
-from __future__ import annotations
-
 import math
 import sys
 from pathlib import Path

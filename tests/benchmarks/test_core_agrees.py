@@ -1,7 +1,5 @@
 """What core and the 3D view draw and measure, beside the reference renderer."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """splat-transform reads what we write, and we read what it writes, splat by splat."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Gradients of the rendered pixels against finite differences, and what is made of them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ PSNR on the nine held-out views against renders of the whole model, decided by t
 decibel or more below what was measured, since the last bits of a platform may move some splats.
 """
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip("numba")

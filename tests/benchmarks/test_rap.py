@@ -1,7 +1,5 @@
 """RAP's features, and its network from a file as PyTorch writes it; the weights are made up."""
 
-from __future__ import annotations
-
 import collections
 import pickle
 import sys

@@ -1,7 +1,5 @@
 """The tiled renderer against a plain one that lays every splat over every pixel, by depth."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

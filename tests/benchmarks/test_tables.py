@@ -1,7 +1,5 @@
 """The tables: methods, costs, the trade from a folder to the report, and the scenes they make."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import json

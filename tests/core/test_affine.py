@@ -1,7 +1,5 @@
 """Splats and harmonics moved by matrices, and how points moved from where they were and are."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

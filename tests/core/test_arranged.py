@@ -1,7 +1,5 @@
 """Converting several files into one: moved, merged, with fewer harmonics, sorted."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras from JSON files, and which file of a folder is read."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

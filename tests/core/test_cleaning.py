@@ -1,7 +1,5 @@
 """Floaters and outliers: what cameras see past goes, what is a surface stays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which reason a splat goes for, and by which evidence: one rule at a time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

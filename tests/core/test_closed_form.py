@@ -1,7 +1,5 @@
 """The closed form against numbers by hand, a plain reference, and its laws."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """COLMAP models, text and binary."""
 
-from __future__ import annotations
-
 import gc
 import struct
 from io import BufferedReader

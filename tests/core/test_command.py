@@ -1,7 +1,5 @@
 """The command without Blender: every option, exit codes, reports, what is left when it stops."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

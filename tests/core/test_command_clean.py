@@ -1,7 +1,5 @@
 """The command `clean`, and `prune --clean`, on a wall with a floater in front of it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

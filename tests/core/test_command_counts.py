@@ -1,7 +1,5 @@
 """What reports say of splats and views: the same everywhere, and what the file written holds."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

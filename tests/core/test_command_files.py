@@ -1,7 +1,5 @@
 """The command and the system: what cannot be entered, read, written or shown."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

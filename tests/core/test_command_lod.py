@@ -1,7 +1,5 @@
 """The command `lod`: what it writes and says, and what it refuses."""
 
-from __future__ import annotations
-
 import importlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command where it is told to stop: Ctrl-C, a polite kill, a closed terminal."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The command's volumes in numbers: `--protect`, `--remove-inside`, `--keep-inside`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Compressed PLY by hand, and files that are not what they say."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the documents name is there: files, links, tests."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

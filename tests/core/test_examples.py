@@ -1,7 +1,5 @@
 """Examples in docstrings give what they promise, and what the documents tell to run runs."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import os

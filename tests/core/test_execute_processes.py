@@ -1,7 +1,5 @@
 """Work on threads and in processes: the same results in order, cancelled, nothing left behind."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Whatever the method: scenes at the edge of what there is, with warnings as errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

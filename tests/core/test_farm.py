@@ -1,7 +1,5 @@
 """The job templates for render farms, run by Open Job Description's own command."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Files that are no 3DGS PLY, but something that people have: named, with what to do."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import struct

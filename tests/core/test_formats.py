@@ -1,7 +1,5 @@
 """Every format but plain PLY: what comes back lies within the bounds of docs/conventions.md."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Broken files of every format end in an error that names them, or in a result."""
 
-from __future__ import annotations
-
 import random
 import re
 

@@ -1,7 +1,5 @@
 """glTF by hand: nodes, integers, bytes beside it, and files that are not what they say."""
 
-from __future__ import annotations
-
 import base64
 import copy
 import json

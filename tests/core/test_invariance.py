@@ -1,7 +1,5 @@
 """What is kept does not depend on the frame or the order of the splats: the committed room."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """.ksplat: files of the reference converter, one by hand, and files that lie."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Imports in the package have no circles, those for types included (docs/architecture.md)."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Levels of detail: nested, each from the one before, and from how far away each will do."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import math

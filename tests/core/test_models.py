@@ -1,7 +1,5 @@
 """What writers of files say of how splats are drawn, and that it survives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

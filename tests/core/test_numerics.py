@@ -1,7 +1,5 @@
 """Numbers at the extremes: the rows of docs/numerics.md."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

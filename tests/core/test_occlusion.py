@@ -1,7 +1,5 @@
 """The occlusion method against numbers by hand, and its laws."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections import namedtuple

@@ -1,7 +1,5 @@
 """What is packaged: everything, with its types."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[2] / "refine_addon"

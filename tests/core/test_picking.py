@@ -1,7 +1,5 @@
 """Which splats a view shows, and which of them areas, places and colours take."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures of views: what is drawn, alone or among other things, and the files they become."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """3DGS PLY files: what is read, what is written, and what is refused in which words."""
 
-from __future__ import annotations
-
 import os
 import re
 import tracemalloc

@@ -1,7 +1,5 @@
 """The one use case, on the committed room; the dial, and when merging deletes."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

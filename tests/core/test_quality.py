@@ -1,7 +1,5 @@
 """The estimate of the pictures' quality, a PSNR as budget, and whether cameras and splats fit."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

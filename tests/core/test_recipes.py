@@ -1,7 +1,5 @@
 """What the recipes tell to run in Blender is understood; docs/command.md has every option."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Refitting: what it learns, and its laws."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Kept splats that are refitted: from file to file, with levels, and what is said of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What scoring rays say splats are worth while others go, against rays drawn anew."""
 
-from __future__ import annotations
-
 import tracemalloc
 from copy import deepcopy
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Splats that go whatever they are worth: as if they had gone before, and counted as removed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """docs/report.md names every key that is written, and none that is not."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Kept splats among stored columns: what changed is put in, all else stays to the bit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

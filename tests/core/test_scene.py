@@ -1,7 +1,5 @@
 """The scene's own frame."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from refine_addon.core import View, ViewSet, execute

@@ -1,7 +1,5 @@
 """Budgets and what they select, against a slow reference that anybody can read."""
 
-from __future__ import annotations
-
 import re
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """SOG: what is in the archive, and archives that lie."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import zipfile

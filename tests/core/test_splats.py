@@ -1,7 +1,5 @@
 """Activations and what counts as drawable."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

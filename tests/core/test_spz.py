@@ -1,7 +1,5 @@
 """SPZ by hand: every version, and files that lie."""
 
-from __future__ import annotations
-
 import gzip
 import importlib
 import struct

@@ -1,7 +1,5 @@
 """Streamed SOG: what splat-transform wrote, what we write, and files that lie."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Many files pruned as one scene, against one file in memory; on disks, behind URLs, on Dask."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import io

@@ -1,7 +1,5 @@
 """What the 3D view draws, as arrays: its order, its colours, its textures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Views, view sets and their even subsets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

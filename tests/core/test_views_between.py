@@ -1,7 +1,5 @@
 """Views between neighbouring ones, and what the estimate tells of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

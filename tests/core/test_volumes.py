@@ -1,7 +1,5 @@
 """Volumes: which points lie inside boxes, spheres and closed meshes."""
 
-from __future__ import annotations
-
 import itertools
 import re
 

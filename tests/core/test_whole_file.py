@@ -1,7 +1,5 @@
 """Files written whole or not at all: whatever fails, whoever else writes, whenever it is killed."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -1,7 +1,5 @@
 """What a file of a lossy format does to the pictures of the views that pruned."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
