@@ -6,24 +6,19 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Cleaning, RefineError, Splats, View, ViewSet, clean
+from refine_addon.core.splats import ARRAYS
 from refine_addon.core.splats import joined as core_joined
+
+from .test_occlusion import splats_of
 
 SIDE = 24
 """Splats along each side of the wall."""
 
 
 def made(means, scale, opacity, color):
-    """Return round splats of one kind."""
-    means = np.atleast_2d(np.asarray(means, np.float32))
-    count = len(means)
-    return Splats(
-        means,
-        np.full((count, 3), np.log(scale), np.float32),
-        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.full(count, np.log(opacity / (1 - opacity)), np.float32),
-        np.full((count, 3), (color - 0.5) / 0.28209479, np.float32),
-        np.zeros((count, 0, 3), np.float32),
-    )
+    """Return round splats of one kind, in float32."""
+    splats = splats_of(means, opacity, scale, np.full(3, color)[None])
+    return Splats(*(np.float32(getattr(splats, name)) for name in ARRAYS))
 
 
 def joined(*parts):
@@ -47,18 +42,6 @@ def cameras(count=6):
 FLOATER = made([[0.1, 0.0, 2.0]], 0.06, 0.8, 0.1)
 
 
-def test_what_views_see_past_goes_as_being_in_front():
-    """All six views see the dark splat at half the depth of the white wall; nothing is near it.
-
-    So a seventh is expected to see past it by (6 + 1) / (6 + 2)."""
-    splats = joined(wall(), FLOATER)
-    cleaned = clean(splats, cameras())
-    assert np.flatnonzero(~cleaned.keep).tolist() == [SIDE**2]
-    assert cleaned.counts() == {"front": 1, "isolated": 0, "giant": 0, "needle": 0}
-    assert cleaned.in_words() == "1 in front of surfaces (88 % sure)"
-    assert cleaned.facts()["sure"]["front"] == pytest.approx(7 / 8)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "goes"), [("default", 1), ("antialiased", 0), ("2dgs", 1)])
 def test_a_floater_is_judged_as_its_model_draws_it(model, goes):
@@ -66,17 +49,6 @@ def test_a_floater_is_judged_as_its_model_draws_it(model, goes):
     dot = made(FLOATER.means, 0.0005, 0.8, 0.1)
     splats = replace(joined(wall(), dot), model=model)
     assert clean(splats, cameras()).counts()["front"] == goes
-
-
-@pytest.mark.slow
-def test_switches_and_protection_spare():
-    """A reason that is off takes nothing, and a protected splat has no reason."""
-    splats = joined(wall(), FLOATER)
-    protected = np.arange(len(splats)) == SIDE**2
-    assert clean(splats, cameras(), Cleaning(("giant",))).keep.all()
-    spared = clean(splats, cameras(), protected=protected)
-    assert spared.keep.all()
-    assert not spared.by_reason["front"].any()
 
 
 @pytest.mark.parametrize(("count", "stays"), [(1, True), (2, False)])
@@ -134,16 +106,6 @@ def test_where_nothing_floats_nothing_is_cleaned_away(splats):
     cleaned = clean(splats, cameras())
     assert cleaned.keep.all()
     assert cleaned.in_words() == "nothing to clean away"
-
-
-def test_settings_that_cannot_be_are_refused():
-    for message, settings in (
-        ("reason is 'fog', expected some of front, isolated", {"reasons": ("fog",)}),
-        ("reason is none, expected", {"reasons": ()}),
-        ("views is -1, expected 0", {"views": -1}),
-    ):
-        with pytest.raises(RefineError, match=message):
-            Cleaning(**settings)
 
 
 def test_cameras_that_see_nothing_are_refused():

@@ -51,7 +51,9 @@ def test_volumes_of_a_kind_are_joined(scene):
 
 
 def test_clean_and_score_leave_out_what_must_go(scene, capsys):
-    """The floater, which `clean` would take, is spared; half of the wall goes, and scores 0."""
+    """The floater, which `clean` would take, is spared; half of the wall goes, and scores 0.
+
+    What is spared counts for no reason."""
     folder, x, z, out = scene
     options = ["--protect", "box:-9,-9,-9,9,9,3", "--remove-inside", HALF]
 
@@ -59,6 +61,7 @@ def test_clean_and_score_leave_out_what_must_go(scene, capsys):
 
     assert len(read_ply(out)) == ((x >= 0.0) | (z < 3.0)).sum()
     assert entry["splats"]["removed_by_user"] == ((x < 0.0) & (z > 3.0)).sum()
+    assert entry["cleaned"]["front"] == 0
     assert call(folder, "score", "--remove-inside", HALF, "-o", out, "--overwrite") == 0
     assert np.array_equal(read_ply(out).rows["refine_score"] == 0.0, x < 0.0)
     assert call(folder, "score", "--protect", HALF, "-o", out, "--overwrite") == 2
@@ -70,7 +73,12 @@ def test_clean_and_score_leave_out_what_must_go(scene, capsys):
         (["--remove-inside", "Cube"], 2, "--remove-inside Cube: objects can be named in Blender"),
         (["--protect", ""], 2, "expected a name, got none"),
         (["--protect", "box:1,2"], 2, "expected box:x0,y0,z0,x1,y1,z1 in numbers, got 'box:1,2'"),
+        (["--protect", "box:0,0,0,1,1,one"], 2, "expected box:x0,y0,z0,x1,y1,z1 in numbers, got"),
+        (["--protect", "box:0,0,0,1,0,1"], 2, "'box:0,0,0,1,0,1': box goes from 0 to 0 in y"),
+        (["--protect", "box:0,0,nan,1,1,1"], 2, "box goes from nan to 1 in z"),
         (["--keep-inside", "sphere:0,0,0,-1"], 2, "sphere has radius -1, expected more than 0"),
+        (["--keep-inside", "sphere:0,0,0,0"], 2, "sphere has radius 0, expected more than 0"),
+        (["--keep-inside", "sphere:0,0,inf,1"], 2, "expected finite numbers"),
         (["--remove-inside", "sphere:99,0,0,1"], 1, "'sphere:99,0,0,1' holds the centre of no"),
         (["--remove-inside", "sphere:0,0,0,99"], 1, "all 577 splats lie where they must go"),
     ],

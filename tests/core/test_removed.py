@@ -96,17 +96,6 @@ def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
         assert np.array_equal(found.merged.keep, found.keep)
 
 
-def test_protection_wins_over_force(splats, views):
-    """The first hundred must go, the first ten stay: ninety must go."""
-    stay, go = EVERY < 10, EVERY < 100
-    found = prune(splats, views, Budget(ratio=0.9), Merge(), protected=stay, removed=go)
-    assert found.keep[:10].all()
-    assert not found.keep[10:100].any()
-    assert not found.merged.changed[:10].any()
-    counts = found.report["splats"]
-    assert (counts["protected"], counts["removed_by_user"]) == (10, 90)
-
-
 @pytest.mark.parametrize("method", [Occlusion(), ClosedForm()])
 def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(splats, views, method):
     """As the panel does it: score without them, store, apply. They score 0 and no other does."""
@@ -148,15 +137,11 @@ def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats,
 
 
 def test_nothing_left_is_refused_but_what_is_protected_is_enough(splats, views):
-    """In one sentence, before any work."""
     every, mine = np.ones(COUNT, bool), EVERY == 200
-    with pytest.raises(RefineError, match=f"all {COUNT} splats lie where they must go"):
-        prune(splats, views, Budget(ratio=0.5), removed=every)
     with pytest.raises(RefineError, match=f"all {COUNT} splats"):
         score(splats, views, removed=every)
-    found = prune(
-        splats, views, Budget(ratio=0.0), ClosedForm(), protected=mine, removed=every
-    )  # fmt: skip
+    how = {"protected": mine, "removed": every}
+    found = prune(splats, views, Budget(ratio=0.0), ClosedForm(), **how)
     assert np.array_equal(found.keep, mine)
 
 

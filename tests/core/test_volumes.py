@@ -1,14 +1,13 @@
 """Volumes: which points lie inside boxes, spheres and closed meshes."""
 
 import itertools
-import re
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from refine_addon.core import Box, MovedVolume, RefineError, Solid, Sphere, Zone, forced
+from refine_addon.core import Box, MovedVolume, RefineError, Solid, Sphere
 from refine_addon.core.volumes import parse
 
 CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
@@ -156,42 +155,3 @@ def test_a_sphere_holds_its_surface_and_placed_it_is_an_ellipsoid():
     assert Sphere((0, 0, 0), 1e200).inside(surface * 1e30).all()  # its square is no float64
     placed = MovedVolume(Sphere((0, 0, 0), 1.0), matrix)
     assert placed.inside(np.array(ends)).tolist() == [True, False] * 3
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("box:1,2,3", "expected box:x0,y0,z0,x1,y1,z1 in numbers, got 'box:1,2,3'"),
-        ("box:0,0,0,1,1,one", "expected box:"),
-        ("box:0,0,0,1,0,1", "'box:0,0,0,1,0,1': box goes from 0 to 0 in y"),
-        ("box:0,0,nan,1,1,1", "box goes from nan to 1 in z"),
-        ("sphere:0,0,0,0", "sphere has radius 0, expected more than 0"),
-        ("sphere:0,0,inf,1", "expected finite numbers"),
-    ],
-)
-def test_numbers_that_are_no_volume_are_refused(text, expected):
-    """With what was got and what was expected. Other texts are names of objects."""
-    with pytest.raises(RefineError, match=re.escape(expected)):
-        parse(text)
-    assert [parse(name) for name in ("Cube", "box", "Box:1", "", "a:b")] == [None] * 5
-
-
-LINE = np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], axis=1)
-
-
-def test_zones_of_a_kind_are_joined_and_protection_wins():
-    """Of x = 0 to 9 keep 0-3 and 5-8, remove 2-5, protect 4 and 9: 2, 3, 5 and 8 are to go.
-
-    With 4 and 5 marked to go and 2 protected by a mask, 3, 5 and 8 go.
-    """
-    ranges = [("keep", 0, 4), ("keep", 5, 8), ("remove", 2, 6)]
-    ranges += [("protect", 4, 5), ("protect", 9, 10)]
-    zones = [Zone(role, role, Box((low, -1, -1), (high, 1, 1))) for role, low, high in ranges]
-    two, marked = np.arange(10) == 2, np.isin(np.arange(10), [4, 5])
-    found, more = forced(zones, LINE), forced(zones, LINE, two, marked)
-
-    assert np.flatnonzero(found.removed).tolist() == [2, 3, 5, 8]
-    assert np.flatnonzero(found.protected).tolist() == [4, 9]
-    assert [fact["splats"] for fact in found.facts] == [4, 3, 4, 1, 1]
-    assert np.flatnonzero(more.removed).tolist() == [3, 5, 8]
-    assert np.flatnonzero(more.protected).tolist() == [2, 4, 9]
