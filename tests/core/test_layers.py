@@ -1,4 +1,7 @@
-"""Imports in the package have no circles, those for types included (docs/architecture.md)."""
+"""Imports in the package have no circles, those for types included (docs/architecture.md).
+
+What is packaged: everything, with its types.
+"""
 
 import ast
 import subprocess
@@ -75,3 +78,11 @@ for name in sys.argv[1:]:
     core = [name for name in MODULES if name.split(".")[0] == "core"]
     assert len(core) > 50
     subprocess.run([sys.executable, "-c", code, *core], check=True, cwd=PACKAGE.parent)
+
+
+def test_every_folder_of_modules_is_a_package_with_types():
+    """Setuptools leaves out those without ``__init__.py``; PEP 561 asks for ``py.typed``."""
+    folders = {path.parent for path in MODULES.values()}
+    assert len(folders) > 5
+    assert [folder for folder in folders if not (folder / "__init__.py").is_file()] == []
+    assert (PACKAGE / "py.typed").is_file()

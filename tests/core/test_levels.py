@@ -25,7 +25,6 @@ from refine_addon.core import (
     read_splats,
     score,
 )
-from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.splats import ARRAYS
@@ -222,25 +221,6 @@ def test_files_of_levels_hold_the_kept_rows_or_what_they_became(tmp_path, wall_f
     for name in ("means", "opacity_logits"):
         expected = getattr(became, name).astype(np.float32)
         np.testing.assert_array_equal(getattr(written, name), expected)
-
-
-@pytest.mark.slow
-def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, wall_file, monkeypatch):
-    """The folder that was made for them goes too."""
-    whole, left = SplatFile.write, []
-
-    def write(self, *rest, **named):
-        left.pop()
-        if not left:
-            raise error
-        return whole(self, *rest, **named)
-
-    monkeypatch.setattr(SplatFile, "write", write)
-    for error in (RefineError("no space"), KeyboardInterrupt()):
-        left[:] = [1, 2]
-        with pytest.raises(type(error)):
-            lod_file(wall_file, tmp_path / "out", cameras(2), TWO, QUICK)
-        assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -46,15 +46,6 @@ def test_a_view_that_cannot_be_is_refused_by_name(changes, message):
         view(name="left", **changes)
 
 
-def test_a_rotation_rounded_by_a_file_becomes_exactly_orthonormal():
-    """Four decimals are what a text file may leave. A mirrored camera, of -1, stays mirrored."""
-    rounded = np.round(ring(7)[1].rotation, 4)
-    rotation = view(rotation=rounded).rotation
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
-    np.testing.assert_allclose(rotation, rounded, atol=1e-4)
-    assert np.linalg.det(view(rotation=np.diag([-1.0, 1, 1])).rotation) == pytest.approx(-1)
-
-
 def test_a_set_needs_a_view_that_counts():
     """Weights sum to one even where their sum overflows; an unknown name is named."""
     with pytest.raises(RefineError, match="no cameras"):

@@ -14,7 +14,6 @@ import pytest
 
 from refine_addon.core import RefineError, read_ply
 from refine_addon.core import whole_file as whole_files
-from refine_addon.core.execute import Cancelled, within
 from refine_addon.core.whole_file import refuse_existing, whole_file
 from tests.strategies import plain_header, plain_ply, splat_names
 
@@ -56,15 +55,6 @@ def test_a_block_that_fails_leaves_what_was_there(tmp_path, error, overwrite):
         raise error
     assert not ERRORS[error] or str(caught.value) == f"{path}: {ERRORS[error]}"
     assert before == contents(tmp_path)
-
-
-def test_a_file_whose_writing_was_cancelled_is_not_put_in_place(tmp_path):
-    def check():
-        raise Cancelled
-
-    with pytest.raises(Cancelled), within(check=check):
-        written(tmp_path / "out")
-    assert contents(tmp_path) == {}
 
 
 @posix
