@@ -8,6 +8,7 @@ import pytest
 from refine_addon.core import Budget, Merge, Occlusion, Refit, ViewSet, prune
 
 from .test_cleaning import cameras
+from .test_invariance import moved
 from .test_levels import colourful
 from .test_merging import around, cloud
 
@@ -20,17 +21,6 @@ def with_lens(views, **lens):
 
 SMALL = {"fx": 25.0, "fy": 25.0, "cx": 20.0, "cy": 15.0, "width": 40, "height": 30}
 PIXEL = {"cx": 0.5, "cy": 0.5, "width": 1, "height": 1}
-
-
-def scaled(splats, views, factor, offset=0.0):
-    return (
-        replace(
-            splats,
-            means=splats.means.astype(np.float64) * factor + offset,
-            log_scales=splats.log_scales + np.float32(np.log(factor)),
-        ),
-        ViewSet(tuple(replace(view, center=view.center * factor + offset) for view in views)),
-    )
 
 
 def with_logits(splats, value):
@@ -48,9 +38,9 @@ SCENES = {
     "the same": lambda splats, views: (splats.take(np.zeros(COUNT, np.int64)), views),
     "opacities of 0": lambda splats, views: (with_logits(splats, -np.inf), views),
     "opacities of 1": lambda splats, views: (with_logits(splats, np.inf), views),
-    "millionths": lambda splats, views: scaled(splats, views, 1e-6),
-    "millions": lambda splats, views: scaled(splats, views, 1e6),
-    "moved": lambda splats, views: scaled(splats, views, 1.0, 1e6),
+    "millionths": lambda splats, views: moved(splats, views, unit=1e-6),
+    "millions": lambda splats, views: moved(splats, views, unit=1e6),
+    "moved": lambda splats, views: moved(splats, views, step=1e6),
 }
 
 

@@ -1,4 +1,4 @@
-"""What is kept does not depend on the frame or the order of the splats: the committed room."""
+"""What is kept depends on no frame, unit or order of the splats: the committed room."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +26,7 @@ pytestmark = pytest.mark.slow
 from .test_levels import merges  # noqa: F401 - a fixture
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
+STILL = np.eye(3)
 QUARTER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # about x, as *Upright* turns
 
 
@@ -37,20 +38,24 @@ def rotation(axis, degrees):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def moved(splats, views, turn, step):
-    """Move splats and views by the same rigid motion."""
+def moved(splats, views, turn=STILL, step=0.0, unit=1.0):
+    """Move splats and views by the same rigid motion, and tell lengths in another unit."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn, step
+    matrix[:3, :3], matrix[:3, 3] = unit * turn, unit * step
     poses = (
-        replace(view, rotation=view.rotation @ turn.T, center=turn @ view.center + step)
+        replace(
+            view, rotation=view.rotation @ turn.T, center=unit * (turn @ view.center + step),
+            near=unit * view.near, far=unit * view.far,
+        )
         for view in views
-    )
+    )  # fmt: skip
     return transformed(splats, matrix, rotate_sh=True), ViewSet(tuple(poses))
 
 
 MOTIONS = {
     "a quarter about x": (QUARTER, np.zeros(3)),
     "a turn and a move": (rotation([3, -1, 2], 111.0), np.array([-3.0, 5.0, 9.0])),
+    "another unit": (STILL, np.zeros(3), 1e6),
 }
 
 

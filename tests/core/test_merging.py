@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core.affine import transformed
 from refine_addon.core.execute import Cancelled
 from refine_addon.core.merging import field as merge_field
 from refine_addon.core.merging import graph as merge_graph
@@ -18,7 +17,6 @@ from refine_addon.core.spherical_harmonics import colors
 from refine_addon.core.splats import ALPHA_MAX, ARRAYS, LOW_PASS, Splats, drawable, opacity
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility.scene import Scene, scene_of
-from tests.core.test_invariance import moved, rotation
 
 SCENE = Scene(np.zeros(3), 1.0, np.eye(3))
 
@@ -361,23 +359,6 @@ def test_absurd_focal_lengths_do_no_harm_and_merging_can_be_cancelled(focal):
     assert all(np.isfinite(getattr(merged, name)).all() for name in ARRAYS)
     with pytest.raises(Cancelled):
         reduced_to(cloud(100), views, measure, 50, progress=lambda fraction, _: fraction < 0.5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
-def test_moved_turned_and_scaled_scenes_merge_alike(unit):
-    splats, matrix = cloud(400, degree=0), np.eye(4)
-    matrix[:3, :3] = unit * rotation([3, -1, 2], 111.0)
-    matrix[:3, 3] = np.array([10.0, -20.0, 5.0]) * unit
-    views = moved(splats, around(), matrix[:3, :3] / unit, matrix[:3, 3] / unit)[1]
-    views = ViewSet(tuple(replace(view, center=view.center * unit) for view in views))
-    here = reduced_to(splats, around(), measure, 200)
-    there = reduced_to(transformed(splats, matrix), views, measure, 200)
-    both = here.keep & there.keep
-    assert np.mean(here.keep == there.keep) > 0.98
-    expected = transformed(here.splats.take(both[here.keep]), matrix).means
-    apart = np.abs(expected - there.splats.means[both[there.keep]]).max(axis=1)
-    assert np.mean(apart < 1e-4 * unit) > 0.95
 
 
 @pytest.mark.slow

@@ -22,12 +22,13 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import closed_form, occlusion
 from refine_addon.core.scoring.closed_form import lambdas
 from refine_addon.core.splats import ARRAYS, drawable
 
+from .test_affine import TURN
 from .test_closed_form import beside_their_neighbours, reference
+from .test_invariance import moved
 from .test_occlusion import cloud as round_cloud
 from .test_views import view
 
@@ -193,41 +194,26 @@ def test_weights_of_scenes_without_variety(statistics, expected):
     assert lambdas(*statistics) == pytest.approx(expected)
 
 
-def drawn(data, count: int = 4) -> Splats:
-    """Splats of which every number is drawn from the extremes."""
-    value = st.sampled_from(EXTREME + DOUBLES) | st.floats(width=32)
-    sizes = {item: getattr(cloud(count), item).shape for item in ARRAYS}
-    arrays = {}
-    for name, shape in sizes.items():
-        size = math.prod(shape)
-        numbers = np.array(data.draw(st.lists(value, min_size=size, max_size=size)), np.float64)
-        if data.draw(st.booleans()):
-            with np.errstate(all="ignore"):
-                numbers = numbers.astype(np.float32)
-        arrays[name] = numbers.reshape(shape)
-    return Splats(**arrays)
-
-
-def drawn_views(data) -> ViewSet:
-    """Two views, of which the first counts."""
-    place = st.sampled_from([0.0, 1e-30, 0.1, 1e6, 1e30])
-    lens = {"fx": [1.0, 50.0, 1e6], "near": [0.0, 1e-30, 1.0]}
-    views = []
-    for weights in ([1.0, 1e-3], [0.0, 1.0, 1e3]):
-        choices = {**lens, "weight": weights}
-        chosen = {name: data.draw(st.sampled_from(some)) for name, some in choices.items()}
-        views.append(view([data.draw(place), 0.0, -data.draw(place)], **chosen))
-    return ViewSet(tuple(views))
-
-
 @pytest.mark.slow
 @by_method_and_floor
 @examples(max_examples=30)
-@given(data=st.data())
-def test_any_values_at_once_give_finite_scores_or_a_sentence(settings, data):
-    splats, views = drawn(data), drawn_views(data)
+@given(numbers=st.lists(st.sampled_from(EXTREME + DOUBLES) | st.floats(width=32), min_size=40),
+       seed=st.integers(0, 2**32))  # fmt: skip
+def test_any_values_at_once_give_finite_scores_or_a_sentence(settings, numbers, seed):
+    """In all attributes of four splats, floats or doubles; of two views the first counts."""
+    random, arrays, views = np.random.default_rng(seed), {}, []
+    for name in ARRAYS:
+        values = random.choice(numbers, getattr(cloud(4), name).shape)
+        with np.errstate(all="ignore"):
+            arrays[name] = values.astype(random.choice([np.float32, np.float64]))
+    for weights in ([1.0, 1e-3], [0.0, 1.0, 1e3]):
+        choices = {"fx": [1.0, 50.0, 1e6], "near": [0.0, 1e-30, 1.0], "weight": weights}
+        chosen = {name: random.choice(some) for name, some in choices.items()}
+        x, z = random.choice([0.0, 1e-30, 0.1, 1e6, 1e30], 2)
+        views.append(view([x, 0.0, -z], **chosen))
+    splats = Splats(**arrays)
     try:
-        check(splats, scored(splats, views, settings))
+        check(splats, scored(splats, ViewSet(tuple(views)), settings))
     except RefineError as error:
         assert any(said in str(error) for said in ("no camera sees", "can be drawn"))
 
@@ -244,21 +230,9 @@ def test_neither_order_nor_place_nor_unit_of_the_scene_matter(exponent, settings
     splats = replace(splats, means=splats.means.astype(float))
     other = view([0.2, 0.1, -0.5], far=4.0, name="b")
     views = ViewSet((view(name="a"), other, view([0, 0, 2], near=0.5, name="c")))
-    random, factor = np.random.default_rng(3), 10.0**exponent
-    turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
-    turn *= np.linalg.det(turn)
-    shift = np.array([4e9, -1e9, 2e9]) * factor
-    order = random.permutation(200)
-    matrix = np.vstack([np.column_stack([turn * factor, shift]), [0, 0, 0, 1]])
-    moved = [
-        replace(
-            one, rotation=one.rotation @ turn.T, center=turn @ one.center * factor + shift,
-            near=one.near * factor, far=one.far * factor,
-        )
-        for one in views
-    ]  # fmt: skip
-    there = transformed(splats, matrix, rotate_sh=True).take(order)
-    found = scored(there, ViewSet(tuple(moved[::-1])), settings)
+    order, step = np.random.default_rng(3).permutation(200), np.array([4e9, -1e9, 2e9])
+    there = moved(splats.take(order), tuple(views)[::-1], TURN, step, 10.0**exponent)
+    found = scored(*there, settings)
     expected = scored(splats, views, settings).values[order]
     # But for rounding, or, of a ranking, one swap of neighbours.
     tolerance = {"rtol": 2e-5} if "lambda" in found.facts else {"atol": 1.5 / 200}
