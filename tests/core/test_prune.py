@@ -1,7 +1,6 @@
 """The one use case, on the committed room; the dial, and when merging deletes."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +17,6 @@ from refine_addon.core import (
     Refit,
     Scores,
     Splats,
-    ViewSet,
     execute,
     prune,
     prune_file,
@@ -113,31 +111,6 @@ def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     # Other processes have floats.
     expected = execute.within(cores=1)(occlusion.score)(wide(file.splats()), some, rounds=rounds)[0]
     assert min(agreement(scores, expected)) >= 0.999
-
-
-@pytest.mark.slow
-def test_kept_splats_of_doubles_are_doubles(small, views, tmp_path):
-    """At an offset of 1e6, float32 knows steps of .0625: each kept splat has a place of its own.
-
-    Every number written is what merging came to, to the last bit; unchanged rows stay.
-    """
-    rows = read_ply(small).rows
-    columns = {name: rows[name].astype("f8") for name in rows.dtype.names}
-    columns["x"] += 1e6
-    path = tmp_path / "in.ply"
-    path.write_bytes(ply_of(columns))
-    moved = (replace(view, center=view.center + np.array([1e6, 0, 0])) for view in views)
-    decided = prune(read_ply(path), ViewSet(tuple(moved)), Budget(ratio=0.6), FEW)
-    decided.write(tmp_path / "out.ply")
-    file, changed = read_ply(tmp_path / "out.ply"), decided.merged.changed
-    assert len(file) == len(rows) - len(rows) * 6 // 10
-    assert file.rows[~changed].tobytes() == read_ply(path).rows[decided.keep][~changed].tobytes()
-    assert len(np.unique(file.rows["x"][changed])) == np.count_nonzero(changed) > 50
-    for item in ARRAYS:
-        wanted = getattr(decided.merged.splats, item)
-        np.testing.assert_array_equal(getattr(file.splats(), item), wanted)
-        assert wanted.dtype == np.float64
-    assert any("merged into" in note for note in decided.report["notes"])
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from refine_addon.core import (
     Box,
     Budget,
     Levels,
-    Merge,
     Refit,
     ViewSet,
     Zone,
@@ -26,10 +25,9 @@ from refine_addon.core.splats import ARRAYS
 from refine_addon.core.visibility.cast import validation_rays
 from tests.strategies import ply_of
 
-from .test_prune import file, small, views  # noqa: F401 - fixtures
+from .test_prune import FEW, HALF, file, small, splats, views  # noqa: F401 - fixtures
 
-FEW, REFIT = Merge(12), Refit(12)
-HALF = Budget(ratio=0.5)
+REFIT = Refit(12)
 
 pytestmark = pytest.mark.slow
 
@@ -40,11 +38,6 @@ def few_rays():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(round_rays, "MIN_RAYS", 1 << 16)
         yield
-
-
-@pytest.fixture(scope="module")
-def splats(small):
-    return read_ply(small).splats()
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +80,13 @@ def test_rounds_are_as_many_as_asked_for_and_each_comes_closer(splats, views):
     assert told[0]["psnr"] < told[1]["psnr"]
 
 
-def test_protected_splats_doubles_and_what_is_not_of_a_splat_stay(small, views, tmp_path):
-    """At an offset of 1e6, float32 knows steps of .0625: each kept splat has a place of its own."""
+@pytest.mark.parametrize("method", [FEW, REFIT], ids=["merge", "refit"])
+def test_kept_splats_of_doubles_are_doubles(small, views, tmp_path, method):
+    """At an offset of 1e6, float32 knows steps of .0625: each kept splat has a place of its own.
+
+    Every number written is what merging or refitting came to, to the last bit; unchanged rows stay,
+    those of the tenth that is protected among them, and so does what is not of a splat.
+    """
     rows = read_ply(small).rows
     columns = {name: rows[name].astype("f8") for name in rows.dtype.names}
     columns["x"] += 1e6
@@ -96,22 +94,25 @@ def test_protected_splats_doubles_and_what_is_not_of_a_splat_stay(small, views, 
     (tmp_path / "in.ply").write_bytes(ply_of(columns))
     shift = np.array([1e6, 0.0, 0.0])
     moved = ViewSet(tuple(replace(view, center=view.center + shift) for view in views))
-    middle = np.median(columns["x"])
-    zone = Zone("protect", "half", Box((middle, -np.inf, -np.inf), (np.inf, np.inf, np.inf)))
-    protected = columns["x"] >= middle
-    result = prune_file(
-        tmp_path / "in.ply", tmp_path / "out.ply", moved, Budget(ratio=0.3), REFIT, zones=[zone]
-    )
-    written = read_ply(tmp_path / "out.ply")
-    spared = protected[result.keep]
+    edge = np.quantile(columns["x"], 0.9)
+    zone = Zone("protect", "tenth", Box((edge, -np.inf, -np.inf), (np.inf, np.inf, np.inf)))
+    protected = columns["x"] >= edge
+    asked = moved, Budget(ratio=0.6), method
+    result = prune_file(tmp_path / "in.ply", tmp_path / "out.ply", *asked, zones=[zone])
+    written, changed = read_ply(tmp_path / "out.ply"), result.merged.changed
+    old = read_ply(tmp_path / "in.ply").rows[result.keep]
+
+    assert len(written) == len(rows) - len(rows) * 6 // 10
     np.testing.assert_array_equal(written.rows["mine"], np.flatnonzero(result.keep))
-    np.testing.assert_array_equal(written.splats().means, result.merged.splats.means)
-    assert written.splats().means.dtype == np.float64
-    assert len(np.unique(written.rows["x"])) > 100
+    assert len(np.unique(written.rows["x"][changed])) == np.count_nonzero(changed) > 50
     assert result.keep[protected].all()
-    assert result.merged.changed[~spared].any()
-    old = read_ply(tmp_path / "in.ply").rows[protected]
-    assert written.rows[spared].tobytes() == old.tobytes()
+    assert not changed[protected[result.keep]].any()
+    assert written.rows[~changed].tobytes() == old[~changed].tobytes()
+    for name in ARRAYS:
+        wanted = getattr(result.merged.splats, name)
+        np.testing.assert_array_equal(getattr(written.splats(), name), wanted)
+        assert wanted.dtype == np.float64
+    assert any("merged into" in note for note in result.report["notes"])
 
 
 def test_a_psnr_is_reached_with_fewer_splats_than_by_merging(splats, views):
