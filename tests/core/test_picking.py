@@ -6,31 +6,22 @@ import numpy as np
 import pytest
 
 from refine_addon.core import picking
-from refine_addon.core.splats import SH_C0, Splats
 from refine_addon.core.views import View, pinhole
+
+from .test_occlusion import look_along_z, splats_of
 
 SIZE = 100
 EVERYWHERE = np.ones((SIZE, SIZE), np.bool_)
 
 
-def splats(means, colors=None, *, scale=0.02, logit=8.0):
-    """Return round splats, opaque but for e^-8, grey or of some colours."""
-    means = np.array(means, np.float32).reshape(-1, 3)
-    count = len(means)
-    colors = np.full((count, 3), 0.5) if colors is None else np.array(colors)
-    return Splats(
-        means=means,
-        log_scales=np.full((count, 3), math.log(scale), np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        opacity_logits=np.full(count, logit, np.float32),
-        sh_dc=((colors - 0.5) / SH_C0).astype(np.float32),
-        sh_rest=np.zeros((count, 0, 3), np.float32),
-    )
+def splats(means, colors=((0.5, 0.5, 0.5),), *, opacity=0.9997):
+    """Return round splats of sigma .02, grey or of some colours."""
+    return splats_of(means, opacity, 0.02, colors)
 
 
-def view(distance=0.0):
-    """Look along +z from -distance: 100 px wide, a slope of 1/2 at the edges."""
-    return View(np.eye(3), np.array([0, 0, -distance]), 100.0, 100.0, 50.0, 50.0, SIZE, SIZE)
+def view():
+    """Look along +z: 100 px wide, a slope of 1/2 at the edges."""
+    return look_along_z(cx=50.0, cy=50.0, width=SIZE, height=SIZE)
 
 
 def wall(depth, edge=1.2, step=0.03):
@@ -94,7 +85,7 @@ def test_surfaces_lie_where_a_ray_has_lost_its_light():
     Each takes 1 - a of the light, where a is nearly .5 only at centres; the reference sums along
     the rays, splat by splat.
     """
-    scene = splats(np.concatenate([wall(2.0 + 0.1 * k, edge=0.5) for k in range(9)]), logit=0.0)
+    scene = splats(np.concatenate([wall(2.0 + 0.1 * k, edge=0.5) for k in range(9)]), opacity=0.5)
     shown = seen(scene)
     footprints = shown.footprints
     depths = scene.means[shown.prepared.gaussians.index, 2]

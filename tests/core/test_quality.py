@@ -161,13 +161,17 @@ def test_on_a_ray_the_nearest_kept_hit_stands_in():
 
 
 def test_a_curve_comes_back_from_json():
-    views = {"a": np.array([51.0, 41.0, 31.004])}
-    facts = json.loads(json.dumps(replace(CURVE, views=views).facts()))
+    """That of a file which an older version wrote has nothing to tell of between."""
+    views, between = {"a": np.array([51.0, 41.0, 31.004])}, np.array([48.0, 36.0, 25.0])
+    facts = json.loads(json.dumps(replace(CURVE, views=views, between=between).facts()))
     again = Quality.from_facts(facts)
+    old = Quality.from_facts({key: value for key, value in facts.items() if key != "between"})
     for name in ("shares", "psnr", "merged"):
         assert np.array_equal(getattr(again, name), getattr(CURVE, name))
     assert again.views["a"].tolist() == [51.0, 41.0, 31.0]
+    assert (again.at_between(0.5), old.at_between(0.5)) == (36.0, None)
     changes = {"psnr": [1.0]}, {"psnr": ["x"]}, {"views": {"a": [1.0]}}, {"views": 1}
+    changes += ({"between": [1.0]},)
     emptied = {name: [] for name in facts}
     for wrong in (None, 3, {}, {"shares": [0.5]}, emptied, *(facts | each for each in changes)):
         assert Quality.from_facts(wrong) is None

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from refine_addon.core import View, ViewSet, execute
+from refine_addon.core import ViewSet, execute
 from refine_addon.core.visibility import scene
 from refine_addon.core.visibility.scene import scene_of
 
-LENS = {"fx": 50.0, "fy": 50.0, "cx": 50.0, "cy": 50.0, "width": 100, "height": 100}
-CENTERS = np.array([[13.0, 0, 0], [7, 0, 0], [10, 3, 0], [10, -3, 0]])
-VIEWS = ViewSet(tuple(View(np.eye(3), center, **LENS) for center in CENTERS))
+from .test_views import view
+
+CENTERS = [[13.0, 0, 0], [7, 0, 0], [10, 3, 0], [10, -3, 0]]
+VIEWS = ViewSet(tuple(map(view, CENTERS)))
 
 
 def test_places_and_their_order_do_not_depend_on_chunks_and_threads(monkeypatch):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Budget, Merge, Occlusion, ViewSet, prune, select
-from refine_addon.core.quality.curve import Quality
 from refine_addon.core.quality.psnr import psnr_against, psnr_kept
 from refine_addon.core.scoring import occlusion
 from refine_addon.core.visibility import projection
@@ -159,13 +158,3 @@ def test_rounds_after_one_give_the_scores_of_all_rounds(between):
     assert scores.views_between == (6 if between else 0)
     np.testing.assert_array_equal(found, scores.values)
     assert (found != once.values).any()
-
-
-def test_what_is_stored_of_the_curve_is_read_again():
-    """A curve of a file that an older version wrote has nothing to tell of between."""
-    values = np.array([[0.2, 0.5], [50.0, 40.0], [53.0, 46.0], [48.0, 36.0]])
-    curve = Quality(*values[:3], between=values[3])
-    old = Quality.from_facts({k: v for k, v in curve.facts().items() if k != "between"})
-    assert Quality.from_facts(curve.facts()).at_between(0.5) == 36.0
-    assert old.at_between(0.5) is None
-    assert Quality.from_facts(curve.facts() | {"between": [1.0]}) is None
