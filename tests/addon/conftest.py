@@ -14,6 +14,8 @@ os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="refine-blender-"
 import bpy  # noqa: I001
 import addon_utils
 
+from tests.strategies import splat_names
+
 ROOT = Path(__file__).parents[2]
 ROOM = ROOT / "tests" / "data" / "room_small"
 MODULE = "bl_ext.dev.refine_addon"
@@ -90,10 +92,15 @@ def empty_scene():
     return scene
 
 
-def _linked(addon, path):
-    mesh = addon.mesh.attributes.mesh_from_file(addon.core.read_ply(path))
-    obj = bpy.data.objects.new("room", mesh)
+def linked(name, data=None):
+    """Return a new object of the scene."""
+    obj = bpy.data.objects.new(name, data)
     bpy.context.scene.collection.objects.link(obj)
+    return obj
+
+
+def _imported(addon, path):
+    obj = linked("room", addon.mesh.attributes.mesh_from_file(addon.core.read_ply(path)))
     bpy.context.view_layer.objects.active = obj
     obj.select_set(True)
     bpy.context.view_layer.update()
@@ -103,7 +110,7 @@ def _linked(addon, path):
 @pytest.fixture
 def room(addon, empty_scene):
     """Import the small trained room: 39,755 splats."""
-    return _linked(addon, ROOM / "point_cloud.ply")
+    return _imported(addon, ROOM / "point_cloud.ply")
 
 
 @pytest.fixture
@@ -116,7 +123,7 @@ def quarter(addon, room):
 @pytest.fixture
 def few(addon, room_cameras, few_file):
     """Import every tenth splat of the room, 3,976, and the cameras."""
-    return _linked(addon, few_file)
+    return _imported(addon, few_file)
 
 
 def _file(step):
@@ -195,11 +202,7 @@ def make_splats():
     """Return a function that makes columns of random splats, in the order of the reference."""
 
     def make(count=8, *, degree=0, seed=0):
-        rng = np.random.default_rng(seed)
-        rest = 3 * ((degree + 1) ** 2 - 1)
-        names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-        names += [f"f_rest_{index}" for index in range(rest)]
-        names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+        rng, names = np.random.default_rng(seed), splat_names(degree, normals=True)
         columns = {name: rng.normal(size=count).astype(np.float32) for name in names}
         for index in range(3):
             columns[f"scale_{index}"] -= 3.0

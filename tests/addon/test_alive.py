@@ -11,7 +11,7 @@ import pytest
 
 from tests.windows import event, started_in_a_window, until
 
-from .conftest import read
+from .conftest import linked, read
 
 
 @pytest.fixture
@@ -84,9 +84,8 @@ def test_a_merge_is_refused_when_other_splats_must_stay_since(addon, obj, start,
     bpy.ops.refine.score()
     settings = bpy.context.scene.refine
     settings.method, settings.percent = "merge", 80.0
-    volume = bpy.data.objects.new("volume", None)
+    volume = linked("volume")
     volume.empty_display_type, volume.location = "CUBE", (1000.0, 0.0, 0.0)
-    bpy.context.scene.collection.objects.link(volume)
     item = settings.volumes.add()
     item.role, item.object = "PROTECT", volume
     bpy.context.view_layer.update()
@@ -152,16 +151,14 @@ def test_scoring_on_the_thread_writes_what_scoring_at_once_writes_and_esc_nothin
 )
 def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, obj, change):
     """Of all objects that are written to; here the second is the one that changed."""
-    other = obj.copy()
-    other.data = obj.data.copy()
-    bpy.context.scene.collection.objects.link(other)
+    other = linked("other", obj.data.copy())
     other.select_set(True)
     operator, context, said = start()
     change(other)
     gate.open.set()
 
     assert until(operator, context) == {"CANCELLED"}
-    assert said == ["object 'room.001': its splats were changed meanwhile; start again"]
+    assert said == ["object 'other': its splats were changed meanwhile; start again"]
     assert noted(addon, obj) is None
     assert context.timers == 0
     assert addon.ui.operator_bases.now() is None
@@ -187,8 +184,7 @@ def test_a_renamed_object_gets_its_result_once_edit_mode_is_left(start, gate, ad
     """Attributes cannot be written there. Another object has its name by then, and stays."""
     operator, context, _ = start()
     obj.name = "other"
-    decoy = bpy.data.objects.new("room", obj.data.copy())
-    bpy.context.scene.collection.objects.link(decoy)
+    decoy = linked("room", obj.data.copy())
     bpy.ops.object.mode_set(mode="EDIT")
     gate.open.set()
     until(operator, context, lambda: addon.ui.operator_bases.now().waits)

@@ -3,12 +3,13 @@
 import json
 import math
 import re
-from pathlib import Path
 
 import bpy
 import pytest
 
-CAMERAS = Path(__file__).parents[1] / "data/room_small/cameras.json"
+from .conftest import ROOM, linked
+
+CAMERAS = ROOM / "cameras.json"
 CLOSED = ["--method", "closed-form"]
 PRUNE = ["prune", "--object", "room"]
 
@@ -122,7 +123,7 @@ def test_what_is_refused_and_a_dry_run_change_nothing(addon, tmp_path, capsys, u
     scene.timeline_markers.clear()
     scene.camera, scene.refine.collection = None, None
     for name, data in (("empty", None), ("camera", bpy.data.cameras.new("camera"))):
-        scene.collection.objects.link(bpy.data.objects.new(name, data))
+        linked(name, data)
     unchanged.start()
     for name, source, options, expected in (
         ("room", "ACTIVE", [], "room: no active camera at frame"),

@@ -6,14 +6,15 @@ import pytest
 
 from tests.e2e.inside.clouds import scatter
 
+from .conftest import linked
+
 
 def instanced(*objects):
     """Return an empty of the scene that instances a collection, which is in no scene itself."""
-    empty, collection = bpy.data.objects.new("instance", None), bpy.data.collections.new("set")
+    empty, collection = linked("instance"), bpy.data.collections.new("set")
     for obj in objects:
         collection.objects.link(obj)
     empty.instance_type, empty.instance_collection = "COLLECTION", collection
-    bpy.context.scene.collection.objects.link(empty)
     bpy.context.view_layer.objects.active = empty
     bpy.context.view_layer.update()
     return empty
@@ -49,9 +50,8 @@ def test_splats_on_points_and_faces_are_made_real_and_scored(quarter, places, ki
     """A triangle of three points, 3 m along x, has three instances, or one on its face.
     They become objects where they stood, also of a hidden one, and are instanced no more."""
     corners = [(3.0, 0.0, 0.0), (6.0, 0.0, 0.0), (6.0, 3.0, 0.0)]
-    ground = bpy.data.objects.new("ground", bpy.data.meshes.new("triangle"))
+    ground = linked("ground", bpy.data.meshes.new("triangle"))
     ground.data.from_pydata(corners, [], [(0, 1, 2)])
-    bpy.context.scene.collection.objects.link(ground)
     bpy.context.view_layer.objects.active = ground
     quarter.select_set(False)
     if kind in {"VERTS", "FACES"}:
@@ -91,8 +91,7 @@ def test_a_linked_empty_is_not_made_real(quarter, tmp_path):
     bpy.data.libraries.write(path, {empty}, fake_user=True)
     with bpy.data.libraries.load(path, link=True) as (_, wanted):
         wanted.objects = [empty.name]
-    linked = wanted.objects[0]
-    bpy.context.scene.collection.objects.link(linked)
-    bpy.context.view_layer.objects.active = linked
+    bpy.context.scene.collection.objects.link(wanted.objects[0])
+    bpy.context.view_layer.objects.active = wanted.objects[0]
     bpy.context.view_layer.update()
     assert not bpy.ops.refine.make_real.poll()

@@ -6,15 +6,9 @@ import pytest
 
 from tests.strategies import ply_of
 
-from .conftest import ROOM, export
+from .conftest import ROOM, export, linked
 
 ROOM_PLY = ROOM / "point_cloud.ply"
-
-
-def _link(mesh):
-    obj = bpy.data.objects.new(mesh.name, mesh)
-    bpy.context.scene.collection.objects.link(obj)
-    return obj
 
 
 @pytest.fixture
@@ -25,7 +19,7 @@ def through(addon, tmp_path):
         source, target = tmp_path / "in.ply", tmp_path / "out.ply"
         source.write_bytes(content if isinstance(content, bytes) else ply_of(content, comments))
         file = addon.core.read_ply(source)
-        obj = _link(addon.mesh.attributes.mesh_from_file(file))
+        obj = linked("in", addon.mesh.attributes.mesh_from_file(file))
         target.unlink(missing_ok=True)
         export(addon, addon.mesh.layout.check(obj), target)
         same = target.read_bytes() == source.read_bytes()
@@ -112,7 +106,8 @@ def test_what_is_no_splats_is_named(addon, room):
     """An empty, triangles, no vertices, a wrong attribute: what is there, what is expected."""
     mesh, attributes = bpy.data.meshes.new("triangles"), room.data.attributes
     mesh.from_pydata([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [], [(0, 1, 2)])
-    others = [bpy.data.objects.new("none", None), _link(mesh), _link(bpy.data.meshes.new("bare"))]
+    bare = bpy.data.meshes.new("bare")
+    others = [linked("none"), linked("triangles", mesh), linked("bare", bare)]
     expected = ["type EMPTY", "no attribute", "no vertices"]
     for kind, sentence in (
         (("INT", "POINT"), r"'scale_1' is INT on POINT, expected FLOAT on POINT"),
@@ -146,19 +141,6 @@ def test_without_harmonics_only_their_finiteness_is_read(addon, make_splats, thr
     splats = addon.mesh.attributes.splats_from_object(checked, sh_rest=False)
     assert splats.sh_rest.shape == (8, 1, 3)
     assert addon.core.splats.drawable(splats).tolist() == [i != 3 for i in range(8)]
-
-
-def test_an_unevenly_scaled_object_is_scored_as_it_stands(addon, make_splats, through):
-    """A scale of (1, 2, 1) on round splats of size s gives ellipsoids s, 2s, s at twice the y."""
-    columns = make_splats(count=50)
-    for axis in range(3):
-        columns[f"scale_{axis}"][:] = -3.0
-    obj = through(columns)[0]
-    obj.scale.y = 2.0
-    splats = addon.objects.splat_group.gather([addon.mesh.layout.check(obj)])
-    sizes = np.sort(splats.log_scales, axis=1)
-    assert np.allclose(splats.means[:, 1], 2 * columns["y"])
-    assert np.allclose(sizes, [-3.0, -3.0, np.log(2) - 3.0], atol=1e-5)
 
 
 def test_an_export_is_moved_as_its_object(addon, core, make_splats, through, tmp_path):

@@ -224,17 +224,3 @@ def test_points_with_the_names_of_a_file_are_splats(addon, quarter, quarter_file
             addon.mesh.attributes.write_attribute(obj.data, name, kind, values)
     obj.data["refine_layout"] = quarter.data["refine_layout"]
     assert exported(obj).path.read_bytes() == quarter_file.read_bytes()
-
-
-@pytest.mark.skipif(bpy.app.version < (5, 3), reason="Blender imports splats since 5.3")
-def test_blenders_own_import_is_what_these_tests_build(core, file, quarter_file, exported):
-    """Same attributes, types and values."""
-    bpy.ops.wm.ply_import(filepath=str(quarter_file), forward_axis="Y", up_axis="Z")
-    native, built = bpy.context.object, as_blender_imports(file.rows)
-    assert_alike(core, exported(native).splats(), file.splats())
-    kinds = [
-        {a.name: (a.data_type, a.domain) for a in o.data.attributes if "radiance" in a.name}
-        for o in (native, built)
-    ]
-    assert native.data.type == "GAUSSIAN_SPLAT"
-    assert kinds[0] == kinds[1]

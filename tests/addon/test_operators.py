@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
-from .conftest import ROOM, applied, export, keep_mask, read, splats_of
+from .conftest import ROOM, applied, export, keep_mask, linked, read, splats_of
 
 
 def test_import_score_apply_export_writes_the_file_that_core_writes(
@@ -53,24 +53,6 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
     np.testing.assert_array_equal(
         core.read_ply(tmp_path / "out.ply").splats().means, core.read_ply(few_file).splats().means
     )
-
-
-def test_every_budget_keeps_the_rows_that_core_keeps(addon, few, few_file, room_views):
-    """Blender stores 0.29 as 0.28999999165534973; floor(.29 * 3976) must still go."""
-    settings, core = bpy.context.scene.refine, addon.core
-    settings.budget = "psnr"
-    bpy.ops.refine.score()
-    file = core.read_ply(few_file)
-    for kind, value in {
-        "ratio": 0.29, "keep": 1234, "max_mb": 0.25, "psnr": 38.5
-    }.items():  # fmt: skip
-        settings.budget = kind
-        setattr(settings, kind, value)
-        expected = core.prune(file, room_views, core.Budget(**{kind: value}), core.ClosedForm())
-
-        np.testing.assert_array_equal(
-            keep_mask(addon, few, settings.to_budget()), expected.keep, kind
-        )
 
 
 def test_apply_removes_the_lowest_ranks_once_and_keeps_everything_else(addon, few):
@@ -195,9 +177,8 @@ def test_an_export_that_cannot_be_leaves_the_file_that_is_there(
 
 
 def _away(scene, kind="PERSP"):
-    camera = scene.camera = bpy.data.objects.new("away", bpy.data.cameras.new("away"))
+    camera = scene.camera = linked("away", bpy.data.cameras.new("away"))
     camera.location.z, camera.data.type = -1000.0, kind
-    scene.collection.objects.link(camera)
     scene.refine.source = "ACTIVE"
 
 
@@ -226,14 +207,10 @@ def test_scoring_that_cannot_be_done_is_explained(room_cameras, unchanged, prepa
     unchanged()
 
 
-def _shared(obj):
-    bpy.context.collection.objects.link(bpy.data.objects.new("other", obj.data))
-
-
 @pytest.mark.parametrize(
     ("prepare", "reason"),
     [
-        (_shared, "shares its data"),
+        (lambda obj: linked("other", obj.data), "shares its data"),
         (lambda obj: obj.shape_key_add(name="Basis"), "shape keys"),
         (lambda _obj: bpy.ops.object.mode_set(mode="WEIGHT_PAINT"), "weight paint mode"),
     ],

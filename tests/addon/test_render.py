@@ -9,7 +9,8 @@ from mathutils import Matrix, Vector
 
 from tests.e2e.inside.clouds import as_cloud, scatter
 
-from .conftest import splats_of
+from .conftest import linked, splats_of
+from .test_instances import instanced
 
 IMAGE = "Render with Splats"
 
@@ -22,10 +23,9 @@ def shot(quarter, room_views):
     data = bpy.data.cameras.new("camera")
     data.sensor_fit, data.clip_start = "HORIZONTAL", 0.1
     data.lens = view.fx / view.width * data.sensor_width
-    scene.camera = bpy.data.objects.new("camera", data)
+    scene.camera = linked("camera", data)
     axes = (np.array([1.0, -1.0, -1.0])[:, None] * view.rotation).T
     scene.camera.matrix_world = Matrix.Translation(view.center) @ Matrix(axes.tolist()).to_4x4()
-    scene.collection.objects.link(scene.camera)
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = 120, 80, 50
     render.engine, render.film_transparent = "CYCLES", True
@@ -146,22 +146,14 @@ def test_instances_are_drawn_and_what_renders_hide_is_not(addon, shot, quarter):
     a point on which nodes instance its geometry. Splats scaled to nothing, as where an animation
     ends one object, do not show."""
     whole = drawn(addon, shot, quarter)
-    collection = bpy.data.collections.new("splats")
-    collection.objects.link(quarter)
+    empty, gone, shown = instanced(quarter), linked("gone", quarter.data), []
     shot.collection.objects.unlink(quarter)
-    empty = bpy.data.objects.new("empty", None)
-    empty.instance_type, empty.instance_collection = "COLLECTION", collection
-    shot.collection.objects.link(empty)
-    gone = bpy.data.objects.new("gone", quarter.data)
-    shot.collection.objects.link(gone)
-    shown = []
     for flat in ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0), (math.nan, 1.0, 1.0)):
         gone.matrix_world = Matrix.Diagonal((*flat, 1.0))
         shown.append(rendered())
     empty.hide_render = True
-    point = bpy.data.objects.new("point", bpy.data.meshes.new("point"))
+    point = linked("point", bpy.data.meshes.new("point"))
     point.data.vertices.add(1)
-    shot.collection.objects.link(point)
     scatter(point, quarter, as_instance=False)
     shown.append(rendered())
     point.hide_render = True

@@ -6,6 +6,8 @@ import pytest
 
 from tests.e2e.inside.clouds import as_cloud
 
+from .conftest import linked
+
 COUNT, FIRST = 9_939, 5_000
 
 
@@ -14,9 +16,7 @@ def halves(addon, quarter, room_cameras):
     """Return the room as two selected objects: its first 5,000 splats, and the rest."""
     rows = np.arange(COUNT)
     addon.mesh.attributes.write_attribute(quarter.data, "row", "INT", rows)
-    other = quarter.copy()
-    other.data = quarter.data.copy()
-    bpy.context.scene.collection.objects.link(other)
+    other = linked("b", quarter.data.copy())
     for obj, name, gone in ((quarter, "a", rows >= FIRST), (other, "b", rows < FIRST)):
         obj.name = name
         addon.mesh.edit.delete_vertices(obj, gone)
@@ -87,10 +87,8 @@ def test_objects_that_cannot_be_scored_together_are_named(halves):
     with pytest.raises(RuntimeError, match="object 'a': the transform is flat"):
         bpy.ops.refine.score()
     halves[0].scale.x = 1.0
-    twin = halves[0].copy()
-    bpy.context.scene.collection.objects.link(twin)
-    twin.select_set(True)
-    with pytest.raises(RuntimeError, match=r"objects 'a' and 'a\.001' share their data"):
+    linked("twin", halves[0].data).select_set(True)
+    with pytest.raises(RuntimeError, match="objects 'a' and 'twin' share their data"):
         bpy.ops.refine.score()
 
 

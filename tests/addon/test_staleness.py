@@ -3,7 +3,7 @@
 import bpy
 import pytest
 
-from .conftest import keep_mask
+from .conftest import keep_mask, linked
 
 
 def hints(addon, obj):
@@ -16,9 +16,7 @@ def test_what_changed_since_scoring_is_said(addon, quarter, room_cameras, tmp_pa
     """One of 72 cameras, a hundredth of a unit, settings of the method; no budget, no name."""
     scene, settings = bpy.context.scene, bpy.context.scene.refine
     camera, plain = room_cameras.objects[30], room_cameras.objects[0]
-    parent, other = (bpy.data.objects.new(name, None) for name in ("parent", "other"))
-    for obj in (parent, other):
-        scene.collection.objects.link(obj)
+    parent, other = linked("parent"), linked("other")
     quarter.parent, quarter.rotation_euler = parent, (0.1, 0.2, 0.3)
     camera.rotation_mode, camera["refine_weight"] = "XYZ", 1.0
     del plain["refine_view"]  # now it is one that was made here, of the scene's render size
@@ -76,8 +74,7 @@ def test_selecting_the_splats_is_no_other_choice_of_cameras(addon, quarter, room
 def test_another_frame_of_a_scored_shot_is_no_change(addon, quarter):
     """The turntable turns, and the views were turned with it; another range is a change."""
     scene = bpy.context.scene
-    scene.camera = bpy.data.objects.new("shot", bpy.data.cameras.new("shot"))
-    scene.collection.objects.link(scene.camera)
+    scene.camera = linked("shot", bpy.data.cameras.new("shot"))
     scene.camera.location = (0.0, 0.0, 3.0)
     for frame, angle in ((1, 0.0), (20, 0.5)):
         quarter.rotation_euler.z = angle

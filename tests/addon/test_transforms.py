@@ -9,6 +9,8 @@ from tests.e2e.inside.clouds import as_blender_imports
 from tests.e2e.inside.extension import select
 from tests.strategies import ply_of
 
+from .conftest import linked
+
 COUNT = 9_939
 TURN = mathutils.Euler((0.4, -0.7, 1.1)).to_quaternion()
 NOWHERE = mathutils.Matrix()
@@ -58,12 +60,6 @@ def set_places(obj, places):
     obj.data.attributes["position"].data.foreach_set("vector", np.float32(places).ravel())
     obj.data.update()
     bpy.context.view_layer.update()
-
-
-def linked(name, data=None):
-    obj = bpy.data.objects.new(name, data)
-    bpy.context.scene.collection.objects.link(obj)
-    return obj
 
 
 @pytest.mark.parametrize("kind", ["MESH", "POINTCLOUD"])

@@ -12,7 +12,7 @@ import pytest
 
 from tests.e2e.inside.clouds import as_cloud
 
-from .conftest import read, splats_of
+from .conftest import linked, read, splats_of
 
 COUNT = 9_939
 CLOSED = ["--method", "closed-form"]
@@ -44,9 +44,8 @@ def empty(location, size, kind="CUBE", name="Empty"):
 
 
 def place(name, location, size, data=None):
-    obj = bpy.data.objects.new(name, data)
+    obj = linked(name, data)
     obj.location, obj.scale = location, size
-    bpy.context.scene.collection.objects.link(obj)
     bpy.context.view_layer.update()
     return obj
 

@@ -13,14 +13,7 @@ import pytest
 
 from tests.windows import event, started_in_a_window, until
 
-
-@pytest.fixture
-def few(addon, quarter, room_cameras):
-    """A twelfth of the room, to be merged to two fifths by four views."""
-    addon.mesh.edit.delete_vertices(quarter, np.arange(len(quarter.data.vertices)) % 3 != 0)
-    settings = bpy.context.scene.refine
-    settings.method, settings.ratio, settings.views = "merge", 0.6, 4
-    return quarter
+from .test_merge import obj  # noqa: F401 - a fixture
 
 
 def bits(obj):
@@ -39,12 +32,12 @@ def bits(obj):
 
 
 @pytest.mark.parametrize("stage", ["deleting", "after deleting", "writing"])
-def test_an_apply_that_fails_leaves_the_mesh_as_it_was(addon, few, monkeypatch, stage):
+def test_an_apply_that_fails_leaves_the_mesh_as_it_was(addon, obj, monkeypatch, stage):
     """With Merge, wherever it fails: attributes, groups, plan and scores are equal to the bit."""
-    few.vertex_groups.new(name="some").add(range(0, 3000, 7), 0.5, "REPLACE")
-    few.data.use_fake_user = True
+    obj.vertex_groups.new(name="some").add(range(0, 3000, 7), 0.5, "REPLACE")
+    obj.data.use_fake_user = True
     bpy.ops.refine.score()
-    before, delete = bits(few), addon.mesh.edit.delete_vertices
+    before, delete = bits(obj), addon.mesh.edit.delete_vertices
 
     def refuse(*arguments):
         if stage == "after deleting":
@@ -57,13 +50,13 @@ def test_an_apply_that_fails_leaves_the_mesh_as_it_was(addon, few, monkeypatch, 
         monkeypatch.setattr(addon.mesh.edit, "delete_vertices", refuse)
     with pytest.raises(RuntimeError, match="refused"):
         bpy.ops.refine.apply()
-    assert bits(few) == before
-    assert few.data.use_fake_user
-    assert [mesh.name for mesh in bpy.data.meshes] == [few.data.name]
+    assert bits(obj) == before
+    assert obj.data.use_fake_user
+    assert [mesh.name for mesh in bpy.data.meshes] == [obj.data.name]
     assert bpy.ops.refine.apply.poll()
 
 
-def test_a_prune_in_the_blend_is_saved_whole_or_changes_nothing(addon, few, room_views, tmp_path):
+def test_a_prune_in_the_blend_is_saved_whole_or_changes_nothing(addon, obj, room_views, tmp_path):
     """What is not exported is not deleted; where the .blend is not saved the export is named."""
 
     def pruned(folder):
@@ -73,22 +66,22 @@ def test_a_prune_in_the_blend_is_saved_whole_or_changes_nothing(addon, few, room
             output=folder / "out.ply", save=True,
         )  # fmt: skip
 
-    blend, name = tmp_path / "blend" / "scene.blend", few.data.name
+    blend, name = tmp_path / "blend" / "scene.blend", obj.data.name
     blend.parent.mkdir()
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
         pruned(tmp_path)
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
-    saved, before = blend.read_bytes(), bits(few)
+    saved, before = blend.read_bytes(), bits(obj)
     with pytest.raises(addon.core.RefineError, match="no folder"):
         pruned(tmp_path / "missing")
-    assert bits(few) == before
+    assert bits(obj) == before
     assert blend.read_bytes() == saved
 
     shutil.rmtree(blend.parent)
     with pytest.raises(addon.core.RefineError, match=r"nothing was removed, .*out\.ply was "):
         pruned(tmp_path)
-    assert bits(few) == before
-    kept = len(few.data.vertices) * 2 // 5 + 1
+    assert bits(obj) == before
+    kept = len(obj.data.vertices) * 2 // 5 + 1
     assert len(addon.core.read_ply(tmp_path / "out.ply")) == kept
 
     blend.parent.mkdir()
@@ -126,12 +119,12 @@ ENDS = {
 
 
 @pytest.mark.parametrize(("name", "how"), [(name, how) for name in ENDS for how in ENDS[name]])
-def test_an_operation_keeps_nothing_when_it_is_over(addon, few, noted, monkeypatch, name, how):
+def test_an_operation_keeps_nothing_when_it_is_over(addon, obj, noted, monkeypatch, name, how):
     """Done or not, on the thread or at once, when Blender's history keeps the operator."""
     operators, said = addon.ui.operators, []
     bpy.ops.refine.score()
     noted.clear()
-    count = len(few.data.vertices)
+    count = len(obj.data.vertices)
 
     def refuse(*_arguments, progress=None, **_options):
         while how in ("escape", "cancelled") and progress(0.5, "waiting") is not False:
@@ -168,4 +161,4 @@ def test_an_operation_keeps_nothing_when_it_is_over(addon, few, noted, monkeypat
     assert [text for text in said if "failed" in text] == ["failed"] * ("fail" in how)
     assert ("nothing was changed" in "".join(said)) == (how == "escape")
     went = name == "apply" and how in ("at once", "done")
-    assert len(few.data.vertices) == (count * 2 // 5 + 1 if went else count)
+    assert len(obj.data.vertices) == (count * 2 // 5 + 1 if went else count)
