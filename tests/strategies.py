@@ -3,6 +3,7 @@
 Nothing here uses the code under test; a file is a concatenation of bytes whose parts are kept.
 """
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -173,6 +174,13 @@ def ply_of(columns: dict[str, np.ndarray], comments: Sequence[str] = ()) -> byte
     lines.append(f"element vertex {len(rows)}")
     lines += [f"property {names[v.dtype.str[1:]]} {name}" for name, v in columns.items()]
     return "\n".join([*lines, "end_header", ""]).encode() + rows.tobytes()
+
+
+def cameras_json(places: dict[str, list[float]], focal: float, width: int, height: int) -> str:
+    """Return Inria's cameras.json of cameras by name that look along z, y down."""
+    lens = {"fx": focal, "fy": focal, "width": width, "height": height}
+    pose = {"rotation": np.eye(3).tolist()} | lens
+    return json.dumps([{"img_name": n, "position": p, **pose} for n, p in places.items()])
 
 
 def plain_header(count: object, names: list[str], form: str = "binary_little_endian") -> bytes:

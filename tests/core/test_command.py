@@ -25,7 +25,7 @@ from refine_addon.core import (
 from refine_addon.core.images import png
 from refine_addon.core.pictures import CAMERAS, PictureFiles, compare
 from refine_addon.version import VERSION
-from tests.strategies import plain_header, plain_ply, splat_names
+from tests.strategies import cameras_json, plain_header, plain_ply, splat_names
 
 ROOT = Path(__file__).parents[2]
 COUNT = 60
@@ -39,12 +39,8 @@ def folder(tmp_path, monkeypatch):
     """Stand in a folder with a splat file and five cameras around it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "in.ply").write_bytes(plain_ply(COUNT, 1))
-    pose = {"rotation": np.eye(3).tolist(), "fx": 180.0, "fy": 180.0, "width": 40, "height": 30}
-    views = [
-        {**pose, "position": [offset, 0.1 * offset * offset, 0.0], "img_name": str(offset)}
-        for offset in (-0.4, -0.2, 0.0, 0.2, 0.4)
-    ]
-    (tmp_path / "cameras.json").write_text(json.dumps(views))
+    places = {str(x): [x, 0.1 * x * x, 0.0] for x in (-0.4, -0.2, 0.0, 0.2, 0.4)}
+    (tmp_path / "cameras.json").write_text(cameras_json(places, 180.0, 40, 30))
     return tmp_path
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from refine_addon.command import main
 from refine_addon.core import read_ply
-from tests.strategies import ply_of, splat_names
+from tests.strategies import cameras_json, ply_of, splat_names
 
 from .test_cleaning import FLOATER, SIDE, cameras, joined, wall
 
@@ -26,15 +26,8 @@ def written(splats, path):
 def files(tmp_path):
     """Return the folder with scene.ply, whose last splat floats, and cameras.json."""
     written(joined(wall(), FLOATER), tmp_path / "scene.ply")
-    poses = [
-        {
-            "img_name": view.name, "width": view.width, "height": view.height,
-            "position": view.center.tolist(), "rotation": view.rotation.tolist(),
-            "fx": view.fx, "fy": view.fy,
-        }
-        for view in cameras()
-    ]  # fmt: skip
-    (tmp_path / "cameras.json").write_text(json.dumps(poses))
+    places = {view.name: view.center.tolist() for view in cameras()}
+    (tmp_path / "cameras.json").write_text(cameras_json(places, 60.0, 80, 60))
     return tmp_path
 
 

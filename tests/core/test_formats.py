@@ -1,6 +1,5 @@
 """Every format but plain PLY: what comes back lies within the bounds of docs/conventions.md."""
 
-import json
 import os
 import re
 import struct
@@ -26,7 +25,7 @@ from refine_addon.core.formats import registry
 from refine_addon.core.formats.registry import SUFFIXES
 from refine_addon.core.pictures import PictureFiles
 from refine_addon.core.splats import base_color, opacity, rotation_matrices
-from tests.strategies import ply_of, splat_names
+from tests.strategies import cameras_json, ply_of, splat_names
 from tests.users import own_folder
 
 FORMATS = [form for form in registry.FORMATS if form.suffix != ".sog" or find_spec("PIL")]
@@ -234,8 +233,7 @@ def test_a_file_that_may_not_be_read_is_replaced(cameras):
 def cameras(tmp_path_factory):
     """Return two views of the test scene."""
     path = tmp_path_factory.mktemp("views") / "cameras.json"
-    camera = {"rotation": np.eye(3).tolist(), "fx": 30, "fy": 30, "width": 64, "height": 48}
-    path.write_text(json.dumps([{**camera, "position": [x, 0, -6]} for x in (0, 1)]))
+    path.write_text(cameras_json({"a": [0, 0, -6], "b": [1, 0, -6]}, 30, 64, 48))
     return read_cameras(path)
 
 
