@@ -10,9 +10,21 @@ NOBODY = 65534
 
 
 @contextlib.contextmanager
+def _nobody() -> Iterator[bool]:
+    """Let the root user be nobody for that long; tell whether that is who runs the tests."""
+    root = os.geteuid() == 0
+    if root:
+        os.seteuid(NOBODY)
+    try:
+        yield root
+    finally:
+        if root:
+            os.seteuid(0)
+
+
+@contextlib.contextmanager
 def closed_folder(files: Mapping[str, str]) -> Iterator[Path]:
     """Make a folder of files that may not be entered; the root user is nobody for that long."""
-    root = os.geteuid() == 0
     with tempfile.TemporaryDirectory() as made:
         Path(made).chmod(0o755)
         folder = Path(made) / "closed"
@@ -20,26 +32,16 @@ def closed_folder(files: Mapping[str, str]) -> Iterator[Path]:
         for name, content in files.items():
             (folder / name).write_text(content)
         folder.chmod(0)
-        if root:
-            os.seteuid(NOBODY)
-        try:
+        with _nobody():
             yield folder
-        finally:
-            if root:
-                os.seteuid(0)
-            folder.chmod(0o700)
+        folder.chmod(0o700)
 
 
 @contextlib.contextmanager
 def own_folder() -> Iterator[Path]:
     """Make a folder; the root user, who may read what nobody else may, is nobody for that long."""
-    root = os.geteuid() == 0
     with tempfile.TemporaryDirectory() as made:
-        if root:
+        if os.geteuid() == 0:
             os.chown(made, NOBODY, NOBODY)
-            os.seteuid(NOBODY)
-        try:
+        with _nobody():
             yield Path(made)
-        finally:
-            if root:
-                os.seteuid(0)

@@ -1,6 +1,5 @@
 """The tiled renderer against a plain one that lays every splat over every pixel, by depth."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -108,12 +107,6 @@ CAMERA = View(np.eye(3), np.zeros(3), 20.0, 20.0, 16.5, 16.5, 32, 32)
 """At the origin, axes of the world, principal point at the centre of pixel (16, 16)."""
 
 
-def single(scale: float, alpha: float, z: float = 2.0, color=(1.0, 0.5, 0.0)) -> Splats:
-    """One ball on the axis; the constant harmonic is 1 / sqrt(4 pi)."""
-    dc = np.float32(math.sqrt(4.0 * math.pi) * (np.array([color]) - 0.5))
-    return replace(round_scene([[0.0, 0.0, z]], [opacity_logits(alpha)], scale), sh_dc=dc)
-
-
 # ----- tests
 
 
@@ -163,14 +156,14 @@ def test_a_splat_behind_or_beside_the_camera_adds_nothing() -> None:
     """
     beside = [(50.0, 0, 2.0), (-50.0, 0, 2.0), (0, 50.0, 2.0), (0, -50.0, 2.0)]
     places = [(0, 0, -2.0), (0, 0, 0.2), *beside]
-    scenes = [replace(single(0.1, 0.9), means=np.array([place])) for place in places]
+    scenes = [round_scene([place], [2.0]) for place in places]
     for scene in [*scenes, scenes[0].take(np.zeros(0, np.int64))]:
         image, stats = rasterizer.render_with_statistics(scene, CAMERA, background=BACKGROUND)
         np.testing.assert_array_equal(image, np.broadcast_to(BACKGROUND, image.shape))
         assert stats.hits.sum() == stats.removal_error.sum() == stats.weight_sum.sum() == 0
         assert len(stats.hits) == len(scene.means)
 
-    assert rasterizer.render(single(0.01, 0.9, z=0.2), CAMERA, near=0.1).max() > 0.5
+    assert rasterizer.render(scenes[1], CAMERA, near=0.1).max() > 0.5
 
 
 def test_the_number_of_threads_changes_no_bit_and_views_add_up() -> None:

@@ -11,7 +11,6 @@ from refine_addon.core import (
     Budget,
     Merge,
     Splats,
-    View,
     ViewSet,
     prune,
     read_cameras,
@@ -24,6 +23,7 @@ from refine_addon.core.affine import transformed
 pytestmark = pytest.mark.slow
 
 from .test_levels import merges  # noqa: F401 - a fixture
+from .test_views import ring
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 STILL = np.eye(3)
@@ -105,13 +105,8 @@ def scene_of_ties(kind):
         rng.normal(size=(1000, 3)).astype(np.float32),
         np.zeros((1000, 0, 3), np.float32),
     )
-    views = []
-    for number, angle in enumerate(np.linspace(0.0, 2 * np.pi, 40, endpoint=False)):
-        c, s = np.cos(angle), np.sin(angle)
-        turn = np.array([[-s, c, 0], [0, 0, -1], [-c, -s, 0]])  # looks inwards
-        center = np.array([3 * c, 3 * s, 0.0])
-        views.append(View(turn, center, 200.0, 200.0, 120.0, 80.0, 240, 160, name=f"{number:03}"))
-    return splats, ViewSet(tuple(views))
+    lens = {"fx": 200.0, "fy": 200.0, "cx": 120.0, "cy": 80.0, "width": 240, "height": 160}
+    return splats, ring(40, **lens)
 
 
 @pytest.mark.parametrize("kind", ["ring", "coincident", "lattice"])

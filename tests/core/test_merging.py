@@ -18,6 +18,8 @@ from refine_addon.core.splats import ALPHA_MAX, ARRAYS, LOW_PASS, Splats, drawab
 from refine_addon.core.views import View, ViewSet
 from refine_addon.core.visibility.scene import Scene, scene_of
 
+from .test_views import ring
+
 SCENE = Scene(np.zeros(3), 1.0, np.eye(3))
 
 
@@ -60,22 +62,22 @@ def cloud(count, seed=0, degree=1, spread=1.0):
     )
 
 
-def looking(at, center, down=(0.0, 1.0, 0.0), **changes):
-    """Return a view from `center` to `at`, 320 x 240 px."""
+LENS = {"fx": 200.0, "fy": 250.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}
+
+
+def looking(at, center, **changes):
+    """Return a view from `center` to `at`, 320 x 240 px, y down."""
     forward = np.array(at, float) - center
     forward /= np.linalg.norm(forward)
-    right = np.cross(down, forward)
+    right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    lens = {"fx": 200.0, "fy": 250.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}
-    return View(rotation, np.array(center, float), **lens | changes)
+    return View(rotation, np.array(center, float), **LENS | changes)
 
 
 def around(count=4, distance=6.0):
     """Look from a circle towards the origin."""
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    places = distance * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
-    return ViewSet(tuple(looking([0, 0, 0], place, (0, 0, -1), fy=200.0) for place in places))
+    return ring(count, distance, **LENS | {"fy": 200.0})
 
 
 def measure(splats, _expected=None, _progress=None):

@@ -14,13 +14,17 @@ from refine_addon.core.splats import SH_C0
 from refine_addon.core.visibility import measuring, projection
 from refine_addon.core.visibility import points as points_module
 
+from . import test_views as views_by_hand
+
 CUT = 1.0 / 255.0
+
+
+LENS = {"fx": 100.0, "fy": 100.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60}
 
 
 def look_along_z(center=(0.0, 0.0, 0.0), **changes) -> View:
     """A camera that looks along +z: 100 px focal length, 80 x 60 image."""
-    lens = {"fx": 100.0, "fy": 100.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60}
-    return View(np.eye(3), np.array(center), **(lens | changes))
+    return views_by_hand.view(center, **LENS | changes)
 
 
 def splats_of(means, alphas=0.5, scales=0.05, color=0.5) -> Splats:
@@ -70,15 +74,7 @@ def cloud(count=300, seed=0) -> Splats:
 
 def ring(count=5) -> ViewSet:
     """Cameras on a circle of radius 5, looking at its middle."""
-    views = []
-    for index in range(count):
-        angle = 2 * math.pi * index / count + 0.3
-        forward = np.array([-math.cos(angle), -math.sin(angle), 0.0])
-        down = np.array([0.0, 0.0, -1.0])
-        rotation = np.stack([np.cross(down, forward), down, forward])
-        view = replace(look_along_z(), rotation=rotation, center=-5.0 * forward)
-        views.append(replace(view, name=f"{index:02}"))
-    return ViewSet(tuple(views))
+    return views_by_hand.ring(count, 5.0, 0.3, **LENS)
 
 
 def test_a_lone_splat_has_the_integrals_of_its_alpha_and_its_squared_colour():

@@ -15,12 +15,14 @@ def view(center=(0.0, 0.0, 0.0), **changes) -> View:
     return View(rotation, np.array(center, float), **values | changes)
 
 
-def ring(count: int) -> ViewSet:
+def ring(count: int, radius=3.0, start=0.0, **lens) -> ViewSet:
+    """Views on a circle around z, looking inwards, named by their numbers."""
     views = []
-    for index, angle in enumerate(np.arange(count) * 2 * np.pi / count):
+    for index, angle in enumerate(np.arange(count) * 2 * np.pi / count + start):
         c, s = np.cos(angle), np.sin(angle)
-        rotation = np.array([[-s, c, 0], [0, 0, -1], [-c, -s, 0]])  # looks inwards
-        views.append(view([3 * c, 3 * s, 0], rotation=rotation, name=str(index)))
+        rotation = np.array([[-s, c, 0], [0, 0, -1], [-c, -s, 0]])
+        center = [radius * c, radius * s, 0]
+        views.append(view(center, rotation=rotation, name=f"{index:02}", **lens))
     return ViewSet(tuple(views))
 
 
@@ -53,7 +55,7 @@ def test_a_set_needs_a_view_that_counts():
     with pytest.raises(RefineError, match="weight 0"):
         ViewSet((view(weight=0.0),))
     with pytest.raises(RefineError, match="no view named 'x' among 4 views"):
-        ring(4).select(["2", "x"])
+        ring(4).select(["02", "x"])
     with np.errstate(all="raise"):
         np.testing.assert_allclose(ViewSet((view(weight=1e308),) * 3).weights, [1 / 3] * 3)
 
