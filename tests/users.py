@@ -10,13 +10,13 @@ NOBODY = 65534
 
 
 @contextlib.contextmanager
-def _nobody() -> Iterator[bool]:
-    """Let the root user be nobody for that long; tell whether that is who runs the tests."""
+def _nobody() -> Iterator[None]:
+    """Let the root user be nobody for that long."""
     root = os.geteuid() == 0
     if root:
         os.seteuid(NOBODY)
     try:
-        yield root
+        yield
     finally:
         if root:
             os.seteuid(0)

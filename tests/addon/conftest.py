@@ -3,7 +3,6 @@
 import importlib
 import os
 import tempfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,10 +13,9 @@ os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="refine-blender-"
 import bpy  # noqa: I001
 import addon_utils
 
+from tests.places import ROOM, ROOT
 from tests.strategies import splat_names
 
-ROOT = Path(__file__).parents[2]
-ROOM = ROOT / "tests" / "data" / "room_small"
 MODULE = "bl_ext.dev.refine_addon"
 
 

@@ -1,14 +1,13 @@
 """The scenes that several tests render."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View
+from tests.places import ROOM  # noqa: F401 - for those that render it
 
-ROOM = Path(__file__).parents[1] / "data/room_small"
 BACKGROUND = (0.2, 0.5, 0.9)
 VIEW = View(np.eye(3), np.array([0.1, -0.2, 0.3]), 31.0, 27.0, 17.0, 16.0, 37, 29, name="a")
 AWAY = replace(VIEW, center=np.array([-0.3, 0.2, -0.1]), name="b")

@@ -25,9 +25,9 @@ from refine_addon.core import (
 from refine_addon.core.images import png
 from refine_addon.core.pictures import CAMERAS, PictureFiles, compare
 from refine_addon.version import VERSION
+from tests.places import ROOT
 from tests.strategies import cameras_json, plain_header, plain_ply, splat_names
 
-ROOT = Path(__file__).parents[2]
 COUNT = 60
 PRUNE = ["prune", "in.ply", "--cameras", "cameras.json"]
 MADE = [*PRUNE, "-o", "out.ply"]

@@ -1,11 +1,11 @@
 """What the documents name is there: files, links, tests."""
 
 import re
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.places import ROOT
+
 DOCUMENTS = sorted(
     path
     for folder in (ROOT, ROOT / "docs", ROOT / "benchmarks", ROOT / "tests/e2e")

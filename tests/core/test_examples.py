@@ -13,9 +13,8 @@ import pytest
 
 from refine_addon.core import read_ply
 from tests.examples import blocks, modules_with_examples
+from tests.places import ROOM, ROOT
 
-ROOT = Path(__file__).parents[2]
-ROOM = ROOT / "tests/data/room_small"
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 SNIPPETS = [
     pytest.param(block, id=block.place)

@@ -21,8 +21,8 @@ from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.methods import Merge, Occlusion
 from refine_addon.core.prune import prune
 from refine_addon.core.selection import Budget
+from tests.places import ROOM
 
-ROOM = Path(__file__).parents[1] / "data/room_small"
 LONG = 600.0  # seconds; a tenth of it is more than any machine needs to notice
 MUCH = 1e3  # seconds of work: worth processes
 

@@ -9,9 +9,8 @@ import pytest
 
 from refine_addon.core import read_ply
 from refine_addon.core.formats.ply import with_count
+from tests.places import ROOM, ROOT
 
-ROOT = Path(__file__).parents[2]
-ROOM = ROOT / "tests/data/room_small"
 OPENJD = Path(sys.executable).with_name("openjd")
 
 pytestmark = [

@@ -25,6 +25,7 @@ from refine_addon.core.formats import registry
 from refine_addon.core.formats.registry import SUFFIXES
 from refine_addon.core.pictures import PictureFiles
 from refine_addon.core.splats import base_color, opacity, rotation_matrices
+from tests.places import DATA
 from tests.strategies import cameras_json, ply_of, splat_names
 from tests.users import own_folder
 
@@ -32,7 +33,7 @@ FORMATS = [form for form in registry.FORMATS if form.suffix != ".sog" or find_sp
 """All but plain PLY; SOG where Pillow is installed."""
 
 SUFFIX = [form.suffix for form in FORMATS]
-KSPLAT = Path(__file__).parents[1] / "data/other_tools/level_1.ksplat"
+KSPLAT = DATA / "other_tools/level_1.ksplat"
 COUNT = 600
 """Splats of the test scene: two whole chunks of a compressed PLY and a part of one."""
 

@@ -1,7 +1,6 @@
 """What is kept depends on no frame, unit or order of the splats: the committed room."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,13 +18,13 @@ from refine_addon.core import (
     select,
 )
 from refine_addon.core.affine import transformed
+from tests.places import ROOM
 
 pytestmark = pytest.mark.slow
 
 from .test_levels import merges  # noqa: F401 - a fixture
 from .test_views import ring
 
-ROOM = Path(__file__).parents[1] / "data/room_small"
 STILL = np.eye(3)
 QUARTER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # about x, as *Upright* turns
 

@@ -1,17 +1,15 @@
 """.ksplat: files of the reference converter, one by hand, and files that lie."""
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from refine_addon.core import read_splats
 from tests.hostile import refused
+from tests.places import DATA
 
 from .test_formats import differences
-
-DATA = Path(__file__).parents[1] / "data"
 
 # Level -> largest errors. Level 0 holds floats. Level 1: half of 3 units / 2 / 32767; a float16 has
 # 11 bits, or steps of 6e-8 below 6e-5: of the least scale here, 1.5e-7, that is .6; components of

@@ -4,7 +4,6 @@ import contextlib
 import importlib
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,12 +27,12 @@ from refine_addon.core import (
 from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.quality.psnr import psnr_against
 from refine_addon.core.splats import ARRAYS
+from tests.places import ROOM
 from tests.strategies import ply_of
 
 from .test_cleaning import cameras, wall
 
 PRUNE = importlib.import_module("refine_addon.core.prune")
-ROOM = Path(__file__).parents[1] / "data/room_small"
 TWO = Levels((0.5, 0.25))
 QUICK = ClosedForm()
 

@@ -14,7 +14,8 @@ from refine_addon.core.splats import SH_C0
 from refine_addon.core.visibility import measuring, projection
 from refine_addon.core.visibility import points as points_module
 
-from . import test_views as views_by_hand
+from .test_views import ring as circle
+from .test_views import view as plain_view
 
 CUT = 1.0 / 255.0
 
@@ -24,7 +25,7 @@ LENS = {"fx": 100.0, "fy": 100.0, "cx": 40.0, "cy": 30.0, "width": 80, "height":
 
 def look_along_z(center=(0.0, 0.0, 0.0), **changes) -> View:
     """A camera that looks along +z: 100 px focal length, 80 x 60 image."""
-    return views_by_hand.view(center, **LENS | changes)
+    return plain_view(center, **LENS | changes)
 
 
 def splats_of(means, alphas=0.5, scales=0.05, color=0.5) -> Splats:
@@ -74,7 +75,7 @@ def cloud(count=300, seed=0) -> Splats:
 
 def ring(count=5) -> ViewSet:
     """Cameras on a circle of radius 5, looking at its middle."""
-    return views_by_hand.ring(count, 5.0, 0.3, **LENS)
+    return circle(count, 5.0, 0.3, **LENS)
 
 
 def test_a_lone_splat_has_the_integrals_of_its_alpha_and_its_squared_colour():

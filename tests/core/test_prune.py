@@ -1,7 +1,6 @@
 """The one use case, on the committed room; the dial, and when merging deletes."""
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,9 +28,9 @@ from refine_addon.core.scoring import closed_form, occlusion
 from refine_addon.core.splats import ARRAYS
 from refine_addon.core.visibility import measuring, points, projection, rays
 from tests.core.test_levels import PRUNE
+from tests.places import ROOM
 from tests.strategies import ply_of
 
-ROOM = Path(__file__).parents[1] / "data/room_small"
 FEW, DELETING = Merge(12), Occlusion(12)
 HALF = Budget(ratio=0.5)
 TENTHS = [tenth / 10 for tenth in range(1, 10)]

@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,8 +33,8 @@ from refine_addon.core.visibility.rays import Rays
 from tests.core.test_invariance import MOTIONS, moved
 from tests.core.test_levels import merges  # noqa: F401 - a fixture
 from tests.core.test_occlusion import cloud, look_along_z, ring, splats_of
+from tests.places import ROOM
 
-ROOM = Path(__file__).parents[1] / "data" / "room_small"
 FAST, KNOWN = ClosedForm(), Alignment(1, known=True)
 CURVE = Quality(*np.array([[0.2, 0.5, 0.8], [50.0, 40.0, 30.0], [52.0, 47.0, 38.0]]))
 

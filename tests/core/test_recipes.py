@@ -2,16 +2,14 @@
 
 import argparse
 import shlex
-from pathlib import Path
 
 import pytest
 
 from refine_addon.command import checks
 from refine_addon.command.options import complete, make_parser
 from tests.examples import blocks
+from tests.places import ROOM, ROOT
 
-ROOT = Path(__file__).parents[2]
-ROOM = ROOT / "tests/data/room_small"
 LINES = {
     document: [
         line.split("#")[0].partition("--command refine ")[2]

@@ -4,7 +4,6 @@ import gzip
 import importlib
 import struct
 import zlib
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,9 +14,9 @@ from refine_addon.core import RefineError, read_splats, write_splats
 from refine_addon.core.affine import QUARTERS
 from refine_addon.core.spherical_harmonics import rotate
 from tests.hostile import refused
+from tests.places import ROOM
 from tests.strategies import plain_ply
 
-ROOM = Path(__file__).parents[1] / "data" / "room_small"
 MEAN = bytes([0, 16, 0, 0, 240, 255, 1, 0, 0])
 """1, -1 and 1/4096 with 12 bits behind the point: 0x001000, 0xfff000, 1."""
 

@@ -14,10 +14,10 @@ from refine_addon.core.formats import streamed_sog
 from refine_addon.core.formats.streamed_sog import StreamedSog, folder_for
 from refine_addon.core.splats import rotation_matrices
 from tests.hostile import refused, with_value
+from tests.places import DATA
 
 pytest.importorskip("PIL", reason="needs Pillow, which SOG does outside of Blender")
 
-DATA = Path(__file__).parents[1] / "data"
 ROOM = DATA / "room_small/point_cloud.ply"
 OTHER = DATA / "other_tools/streamed/lod-meta.json"
 

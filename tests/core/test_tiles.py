@@ -44,13 +44,13 @@ from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import validation_rays
 from refine_addon.core.whole_file import Url
 from tests.hostile import files_of_at_most
+from tests.places import ROOM
 from tests.strategies import plain_header, plain_ply, ply_of, splat_names
 
 from .test_levels import merges  # noqa: F401 - a fixture
 
 fsspec = pytest.importorskip("fsspec")
 
-ROOM = Path(__file__).parents[1] / "data/room_small"
 COUNT = 5000
 CUTS = (0, 700, 700, 2600, COUNT)  # a short tile, an empty one, and two that are read in pieces
 HALF = Budget(ratio=0.5)
