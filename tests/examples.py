@@ -1,5 +1,7 @@
 """Find what documents promise: examples in docstrings, and fenced blocks in Markdown."""
 
+import doctest
+import importlib
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -16,13 +18,17 @@ class Block(NamedTuple):
     excused: bool
 
 
-def modules_with_examples(package: Path, name: str) -> list[str]:
-    """Return the modules of a package folder whose docstrings have examples, by full name."""
-    return sorted(
+def broken_promises(package: Path, name: str, *, but: str = " ") -> list[str]:
+    """Return the modules below a package's folder whose examples give something else."""
+    found = sorted(
         ".".join((name, *path.relative_to(package).with_suffix("").parts))
         for path in package.rglob("*.py")
         if ">>> " in path.read_text(encoding="utf-8")
     )
+    tried = [module for module in found if but not in module]
+    assert tried
+    results = {module: doctest.testmod(importlib.import_module(module)) for module in tried}
+    return [module for module, done in results.items() if done.failed or not done.attempted]
 
 
 def blocks(document: Path) -> list[Block]:

@@ -63,6 +63,12 @@ def read(addon, obj, name):
     return addon.mesh.attributes.read_attribute(obj.data, name)
 
 
+def choose(addon, obj, rows):
+    """Select these splats alone."""
+    count = addon.mesh.layout.splat_count(obj.data)
+    addon.mesh.selection.select(obj, np.isin(np.arange(count), rows))
+
+
 def splats_of(addon, obj):
     return addon.objects.splat_group.gather([addon.mesh.layout.check(obj)], whole=True)
 

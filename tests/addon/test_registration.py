@@ -2,6 +2,9 @@
 
 import bpy
 
+from tests.examples import broken_promises
+from tests.places import ROOT
+
 
 def test_every_button_and_setting_explains_itself(addon):
     """A tooltip each: a docstring of operators, a description of properties."""
@@ -12,3 +15,8 @@ def test_every_button_and_setting_explains_itself(addon):
         own = [p for p in properties if p.identifier in getattr(cls, "__annotations__", {})]
         silent += [f"{cls.__name__}.{p.identifier}" for p in own if not p.description]
     assert silent == []
+
+
+def test_examples_in_docstrings_give_what_they_promise(addon):
+    """Those of what needs Blender, the command among it."""
+    assert broken_promises(ROOT / "refine_addon", addon.__name__, but=".core.") == []

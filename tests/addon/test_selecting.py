@@ -6,12 +6,9 @@ import pytest
 
 from tests.e2e.inside.clouds import as_cloud
 
+from .conftest import choose
+
 COUNT = 9_939
-
-
-def choose(addon, obj, rows):
-    count = addon.mesh.layout.splat_count(obj.data)
-    addon.mesh.selection.select(obj, np.isin(np.arange(count), rows))
 
 
 def chosen(addon, obj):

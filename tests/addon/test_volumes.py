@@ -12,7 +12,7 @@ import pytest
 
 from tests.e2e.inside.clouds import as_cloud
 
-from .conftest import linked, read, splats_of
+from .conftest import choose, linked, read, splats_of
 
 COUNT = 9_939
 CLOSED = ["--method", "closed-form"]
@@ -58,10 +58,6 @@ def volume(obj, role):
 
 def facts(addon, obj):
     return addon.objects.demands.record(obj.data)
-
-
-def select(addon, obj, rows):
-    addon.mesh.selection.select(obj, np.isin(np.arange(COUNT), rows))
 
 
 def stale(addon, obj):
@@ -157,13 +153,17 @@ def test_the_panel_does_what_volumes_say(addon, quarter, crop, kind):
 def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp_path, method):
     """By the saved scene, by options that name its objects, and by masks: the same file.
 
-    Splats 0 to 99 are marked by hand to stay, which volumes do not overrule.
+    Splats 0 to 99 are marked by hand to stay, which volumes do not overrule, 100 to 199 to go.
     """
-    (protected, removed), marked = crop, np.arange(COUNT) < 100
-    assert (marked & removed).any()
-    protected, removed = protected | marked, removed & ~marked
-    select(addon, quarter, range(100))
-    bpy.ops.refine.protect(mark="STAY")
+    (protected, removed), rows = crop, np.arange(COUNT)
+    stay, go = rows < 100, rows // 100 == 1
+    assert (stay & removed).any()
+    assert (go & ~removed).any()
+    protected = protected | stay
+    removed = (removed | go) & ~protected
+    for marked, mark in ((stay, "STAY"), (go, "GO")):
+        choose(addon, quarter, rows[marked])
+        bpy.ops.refine.protect(mark=mark)
     settings = bpy.context.scene.refine
     settings.ratio, settings.method, settings.views = 0.8, method, 4
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
@@ -199,7 +199,7 @@ def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp
 def test_marks_are_added_released_and_cleared(addon, quarter, unchanged, kind):
     """10 and 10 more that overlap in 5 are 15; 3 of them released are 12."""
     obj = as_cloud(addon, quarter) if kind == "POINTCLOUD" else quarter
-    select(addon, obj, ())
+    choose(addon, obj, ())
     unchanged.start()
     with pytest.raises(RuntimeError, match="no splat is selected; select some first"):
         bpy.ops.refine.protect(mark="STAY")
@@ -208,11 +208,11 @@ def test_marks_are_added_released_and_cleared(addon, quarter, unchanged, kind):
         (range(10), "STAY", range(10)), (range(5, 15), "STAY", range(15)),
         (range(3), "NONE", range(3, 15)),
     ):  # fmt: skip
-        select(addon, obj, rows)
+        choose(addon, obj, rows)
         assert bpy.ops.refine.protect(mark=mark) == {"FINISHED"}
         assert np.flatnonzero(read(addon, obj, "refine_protect")).tolist() == list(marked)
         assert facts(addon, obj)["protected"] == len(marked)
-    select(addon, obj, range(COUNT))
+    choose(addon, obj, range(COUNT))
     bpy.ops.refine.protect(mark="NONE")
     assert "refine_protect" not in obj.data.attributes
     assert "refine_force" not in obj.data.attributes

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from refine_addon.core.splats import Splats
+from refine_addon.core.splats import Splats, opacity
 from refine_addon.core.views import View
-from tests.places import ROOM  # noqa: F401 - for those that render it
+from tests.core.test_occlusion import splats_of
 
 BACKGROUND = (0.2, 0.5, 0.9)
 VIEW = View(np.eye(3), np.array([0.1, -0.2, 0.3]), 31.0, 27.0, 17.0, 16.0, 37, 29, name="a")
@@ -31,15 +31,7 @@ def soft_scene(count: int = 12) -> Splats:
 
 def round_scene(places: list[list[float]], logits: list[float], size: float = 0.1) -> Splats:
     """Return round white splats."""
-    count = len(places)
-    return Splats(
-        np.array(places, np.float64),
-        np.full((count, 3), np.log(size)),
-        np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        np.array(logits, np.float64),
-        np.full((count, 3), 1.7),
-        np.zeros((count, 0, 3)),
-    )
+    return splats_of(places, opacity(np.array(logits)), size, 0.98)
 
 
 def cube_scene(count: int = 400) -> Splats:

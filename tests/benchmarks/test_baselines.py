@@ -17,8 +17,9 @@ from refine_addon.core.errors import RefineError
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.splats import opacity, rotation_matrices
 from refine_addon.core.views import View, ViewSet
-from tests.benchmarks.scenes import ROOM, cube_scene, round_scene
+from tests.benchmarks.scenes import cube_scene, round_scene
 from tests.core.test_closed_form import three_splats
+from tests.places import ROOM
 
 CLOUD = ROOM / "point_cloud.ply"
 

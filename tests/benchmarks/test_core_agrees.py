@@ -20,7 +20,7 @@ from refine_addon.core.splats import MODELS, with_model
 from refine_addon.core.visibility import measuring, points, projection
 from refine_addon.viewport import arrays
 from refine_addon.viewport.arrays import Eye
-from tests.benchmarks.scenes import ROOM
+from tests.places import ROOM
 
 VIEW = View(np.eye(3), np.zeros(3), 100.0, 110.0, 60.3, 41.7, 120, 80, near=0.2)
 SIDES = (12.0, 6.0, 3.0, 1.5)

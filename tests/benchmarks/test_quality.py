@@ -13,7 +13,7 @@ from benchmarks.baselines.refine import refine
 from benchmarks.tables.evaluate import Evaluator, read_scene
 from benchmarks.tables.methods import as_scores
 from refine_addon.core import Budget, ClosedForm, Merge, Occlusion, prune, score, select
-from tests.benchmarks.scenes import ROOM
+from tests.places import ROOM
 
 
 @pytest.fixture(scope="module")

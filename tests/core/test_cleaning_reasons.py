@@ -23,9 +23,7 @@ ALL = Cleaning(JUDGED)
 
 def stretched(place, scales, opacity=0.8, color=0.1):
     """Return one splat with a standard deviation along each axis."""
-    return replace(
-        made([place], 1.0, opacity, color), log_scales=np.log(np.array([scales], np.float32))
-    )
+    return made([place], [scales], opacity, color)
 
 
 VEIL = made([[0.0, 0.0, 2.0]], 1.5, 0.2, 0.1)

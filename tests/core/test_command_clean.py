@@ -7,25 +7,18 @@ import pytest
 
 from refine_addon.command import main
 from refine_addon.core import read_ply
-from tests.strategies import cameras_json, ply_of, splat_names
+from tests.strategies import cameras_json
 
 from .test_cleaning import FLOATER, SIDE, cameras, joined, wall
+from .test_levels import file_of
 
 WHOLE = SIDE**2 + 1
-
-
-def written(splats, path):
-    """Write splats of degree 0 as a plain PLY; return its path."""
-    parts = (splats.means, splats.sh_dc, splats.opacity_logits[:, None], splats.log_scales)
-    rows = np.hstack([*parts, splats.quaternions]).astype("<f4")
-    path.write_bytes(ply_of(dict(zip(splat_names(0), rows.T, strict=True))))
-    return path
 
 
 @pytest.fixture
 def files(tmp_path):
     """Return the folder with scene.ply, whose last splat floats, and cameras.json."""
-    written(joined(wall(), FLOATER), tmp_path / "scene.ply")
+    file_of(joined(wall(), FLOATER), tmp_path / "scene.ply")
     places = {view.name: view.center.tolist() for view in cameras()}
     (tmp_path / "cameras.json").write_text(cameras_json(places, 60.0, 80, 60))
     return tmp_path
@@ -109,10 +102,11 @@ def test_prune_cleans_before_the_budget_counts(files, capsys, method):
     ("words", "expected"),
     [
         (["clean", "scene.ply", "--reasons", "fog"], "reason is 'fog', expected some of front"),
-        (["clean", "scene.ply", "--reasons", ","], "reason is none, expected"),
         (["clean", "scene.ply", "--views", "-1"], "views is -1, expected 0"),
+        (["prune", "scene.ply", "--views", "-1"], "views is -1, expected 0"),
+        (["prune", "scene.ply", "--method", "refit", "--rounds", "0"], "rounds is 0, expected 1"),
+        (["prune", "scene.ply", "--method", "refit", "--rounds", "101"], "rounds is 101, expected"),
         (["clean", "scene.ply", "a.ply", "-o", "x.ply"], "-o x.ply is one file, expected a folder"),
-        (["clean", "scene.ply", "b/scene.ply", "-o", "out"], "scene.ply and b/scene.ply would bo"),
         (["prune", "--clean", "--object", "Splats"], "--clean goes with INPUT files"),
     ],
 )

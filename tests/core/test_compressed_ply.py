@@ -87,8 +87,7 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize("case", range(len(FAULTS)))
-def test_what_is_wrong_is_named_with_its_place(tmp_path, case):
+@pytest.mark.parametrize(("data", "expected"), FAULTS, ids=range(len(FAULTS)))
+def test_what_is_wrong_is_named_with_its_place(tmp_path, data, expected):
     """The element, the property, what was found and what was expected."""
-    data, expected = FAULTS[case]
     refused(tmp_path / "a.ply", expected, data)

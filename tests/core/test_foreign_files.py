@@ -48,10 +48,9 @@ FOREIGN = [
 ]
 
 
-@pytest.mark.parametrize("case", range(len(FOREIGN)))
-def test_a_known_format_is_named_and_so_is_what_to_do(tmp_path, case):
+@pytest.mark.parametrize(("file", "data", "expected"), FOREIGN, ids=range(len(FOREIGN)))
+def test_a_known_format_is_named_and_so_is_what_to_do(tmp_path, file, data, expected):
     """By what the file holds; by its name only where nothing in it tells. As cameras, too."""
-    file, data, expected = FOREIGN[case]
     refused(tmp_path / file, f": {expected}", data, read=read_ply)
     refused(tmp_path / file, f": not a camera file: {expected.split(':')[0]}", read=read_cameras)
 

@@ -1,4 +1,4 @@
-"""What is kept depends on no frame, unit or order of the splats: the committed room."""
+"""What is kept, or cleaned away, depends on no frame, no unit and no order of the splats."""
 
 from dataclasses import replace
 
@@ -11,6 +11,7 @@ from refine_addon.core import (
     Merge,
     Splats,
     ViewSet,
+    clean,
     prune,
     read_cameras,
     read_ply,
@@ -20,10 +21,11 @@ from refine_addon.core import (
 from refine_addon.core.affine import transformed
 from tests.places import ROOM
 
-pytestmark = pytest.mark.slow
-
+from .test_cleaning import FLOATER, cameras, joined, wall
 from .test_levels import merges  # noqa: F401 - a fixture
 from .test_views import ring
+
+pytestmark = pytest.mark.slow
 
 STILL = np.eye(3)
 QUARTER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # about x, as *Upright* turns
@@ -120,3 +122,10 @@ def test_ties_are_decided_by_what_does_not_move(merges, kind, method):
 
     assert jaccard(kept(*turned, method, most=24), expected) >= 0.9999
     assert jaccard(kept(*permuted, method, most=24), expected[..., order]) >= 0.9999
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_neither_order_nor_unit_nor_frame_decides_what_is_cleaned_away(unit):
+    splats, views = joined(wall(), FLOATER), cameras()
+    other = moved(splats.take(slice(None, None, -1)), tuple(views)[::-1], QUARTER, 5.0, unit)
+    assert np.array_equal(clean(*other).keep[::-1], clean(splats, views).keep)

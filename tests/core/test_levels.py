@@ -160,7 +160,6 @@ def test_levels_that_cannot_be_are_refused():
     .001 of 5 splats are none, but a level without any is no level."""
     for given, word in (
         ({}, "got none"),
-        ({"shares": (0.5,), "psnr": (40.0,)}, "got both"),
         ({"shares": (1.0,)}, "less than 1"),
         ({"shares": (0.5, 0.0)}, "more than 0"),
         ({"shares": (math.nan,)}, "level is nan"),

@@ -35,6 +35,7 @@ from refine_addon.core.visibility.cast import hits
 from tests.strategies import ply_of, splat_names
 
 from .test_numerics import cloud as random_splats
+from .test_occlusion import splats_of
 
 
 def cloud(count):
@@ -216,15 +217,7 @@ def test_a_disc_seen_from_far_away_is_its_low_pass():
 
 def two(means, sizes, model):
     """Return two splats of one shape, along the axes."""
-    splats = replace(
-        cloud(2),
-        means=np.array(means),
-        log_scales=np.log(np.tile(sizes, (2, 1))),
-        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
-        opacity_logits=np.full(2, -1.0),
-        sh_dc=np.ones((2, 3)),
-    )
-    return with_model(splats, model)
+    return with_model(splats_of(means, 0.27, sizes, 0.78), model)
 
 
 def merged_to_one(splats):

@@ -12,16 +12,13 @@ from .test_occlusion import look_along_z, splats_of
 
 SIZE = 100
 EVERYWHERE = np.ones((SIZE, SIZE), np.bool_)
+VIEW = look_along_z(cx=50.0, cy=50.0, width=SIZE, height=SIZE)
+"""It has a slope of 1/2 at the edges."""
 
 
 def splats(means, colors=((0.5, 0.5, 0.5),), *, opacity=0.9997):
     """Return round splats of sigma .02, grey or of some colours."""
     return splats_of(means, opacity, 0.02, colors)
-
-
-def view():
-    """Look along +z: 100 px wide, a slope of 1/2 at the edges."""
-    return look_along_z(cx=50.0, cy=50.0, width=SIZE, height=SIZE)
 
 
 def wall(depth, edge=1.2, step=0.03):
@@ -31,9 +28,8 @@ def wall(depth, edge=1.2, step=0.03):
     return np.stack([across, down, np.full_like(across, depth)], axis=1)
 
 
-def seen(scene, camera=None):
+def seen(scene, camera=VIEW):
     """Return what a view shows of splats."""
-    camera = camera or view()
     return picking.look(picking.prepare(scene, camera), camera)
 
 
@@ -88,8 +84,8 @@ def test_surfaces_lie_where_a_ray_has_lost_its_light():
     scene = splats(np.concatenate([wall(2.0 + 0.1 * k, edge=0.5) for k in range(9)]), opacity=0.5)
     shown = seen(scene)
     footprints = shown.footprints
-    depths = scene.means[shown.prepared.gaussians.index, 2]
-    found = picking.surfaces(footprints, depths, view(), 10)
+    depths = scene.means[shown.prepared.gaussians.index, 2].astype(np.float32)
+    found = picking.surfaces(footprints, depths, VIEW, 10)
     axes = np.stack([footprints.major.T, footprints.minor.T], axis=2)
     inverse = np.linalg.inv(axes @ axes.transpose(0, 2, 1))
     for row, column in ((4, 5), (5, 5)):

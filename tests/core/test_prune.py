@@ -211,11 +211,3 @@ def test_merging_needs_splats_and_views(splats, views):
     for given in ({"splats": None, "scores": scores}, {"splats": splats}):
         with pytest.raises(RefineError, match="need both"):
             prune(views=None, budget=HALF, **given)
-
-
-@pytest.mark.parametrize("rounds", [0, -1, 101, 1_000_000])
-def test_settings_out_of_range_are_refused(rounds):
-    with pytest.raises(RefineError, match="views is -1, expected 0"):
-        Occlusion(-1)
-    with pytest.raises(RefineError, match=f"rounds is {rounds}, expected 1 to 100"):
-        Refit(rounds=rounds)

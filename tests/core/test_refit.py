@@ -13,6 +13,7 @@ from refine_addon.core.visibility import cast as casting
 from refine_addon.core.visibility import projection
 from refine_addon.core.visibility.cast import cast, cast_visible
 from tests.core.test_invariance import moved, rotation
+from tests.core.test_levels import equal
 from tests.core.test_occlusion import cloud, ring
 from tests.hostile import files_of_at_most
 
@@ -110,8 +111,7 @@ def test_threads_files_and_processes_change_no_bit(monkeypatch, how):
         found = execute.within(cores=threads)(list)(refit.refit_rounds(kept, splats, ring(), 2))[-1]
     assert not here
     assert (found.psnr, found.rounds) == (expected.psnr, 2)
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(found.splats, name), getattr(expected.splats, name))
+    assert equal(found.splats, expected.splats)
 
 
 @pytest.mark.parametrize("pairs", [50, 1 << 15])

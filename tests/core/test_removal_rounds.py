@@ -15,7 +15,7 @@ from refine_addon.core.visibility import cast, projection
 from refine_addon.core.visibility import rays as rays_module
 from refine_addon.core.visibility.cast import RaySample
 from refine_addon.core.visibility.rays import Rays
-from tests.core.test_occlusion import cloud, ring
+from tests.core.test_occlusion import cloud, footprints_of, ring
 
 RANDOM = np.random.default_rng(5)
 
@@ -123,12 +123,6 @@ def test_what_is_left_grows_as_rays_tell_and_unhit_splats_as_all_do(scene, threa
 WIDE = replace(ring()[0], width=2000, height=1500, fx=900.0, fy=900.0, cx=1000.0, cy=750.0)
 
 
-def footprints_in(view):
-    splats = cloud()
-    gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)))
-    return projection.project(gaussians, frame, view)
-
-
 @pytest.mark.parametrize("count", [8, 16, 37, 64])
 def test_equally_many_scoring_and_validation_rays_lie_apart(count, monkeypatch):
     """Half a step of the sequence is .38 of the way to the next column, .28 to the next row.
@@ -137,7 +131,7 @@ def test_equally_many_scoring_and_validation_rays_lie_apart(count, monkeypatch):
     """
     monkeypatch.setitem(cast.RAYS, "scoring", cast.RAYS["validation"])
     view = replace(WIDE, width=480, height=320, fx=450.0, fy=450.0, cx=240.0, cy=160.0)
-    views, footprints = [(view, 1.0 / count)] * count, footprints_in(view)
+    views, footprints = [(view, 1.0 / count)] * count, footprints_of(cloud(), view)
     for number in (0, count // 2, count - 1):
         some, others = (
             cast.cast_view(views, number, footprints, kind) for kind in ("validation", "scoring")
@@ -157,7 +151,7 @@ def test_large_pictures_full_of_vast_splats_take_bounded_memory(monkeypatch):
     while they are cast: 2.4 GB on two threads. A fifth of a million of each are 48 MB at most.
     Where splats are few, rays are as many as 16 bits tell apart.
     """
-    few = cast.cast_view([(WIDE, 1.0)], 0, footprints_in(WIDE), "scoring")
+    few = cast.cast_view([(WIDE, 1.0)], 0, footprints_of(cloud(), WIDE), "scoring")
     assert 59_000 < few.count < 1 << 16
     monkeypatch.setattr(cast, "MAX_HITS_OF_VIEW", 200_000)
     view = replace(WIDE, width=1920, height=1080, fx=1e3, fy=1e3, cx=960.0, cy=540.0)

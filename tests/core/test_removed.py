@@ -25,14 +25,8 @@ from refine_addon.core import (
     score,
 )
 from refine_addon.core.mapped import on_disk
-from refine_addon.core.splats import ARRAYS
 from tests.core.test_cleaning import FLOATER, cameras, joined, wall
-from tests.core.test_levels import cameras as level_cameras
-from tests.core.test_levels import (
-    colourful,
-    file_of,
-    merges,  # noqa: F401 - a fixture
-)
+from tests.core.test_levels import colourful, equal, file_of, merges  # noqa: F401 - a fixture
 
 pytestmark = pytest.mark.slow
 
@@ -55,7 +49,7 @@ def splats():
 
 @pytest.fixture(scope="module")
 def views():
-    return level_cameras()
+    return cameras()
 
 
 @pytest.fixture(scope="module")
@@ -214,5 +208,4 @@ def test_protected_splats_keep_every_bit(
     assert np.count_nonzero(found.keep) == COUNT - int(0.3 * COUNT)
     assert found.merged.changed.any()
     assert found.keep[mine].all()
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(kept, name)[same], getattr(splats, name)[mine])
+    assert equal(kept.take(same), splats.take(mine))

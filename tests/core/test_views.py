@@ -1,12 +1,14 @@
-"""Views, view sets and their even subsets."""
+"""Views, view sets, their even subsets, and the frame of a scene that they see."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, View, ViewSet
+from refine_addon.core import RefineError, View, ViewSet, execute
+from refine_addon.core.visibility import scene
 from refine_addon.core.visibility.frustum import census
+from refine_addon.core.visibility.scene import scene_of
 
 
 def view(center=(0.0, 0.0, 0.0), **changes) -> View:
@@ -143,3 +145,25 @@ def test_points_are_counted_in_each_view():
     views = ViewSet((view(), view(near=3.0), view([0, 0, 2.5]), view([2.1, 0, 0])))
     assert census(points, views).tolist() == [1, 0, 0, 1]
     assert census(points, views.take([0, 0, 3])).tolist() == [1, 1, 1]
+
+
+def test_places_and_their_order_do_not_depend_on_chunks_and_threads(monkeypatch):
+    """In chunks of 64 as all at once; the last chunk has one row, which BLAS rounds otherwise.
+
+    A third of the points are there three times: equal ones keep their order.
+    """
+    generator = np.random.default_rng(0)
+    means = generator.normal(size=(1473, 3))[generator.integers(0, 491, 1473)]
+    drawn, rows = generator.random(1473) < 0.9, np.arange(1473)
+    views = ViewSet((view([13.0, 0, 0]), view([7, 0, 0]), view([10, 3, 0]), view([10, -3, 0])))
+    whole = scene_of(means, drawn, views)
+    places = (means - whole.origin) @ (whole.axes.T / whole.size)
+    order = scene.spatial_order(places)
+    monkeypatch.setattr(scene, "_CHUNK", 64)
+    one, three = (execute.within(cores=n)(scene_of)(means, drawn, views) for n in (1, 3))
+    assert one.size == three.size == whole.size
+    np.testing.assert_array_equal(three.axes, one.axes)
+    with execute.within(cores=3):
+        np.testing.assert_array_equal(whole.positions(means), places)
+        np.testing.assert_array_equal(whole.positions(means, rows[::2]), places[::2])
+        np.testing.assert_array_equal(scene.spatial_order(places), order)

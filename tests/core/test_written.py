@@ -9,18 +9,16 @@ from refine_addon.core import Budget, ClosedForm, Occlusion, operations, prune_f
 from refine_addon.core.affine import transformed
 from refine_addon.core.quality.psnr import psnr_against
 
-from .test_cleaning import cameras, wall
-from .test_command_clean import written
+from .test_cleaning import cameras
+from .test_levels import colourful, file_of
 
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     """Return a file of 576 splats in as many colours, no two of them equally deep."""
-    random = np.random.default_rng(8)
-    colors = random.uniform(-1.0, 1.0, (576, 3)).astype(np.float32)
-    means = wall().means + random.normal(0.0, 0.05, (576, 3)).astype(np.float32)
-    splats = replace(wall(), sh_dc=colors, means=means)
-    return written(splats, tmp_path_factory.mktemp("scene") / "a.ply")
+    splats = colourful()
+    splats.means[:] += np.random.default_rng(8).normal(0.0, 0.05, (576, 3))
+    return file_of(splats, tmp_path_factory.mktemp("scene") / "a.ply")
 
 
 @pytest.mark.slow
@@ -63,7 +61,7 @@ def test_a_file_in_another_frame_is_moved_to_that_of_the_views(source, tmp_path)
     matrix = np.eye(4)
     matrix[0, 3] = 2.0
     moved = transformed(read_splats(out).splats(), np.linalg.inv(matrix))
-    aside = written(moved, tmp_path / "b.ply")
+    aside = file_of(moved, tmp_path / "b.ply")
 
     def psnr(matrix):
         """Of the other file, as told of the first."""
