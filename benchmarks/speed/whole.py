@@ -34,8 +34,8 @@ FIGURES = Path(__file__).parent / "figures.json"
 REFITTED = 200_000
 """Scenes of at most so many splats are refitted, too."""
 
-CHANGED = 0.1
-"""A figure that differs by more than this share is marked."""
+CHANGED, LEAST = 0.1, 0.1
+"""A figure that differs by more than this share, and this many seconds or MB, is marked."""
 
 
 class Figure(NamedTuple):
@@ -96,8 +96,8 @@ def table(figures: Mapping[str, Figure], before: Mapping[str, Sequence[float]]) 
             over = " / ".join(f"{a / max(b, 1e-9):.2f}" for a, b in zip(figure, other, strict=True))
         changes = []
         for now, then, what in zip(figure, before.get(name, figure), Figure._fields, strict=True):
-            if abs(now - then) > CHANGED * then:
-                changes.append(f"{what} {now / max(then, 1e-9) - 1.0:+.0%}")
+            if abs(now - then) > max(CHANGED * then, LEAST):
+                changes.append(f"{what} {now / max(then, LEAST) - 1.0:+.0%}")
         known = ", ".join(changes) or ("as before" if name in before else "new")
         lines.append(
             f"| {name} | {figure.busy:.1f} s | {figure.megabytes:.0f} MB | {over} | {known} |"
