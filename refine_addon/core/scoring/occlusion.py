@@ -22,7 +22,7 @@ from ..execute import Progress, part, report, run, run_all, seconds, silent, sta
 from ..mapped import folder_of, note, noted
 from ..scores import Scores, shares_gone
 from ..splats import Splats, refuse_undrawable
-from ..views import View, ViewSet
+from ..views import ViewSet
 from ..visibility import projection
 from ..visibility.between import views_beside, views_between, with_views_between
 from ..visibility.cast import RaySample
@@ -120,13 +120,12 @@ def score(
     some, worth = measured.take(sample, axis=1), prior[index[sample]]
     folds = _folds(some, of_groups, errors, worth, part(weighing, 0.0, 0.5))
     weights, left_out = coverage.floor_weights(folds, _with_floors(some, worth))
-    more: list[View] = []
-    told = views_between(views, BETWEEN)
     if most_between and left_out > LEFT_OUT:
         near = partial(views_beside, views, gaussians, scene, left_out)
-        more = with_views_between(views, most_between, gaussians, scene)
-        more += near(len(views), 0)
+        more = with_views_between(views, most_between, gaussians, scene) + near(len(views), 0)
         told = near(TOLD, 1)
+    else:
+        more, told = [], views_between(views, BETWEEN)
     if more:
         share, every = _with_between(views, more)
         for scoring in samples[1:]:

@@ -104,7 +104,7 @@ def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[A
     return sent
 
 
-def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int | None) -> Splats:
+def copied(tiles: Sequence[Tile], folder: Path, progress: Progress) -> Splats:
     """Copy tiles to files of a new folder, of their widest types and highest degree, else 0."""
     dtypes = dict.fromkeys(tile.dtype for tile in tiles if tile.splats)
     kinds = [splats_from_columns(np.empty(0, each), tiles[0].model) for each in dtypes]
@@ -113,7 +113,7 @@ def copied(tiles: Sequence[Tile], folder: Path, progress: Progress, threads: int
     def read(piece: tuple[Tile, int, int]) -> Splats:
         return joined([*kinds, splats_from_columns(rows_of(*piece), tiles[0].model)])
 
-    return on_disk(folder, run(read, pieces, progress=progress, what="reading", threads=threads))
+    return on_disk(folder, run(read, pieces, progress=progress, what="reading"))
 
 
 # Writing.
@@ -173,7 +173,7 @@ class Outputs:
         states = (noted(self._job, RENAMED)[1] or {}).items()
         return {number: state for number, state in states if self._is_renamed(number, *state)}
 
-    def write(self, kept: Kept, progress: Progress, threads: int | None) -> list[int]:
+    def write(self, kept: Kept, progress: Progress) -> list[int]:
         """Write all tiles to waiting files, then rename these; returns bytes of each.
 
         What is in place stays. If a file is in the way, none is renamed, and `Interrupted` raised.
@@ -182,7 +182,7 @@ class Outputs:
         numbers = [number for number in range(len(self._tiles)) if number not in there]
         work = partial(_write_tile, self._job, self._tiles, kept, self._waiting)
         cost = seconds("write", sum(self._tiles[number].splats for number in numbers))
-        run_all(work, numbers, progress=progress, what="writing", threads=threads, cost=cost)
+        run_all(work, numbers, progress=progress, what="writing", cost=cost)
         there = self.in_place()
         try:
             self._refuse_existing(there)

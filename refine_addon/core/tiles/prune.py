@@ -85,7 +85,7 @@ def prune_tiles(
             held.enter_context(new_folder(output))
             outputs = Outputs(job, tiles, output, overwrite)
         held.enter_context(_opened(job, outputs))
-        held.enter_context(within(cluster=workers))
+        held.enter_context(within(cluster=workers, cores=threads))
         if workers is not None:
             goes_on, _ = noted(job, "begun")
             note(job, "begun", None)
@@ -95,8 +95,8 @@ def prune_tiles(
         reading, deciding, writing = stages(
             progress, seconds("read", count), scoring, seconds("write", count)
         )
-        decided = partial(_decided, job, tiles, views, budget, method, clock)
-        kept, counts, report = once(job, "kept", lambda: decided(reading, deciding, threads))
+        decided = partial(_decided, job, tiles, views, budget, method, clock, reading, deciding)
+        kept, counts, report = once(job, "kept", decided)
         if outputs is None:
             sizes = [
                 tile.size - tile.header + len(header_of(tile, count))
@@ -104,7 +104,7 @@ def prune_tiles(
                 for tile, (count, _) in zip(tiles, counts, strict=True)
             ]  # fmt: skip
         else:
-            sizes = outputs.write(kept, writing, threads)
+            sizes = outputs.write(kept, writing)
         clock.lap("write_s")
     report["files"] = {
         "input": f"{len(tiles)} tiles", "output": None if outputs is None else str(output),
@@ -121,15 +121,15 @@ def prune_tiles(
     return report
 
 
-def _decided(job, tiles, views, budget, method, clock, reading, deciding, threads):
+def _decided(job, tiles, views, budget, method, clock, reading, deciding):
     """Kept splats, numbers of kept and unseen splats of each tile, and the report."""
-    splats = once(job, "splats", lambda: copied(tiles, job / "splats", reading, threads))
+    splats = once(job, "splats", lambda: copied(tiles, job / "splats", reading))
     clock.lap("read_s")
     row_bytes = max(tile.dtype.itemsize for tile in tiles)
     result = prune(
         splats, views, budget, method,
         sizes=(row_bytes, sum(tile.size - tile.end + tile.begin for tile in tiles)),
-        clock=clock, progress=deciding, threads=threads,
+        clock=clock, progress=deciding,
     )  # fmt: skip
     assert result.scores is not None
     begins = np.cumsum([tile.splats for tile in tiles])[:-1]
