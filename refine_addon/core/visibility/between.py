@@ -18,11 +18,10 @@ from .scene import Scene
 
 WIDEST = math.radians(90.0)  # views turned farther from each other get no view in between
 CLEAR = 0.5  # least transmittance between two views that stand in the same free space
-BESIDE = 0.3  # how far `views_beside` move at most, scene sizes
-FAR, TURNED = 1.0 / 8.0, 0.04
-"""Moves of `views_beside` in distances to the third view, and turns in radians, for each dB that
-views left out lose more: 2.6 to 5 of 12 or 20 cameras of a capture, 11 to 12 in houses."""
-_TRIES = 8  # places beside a view
+BESIDE = 0.3  # how far a step of `views_beside` is at most, scene sizes
+FAR, TURNED = 0.31, 0.05
+"""Steps of `views_beside`, times `far`, in distances to the third view, and turns in radians."""
+_STEPS, _TRIES = 2, 16  # around corners, too; tries for both
 _CANDIDATES = 64  # nearest views of each that may be its neighbours
 _FOCAL = 1000.0  # px of `transmittance`: a ray is a thousandth of its length wide
 
@@ -77,31 +76,32 @@ def with_views_between(
 
 
 def views_beside(
-    views: ViewSet, gaussians: Gaussians, scene: Scene, left_out: float, most: int, seed: int
+    views: ViewSet, gaussians: Gaussians, scene: Scene, far: float, most: int, seed: int
 ) -> list[View]:
-    """At most `most` views moved and turned from `views`, several each if need be, in free space.
+    """At most `most` views two steps and turns away from `views`, several each, in free space.
 
-    The more views left out lose, `left_out` dB, the farther (`FAR`). They face no wall near.
+    Steps and turns are `far` times `FAR` and `TURNED`. They face no wall near.
     """
     centers, found = views.centers, []
     starts = [view for view, _ in views.spread(most).by_distance()]
     for number, view in enumerate((starts * most)[:most]):
         away = np.sort(np.linalg.norm(centers - view.center, axis=1))[1:4]
-        random = np.random.default_rng([seed, number])
+        longest = min([BESIDE * scene.size, *(far * FAR * away[-1:])])
+        random, taken = np.random.default_rng([seed, number]), 0
         for _ in range(_TRIES):
-            step = random.normal(size=3) * (1.0, 0.4, 1.0) / math.sqrt(3.0)
-            step *= min(FAR * left_out * away[-1] if len(away) else np.inf, BESIDE * scene.size)
-            turn = 0.5 * TURNED * left_out * random.normal(size=3) * (0.4, 1.0, 0.1)
+            step = longest * random.normal(size=3) * (1.0, 0.4, 1.0) / math.sqrt(3.0)
+            turn = far * TURNED * random.normal(size=3) * (0.4, 1.0, 0.1)
             turned = rotation_matrices(unit_quaternions(np.array([[1.0, *turn]])))[0]
             moved = replace(
-                view, center=view.center + step @ view.rotation, name=f"beside {view.name}",
-                rotation=turned @ view.rotation,
-            )  # fmt: skip
+                view, center=view.center + step @ view.rotation, rotation=turned @ view.rotation
+            )
             ahead = moved.center + np.linalg.norm(step) * moved.rotation[2]
-            paths = (view.center, moved.center), (moved.center, ahead)
-            if all(transmittance(gaussians, scene, *path) > CLEAR for path in paths):
-                found.append(moved)
-                break
+            paths = [(view.center, moved.center), (moved.center, ahead)]
+            if all(transmittance(gaussians, scene, *path) > CLEAR for path in paths[: taken + 1]):
+                view, taken = moved, taken + 1
+                if taken == _STEPS:
+                    found.append(replace(view, name=f"{number} beside {view.name}"))
+                    break
     return found
 
 
