@@ -289,7 +289,7 @@ def _streamed(target, views, overwrite):
                 streamed.append(StreamedSog(finest.means, distance, folder))
                 streamed[0].add(finest)
                 _, said = losses(file, sog.FORMAT, whole)
-            keep, columns = level.result.keep, level.result.changed(file.rows)
+            keep, columns = level.result.keep, level.result.changed()
             size = streamed[0].add(held_splats(target, sog.FORMAT, file, keep, columns))
             missing, _ = losses(file, sog.FORMAT, keep)
             return f"{level.number}_*/{sog.META}", size, missing, said

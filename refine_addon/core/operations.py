@@ -150,7 +150,7 @@ def run(
         report(silent if stopped else writing, 0.0, "writing")
         file = scene.file()
         result = replace(result, source=file, matrix=scene.matrix)
-        keep, columns = result.keep, result.changed(file.rows)
+        keep, columns = result.keep, result.changed()
         if written is not None:
             write_splats(written, file, keep, columns=columns, overwrite=overwrite, threads=threads)
         dry = (file, form, keep, columns)
@@ -239,7 +239,7 @@ def prune_scene(
 
         def changed(result: Result) -> list[tuple[NDArray[np.bool_], Changes]]:
             result = replace(result if left is None else result.for_all(left), matrix=scene.matrix)
-            return [(result.keep, result.changed(files[0].rows))]
+            return [(result.keep, result.changed())]
 
         if fits:
             files, methods = [scene.file()], {ClosedForm(method.views): silent, method: progress}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from .errors import RefineError
 from .execute import Cancelled
 from .formats.format import new_file
 from .formats.ply import SplatFile
-from .formats.ply_columns import ChangedColumns
+from .formats.ply_columns import Changed, Changes, values_by_name
 from .formats.registry import write_splats
 from .merging.merge import Merged
 from .scores import Scores
@@ -96,15 +95,11 @@ class Result:
         file = self.source
         if not isinstance(file, SplatFile):
             file = file_of(self.all_splats())
-        columns = self.changed(file.rows)
+        columns = self.changed()
         write_splats(path, file, self.keep, columns=columns, overwrite=overwrite, threads=threads)
 
-    def changed(self, stored: Any) -> Mapping[str, NDArray[Any]]:
-        """Properties, (N,) by name, with new values in the stored types; none if nothing changed.
-
-        `stored` has all properties by name, such as `SplatFile.rows`: rows that did not change
-        equal it to the bit.
-        """
+    def changed(self) -> Changes:
+        """Properties with new values, in the frame of the file; all other rows stay to the bit."""
         merged = self.merged
         if merged is None:
             return self.columns
@@ -112,7 +107,7 @@ class Result:
         splats = merged.splats.take(changed)
         if self.matrix is not None and not np.array_equal(self.matrix, np.eye(4)):
             splats = transformed(splats, np.linalg.inv(self.matrix))
-        return ChangedColumns(stored, np.flatnonzero(merged.keep)[changed], splats)
+        return Changed(np.flatnonzero(merged.keep)[changed], values_by_name(splats))
 
 
 def file_of(splats: Splats, path: Path = Path("splats.ply"), stored_bytes: int = 0) -> SplatFile:

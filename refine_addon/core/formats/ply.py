@@ -27,7 +27,7 @@ from ..place import Place, foreign_kind, refuse_pointer
 from ..splats import MODELS, Model, Splats
 from ..whole_file import Url, expanded, refuse_mapped, whole_file
 from . import ply_columns
-from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, ChangedColumns, Changes, Keep
+from .ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE, Changed, Changes, Keep
 
 HEADER_LIMIT = 1 << 20  # longest header that is read, bytes
 TEXT = "="  # stands for ASCII among byte orders: once parsed, numbers have the machine's
@@ -159,7 +159,7 @@ class SplatFile:
         """Header, row dtype and number of splats of the output; refuse columns that do not fit."""
         count = len(self) if keep is None else int(np.count_nonzero(keep))
         header, names = with_count(self.header, count), self.rows.dtype.names or ()
-        if isinstance(columns, ChangedColumns):
+        if isinstance(columns, Changed):
             return header, self.rows.dtype, count  # in stored types, and not computed for this
         declared, place = [], Place(self.path)
         for name, values in columns.items():
@@ -492,27 +492,31 @@ def write_rows(
     stream: BinaryIO, rows: NDArray[Any], keep: Keep, columns: Changes, threads: int | None = 1
 ) -> None:
     """Write kept rows, a chunk at a time, with `columns` set or appended (`SplatFile.write`)."""
-    columns = columns or {}
-    plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
-    row = _grown(rows.dtype, columns)
+    changed, values = columns if isinstance(columns, Changed) else (None, columns or {})
+    row = _grown(rows.dtype, values)
+    # As bytes, since NumPy gives no buffer of rows that have a field such as a:b.
+    plain, grown = rows.view(f"V{rows.dtype.itemsize}"), np.dtype(f"V{row.itemsize}")
     at: Any = {"names": ["stored"], "formats": [plain.dtype], "itemsize": row.itemsize}
 
     def bytes_of(piece: slice) -> NDArray[Any]:
-        stored = plain[piece]
-        if isinstance(columns, ChangedColumns):
-            stored = columns.put(stored, rows.dtype, piece)
-        elif columns:
-            read, stored = stored, np.empty(len(stored), row)
+        stored, some, own = plain[piece], slice(None), piece
+        if values:
+            read, stored = stored, np.empty(len(stored), grown)
             stored.view(np.dtype(at))["stored"] = read
+            if changed is not None:
+                own = slice(*np.searchsorted(changed, (piece.start, piece.stop)))
+                some = changed[own] - piece.start
+            part = stored[some]
+            fields = part.view(row)
             # A double may be too large or too small for a float; a signalling NaN becomes quiet.
             with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-                for name, values in columns.items():
-                    stored[name] = values[piece]
-        # As bytes, since NumPy gives no buffer of rows that have a field such as a:b.
-        every = np.ascontiguousarray(stored).view(np.dtype((np.void, row.itemsize)))
+                for name, new in values.items():
+                    fields[name] = new[own]
+            stored[some] = part
+        every = np.ascontiguousarray(stored)
         return every if keep is None else every[keep[piece]]
 
-    pieces = chunks(len(plain), _CHANGED_ROWS if columns else _ROWS)
+    pieces = chunks(len(plain), _CHANGED_ROWS if values else _ROWS)
     copies = map(bytes_of, pieces) if threads == 1 else run(bytes_of, pieces, threads=threads)
     stream.writelines(chunk.data for chunk in copies)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -79,43 +79,16 @@ Columns: TypeAlias = "Mapping[str, NDArray[Any]] | NDArray[Any]"
 Keep: TypeAlias = "NDArray[np.bool_] | None"
 """Kept rows among N, (N,); None stands for all."""
 
-Changes: TypeAlias = "Mapping[str, NDArray[Any]] | None"
-"""Properties of N splats by name, (N,) each, to be set or appended."""
+
+class Changed(NamedTuple):
+    """New values of some rows among N."""
+
+    rows: NDArray[np.int64]  # (n,), ascending
+    columns: Mapping[str, NDArray[Any]]  # (n,) each, by the name of a property that is stored
 
 
-class ChangedColumns(Mapping[str, "NDArray[Any]"]):
-    """Properties with new values in `rows`, (n,) ascending, rounded once to the stored type.
-
-    A column is copied when it is read; `put` serves to write a binary PLY without such copies.
-    """
-
-    def __init__(self, stored: Columns, rows: NDArray[np.int64], splats: Splats) -> None:
-        self._stored, self._rows, self._values = stored, rows, values_by_name(splats)
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        values = self._values[name]
-        column: NDArray[Any] = self._stored[name].copy()
-        with np.errstate(over="ignore", under="ignore"):  # doubles beyond float32
-            column[self._rows] = values
-        return column
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def put(self, stored: NDArray[Any], dtype: np.dtype[Any], piece: slice) -> NDArray[Any]:
-        """Copy of the rows of a piece, (n,) void, each of type `dtype`, with the new values."""
-        low, high = np.searchsorted(self._rows, (piece.start, piece.stop))
-        rows, copy = self._rows[low:high] - piece.start, stored.copy()
-        changed = stored[rows]
-        fields = changed.view(dtype)
-        with np.errstate(over="ignore", under="ignore"):
-            for name, values in self._values.items():
-                fields[name] = values[low:high]
-        copy[rows] = changed
-        return copy
+Changes: TypeAlias = "Mapping[str, NDArray[Any]] | Changed | None"
+"""Properties of N splats by name, (N,) each, to be set or appended; or those of some rows."""
 
 
 def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:

@@ -18,7 +18,7 @@ from ..whole_file import Url, expanded, whole_file
 from . import by_name, compressed_ply, glb, sog, spz, streamed_sog
 from .format import Format
 from .ply import SplatFile, read_plain
-from .ply_columns import Changes, Keep, other_properties, splats_from_columns
+from .ply_columns import Changed, Changes, Keep, other_properties, splats_from_columns
 
 # ``.splat`` comes last, since only its name tells it from others.
 FORMATS = (compressed_ply.FORMAT, spz.FORMAT, glb.FORMAT, sog.FORMAT, by_name.SPLAT)
@@ -167,11 +167,15 @@ def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: 
     """Splats that an output in a format gets, see `write_splats`; errors name `path`."""
     rows = file.rows if keep is None else file.rows[keep]
     if columns:
-        rows = rows.copy()
-        for name, values in columns.items():
+        kept = np.arange(len(file)) if keep is None else np.flatnonzero(keep)
+        if not isinstance(columns, Changed):
+            columns = Changed(kept, {name: values[kept] for name, values in columns.items()})
+        rows, some = rows.copy(), np.searchsorted(kept, columns.rows)
+        for name, values in columns.columns.items():
             if name not in (rows.dtype.names or ()):
                 Place(path).fail(f"{form.suffix} holds no property '{name}'; write to a .ply")
-            rows[name] = values if keep is None else values[keep]
+            with np.errstate(over="ignore", under="ignore"):  # doubles beyond float32
+                rows[name][some] = values
     splats = splats_from_columns(rows, file.model)
     good = drawable(splats)
     if not good.any():

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_left
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from ..errors import RefineError
 from ..execute import Progress, chunks, run, run_all, seconds
 from ..formats import ply
-from ..formats.ply_columns import THIRD_SCALE, ChangedColumns, splats_from_columns
+from ..formats.ply_columns import THIRD_SCALE, Changed, Changes, splats_from_columns, values_by_name
 from ..mapped import Interrupted, Mapped, note, noted, on_disk, whole
 from ..splats import Model, Splats, joined
 from ..whole_file import Url, alike, refuse_one_file
@@ -131,14 +130,14 @@ class Kept(NamedTuple):
     changed: Mapped  # rows of the kept splats with new values, ascending
     became: Splats | None  # these values
 
-    def columns(self, rows: NDArray[Any], begin: int) -> Mapping[str, NDArray[Any]]:
+    def columns(self, rows: NDArray[Any], begin: int) -> Changes:
         """New values of rows of a tile, which are those of the scene from `begin` on."""
         if self.became is None:
-            return {}
+            return None
         first, end = (bisect_left(self.changed, row) for row in (begin, begin + len(rows)))
         splats, changed = self.became.take(slice(first, end)), self.changed[first:end] - begin
-        degree = splats_from_columns(rows[:1]).sh_rest.shape[1]
-        return ChangedColumns(rows, changed, replace(splats, sh_rest=splats.sh_rest[:, :degree]))
+        degree = splats_from_columns(rows[:1]).sh_degree
+        return Changed(changed, values_by_name(splats.up_to_degree(degree)))
 
 
 def header_of(tile: Tile, kept: int) -> bytes:
