@@ -23,8 +23,8 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -313,7 +313,7 @@ def _in_turn(work, items, tell):
 
 def _side_by_side(work, items, threads, tell, stop=lambda: None):
     """Do work on several threads; `stop` ends what no `checkpoint` does."""
-    cancelled, step = threading.Event(), max(len(items) // 100, 1)
+    cancelled = threading.Event()
 
     def check():
         if cancelled.is_set():
@@ -323,25 +323,38 @@ def _side_by_side(work, items, threads, tell, stop=lambda: None):
         with within(check=check, cores=1):
             return work(item)
 
+    def cancel(futures):
+        cancelled.set()
+        for future in futures:
+            future.cancel()
+        stop()
+
     with ThreadPoolExecutor(threads) as pool:
-        left, futures = deque(items), deque[Any]()
-        try:
-            for done in range(len(items)):
-                if done % step == 0:
-                    tell(done)
-                while left and len(futures) < _AHEAD * threads:
-                    futures.append(pool.submit(checked, left.popleft()))
-                future = futures.popleft()  # deleted below, to free its result
-                while not future.done() and not wait([future], _INTERVAL).done:
-                    tell(done)
-                yield future.result()
-                del future
-        except BaseException:
-            cancelled.set()
-            for future in futures:
-                future.cancel()
-            stop()
-            raise
+        yield from sent_ahead(
+            lambda item: pool.submit(checked, item), items, _AHEAD * threads, tell, cancel
+        )
+
+
+def sent_ahead(submit: Any, items: Sequence[Any], ahead: int, tell: Any, cancel: Any) -> Iterator:
+    """Yield results of futures of ``submit(item)`` in order; so many items are sent `ahead`.
+
+    ``tell(done)`` is called ten times a second. After an error ``cancel(futures)`` gets the others.
+    """
+    left, futures, step = deque(items), deque[Any](), max(len(items) // 100, 1)
+    try:
+        for done in range(len(items)):
+            if done % step == 0:
+                tell(done)
+            while left and len(futures) < ahead:
+                futures.append(submit(left.popleft()))
+            ended = threading.Event()
+            futures[0].add_done_callback(lambda _, ended=ended: ended.set())
+            while not ended.wait(_INTERVAL):
+                tell(done)
+            yield futures.popleft().result()
+    except BaseException:
+        cancel([*futures])
+        raise
 
 
 def start(cost: float) -> None:

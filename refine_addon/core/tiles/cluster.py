@@ -11,10 +11,7 @@ import contextlib
 import functools
 import pickle
 import signal
-import threading
 import time
-import uuid
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import resource_tracker
@@ -23,7 +20,7 @@ from typing import Any
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..execute import Progress, report, run_all, within
+from ..execute import Progress, chunks, report, run_all, sent_ahead, within
 from ..mapped import Interrupted
 from ..whole_file import explained
 from .files import Tile, bytes_of, waiting_in
@@ -31,7 +28,6 @@ from .files import Tile, bytes_of, waiting_in
 _AHEAD = 3  # groups of items for each thread that are sent ahead, whose results may wait here
 _TOGETHER = 16  # most items in a group: each group takes scheduler and coordinator about 15 ms
 _TURNS = 4  # least groups for each thread, so that all end at about the same time
-_INTERVAL = 0.2  # seconds between two looks whether to go on
 _ALONE = 60.0  # seconds without any worker after which a job ends
 
 _MEMORY = {
@@ -129,35 +125,24 @@ class Cluster:
 
         threads = max(sum(self._client.nthreads().values()), 1)
         size = max(1, min(_TOGETHER, len(items) // (_TURNS * threads)))
-        left = deque(items[start : start + size] for start in range(0, len(items), size))
-        waiting: deque[Any] = deque()
-        done = 0
-        try:
-            while left or waiting:
-                while left and len(waiting) < _AHEAD * threads:
-                    key = f"refine-{uuid.uuid4().hex}"
-                    waiting.append(self._client.submit(_run, packed, left.popleft(), key=key))
-                self._wait(waiting[0], functools.partial(report, progress, done / len(items), what))
-                for result in waiting.popleft().result():
-                    yield result
-                    done += 1
-        except (KilledWorker, CancelledError, CommClosedError) as error:
-            raise Interrupted(f"workers were lost ({error})") from error
-        finally:
-            self._client.cancel([*waiting])
+        groups, seen = [items[each] for each in chunks(len(items), size)], time.monotonic()
 
-    def _wait(self, future: Any, look: Callable[[], None]) -> None:
-        """Wait for a future; meanwhile ``look()`` may raise `Cancelled`."""
-        ended, seen = threading.Event(), time.monotonic()
-        future.add_done_callback(lambda _: ended.set())
-        look()
-        while not ended.wait(_INTERVAL):
-            look()
+        def look(done: int) -> None:
+            nonlocal seen
+            report(progress, done / len(groups), what)
             alone = time.monotonic() - seen
             if alone > _ALONE / 10.0 and self._client.nthreads():
                 seen = time.monotonic()
             elif alone > _ALONE:
                 raise Interrupted("all workers were lost")
+
+        submit = functools.partial(self._client.submit, _run, packed, pure=False)
+        try:
+            for results in sent_ahead(submit, groups, _AHEAD * threads, look, self._client.cancel):
+                yield from results
+                seen = time.monotonic()
+        except (KilledWorker, CancelledError, CommClosedError) as error:
+            raise Interrupted(f"workers were lost ({error})") from error
 
 
 def _run(packed: bytes, items: Sequence[Any]) -> list[Any]:
