@@ -303,14 +303,9 @@ class _Prune:
         tried: Estimates | None = None,
     ) -> Result:
         """Result of deletion, or the `outcome` of merging; `tried` if deletion was as good."""
-        keep, psnr, between = chosen
-        summary = reports.of_prune(
-            scores, keep, self.budget, self.method, self.sizes, self.clock,
-            psnr=psnr, between=between, measured=measured or {"delete": psnr}, outcome=outcome,
-            tried=tried, timed=self.scores is None,
-        )  # fmt: skip
+        summary = reports.of_prune(self, scores, chosen, measured, outcome, tried)
         merged = None if outcome is None or outcome.done == "delete" else outcome.final
-        return Result(keep, summary, scores, merged, getattr(outcome, "stopped", None))
+        return Result(chosen[0], summary, scores, merged, getattr(outcome, "stopped", None))
 
     def merge(self, progress: Progress) -> Result:
         """Merge down to the budget, refit if asked; delete where that is as good."""

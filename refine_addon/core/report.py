@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cleaning.clean import Cleaned
-from .methods import ClosedForm, Method
+from .methods import ClosedForm
 from .quality.curve import FEWEST, Way, expected, expected_seconds, in_words, out_of_reach, parted
 from .scores import Scores
-from .selection import Budget
 from .volumes import Forced
 
 SEES_TOO_LITTLE = "the views see too little for an estimate of the pictures' quality"
@@ -92,27 +91,23 @@ def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
 
 
 def of_prune(
+    run: Any,
     scores: Scores,
-    keep: NDArray[np.bool_],
-    budget: Budget,
-    method: Method,
-    sizes: tuple[float, int],
-    clock: Clock,
-    *,
-    psnr: float | None,
-    between: float | None,
-    measured: Mapping[Way, float | None],
-    timed: bool,
+    chosen: tuple[NDArray[np.bool_], float | None, float | None],
+    measured: Mapping[Way, float | None] | None = None,
     outcome: Any = None,
     tried: Mapping[Way, float | None] | None = None,
 ) -> dict[str, Any]:
     """Report of a prune as plain JSON values; it shares the clock's times, later laps too.
 
-    PSNR, dB, is `psnr` in the views that decided, `between` in views in between, `measured` on rays
-    by method. `timed` says whether the clock timed the scoring, from which other methods' times are
-    predicted. `outcome` is that of merging, `tried` its PSNR if deletion was as good.
+    `run` has budget, method, sizes, clock, and scores if these were given: else the clock timed
+    them, from which other methods' times are predicted. `chosen` are the kept splats, (N,), and the
+    PSNR, dB, in views that decided and in between; `measured` is that on rays by method. `outcome`
+    is that of merging, `tried` its PSNR if deletion was as good.
     """
-    count, curve = len(keep), scores.quality
+    keep, psnr, between = chosen
+    budget, method, clock = run.budget, run.method, run.clock
+    count, curve, measured = len(keep), scores.quality, measured or {"delete": psnr}
     report: dict[str, Any] = {**seen_by(scores, Forced())}
     report["splats"] |= kept_and_removed(keep)
     report["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
@@ -121,7 +116,7 @@ def of_prune(
     if budget.psnr is not None:
         why = out_of_reach(budget.psnr, removed, count, psnr)
     elif budget.max_mb is not None and not removed:
-        size = size_in_words(int(sizes[0] * count + sizes[1]))
+        size = size_in_words(int(run.sizes[0] * count + run.sizes[1]))
         why = f"already {size}: the budget removes nothing"
     if psnr is None:
         note = NOT_ESTIMATED if scores.ray_sample is None else SEES_TOO_LITTLE
@@ -152,7 +147,7 @@ def of_prune(
     if method.changes and outcome is None and removed:
         notes.append(deleted_note(psnr, None if tried is None else tried["merge"]))
     deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
-    took = None if deletes == "closed-form" or not timed else clock.timings["score_s"]
+    took = None if deletes == "closed-form" or run.scores is not None else clock.timings["score_s"]
     report |= {
         "budget": {budget.kind: getattr(budget, budget.kind)},
         "settings": method.facts(),
