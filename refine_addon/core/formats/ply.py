@@ -523,7 +523,5 @@ def write_rows(
 
 def _grown(dtype, columns):
     """Row dtype with columns appended, in the byte order of x."""
-    names, order = dtype.names or (), dtype["x"].byteorder
-    new = [name for name in columns if name not in names]
-    fields = [(name, dtype[name]) for name in names]
-    return np.dtype([*fields, *((name, columns[name].dtype.newbyteorder(order)) for name in new)])
+    order, new = dtype["x"].byteorder, [name for name in columns if name not in dtype.names]
+    return np.dtype(dtype.descr + [(n, columns[n].dtype.newbyteorder(order)) for n in new])
