@@ -190,8 +190,8 @@ def lod(
     number, fewest = 0, len(splats)
     for goal, budget, of_level in zip(levels.goals, budgets, of_levels, strict=True):
         result = prune(
-            left, views, budget, method, protected=demands.protected, removed=demands.removed,
-            scores=scores, origin=origin, progress=of_level, threads=threads,
+            left, views, budget, method, **demands.masks, scores=scores, origin=origin,
+            progress=of_level, threads=threads,
         )  # fmt: skip
         if method.changes:
             left, demands = result.splats, demands.of(result.keep)
@@ -358,10 +358,8 @@ def lod_file(
         demands, entries, notes, remarks = scene.demands, list[dict[str, Any]](), list[str](), {}
         count = len(scene.splats)
         making, writing = stages(progress, seconds("merge", count), seconds("write", count))
-        for level in lod(
-            scene.splats, views, levels, method,
-            protected=demands.protected, removed=demands.removed, progress=making, threads=threads,
-        ):  # fmt: skip
+        how = {**demands.masks, "progress": making, "threads": threads}
+        for level in lod(scene.splats, views, levels, method, **how):
             name, size, missing, more = add(scene, level)
             notes += [note for note in more if note not in notes]
             entry = level.facts() | {"left_out": missing, "file": name, "bytes": size}

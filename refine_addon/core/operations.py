@@ -220,9 +220,8 @@ def prune_scene(
         demands, splats, left = scene.demands, scene.splats, None
         if cleaning is not None:
             cleaned = clean_splats(
-                splats, views, cleaning, protected=demands.protected, removed=demands.removed,
-                progress=part(progress, 0.0, 0.3),
-            )  # fmt: skip
+                splats, views, cleaning, **demands.masks, progress=part(progress, 0.0, 0.3)
+            )
             clock.lap("clean_s")
             # The budget counts what the user removed, so that is not cleaned away.
             left = cleaned.keep if demands.removed is None else cleaned.keep | demands.removed
@@ -234,7 +233,7 @@ def prune_scene(
         def pruned(method: Method, sizes: tuple[float, int], **more: Any) -> Result:
             return prune(
                 splats, views, budget, method, sizes=sizes, partial=True, reusable=reusable or fits,
-                protected=demands.protected, removed=demands.removed, **more,
+                **demands.masks, **more,
             )  # fmt: skip
 
         def changed(result: Result) -> list[tuple[NDArray[np.bool_], Changes]]:
@@ -361,10 +360,7 @@ def clean_file(
 
     def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands = scene.demands
-        cleaned = clean_splats(
-            scene.splats, views, cleaning, protected=demands.protected, removed=demands.removed,
-            progress=progress,
-        )  # fmt: skip
+        cleaned = clean_splats(scene.splats, views, cleaning, **demands.masks, progress=progress)
         clock.lap("clean_s")
         report: dict[str, Any] = {
             **seen_by(cleaned, demands),
@@ -384,10 +380,7 @@ def score_scene(views: ViewSet, method: Method) -> Decide:
 
     def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands = scene.demands
-        scores = score(
-            scene.splats, views, method, protected=demands.protected, removed=demands.removed,
-            progress=progress,
-        )  # fmt: skip
+        scores = score(scene.splats, views, method, **demands.masks, progress=progress)
         clock.lap("score_s")
         report: dict[str, Any] = {
             **seen_by(scores, demands),

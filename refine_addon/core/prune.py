@@ -129,11 +129,7 @@ def with_quality(
     """Scores with the curve of the estimated PSNR, if they have validation rays; see `score`."""
     if scores.ray_sample is None:
         return scores
-    curve = quality_curve(
-        scores.ray_sample, scores.values, protected=protected, settled=scores.settled,
-        between=scores.between if scores.tells else None, progress=progress,
-    )  # fmt: skip
-    return replace(scores, quality=curve)
+    return replace(scores, quality=quality_curve(scores, protected, progress))
 
 
 def _with_views(scores: Scores, splats: Splats, views: ViewSet, used: ViewSet) -> Scores:

@@ -9,7 +9,7 @@ divided into groups, and one ray decides for a group if no triangle touches its 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -250,6 +250,11 @@ class Forced:
     removed: Mask = None  # none of the protected ones
     facts: tuple[dict[str, Any], ...] = ()  # ``role``, ``name``, ``splats`` of each volume
 
+    @property
+    def masks(self) -> dict[str, Any]:
+        """``protected`` and ``removed``, as arguments of what decides."""
+        return {"protected": self.protected, "removed": self.removed}
+
     def counts(self) -> dict[str, int]:
         """How many splats are ``protected`` and how many were ``removed_by_user``."""
         masks = {"protected": self.protected, "removed_by_user": self.removed}
@@ -257,9 +262,8 @@ class Forced:
 
     def of(self, rows: NDArray[np.bool_]) -> Forced:
         """The same for the splats in `rows`, (N,) bool."""
-        masks = (self.protected, self.removed)
-        protected, removed = (None if mask is None else mask[rows] for mask in masks)
-        return Forced(protected, removed, self.facts)
+        masks: dict[str, Any] = {n: None if m is None else m[rows] for n, m in self.masks.items()}
+        return replace(self, **masks)
 
 
 def forced(

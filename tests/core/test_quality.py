@@ -113,7 +113,8 @@ def test_a_view_whose_splats_stay_is_not_changed():
     means[10:, 0] += 40.0
     splats = splats_of(means, color=0.9, scales=0.2)
     views = ViewSet((replace(look_along_z(), name="a"), look_along_z((40.0, 0, 0), name="b")))
-    curve = quality_curve(validation_rays(splats, views), np.arange(20, dtype=np.float32))
+    values, rays = np.arange(20, dtype=np.float32), validation_rays(splats, views)
+    curve = quality_curve(Scores(values, np.zeros(20, np.int32), 2, 0, ray_sample=rays))
     assert curve.of_views(0.5) == {"a": pytest.approx(curve.views["a"][4]), "b": PSNR_CAP}
     assert curve.of_views(0.5)["a"] < 30.0
 

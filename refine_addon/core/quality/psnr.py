@@ -48,25 +48,19 @@ def psnr_kept(sample: RaySample, keep: NDArray[np.bool_]) -> float | None:
     """Mean PSNR of all views, dB, if only splats `keep`, (N,), stay; None if too little is seen."""
     if not _enough(sample):
         return None
-    views = sample.seeing()
     removing = _removing(sample, keep.astype(np.int64)[sample.splat_rows], [1])
-    return float(_mean(sample, _of_views(sample, removing, views, silent), views)[0])
+    return float(_of_views(sample, removing, sample.seeing(), silent)[1][0])
 
 
 def quality_curve(
-    sample: RaySample,
-    values: NDArray[np.float32],
-    *,
-    protected: NDArray[np.bool_] | None = None,
-    settled: int | None = None,
-    between: RaySample | None = None,
-    progress: Progress = silent,
+    scores: Any, protected: NDArray[np.bool_] | None = None, progress: Progress = silent
 ) -> Quality | None:
     """Estimated PSNR at each of `curve.SHARES`; None if too little is seen.
 
-    Splats of the lowest `values` are removed first, of equal ones the first in the file,
-    `protected` ones last. The curve ends after `settled` splats, see `Scores`.
+    Splats of the lowest of the `Scores` are removed first, of equal ones the first in the file,
+    `protected` ones last. The curve ends after those that are settled.
     """
+    sample, values, settled = scores.ray_sample, scores.values, scores.settled
     last = len(values) if settled is None else settled
     if settled is not None and protected is not None:
         last -= int(np.count_nonzero(protected))
@@ -96,22 +90,22 @@ def quality_curve(
             gains.append(psnr_of(stood_in, truth, view) - psnr_of(deleted, truth, view))
         return gains
 
-    of_views, seeing = removing(sample, part(progress, 0.0, 0.5)), sample.seeing()
-    validating = sample.validating()
-    gains = _of_views(sample, gaining, validating, part(progress, 0.5, 1.0))
-    psnr = np.minimum.accumulate(_mean(sample, of_views, seeing))
-    names = [sample.views[number][0].name for number in seeing]
+    of_views, mean = removing(sample, part(progress, 0.0, 0.5))
+    _, gains = _of_views(sample, gaining, sample.validating(), part(progress, 0.5, 1.0))
+    psnr = np.minimum.accumulate(mean)
+    names = [sample.views[number][0].name for number in sample.seeing()]
     curve = Quality(
         np.array(SHARES[: len(removed)]),
         psnr,
-        merged_from(psnr, _mean(sample, gains, validating), len(values)),
+        merged_from(psnr, gains, len(values)),
         len(values) >= FEWEST,
         dict(zip(names, np.minimum.accumulate(of_views, axis=1), strict=True)),
         sample.hits_of_ray(),
     )
+    between = scores.between if scores.tells else None
     if between is not None and _enough(between):
-        means = _mean(between, removing(between, silent), between.seeing())
-        curve = replace(curve, between=np.minimum.accumulate(means))
+        _, mean = removing(between, silent)
+        curve = replace(curve, between=np.minimum.accumulate(mean))
     return curve
 
 
@@ -132,8 +126,8 @@ def psnr_against(
 
     if not _enough(sample):
         return None
-    numbers, later = sample.validating(), part(progress, 0.2, 1.0)
-    return float(_mean(sample, _of_views(sample, compare, numbers, later), numbers)[0])
+    _, mean = _of_views(sample, compare, sample.validating(), part(progress, 0.2, 1.0))
+    return float(mean[0])
 
 
 def _enough(sample):
@@ -158,20 +152,19 @@ def _removing(sample, place, counts):
 
 
 def _of_views(sample, compare, numbers, progress):
-    """Results of ``compare(number, rays)`` for each of v views, (v, L)."""
+    """Results of ``compare(number, rays)`` for v views, (v, L), and their weighted mean, (L,).
+
+    The mean of views in between is less by `DOUBT` standard errors.
+    """
 
     def compare_one(number):
         return compare(number, sample.rays[number])
 
-    return np.array(run_all(compare_one, numbers, progress=progress, what="estimating"))
-
-
-def _mean(sample, values, numbers):
-    """Weighted mean over views of values, (v, L); in between less `DOUBT` standard errors."""
+    values = np.array(run_all(compare_one, numbers, progress=progress, what="estimating"))
     weights = np.array([sample.views[number][1] for number in numbers])
     weights /= weights.sum()
     mean = weights @ values
     if sample.kind == "between":
         spread = np.square(weights) @ np.square(values - mean)
         mean -= DOUBT * np.sqrt(spread * len(weights) / max(len(weights) - 1, 1))
-    return mean
+    return values, mean
