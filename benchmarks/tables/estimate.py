@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from refine_addon.core import Merge, Method, Occlusion, Refit, prune
 from refine_addon.core.errors import RefineError
-from refine_addon.core.prune import with_quality
 from refine_addon.core.quality.curve import Way
+from refine_addon.core.quality.psnr import with_quality
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import ViewSet

@@ -25,7 +25,7 @@ from .merging.merge import Merged, copied, merge, stage_counts, stage_seconds
 from .methods import DEFAULT, ClosedForm, Method, Refit
 from .quality.alignment import alignment
 from .quality.curve import AS_GOOD, FARTHER, PLAIN, Way, deletion_will_do, left_to_lose, needed
-from .quality.psnr import psnr_against, psnr_kept, quality_curve
+from .quality.psnr import psnr_against, psnr_kept, with_quality
 from .refit.refit import Refitted, expected_rounds, refit_rounds
 from .report import Clock
 from .result import Origin, Result
@@ -117,19 +117,7 @@ def score(
                 splats, used, settled=settled, most_between=method.between(used), progress=scoring
             )
         scores = _with_views(scores, splats, views, used)
-        return with_quality(scores, protected=protected, progress=estimating)
-
-
-def with_quality(
-    scores: Scores,
-    *,
-    protected: NDArray[np.bool_] | None = None,
-    progress: Progress = silent,
-) -> Scores:
-    """Scores with the curve of the estimated PSNR, if they have validation rays; see `score`."""
-    if scores.ray_sample is None:
-        return scores
-    return replace(scores, quality=quality_curve(scores, protected, progress))
+        return with_quality(scores, protected, estimating)
 
 
 def _with_views(scores: Scores, splats: Splats, views: ViewSet, used: ViewSet) -> Scores:
@@ -285,7 +273,7 @@ class _Prune:
             )  # fmt: skip
         elif self.budget.psnr is not None and self.protected is not None:
             # Other splats may have been protected when these scores were made.
-            scores = with_quality(scores, protected=self.protected)
+            scores = with_quality(scores, self.protected)
         self.clock.lap("score_s")
         report(progress, 0.94, "selecting")
         return self._result(scores, self._select(scores))
@@ -320,7 +308,7 @@ class _Prune:
         )  # fmt: skip
         scores = _with_views(scores, self.splats, self.views, self.used)
         if goal is not None:
-            scores = with_quality(scores, protected=self.protected)
+            scores = with_quality(scores, self.protected)
         self.clock.lap("score_s")
         chosen: _Chosen = np.ones(count, np.bool_), None, None
         if not (refits and goal is not None):
@@ -352,7 +340,7 @@ class _Prune:
                 progress=lambda *_: progress(1.0, "selecting"),
             )  # fmt: skip
             if goal is not None:
-                scores = with_quality(scores, protected=self.protected)
+                scores = with_quality(scores, self.protected)
             return self._result(scores, self._select(scores), tried=tried)
         # Where a PSNR is asked for, deletion keeps another number of splats.
         measured = outcome.psnr if goal is not None else {"delete": plain, **outcome.psnr}

@@ -204,9 +204,7 @@ def _predicted(scores, share, measured, took, *, once=False):
     """PSNR of each method at a share removed, dB, measured or predicted, why one is missing, and
     seconds by those that scoring `took`, None if unknown; see `expected_seconds`.
     """
-    rays, many = scores.ray_sample, len(scores.values) >= FEWEST
-    hits = rays.hits_of_ray() if rays is not None and many else None
-    psnr = expected(scores.quality, share, measured, hits)
+    psnr = expected(scores, share, measured)
     seconds = None if took is None else expected_seconds(took, share, once=once)
     return {
         "psnr": {way: None if value is None else round(value, 2) for way, value in psnr.items()},

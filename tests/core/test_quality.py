@@ -26,7 +26,7 @@ from refine_addon.core.affine import QUARTERS
 from refine_addon.core.pictures import compare
 from refine_addon.core.quality.alignment import Alignment, alignment
 from refine_addon.core.quality.curve import PSNR_CAP, SHARES, Quality
-from refine_addon.core.quality.psnr import psnr_kept, psnr_of, quality_curve
+from refine_addon.core.quality.psnr import psnr_kept, psnr_of, with_quality
 from refine_addon.core.visibility import cast
 from refine_addon.core.visibility.cast import validation_rays
 from refine_addon.core.visibility.rays import Rays
@@ -114,7 +114,7 @@ def test_a_view_whose_splats_stay_is_not_changed():
     splats = splats_of(means, color=0.9, scales=0.2)
     views = ViewSet((replace(look_along_z(), name="a"), look_along_z((40.0, 0, 0), name="b")))
     values, rays = np.arange(20, dtype=np.float32), validation_rays(splats, views)
-    curve = quality_curve(Scores(values, np.zeros(20, np.int32), 2, 0, ray_sample=rays))
+    curve = with_quality(Scores(values, np.zeros(20), 2, 0, ray_sample=rays)).quality
     assert curve.of_views(0.5) == {"a": pytest.approx(curve.views["a"][4]), "b": PSNR_CAP}
     assert curve.of_views(0.5)["a"] < 30.0
 

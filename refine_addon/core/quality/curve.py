@@ -182,14 +182,9 @@ def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.fl
     return np.asarray(gain.clip(0.0), np.float64)
 
 
-def expected(
-    curve: Quality | None,
-    share: float,
-    measured: Mapping[Way, float | None],
-    hits: float | None = None,
-) -> dict[Way, float | None]:
+def expected(scores: Any, share: float, measured: Mapping[Way, float | None]) -> dict[Way, Any]:
     """PSNR of each way to remove a share, dB: as measured, else predicted, also from merging's."""
-    psnr: dict[Way, float | None] = {}
+    psnr, curve, rays = dict[Way, Any](), scores.quality, scores.ray_sample
     for way in WAYS:
         psnr[way] = measured.get(way)
         if psnr[way] is None and curve is not None and (curve.foretold or way == "delete"):
@@ -197,8 +192,8 @@ def expected(
     merged = measured.get("merge")
     if measured.get("refit") is None and merged is not None:
         psnr["refit"] = None
-        if hits is not None:
-            psnr["refit"] = min(merged + float(refit_gain(share, hits)), PSNR_CAP)
+        if rays is not None and len(scores.values) >= FEWEST:
+            psnr["refit"] = min(merged + float(refit_gain(share, rays.hits_of_ray())), PSNR_CAP)
     return psnr
 
 

@@ -52,15 +52,17 @@ def psnr_kept(sample: RaySample, keep: NDArray[np.bool_]) -> float | None:
     return float(_of_views(sample, removing, sample.seeing(), silent)[1][0])
 
 
-def quality_curve(
+def with_quality(
     scores: Any, protected: NDArray[np.bool_] | None = None, progress: Progress = silent
-) -> Quality | None:
-    """Estimated PSNR at each of `curve.SHARES`; None if too little is seen.
+) -> Any:
+    """`Scores` with the estimated PSNR at each of `curve.SHARES`, if they have validation rays.
 
-    Splats of the lowest of the `Scores` are removed first, of equal ones the first in the file,
-    `protected` ones last. The curve ends after those that are settled.
+    It is None if too little is seen. The lowest scores are removed first, of equal ones the first
+    in the file, `protected` splats last. The curve ends after the scores that are settled.
     """
     sample, values, settled = scores.ray_sample, scores.values, scores.settled
+    if sample is None:
+        return scores
     last = len(values) if settled is None else settled
     if settled is not None and protected is not None:
         last -= int(np.count_nonzero(protected))
@@ -69,7 +71,7 @@ def quality_curve(
         for shares in (SHARES, MERGED_SHARES)
     )
     if not removed or not _enough(sample):
-        return None
+        return replace(scores, quality=None)
     order = np.argsort(values, kind="stable")
     if protected is not None:
         order = order[np.argsort(protected[order], kind="stable")]
@@ -106,7 +108,7 @@ def quality_curve(
     if between is not None and _enough(between):
         _, mean = removing(between, silent)
         curve = replace(curve, between=np.minimum.accumulate(mean))
-    return curve
+    return replace(scores, quality=curve)
 
 
 def psnr_against(
