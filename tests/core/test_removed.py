@@ -57,13 +57,6 @@ def scores(splats, views):
     return score(splats, views, removed=REMOVED)
 
 
-def rest_budget(budget):
-    """Return what is left to a budget when some have gone: a share counts these."""
-    if budget.ratio is None:
-        return budget
-    return Budget(keep=COUNT - max(int(budget.ratio * COUNT), int(REMOVED.sum())))
-
-
 @pytest.mark.parametrize(
     ("method", "budget"),
     [(Occlusion(), one) for one in DELETED] + [(Merge(), one) for one in MERGED],
@@ -73,8 +66,10 @@ def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
     merges, splats, views, budget, method
 ):
     """The same splats, values and estimate as when they are deleted first, by hand."""
-    size = {"sizes": (20.0, 0)}
-    left = prune(splats.take(REST), views, rest_budget(budget), method, **size)
+    size, rest = {"sizes": (20.0, 0)}, budget
+    if budget.ratio is not None:  # a share counts those that have gone
+        rest = Budget(keep=COUNT - max(int(budget.ratio * COUNT), int(REMOVED.sum())))
+    left = prune(splats.take(REST), views, rest, method, **size)
 
     found = prune(splats, views, budget, method, removed=REMOVED, **size)
 
