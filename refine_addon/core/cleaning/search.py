@@ -20,7 +20,7 @@ from ..execute import Progress, part, run_all, silent
 from ..merging.graph import nearest
 from ..visibility import projection
 from ..visibility.cast import aimed, cast, depth_complexity, pixels
-from ..visibility.measuring import VIEW_GROUPS
+from ..visibility.measuring import view_groups
 from ..visibility.projection import Gaussians
 from ..visibility.rays import in_front
 from .support import FRACTION, REACHED, Evidence, Hits, evidence_of, own_support, share
@@ -103,6 +103,7 @@ class Search:
 
     def __init__(self, gaussians, scene, views):
         self.gaussians, self.scene, self.views = gaussians, scene, views
+        self.groups = view_groups(len(views))
         self.shown = np.zeros(len(gaussians), np.bool_)
         self.huge = gaussians.largest >= HUGE
         self.hits: list[Hits | None] = [None] * len(views)
@@ -154,7 +155,7 @@ class Search:
                     width[hits.hit] = np.maximum(width[hits.hit], hits.width)
             return sums
 
-        of_groups = self._by_views(of_group, progress, "casting rays")
+        of_groups = run_all(of_group, self.groups, progress=progress, what="casting rays")
         total = reduce(np.add, of_groups)
         total[3] = np.max([sums[3] for sums in of_groups], axis=0)
         if len(self.shown) and not total[3].any():
@@ -183,7 +184,7 @@ class Search:
                     sums[2:, hits.hit] += evidence_of(light, absent, self.gaussians.colors)
             return sums
 
-        return self._by_views(of_group, progress, "looking past suspects")
+        return run_all(of_group, self.groups, progress=progress, what="looking past suspects")
 
     def hits_of_view(self, number, footprints, absent, targets=None) -> Hits | None:
         """`Hits` of a view by its number, which sets its pixels; None if its rays hit nothing.
@@ -215,12 +216,6 @@ class Search:
         reached = reached[order]
         width = footprints.sigmas[0] / np.float32(max(view.width, view.height))
         return Hits(rays.hit, width, rays.owner[reached], rays.alpha[reached], key[order], scale)
-
-    def _by_views(self, work, progress, what):
-        """Results of `work` for each group of numbers of views."""
-        count = min(VIEW_GROUPS, len(self.views))
-        groups = [range(first, len(self.views), count) for first in range(count)]
-        return run_all(work, groups, progress=progress, what=what)
 
 
 def _targets(footprints, targets, number, area):
