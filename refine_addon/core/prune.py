@@ -327,8 +327,7 @@ class _Prune:
         self.clock.lap("merge_s")
         between, rays = None, self._first(scores).scores.between
         if rays is not None and outcome.stopped is None:
-            after = outcome.final.splats
-            between = psnr_against(rays, after, self.used)
+            between = psnr_against(rays, outcome.final.splats, self.used)
         pairs = [(plain, outcome.reached)]
         if beside is not None and between is not None:
             pairs.append((beside, between + FARTHER * (scores.views_between > 0)))

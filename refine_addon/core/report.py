@@ -85,9 +85,9 @@ def seen_by(found: Scores | Cleaned, demands: Forced) -> dict[str, dict[str, int
 
 
 def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
-    """How many splats are kept and removed."""
+    """How many splats there were, are kept and are removed."""
     kept = int(np.count_nonzero(keep))
-    return {"kept": kept, "removed": len(keep) - kept}
+    return {"before": len(keep), "kept": kept, "removed": len(keep) - kept}
 
 
 def of_prune(

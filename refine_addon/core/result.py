@@ -17,6 +17,7 @@ from .formats.ply import SplatFile
 from .formats.ply_columns import Changed, Changes, values_by_name
 from .formats.registry import write_splats
 from .merging.merge import Merged
+from .report import kept_and_removed
 from .scores import Scores
 from .splats import Splats, among_all
 
@@ -75,8 +76,7 @@ class Result:
     def for_all(self, rest: NDArray[np.bool_]) -> Result:
         """Result for all N splats, from this for those in `rest`, (N,) bool; others are removed."""
         keep = among_all(self.keep, rest)
-        total, kept = len(keep), int(np.count_nonzero(keep))
-        self.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}
+        self.report["splats"] |= kept_and_removed(keep)
         return replace(
             self,
             keep=keep,
