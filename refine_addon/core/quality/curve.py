@@ -104,17 +104,16 @@ class Quality:
 
     def of_views(self, share: float, way: Way = "delete") -> dict[str, float]:
         """PSNR of single views, dB, taken to gain as much by a method as all views together."""
-        gain = self.at(share, way) - self.at(share)
-        return {
-            name: min(self._at(psnr, share) + gain, PSNR_CAP) for name, psnr in self.views.items()
-        }
+        return dict(zip(self.views, self._gained([*self.views.values()], share, way), strict=True))
 
     def at_between(self, share: float, way: Way = "delete") -> float | None:
         """PSNR of views in between, dB, taken to gain as much by a method; None if unknown."""
-        if self.between is None:
-            return None
-        deleted = self._at(self.between, share)
-        return min(deleted + self.at(share, way) - self.at(share), PSNR_CAP)
+        return None if self.between is None else self._gained([self.between], share, way)[0]
+
+    def _gained(self, curves, share, way):
+        """PSNR of views by these, (L,) each, dB: what deletion has, and what all views gain."""
+        gain = self.at(share, way) - self.at(share)
+        return [min(self._at(psnr, share) + gain, PSNR_CAP) for psnr in curves]
 
     def share(self, psnr: float, way: Way = "delete") -> float:
         """Largest share that leaves at least `psnr` dB, at most the last of the curve; or 0."""
