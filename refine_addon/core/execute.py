@@ -275,7 +275,7 @@ def run(
 
     cluster = _own.cluster
     if cost and cluster is not None and len(packed := pickle.dumps(work)) <= _SENT:
-        yield from cluster.run(packed, todo, progress, what)
+        yield from cluster.run(packed, todo, tell)
         return
     threads = min(default_threads() if threads is None else threads, max(len(todo), 1))
     if _worth(cost, threads):

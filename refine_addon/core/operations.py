@@ -128,9 +128,8 @@ def run(
     splats. `save` follows the writing.
     """
     clock, written = Clock(), None if dry_run else output
-    with within(cores=threads), contextlib.ExitStack() as held:
-        if pictures is not None and views is not None:
-            held.enter_context(pictures.opened(views))
+    folder = pictures.opened(views) if pictures and views else contextlib.nullcontext()
+    with within(cores=threads), folder:
         if written is not None:
             refuse_existing(written, overwrite=overwrite)
             if source is not None:

@@ -836,7 +836,7 @@ def test_a_job_whose_workers_are_all_lost_ends(monkeypatch):
     client = SimpleNamespace(nthreads=dict, submit=lambda *_, **__: future, cancel=lambda _: None)
     began = time.monotonic()
     with pytest.raises(Interrupted, match="all workers were lost"):
-        next(cluster.Cluster(client).run(b"", [0], lambda *_: None, ""))
+        next(cluster.Cluster(client).run(b"", [0], lambda _: None))
     assert time.monotonic() - began > 0.5
 
 

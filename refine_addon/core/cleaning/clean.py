@@ -215,8 +215,7 @@ def clean(
             refuse_undrawable(int(np.count_nonzero(good)), len(left))
         deciding = [view for view, _ in views.spread(settings.views).by_distance()]
         slender = is_slender(left.log_scales[gaussians.index])
-        search = Search(gaussians, scene, deciding)
-        suspects = search.find(slender, part(progress, 0.05, 1.0))
+        suspects = Search(gaussians, scene, deciding).find(slender, part(progress, 0.05, 1.0))
         shows, faint, sure = judge(gaussians, suspects)
         faint &= suspects.doubted & ~suspects.large
         haze = faint & (gaussians.alphas < FAINT) & _near_any(gaussians, scene, deciding, faint)

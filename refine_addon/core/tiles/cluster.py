@@ -20,7 +20,7 @@ from typing import Any
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..execute import Progress, chunks, report, run_all, sent_ahead, within
+from ..execute import chunks, run_all, sent_ahead, within
 from ..mapped import Interrupted
 from ..whole_file import explained
 from .files import Tile, bytes_of, waiting_in
@@ -118,7 +118,7 @@ class Cluster:
                 return
         raise Interrupted("the workers were lost again and again")
 
-    def run(self, packed: bytes, items: Sequence[Any], progress: Progress, what: str) -> Iterator:
+    def run(self, packed: bytes, items: Sequence[Any], tell: Callable[[int], None]) -> Iterator:
         """Yield results of pickled work on items, in order; `Interrupted` if workers are lost."""
         from distributed import CancelledError, KilledWorker
         from distributed.comm import CommClosedError
@@ -129,7 +129,7 @@ class Cluster:
 
         def look(done: int) -> None:
             nonlocal seen
-            report(progress, done / len(groups), what)
+            tell(done * size)
             alone = time.monotonic() - seen
             if alone > _ALONE / 10.0 and self._client.nthreads():
                 seen = time.monotonic()
