@@ -1,6 +1,7 @@
 """Registration with Blender, in order; `unregister` undoes it in reverse.
-Every class of Blender's kinds in `MODULES` is registered. Modules list functions that draw into
-Blender's menus in `MENUS`, and handlers of Blender's events, with the events, in `HANDLERS`."""
+Every class of Blender's kinds in `MODULES` is registered; an operator's name is that of its class:
+``refine.apply`` is `REFINE_OT_apply`. Modules list functions that draw into Blender's menus in
+`MENUS`, and handlers of Blender's events, with the events, in `HANDLERS`."""
 
 from __future__ import annotations
 
@@ -42,6 +43,8 @@ _commands: list[object] = []
 def register() -> None:
     """Register classes, properties, menu entries and the command ``refine``."""
     for cls in CLASSES:
+        if issubclass(cls, bpy.types.Operator):
+            cls.bl_idname = cls.__name__.replace("REFINE_OT_", "refine.")
         bpy.utils.register_class(cls)
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
     for name, entry in MENUS:

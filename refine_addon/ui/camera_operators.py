@@ -61,7 +61,6 @@ _MARGIN = 1.1  # Distance of a camera over the least that frames all
 class REFINE_OT_turn_cameras(Acting, bpy.types.Operator):
     """Turn the cameras that decide about the world's X axis, and drop the scores"""
 
-    bl_idname = "refine.turn_cameras"
     bl_label = "Turn the Cameras"
 
     quarters: IntProperty(
@@ -99,7 +98,6 @@ class REFINE_OT_turn_cameras(Acting, bpy.types.Operator):
 class REFINE_OT_add_ring(Acting, bpy.types.Operator):
     """Add cameras around the splats, taking Z as up; they decide together with the others"""
 
-    bl_idname = "refine.add_ring"
     bl_label = "Add a Ring of Cameras"
 
     count: IntProperty(name="Cameras", description="Number of cameras", default=16, min=3, max=360)

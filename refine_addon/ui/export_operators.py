@@ -66,7 +66,6 @@ class Exporting(Job, ExportHelper):
 class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     """Write the active object's splats to a file, in the format that its suffix names"""
 
-    bl_idname = "refine.export_ply"
     bl_label = "Export Splats"
     doing = "Writing splats"
 
@@ -123,7 +122,6 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
 class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
     """Write the active object and its levels as a streamed SOG: a folder that web viewers load"""
 
-    bl_idname = "refine.export_levels"
     bl_label = "Export Levels"
     doing = "Writing levels"
 

@@ -91,7 +91,6 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
     # On a thread also because Blender does not record an operator that ends within the file
     # browser's call: *Adjust Last Operation* would still be that of the splats imported before,
     # and adjusting them would undo these cameras.
-    bl_idname = "refine.import_cameras"
     bl_label = "Import Cameras"
     doing = "Reading cameras"
 
@@ -170,7 +169,6 @@ FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)  # File browser'
 class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
     """Import files of splats as meshes: a vertex for each splat, an attribute for each property"""
 
-    bl_idname = "refine.import_ply"
     bl_label = "Import Splats"
     doing = "Reading splats"
 

@@ -62,7 +62,6 @@ class RefineVolume(bpy.types.PropertyGroup):
 class REFINE_OT_add_volume(Acting, bpy.types.Operator):
     """Add a volume to the list"""
 
-    bl_idname = "refine.add_volume"
     bl_label = "Add Volume"
     needs = (idle, on_splats)
 
@@ -115,7 +114,6 @@ def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
 class REFINE_OT_drop_volume(Acting, bpy.types.Operator):
     """Remove the volume from the list; the object stays"""
 
-    bl_idname = "refine.drop_volume"
     bl_label = "Remove from List"
     needs = (idle,)
 
@@ -139,7 +137,6 @@ _ITEMS = (
 class REFINE_OT_protect(Acting, bpy.types.Operator):
     """Mark the selected splats to stay, or to go"""
 
-    bl_idname = "refine.protect"
     bl_label = "Mark Splats"
 
     mark: EnumProperty(name="Mark", description="The mark to set", items=_ITEMS)
@@ -159,7 +156,6 @@ class REFINE_OT_protect(Acting, bpy.types.Operator):
 class REFINE_OT_find_floaters(Job, bpy.types.Operator):
     """Find splats that float where cameras see empty space, and ask whether to delete them"""
 
-    bl_idname = "refine.find_floaters"
     bl_label = "Find Floaters"
     doing = "Looking for floaters"
 
@@ -199,7 +195,6 @@ _WORDS = {"SELECTED": "is selected", "FLOATERS": "floats", "VOLUMES": "must go"}
 class REFINE_OT_delete(Acting, bpy.types.Operator):
     """Delete splats now, without scores"""
 
-    bl_idname = "refine.delete"
     bl_label = "Delete Splats"
 
     what: EnumProperty(name="What", description="Which splats go", items=WHAT)

@@ -58,7 +58,6 @@ def _of_objects(group: Members) -> str:
 class REFINE_OT_score(Job, bpy.types.Operator):
     """Score each splat by how much the cameras would miss it (Esc cancels)"""
 
-    bl_idname = "refine.score"
     bl_label = "Score"
     doing = "Scoring splats"
 
@@ -104,7 +103,6 @@ class REFINE_OT_score(Job, bpy.types.Operator):
 class REFINE_OT_apply(Job, bpy.types.Operator):
     """Delete the splats that the budget does not keep; Merge and Refit adapt the kept ones"""
 
-    bl_idname = "refine.apply"
     bl_label = "Apply"
     bl_options = {"UNDO"}
     needs = (*Job.needs, scored)
@@ -159,7 +157,6 @@ class REFINE_OT_apply(Job, bpy.types.Operator):
 class REFINE_OT_levels(Job, bpy.types.Operator):
     """Make copies of the active object with fewer and fewer splats, hidden in a new collection"""
 
-    bl_idname = "refine.levels"
     bl_label = "Make Levels"
     doing = "Making levels"
 
@@ -189,7 +186,6 @@ class REFINE_OT_levels(Job, bpy.types.Operator):
 class REFINE_OT_compare(Job, bpy.types.Operator):
     """Draw what the active camera sees before and after Apply, and measure the loss in dB"""
 
-    bl_idname = "refine.compare"
     bl_label = "Compare"
     bl_options = {"REGISTER"}
     needs = (*Job.needs, scored)

@@ -30,7 +30,6 @@ from .wrapped import InSidebar, counted
 class REFINE_OT_view(bpy.types.Operator):
     """Draw the splats in the 3D views; nothing in the scene is changed"""
 
-    bl_idname = "refine.view"
     bl_label = "Show Splats"
     bl_options = {"INTERNAL"}
 
@@ -64,7 +63,6 @@ def _instances(context: bpy.types.Context) -> str:
 class REFINE_OT_make_real(Acting, bpy.types.Operator):
     """Turn the splats that the active object instances into objects, which can be scored"""
 
-    bl_idname = "refine.make_real"
     bl_label = "Make Splats Real"
     needs = (idle, in_object_mode, _instances)
 

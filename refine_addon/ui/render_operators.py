@@ -56,7 +56,6 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 
     # Blender passes an event first to the modal operator that started last. Blender's own render
     # passes Esc to no other, even if it has just ended by itself and so is not stopped.
-    bl_idname = "refine.watch_render"
     bl_label = "Watch a Render"
     bl_options = {"INTERNAL"}
 
@@ -77,7 +76,6 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 class REFINE_OT_render(Needing, bpy.types.Operator):
     """Render splats among what the scene's engine renders; animations go where Output says"""
 
-    bl_idname = "refine.render"
     bl_label = "Render with Splats"
     bl_options = {"REGISTER"}
     needs = (idle, no_render)

@@ -48,7 +48,6 @@ SETS = (
 class REFINE_OT_select(Acting, bpy.types.Operator):
     """Select or hide splats"""
 
-    bl_idname = "refine.select"
     bl_label = "Select"
 
     action: EnumProperty(name="Action", description="What to do", items=ACTIONS)
@@ -73,7 +72,6 @@ class REFINE_OT_select(Acting, bpy.types.Operator):
 class REFINE_OT_select_by(Acting, bpy.types.Operator):
     """Select splats by a property"""
 
-    bl_idname = "refine.select_by"
     bl_label = "Select By"
 
     what: EnumProperty(name="What", description="The splats to select", items=SETS)
@@ -115,7 +113,6 @@ def taken(context: Context, checked: SplatObject, what: str) -> NDArray[np.bool_
 class REFINE_OT_grow_selection(Job, bpy.types.Operator):
     """Select the neighbours of selected splats too, or deselect those at the edge (Esc cancels)"""
 
-    bl_idname = "refine.grow_selection"
     bl_label = "Grow Selection"
     doing = "Looking for neighbours"
 
@@ -139,7 +136,6 @@ class REFINE_OT_grow_selection(Job, bpy.types.Operator):
 class REFINE_OT_separate_selected(Acting, bpy.types.Operator):
     """Move the selected splats into a new object"""
 
-    bl_idname = "refine.separate_selected"
     bl_label = "Separate Selected"
 
     def act(self, context: Context) -> None:
@@ -170,7 +166,6 @@ class REFINE_OT_separate_selected(Acting, bpy.types.Operator):
 class REFINE_OT_grade(Acting, bpy.types.Operator):
     """Grade the colours of the selected splats, or of all if none is selected"""
 
-    bl_idname = "refine.grade"
     bl_label = "Grade Colours"
 
     exposure: FloatProperty(

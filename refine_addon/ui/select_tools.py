@@ -180,7 +180,6 @@ def _in_view(context: Context) -> str:
 class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
     """Select the splats that the view shows, with Through also those behind them"""
 
-    bl_idname = "refine.select_stroke"
     bl_label = "Select Splats"
     bl_options = {"UNDO"}
     needs = (idle, on_splats, _in_view)

@@ -29,7 +29,6 @@ _SOON = 0.1  # Seconds until new splats are stamped: Blender's operator is over 
 class REFINE_OT_bake_transform(Acting, bpy.types.Operator):
     """Apply the transforms of selected objects to their splats: places, sizes, turns, colours"""
 
-    bl_idname = "refine.bake_transform"
     bl_label = "Bake Transform"
     needs = (*Acting.needs, in_object_mode)
 
@@ -50,7 +49,6 @@ class REFINE_OT_bake_transform(Acting, bpy.types.Operator):
 class REFINE_OT_mend(Job, bpy.types.Operator):
     """Make sizes, rotations and colours follow what Blender's own tools did to the positions"""
 
-    bl_idname = "refine.mend"
     bl_label = "Mend Splats"
     needs = (*Job.needs, in_object_mode)
     doing = "Mending splats"
