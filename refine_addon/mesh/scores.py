@@ -29,6 +29,7 @@ SCORED = "refine_scored"
 """Boolean point attribute: whether the splat has a score. False if it was removed by the user, or
 added later, as false is Blender's default."""
 
+_TOLD = ("method", "views_given", "views_used", "views_between")  # Fields of `Scores` in a record
 RECORD = "refine_scores"  # Custom property of the mesh: record of its scoring, JSON
 REASON = "refine_floats"  # Integer point attribute: 0, or 1 + the index of a reason in `REASONS`
 FLOATERS = "refine_floaters"  # Custom property of the mesh: floaters by reason, and how sure, JSON
@@ -53,10 +54,7 @@ def store(
     scored = np.ones(total, np.bool_) if scores.scored is None else scores.scored
     of_all = {
         "settings": method.facts(),
-        "method": scores.method,
-        "views_given": scores.views_given,
-        "views_used": scores.views_used,
-        "views_between": scores.views_between,
+        **{name: getattr(scores, name) for name in _TOLD},
         "weights": scores.facts,
         "notes": scores.notes,
         "quality": scores.quality.facts() if scores.quality else None,
@@ -144,15 +142,12 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
     return Scores(
         values=values,
         seen=seen,
-        views_used=first["views_used"],
         undrawable=int(np.count_nonzero((values == 0.0) & scored)),
         facts=first.get("weights", {}),
         notes=tuple(first.get("notes", ())),
-        method=first.get("method", ""),
-        views_given=first["views_given"],
-        views_between=first.get("views_between", 0),
         quality=Quality.from_facts(first.get("quality")) if whole else None,
         scored=None if scored.all() else scored,
+        **{name: first[name] for name in _TOLD if name in first},
     )
 
 

@@ -8,6 +8,7 @@ import pickle
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import bpy
@@ -124,7 +125,7 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
         if obj.type == "EMPTY":
             what = f"an empty shown as {obj.empty_display_type.replace('_', ' ').lower()}"
         raise RefineError(f"{label}: is {what}, {UNFIT}")
-    return Zone(role, label, _CachedVolume(label, make), idle)
+    return Zone(role, label, SimpleNamespace(inside=partial(_inside, label, make)), idle)
 
 
 def _is_shape(obj: bpy.types.Object) -> bool:
@@ -202,23 +203,17 @@ def _surface(obj: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int
         evaluated.to_mesh_clear()
 
 
-@dataclass(frozen=True, eq=False)
-class _CachedVolume:
-    """A volume that caches its last answers: sliders repeat the same questions."""
-
-    label: str
-    make: partial[Any]
-
-    def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        digest = hashlib.blake2b(pickle.dumps(self.make), digest_size=16)
-        digest.update(np.ascontiguousarray(points))
-        key = digest.digest()
-        if key not in _masks:
-            try:
-                mask = self.make().inside(points)
-            except RefineError as error:
-                raise RefineError(f"{self.label}: {error}") from error
-            while len(_masks) >= _MOST_MASKS:
-                del _masks[next(iter(_masks))]  # the oldest
-            _masks[key] = mask
-        return _masks[key]
+def _inside(label: str, make: partial[Any], points: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which points lie in a volume. Keeps its last answers: sliders repeat the same questions."""
+    digest = hashlib.blake2b(pickle.dumps(make), digest_size=16)
+    digest.update(np.ascontiguousarray(points))
+    key = digest.digest()
+    if key not in _masks:
+        try:
+            mask = make().inside(points)
+        except RefineError as error:
+            raise RefineError(f"{label}: {error}") from error
+        while len(_masks) >= _MOST_MASKS:
+            del _masks[next(iter(_masks))]  # the oldest
+        _masks[key] = mask
+    return _masks[key]

@@ -19,11 +19,12 @@ from ..core.methods import ClosedForm
 from ..core.operations import row_in
 from ..core.prune import prune
 from ..core.quality.alignment import Alignment
-from ..core.quality.curve import Quality, Way, expected_seconds, in_words, out_of_reach, parted
+from ..core.quality.curve import WAYS, Quality, expected_seconds, in_words, out_of_reach, parted
 from ..core.report import MANY_UNSEEN, sizes_in_words
 from ..core.scores import TELLING
 from ..core.selection import Budget, quality_of
 from ..core.splats import MODELS
+from ..core.volumes import Forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -34,9 +35,6 @@ from . import images, operator_bases
 from .wrapped import counted
 
 REST = 0.2  # Seconds without a change after which a slider rests
-
-WAYS: dict[str, Way] = {"occlusion": "delete", "merge": "merge", "refit": "refit"}
-"""What each method does after scoring with occlusion."""
 
 _last: list[tuple[Any, dict[str, Any]]] = []  # The last plan, behind its key; empty without one
 
@@ -102,13 +100,13 @@ def shown(context: bpy.types.Context) -> dict[str, Any] | None:
 def sentence(plan: dict[str, Any]) -> str:
     """The splats and megabytes that a plan keeps, in words; not of a plan with an error.
 
-    >>> plan = {"splats": 100, "kept": 50, "bytes_before": 5e6, "bytes_after": 2.5e6}
+    >>> plan = {"before": 100, "kept": 50, "bytes_before": 5e6, "bytes_after": 2.5e6}
     >>> sentence(plan | {"about": False})
     'Keeps 50 of 100, 2.5 of 5.0 MB'
     """
     about = "about " if plan["about"] else ""
     sizes = sizes_in_words(plan["bytes_after"], "of", plan["bytes_before"])
-    return f"Keeps {about}{plan['kept']:,} of {plan['splats']:,}, {sizes}"
+    return f"Keeps {about}{plan['kept']:,} of {plan['before']:,}, {sizes}"
 
 
 def price(plan: dict[str, Any] | None, method: str) -> str:
@@ -116,7 +114,7 @@ def price(plan: dict[str, Any] | None, method: str) -> str:
     curve: Quality | None = plan.get("quality") if plan else None
     if plan is None or curve is None or plan["closed"] != (method == ClosedForm.name):
         return ""
-    way, share = WAYS.get(method, "delete"), plan["share"]
+    way, share = method if method in WAYS else "delete", plan["share"]
     if way != "delete" and not curve.foretold:
         return ""
     words = in_words(curve.at(share, way))
@@ -143,9 +141,9 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
         texts.append(f"no splat lies in the view of {counted(none, 'camera')}")
     texts.append(alignment.distant())
     unseen = plan["unseen"]
-    if unseen >= MANY_UNSEEN * plan["splats"]:
-        go = f"{plan['unseen_gone'] / unseen:.0%} of these go"
-        texts.append(f"{unseen / plan['splats']:.0%} of the splats lie in no view; {go}")
+    if unseen >= MANY_UNSEEN * plan["before"]:
+        go = f"{plan['unseen_removed'] / unseen:.0%} of these go"
+        texts.append(f"{unseen / plan['before']:.0%} of the splats lie in no view; {go}")
     return [_sentence(text) for text in texts if text]
 
 
@@ -219,12 +217,11 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     settings, record = scene.refine, mesh_scores.record(obj.data) or {}
     group = splat_group.members(obj)
     masks, budget = demands.refresh(scene, group), settings.to_budget()
-    method = settings.to_method().deleting()
-    arguments = splat_group.stored_arguments(group, budget, masks, method)
-    scores, protected, removed = arguments["scores"], masks["protected"], masks["removed"]
+    method = settings.to_method()
+    arguments = splat_group.stored_arguments(group, budget, masks, method.deleting())
+    scores, forced = arguments["scores"], Forced(**masks).counts()
     count, curve = len(scores.values), scores.quality
-    rest = np.ones(count, np.bool_) if removed is None else ~removed
-    left, way = int(np.count_nonzero(rest)), WAYS.get(settings.method, "delete")
+    left, way = count - forced["removed_by_user"], method.name if method.changes else "delete"
     form, uids = settings.to_form(), [member.mesh.session_uid for member in group]
     if form is not None:
         if (form, uids, count) != (_rows or [None])[0]:
@@ -234,15 +231,15 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     predicted = budget.psnr is not None and way != "delete"
     about = predicted or form is not None
     if predicted:
-        stays = 0 if protected is None else int(np.count_nonzero(protected & rest))
         gone = math.floor(quality_of(scores).share(budget.psnr, way) * left)
-        arguments["budget"] = Budget(keep=max(left - min(gone, left - stays), 1))
-    keep = prune(**arguments).keep
-    splat_group.mark_removed(group, keep)
-    outcome = Outcome.of(count, int(np.count_nonzero(keep)), *map(int, arguments["sizes"]))
+        arguments["budget"] = Budget(keep=max(left - min(gone, left - forced["protected"]), 1))
+    result = prune(**arguments)
+    splat_group.mark_removed(group, result.keep)
+    counts = result.report["splats"]
+    outcome = Outcome.of(count, counts["kept"], *map(int, arguments["sizes"]))
     gone = left - outcome.kept
-    share, unseen = gone / left, rest & (scores.seen == 0)
-    becomes: Way = way
+    share = gone / left
+    becomes = way
     if way != "delete" and (curve is None or curve.as_good(share, way)):
         becomes = "delete"
     closed = record.get("method") == ClosedForm.name
@@ -259,10 +256,8 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
         if record.get("seconds") and not closed:
             seconds = {**expected_seconds(record["seconds"], share, once=False), "delete": 0.0}
     return {
-        **outcome._asdict(), "splats": count, "about": about, "share": share, "becomes": becomes,
+        **counts, **outcome._asdict(), "about": about, "share": share, "becomes": becomes,
         "quality": curve, "closed": closed, "seconds": seconds, "remark": remark, "views": views,
-        "unseen": int(np.count_nonzero(unseen)),
-        "unseen_gone": int(np.count_nonzero(unseen & ~keep)),
     }  # fmt: skip
 
 

@@ -49,7 +49,7 @@ def test_both_halves_keep_what_the_whole_room_keeps(
 
     assert bpy.ops.refine.score() == {"FINISHED"}
     plan = addon.ui.plans.stored(halves[1], settings)
-    assert (plan["splats"], plan["kept"]) == (COUNT, COUNT - 7_951)
+    assert (plan["before"], plan["kept"]) == (COUNT, COUNT - 7_951)
     members = group.members(halves[1])
     together = addon.mesh.scores.stored_scores(members)
     assert (together.quality is None) == (method == "closed-form")
