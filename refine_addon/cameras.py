@@ -15,10 +15,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from .core import RefineError, View, ViewSet
 from .core.affine import QUARTER, QUARTERS, UNKNOWN_AXES, quaternion
-from .core.errors import RefineError
 from .core.formats.ply import HEADER_LIMIT, raw_header
-from .core.views import View, ViewSet
 from .mesh.layout import AXES, LAYOUT, VERTICAL_AXIS, is_native
 
 WEIGHT = "refine_weight"  # Custom property of a camera object: the weight of its view, 1 without it

@@ -13,8 +13,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import RefineError
 from ..core.affine import Move, affine_moves
-from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from .layout import ROTATION, SCALE, Data, check, has, is_native, sh_degree
 

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import RefineError
+from ..core import RefineError
 from ..core.formats.ply import REQUIRED
 from . import attributes as mesh_attributes
 from .layout import SplatObject, has, splat_count

@@ -17,7 +17,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import RefineError
+from ..core import RefineError
 from ..core.formats.ply import new_header, stated_model, vertex_header, with_count, with_model
 from ..core.formats.ply_columns import REQUIRED, REST_COUNTS, THIRD_SCALE
 from ..core.splats import MODELS, Model, opacity, scales, single_log_scales, single_logits

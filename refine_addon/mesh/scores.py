@@ -12,12 +12,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import Method, RefineError, Scores, rank
 from ..core.cleaning.clean import REASONS, Cleaned, in_words
-from ..core.errors import RefineError
-from ..core.methods import Method
 from ..core.quality.curve import Quality
-from ..core.scores import Scores
-from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from .layout import Data, SplatObject, has, recorded, rows_of, splat_count

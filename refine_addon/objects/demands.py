@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import world_matrix
+from ..core import RefineError
 from ..core.affine import moved
-from ..core.errors import RefineError
 from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Zone, any_of, forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit

@@ -14,22 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import world_matrix
+from ..core import Budget, Level, RefineError, Result, SplatFile, ViewSet, prune
 from ..core.affine import is_uniform, transformed
-from ..core.errors import RefineError
 from ..core.execute import silent
 from ..core.formats.format import Format
-from ..core.formats.ply import SplatFile
 from ..core.formats.ply_columns import values_by_name
-from ..core.lod import Level
 from ..core.methods import DEFAULT, Merge, Method
 from ..core.operations import Scene, prune_scene, run, score_scene, to_size
 from ..core.pictures import PictureFiles
-from ..core.prune import prune
-from ..core.result import Result
-from ..core.selection import Budget
 from ..core.spherical_harmonics import recolored
 from ..core.splats import Splats, joined
-from ..core.views import ViewSet
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit

@@ -13,17 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import snapped
+from ..core import RefineError
 from ..core.affine import Move, baked, check_affine, is_flat, is_uniform, moved
-from ..core.errors import RefineError
 from ..core.execute import chunks, run_all
 from ..core.formats.ply_columns import values_by_name
 from ..core.splats import Splats, above_constant
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
-from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject
+from ..mesh.layout import SplatObject, forget_axis, sh_degree
 
 _NORMALS = ("nx", "ny", "nz")
 _ROWS = 1 << 14  # Splats moved at a time on one thread
@@ -107,7 +106,7 @@ def _turned_normals(normals: NDArray[np.float32], matrix: NDArray[np.float64]) -
 
 def uneven_notes(checked: SplatObject, matrix: NDArray[np.float64]) -> list[str]:
     """A sentence if colours cannot follow a (4, 4) matrix exactly."""
-    if is_uniform(matrix) or not mesh_layout.sh_degree(checked.mesh):
+    if is_uniform(matrix) or not sh_degree(checked.mesh):
         return []
     return [
         f"object '{checked.obj.name}': the scale is uneven, which harmonics cannot follow exactly: "
@@ -125,7 +124,7 @@ def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) ->
             mesh_attributes.write_columns(checked.mesh, checked.layout, columns)
             mesh_drift.stamp(checked.mesh)
             if columns:
-                mesh_layout.forget_axis(checked.mesh)
+                forget_axis(checked.mesh)
 
 
 def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:

@@ -10,9 +10,8 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import Splats, View
 from ..core.pictures import Layers
-from ..core.splats import Splats
-from ..core.views import View
 from ..viewport import shader
 from ..viewport.arrays import Eye, as_texture, colors, farthest_first, in_front, pack
 

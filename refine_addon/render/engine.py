@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from .. import main_thread
 from ..cameras import active_camera, pose
+from ..core import RefineError
 from ..core.affine import is_flat, transformed
-from ..core.errors import RefineError
 from ..core.execute import Cancelled, checkpoint, report, within
 from ..core.images import linear_of
 from ..core.pictures import Layers, draw, seen_from

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .. import main_thread
 from ..cameras import active_camera
-from ..core.execute import Cancelled
+from ..core import Cancelled
 from ..core.images import read_exr
 from ..core.pictures import Layers, in_order
 from ..mesh import layout as mesh_layout

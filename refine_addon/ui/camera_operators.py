@@ -12,8 +12,8 @@ import numpy as np
 from bpy.props import IntProperty
 
 from ..cameras import CameraChoice
+from ..core import RefineError
 from ..core.affine import QUARTERS
-from ..core.errors import RefineError
 from ..core.quality.curve import in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout

@@ -14,22 +14,21 @@ from bpy.types import Context
 from bpy_extras.io_utils import ImportHelper
 
 from ..cameras import SHEAR, SOURCE, create_cameras, known_turn, y_down
+from ..core import SplatFile, ViewSet
 from ..core.affine import AXES, QUARTER
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError, described
 from ..core.execute import Progress, report, stages
-from ..core.formats.ply import SplatFile
 from ..core.formats.registry import INDEX_NAMES, READ_SUFFIXES, read_splats
 from ..core.formats.streamed_sog import INDEX
 from ..core.operations import by_cameras
 from ..core.quality.alignment import Alignment
-from ..core.views import ViewSet
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import layout as mesh_layout
 from ..viewport import draw
-from . import operator_bases, properties
-from .operator_bases import FAILURES, Answer, Job, Work, idle, in_object_mode
+from . import properties
+from .operator_bases import FAILURES, Answer, Job, Work, idle, in_object_mode, target_collection
 from .wrapped import counted
 
 _ABOVE = 3  # folders above the splats in which their cameras are looked for
@@ -58,7 +57,7 @@ class _Importing(Job, ImportHelper):
     def add_cameras(self, context: Context, views: ViewSet) -> bpy.types.Collection:
         """Camera objects in a new collection, which decides from now on."""
         scene, collection = context.scene, bpy.data.collections.new("Cameras")
-        operator_bases.target_collection(context).children.link(collection)
+        target_collection(context).children.link(collection)
         cameras = create_cameras(views, collection, upright=self.upright)
         scene.refine.collection, scene.refine.source = collection, "COLLECTION"
         if self.set_resolution:
@@ -286,7 +285,7 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         obj = bpy.data.objects.new(mesh.name, mesh)
         if self.upright:
             obj.matrix_world = mathutils.Matrix(QUARTER.tolist()).to_4x4()
-        operator_bases.target_collection(context).objects.link(obj)
+        target_collection(context).objects.link(obj)
         self.tell(mesh_attributes.import_notes(file))
         return obj
 

@@ -7,18 +7,16 @@ import numpy as np
 from bpy.props import EnumProperty, IntProperty, PointerProperty
 from bpy.types import Context
 
-from ..core.cleaning.clean import Cleaned, Cleaning, clean
-from ..core.errors import RefineError
+from ..core import Cleaned, Cleaning, RefineError, clean
 from ..core.execute import Progress
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh import selection
-from ..mesh.layout import SplatObject
 from ..objects import demands, splat_group
-from . import operator_bases, plans
-from .operator_bases import Acting, Answer, Job, Work, idle, on_splats, tooltips
+from . import plans
+from .operator_bases import Acting, Answer, Job, Work, idle, on_splats, target_collection, tooltips
 from .operators import chosen_views
 from .select_operators import some, taken
 
@@ -77,7 +75,7 @@ class REFINE_OT_add_volume(Acting, bpy.types.Operator):
             item.role = self.role
             item.object = obj
 
-    def _new_empty(self, context: Context, checked: SplatObject) -> bpy.types.Object:
+    def _new_empty(self, context: Context, checked: mesh_layout.SplatObject) -> bpy.types.Object:
         """A new empty around the middle half of the splats, or nearly all if they are kept."""
         means = demands.finite_means(checked)
         share = _OUTSIDE_KEPT if self.role == "KEEP" else _OUTSIDE
@@ -91,7 +89,7 @@ class REFINE_OT_add_volume(Acting, bpy.types.Operator):
             away = np.linalg.norm(means - (low + high) / 2.0, axis=1)
             obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), _LEAST_HALF),) * 3
         obj.show_in_front = True
-        operator_bases.target_collection(context).objects.link(obj)
+        target_collection(context).objects.link(obj)
         for other in context.selected_objects:
             other.select_set(False)
         obj.select_set(True)

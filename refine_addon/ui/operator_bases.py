@@ -17,9 +17,8 @@ from .. import main_thread
 from ..core.errors import RefineError, described
 from ..core.execute import Cancelled, Progress, TimeLeft, in_time, silent, within
 from ..mesh import attributes as mesh_attributes
-from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.layout import SplatObject
+from ..mesh.layout import SplatObject, check, looks_like_splats
 from ..viewport import draw as viewport_draw
 
 _STEP = 0.05  # Seconds between two looks at the thread
@@ -148,7 +147,7 @@ class Running:
         """The objects; `RefineError` if their splats changed since."""
         group = []
         for obj, target in self.objects():
-            group.append(mesh_layout.check(obj))
+            group.append(check(obj))
             if Target.of(group[-1]).splats != target.splats:
                 raise RefineError(
                     f"object '{target.name}': its splats were changed meanwhile; start again"
@@ -236,7 +235,7 @@ def in_object_mode(context: Context) -> str:
 
 def on_splats(context: Context) -> str:
     """A need: the active object holds splats."""
-    if mesh_layout.looks_like_splats(context.object):
+    if looks_like_splats(context.object):
         return ""
     return "Select an object that holds splats, or import a file of splats"
 

@@ -14,21 +14,18 @@ from bpy.types import Context
 from numpy.typing import NDArray
 
 from ..cameras import CameraChoice
+from ..core import Result, Scores, ViewSet
 from ..core.execute import Progress, part
 from ..core.lod import Level, lod, viewing_distance
 from ..core.pictures import AMPLIFIED, KINDS, Comparison, compare
 from ..core.prune import REFITTING, prune, score
 from ..core.quality.curve import in_words
 from ..core.report import scoring_notes, sizes_in_words
-from ..core.result import Result
-from ..core.scores import Scores
-from ..core.views import ViewSet
 from ..core.visibility import frustum
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
-from ..objects.splat_group import Change, Members
 from ..viewport import draw as viewport_draw
 from . import plans
 from .images import put
@@ -43,7 +40,7 @@ def chosen_views(context: Context) -> ViewSet:
     return CameraChoice.of_scene(context.scene).views(context, context.object)
 
 
-def apply_arguments(context: Context, group: Members) -> dict[str, Any]:
+def apply_arguments(context: Context, group: splat_group.Members) -> dict[str, Any]:
     """Arguments of `prune` for the selected objects, from the panel's settings."""
     settings, masks = context.scene.refine, demands.Demands.of_scene(context.scene).masks(group)
     method = splat_group.possible(group, settings.to_method())
@@ -51,7 +48,7 @@ def apply_arguments(context: Context, group: Members) -> dict[str, Any]:
     return splat_group.stored_arguments(group, settings.to_budget(), masks, method, views)
 
 
-def _of_objects(group: Members) -> str:
+def _of_objects(group: splat_group.Members) -> str:
     return f" of {len(group)} objects" if len(group) > 1 else ""
 
 
@@ -123,7 +120,7 @@ class REFINE_OT_apply(Job, bpy.types.Operator):
         reads = [splat_group.read_for_export(member) for member in group] if form else []
         arguments = apply_arguments(context, group)
 
-        def pruned(progress: Progress) -> tuple[Result, list[Change]]:
+        def pruned(progress: Progress) -> tuple[Result, list[splat_group.Change]]:
             sized = splat_group.sized(arguments, form, reads) if form else arguments
             result = prune(**sized, partial=True, progress=progress)
             return result, splat_group.changes(frames, result)

@@ -20,7 +20,6 @@ from ..viewport import draw as viewport_draw
 from . import camera_operators, images, operators, plans, render_operators, transforms, wrapped
 from .marks import ROLES
 from .operator_bases import Acting, Answer, idle, in_object_mode, now, tooltips
-from .plans import cached
 from .properties import HINTS, METHODS
 from .select_operators import ACTIONS
 from .select_tools import SHAPES, selected_count
@@ -49,7 +48,7 @@ def _count(context: bpy.types.Context) -> int:
     def count() -> int:
         return sum(mesh_layout.splat_count(p.obj.data) for p in instances.shown_by(context))
 
-    return cached("instanced", count)
+    return plans.cached("instanced", count)
 
 
 def _instances(context: bpy.types.Context) -> str:
@@ -114,7 +113,7 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
             layout.label(text=frames, icon="CAMERA_DATA")
         elif settings.source != "ACTIVE":
             choice = CameraChoice.of_scene(context.scene)
-            count = cached("cameras", lambda: len(choice.cameras(context)))
+            count = plans.cached("cameras", lambda: len(choice.cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
             layout.prop(settings, "exact")
         obj = context.object
@@ -122,7 +121,7 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
             return
         record = mesh_scores.record(obj.data)
         if record is None:
-            turn = cached("turn", lambda: known_turn(context, obj))
+            turn = plans.cached("turn", lambda: known_turn(context, obj))
             alignment = Alignment(turn, known=True)
         else:
             alignment = Alignment.from_facts(record.get("alignment"))
@@ -301,7 +300,7 @@ def _draw_objects(layout: bpy.types.UILayout, objects: Sequence[bpy.types.Object
     several = len(objects) > 1
     name = f"{len(objects)} objects, one scene" if several else obj.name
     text = f"{name}: {count:,} splats, SH degree {degree}"
-    stored = None if several else cached("layout", lambda: mesh_layout.layout_if_any(obj))
+    stored = None if several else plans.cached("layout", lambda: mesh_layout.layout_if_any(obj))
     text += f", {size_in_words(stored.file_bytes(count))}" if stored else ""
     wrapped.label(layout, text, icon="OUTLINER_OB_POINTCLOUD")
     if several:
@@ -322,7 +321,7 @@ def _draw_plan(layout: bpy.types.UILayout, obj: Any, record: Any, plan: Any) -> 
         return
     objects = splat_group.chosen(obj)
     question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
-    if changed := cached(question, lambda: plans.stale(*objects)):
+    if changed := plans.cached(question, lambda: plans.stale(*objects)):
         wrapped.label(layout, f"Score again: {', '.join(changed)}", icon="ERROR")
     if plan is None:
         return  # a timer makes it

@@ -13,11 +13,9 @@ import bpy
 import numpy as np
 
 from ..cameras import SOURCE, WEIGHT, CameraChoice, render_size
-from ..core.errors import RefineError
+from ..core import ClosedForm, RefineError, prune
 from ..core.execute import in_time
-from ..core.methods import ClosedForm
 from ..core.operations import row_in
-from ..core.prune import prune
 from ..core.quality.alignment import Alignment
 from ..core.quality.curve import WAYS, Quality, expected_seconds, in_words, out_of_reach, parted
 from ..core.report import MANY_UNSEEN, sizes_in_words
@@ -30,7 +28,6 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
-from ..objects.splat_group import Outcome
 from . import images, operator_bases
 from .wrapped import counted
 
@@ -236,7 +233,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     result = prune(**arguments)
     splat_group.mark_removed(group, result.keep)
     counts = result.report["splats"]
-    outcome = Outcome.of(count, counts["kept"], *map(int, arguments["sizes"]))
+    outcome = splat_group.Outcome.of(count, counts["kept"], *map(int, arguments["sizes"]))
     gone = left - outcome.kept
     share = gone / left
     becomes = way

@@ -18,15 +18,12 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core import Budget, Levels, Merge, Method, RefineError
 from ..core.cleaning.clean import DEFAULT_REASONS
-from ..core.errors import RefineError
 from ..core.formats.format import Format
 from ..core.formats.ply import REQUIRED
 from ..core.formats.registry import SUFFIXES, format_named
-from ..core.lod import Levels
 from ..core.methods import METHODS as CORE_METHODS
-from ..core.methods import Merge, Method
-from ..core.selection import Budget
 from ..core.splats import MODELS
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING

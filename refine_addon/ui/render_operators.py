@@ -13,7 +13,7 @@ import numpy as np
 from bpy.props import BoolProperty
 
 from .. import main_thread
-from ..core.execute import Cancelled
+from ..core import Cancelled
 from ..render import card, engine, meshes
 from ..viewport import draw as viewport_draw
 from .images import put

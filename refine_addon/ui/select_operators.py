@@ -8,8 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from bpy.types import Context
 from numpy.typing import NDArray
 
-from ..core import picking
-from ..core.errors import RefineError
+from ..core import RefineError, picking
 from ..core.execute import Progress
 from ..core.spherical_harmonics import grading
 from ..core.splats import opacity
@@ -18,7 +17,6 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh import selection
-from ..mesh.layout import SplatObject
 from ..objects import splat_group
 from ..objects.demands import Demands
 from ..viewport import draw as viewport_draw
@@ -87,7 +85,7 @@ class REFINE_OT_select_by(Acting, bpy.types.Operator):
         self.report({"INFO"}, f"{selection.count(checked.obj):,} splats are selected")
 
 
-def taken(context: Context, checked: SplatObject, what: str) -> NDArray[np.bool_]:
+def taken(context: Context, checked: mesh_layout.SplatObject, what: str) -> NDArray[np.bool_]:
     """Splats of one of `SETS`, or of `marks.WHAT`, (N,)."""
     settings = context.scene.refine
     if what == "SELECTED":

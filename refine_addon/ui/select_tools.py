@@ -18,11 +18,10 @@ from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
 from ..cameras import world_matrix
-from ..core import picking
+from ..core import Splats, picking
 from ..core.affine import transformed
 from ..core.execute import Progress
 from ..core.picking import Mode, Prepared, Sight, Surface
-from ..core.splats import Splats
 from ..core.views import pinhole
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit

@@ -13,7 +13,7 @@ import numpy as np
 from bpy.props import BoolProperty
 from bpy.types import Context
 
-from ..core.errors import RefineError
+from ..core import RefineError
 from ..core.execute import Progress, run_all
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit

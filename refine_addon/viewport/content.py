@@ -14,7 +14,7 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import RefineError
+from ..core import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores

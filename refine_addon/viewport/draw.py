@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import RefineError
+from ..core import RefineError
 from ..mesh import drift as mesh_drift
 from ..mesh.layout import changed_data, looks_like_splats, splat_count
 from ..objects.instances import placings
