@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core import RefineError
 from ..core.affine import Move, affine_moves
-from . import attributes as mesh_attributes
+from . import attributes
 from .layout import ROTATION, SCALE, Data, check, has, is_native, sh_degree
 
 HOME = "refine_home"
@@ -45,11 +45,11 @@ class Drift(NamedTuple):
 
 def stamp(mesh: Data) -> None:
     """Note the present state of all splats as free of drift."""
-    position = mesh_attributes.read_attribute(mesh, "position")
-    mesh_attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", position)
+    position = attributes.read_attribute(mesh, "position")
+    attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", position)
     number = (zlib.crc32(position.data) << 3 & _OBJECT) or 1 << 3
     codes = _checksums(_shapes(mesh)) << _CHECKSUM | np.uint32(number | sh_degree(mesh))
-    mesh_attributes.write_attribute(mesh, SHAPE, "INT", codes.view(np.int32))
+    attributes.write_attribute(mesh, SHAPE, "INT", codes.view(np.int32))
 
 
 def is_stamped(mesh: Data) -> bool:
@@ -116,7 +116,7 @@ class Notes:
 
     def __init__(self, mesh: Data) -> None:
         self.home, self.position, codes = (
-            mesh_attributes.read_attribute(mesh, name) for name in (HOME, "position", SHAPE)
+            attributes.read_attribute(mesh, name) for name in (HOME, "position", SHAPE)
         )
         self.codes = codes.view(np.uint32)
         # In Blender's own splats the attribute names of harmonics do not depend on the degree.
@@ -164,7 +164,7 @@ def _shapes(mesh: Data) -> list[NDArray[np.float32]]:
     names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
     names = [SCALE, ROTATION] if is_native(mesh) else names
     there = (name for name in names if name in mesh.attributes)  # discs have no third scale
-    return [mesh_attributes.read_attribute(mesh, name) for name in there]
+    return [attributes.read_attribute(mesh, name) for name in there]
 
 
 def _checksums(shapes: Sequence[NDArray[np.float32]], step: int = 1) -> NDArray[np.uint32]:

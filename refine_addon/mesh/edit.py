@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core import RefineError
 from ..core.formats.ply import REQUIRED
-from . import attributes as mesh_attributes
+from . import attributes
 from .layout import SplatObject, has, splat_count
 
 REMOVE = "refine_remove"  # Boolean point attribute: splats that the budget removes
@@ -80,11 +80,11 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
     """Delete the marked vertices, (N,) bool, where `check_deletable` allows it.
     `all_or_nothing` undoes a failure. An applied geometry-nodes modifier is the fastest way, and
     keeps attributes of every type, vertex groups, materials and custom properties."""
-    mesh_attributes.remove_attribute(obj.data, REMOVE)
+    attributes.remove_attribute(obj.data, REMOVE)
     if not remove.any():
         return
     expected = len(remove) - int(np.count_nonzero(remove))
-    mesh_attributes.write_attribute(obj.data, REMOVE, "BOOLEAN", remove)
+    attributes.write_attribute(obj.data, REMOVE, "BOOLEAN", remove)
     tree, _ = _tree("GeometryNodeDeleteGeometry", REMOVE, "BOOLEAN", "Selection")
     modifier = obj.modifiers.new("REFINE delete", "NODES")
     name = modifier.name
@@ -103,7 +103,7 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         if name in obj.modifiers:
             obj.modifiers.remove(obj.modifiers[name])
         bpy.data.node_groups.remove(tree)
-        mesh_attributes.remove_attribute(obj.data, REMOVE)
+        attributes.remove_attribute(obj.data, REMOVE)
     left = splat_count(obj.data)
     if left != expected:
         raise RefineError(
@@ -117,18 +117,18 @@ def mark(obj: bpy.types.Object, name: str, values: NDArray[Any]) -> None:
     check_writable(obj)
     if name == REMOVE or values.any():
         kind = "BOOLEAN" if values.dtype == np.bool_ else "INT"
-        mesh_attributes.write_attribute(obj.data, name, kind, values)
+        attributes.write_attribute(obj.data, name, kind, values)
     elif name in obj.data.attributes:
-        mesh_attributes.remove_attribute(obj.data, name)
+        attributes.remove_attribute(obj.data, name)
     else:
         return
-    mesh_attributes.updated(obj.data)
+    attributes.updated(obj.data)
 
 
 def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     # A splat's own properties protect nothing.
     if has(obj.data, name, *MARKING) and name not in REQUIRED:
-        return mesh_attributes.read_attribute(obj.data, name) > 0
+        return attributes.read_attribute(obj.data, name) > 0
     return group_weights(obj, name) > 0.0 if name in obj.vertex_groups else None
 
 
@@ -158,7 +158,7 @@ def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
         bpy.context.scene.collection.objects.link(helper)
         helper.modifiers.new("REFINE read", "NODES").node_group = tree
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        return mesh_attributes.read_attribute(helper.evaluated_get(depsgraph).data, _GROUP_VALUES)
+        return attributes.read_attribute(helper.evaluated_get(depsgraph).data, _GROUP_VALUES)
     finally:
         bpy.data.objects.remove(helper)
         bpy.data.node_groups.remove(tree)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ..core import Method, RefineError, Scores, rank
 from ..core.cleaning.clean import REASONS, Cleaned, in_words
 from ..core.quality.curve import Quality
-from . import attributes as mesh_attributes
-from . import edit as mesh_edit
+from . import attributes, edit
 from .layout import Data, SplatObject, has, recorded, rows_of, splat_count
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
@@ -46,7 +45,7 @@ def store(
     curve has it. `facts`: what panels tell besides: `cameras`, name and number of splats of each
     view, and `seconds` of scoring."""
     for checked in group:
-        mesh_edit.check_writable(checked.obj)
+        edit.check_writable(checked.obj)
     total, ranks = len(scores.values), rank(scores.values)
     scored = np.ones(total, np.bool_) if scores.scored is None else scores.scored
     of_all = {
@@ -61,23 +60,23 @@ def store(
     }
     for checked, origin, rows in zip(group, origins, rows_of(map(len, group)), strict=True):
         mesh = checked.mesh
-        mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values[rows])
-        mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks[rows])
-        mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen[rows])
-        mesh_attributes.write_attribute(mesh, SCORED, "BOOLEAN", scored[rows])
+        attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values[rows])
+        attributes.write_attribute(mesh, RANK, "FLOAT", ranks[rows])
+        attributes.write_attribute(mesh, SEEN, "INT", scores.seen[rows])
+        attributes.write_attribute(mesh, SCORED, "BOOLEAN", scored[rows])
         stay = digest(None if protected is None else protected[rows])
         own = {"splats": len(checked), "origin": origin, "protected": stay}
         mesh[RECORD] = json.dumps(of_all | own)
-        mesh_attributes.updated(mesh)
+        attributes.updated(mesh)
 
 
 def forget(checked: SplatObject) -> None:
     """Remove a writable object's scores, their record, and the preview of what goes."""
     mesh = checked.mesh
-    for name in (SCORE, RANK, SEEN, SCORED, mesh_edit.REMOVE):
-        mesh_attributes.remove_attribute(mesh, name)
+    for name in (SCORE, RANK, SEEN, SCORED, edit.REMOVE):
+        attributes.remove_attribute(mesh, name)
     mesh.pop(RECORD, None)
-    mesh_attributes.updated(mesh)
+    attributes.updated(mesh)
 
 
 def digest(mask: NDArray[np.bool_] | None) -> list[int]:
@@ -115,7 +114,7 @@ def stored_scores(group: Sequence[SplatObject], removed: NDArray[np.bool_] | Non
         scoring, label = record(checked.mesh), f"object '{checked.obj.name}'"
         if scoring is None or not all(has(checked.mesh, *each) for each in _KINDS.items()):
             raise RefineError(f"{label}: has no scores; score it first")
-        own = [mesh_attributes.read_attribute(checked.mesh, name) for name in _KINDS]
+        own = [attributes.read_attribute(checked.mesh, name) for name in _KINDS]
         count = len(checked)
         unscored = int(np.count_nonzero(~own[2] & ~removed[rows]))
         if count > scoring["splats"] or unscored:
@@ -153,11 +152,11 @@ def store_floaters(checked: SplatObject, cleaned: Cleaned) -> None:
     reasons = np.zeros(len(cleaned.keep), np.int32)
     for number, name in enumerate(REASONS, start=1):
         reasons[cleaned.by_reason[name]] = number
-    mesh_attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
+    attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
     counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.by_reason.items()}
     content = {"splats": len(reasons), "counts": counts, "sure": cleaned.surety()}
     checked.mesh[FLOATERS] = json.dumps(content)
-    mesh_attributes.updated(checked.mesh)
+    attributes.updated(checked.mesh)
 
 
 def floaters(mesh: Data) -> dict[str, tuple[int, float]] | None:
@@ -188,4 +187,4 @@ def floater_mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.b
     if floaters(checked.mesh) is None:
         raise RefineError(f"object '{checked.obj.name}': find floaters first: Clean")
     numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
-    return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)
+    return np.isin(attributes.read_attribute(checked.mesh, REASON), numbers)

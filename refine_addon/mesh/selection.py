@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from . import attributes as mesh_attributes
+from . import attributes
 from .edit import mark
 from .layout import Data, SplatObject, check, splat_count
 
@@ -89,6 +89,6 @@ def _flags(obj: bpy.types.Object, name: str, flag: str) -> NDArray[np.bool_]:
     if _in_edit_mode(obj):
         vertices = bmesh.from_edit_mesh(obj.data).verts
         return np.fromiter(map(attrgetter(flag), vertices), np.bool_, len(vertices))
-    values = mesh_attributes.attribute_if_any(obj.data, name, "BOOLEAN", "FLOAT")
+    values = attributes.attribute_if_any(obj.data, name, "BOOLEAN", "FLOAT")
     count = splat_count(obj.data)
     return np.zeros(count, np.bool_) if values is None or len(values) != count else values > 0

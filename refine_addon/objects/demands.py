@@ -19,8 +19,7 @@ from ..cameras import world_matrix
 from ..core import RefineError
 from ..core.affine import moved
 from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Zone, any_of, forced
-from ..mesh import attributes as mesh_attributes
-from ..mesh import edit as mesh_edit
+from ..mesh import attributes, edit
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import Data, SplatObject, recorded, splat_count
 
@@ -52,12 +51,12 @@ class Demands:
 
     def of_each(self, group: Sequence[SplatObject]) -> list[Forced]:
         """The same for each object. A name protects in the objects that have it, at least one."""
-        by_name = [mesh_edit.named_masks(group, name) for name in self.names]
+        by_name = [edit.named_masks(group, name) for name in self.names]
         return [self._forced(*each) for each in zip(group, *by_name, strict=True)]
 
     def _forced(self, checked: SplatObject, *named: NDArray[np.bool_] | None) -> Forced:
-        stay = mesh_attributes.attribute_if_any(checked.mesh, mesh_edit.PROTECT, "BOOLEAN")
-        out = mesh_attributes.attribute_if_any(checked.mesh, mesh_edit.MUST_GO, "BOOLEAN")
+        stay = attributes.attribute_if_any(checked.mesh, edit.PROTECT, "BOOLEAN")
+        out = attributes.attribute_if_any(checked.mesh, edit.MUST_GO, "BOOLEAN")
         means = world_means(checked) if self.zones else np.empty((0, 3))
         try:
             return forced(self.zones, means, any_of(stay, *named), out)
@@ -89,7 +88,7 @@ def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
 
 def world_means(checked: SplatObject) -> NDArray[np.float64]:
     """Centres of an object's splats in the world, (N, 3)."""
-    means = mesh_attributes.read_attribute(checked.mesh, "position")
+    means = attributes.read_attribute(checked.mesh, "position")
     return moved(means, world_matrix(checked.obj))
 
 
@@ -141,15 +140,15 @@ def _mark(checked: SplatObject, forced: Forced, reasons: Collection[str]) -> Non
     for number, mask in ((2, removed), (1, forced.protected)):
         if mask is not None:
             force[mask] = number
-    mesh_edit.mark(checked.obj, mesh_edit.FORCE, force)
+    edit.mark(checked.obj, edit.FORCE, force)
     if mesh_scores.record(mesh) is None:
         going, searched = force == 2, mesh_scores.floaters(mesh) is not None
         if searched:
             going |= (force != 1) & mesh_scores.floater_mask(checked, reasons)
         if searched or removed is not None:
-            mesh_edit.mark(checked.obj, mesh_edit.REMOVE, going)
+            edit.mark(checked.obj, edit.REMOVE, going)
         else:
-            mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
+            attributes.remove_attribute(mesh, edit.REMOVE)
     if forced.facts or forced.protected is not None or removed is not None:
         volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]
         _store(mesh, {**forced.counts(), "volumes": volumes})
@@ -198,7 +197,7 @@ def _surface(obj: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int
             "where Blender applies no modifiers; enable it first"
         )
     try:
-        return mesh_attributes.read_triangles(evaluated.to_mesh())
+        return attributes.read_triangles(evaluated.to_mesh())
     finally:
         evaluated.to_mesh_clear()
 

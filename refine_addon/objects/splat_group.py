@@ -24,9 +24,7 @@ from ..core.operations import Scene, prune_scene, run, score_scene, to_size
 from ..core.pictures import PictureFiles
 from ..core.spherical_harmonics import recolored
 from ..core.splats import Splats, joined
-from ..mesh import attributes as mesh_attributes
-from ..mesh import drift as mesh_drift
-from ..mesh import edit as mesh_edit
+from ..mesh import attributes, drift, edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject, rows_of
@@ -96,7 +94,7 @@ def gather(group: Sequence[SplatObject], *, whole: bool | None = False) -> Splat
     for checked in group:
         matrix = world_matrix(checked.obj)
         harmonics = is_uniform(matrix) if whole is None else whole
-        splats = mesh_attributes.splats_from_object(checked, sh_rest=harmonics)
+        splats = attributes.splats_from_object(checked, sh_rest=harmonics)
         if not np.array_equal(matrix, np.eye(4)):
             try:
                 splats = transformed(splats, matrix, rotate_sh=harmonics)
@@ -126,11 +124,11 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
 
 def drift_notes(checked: SplatObject) -> list[str]:
     """Sentences on drift; see `mesh.drift`."""
-    drift = mesh_drift.found(checked.mesh)
-    if drift is None:
+    found = drift.found(checked.mesh)
+    if found is None:
         return []
-    remedy = "; Mend Splats in the panel puts that right" if drift.mendable else ""
-    return [f"object '{checked.obj.name}': {sentence}{remedy}" for sentence in drift.sentences]
+    remedy = "; Mend Splats in the panel puts that right" if found.mendable else ""
+    return [f"object '{checked.obj.name}': {sentence}{remedy}" for sentence in found.sentences]
 
 
 def stored_arguments(
@@ -138,7 +136,7 @@ def stored_arguments(
 ) -> dict[str, Any]:
     """Arguments of `prune` from stored scores; `views` for merging and refitting, None to delete.
     `RefineError` if splats have no scores, or objects were not scored together."""
-    sizes = [mesh_attributes.file_size(member) for member in group]
+    sizes = [attributes.file_size(member) for member in group]
     return {
         "splats": None if views is None else gather(group, whole=True),
         "views": views,
@@ -172,7 +170,7 @@ def sized(
 def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
     """Mark splats outside `keep`, (N,) of all objects."""
     for member, rows in zip(group, rows_of(map(len, group)), strict=True):
-        mesh_edit.mark(member.obj, mesh_edit.REMOVE, ~keep[rows])
+        edit.mark(member.obj, edit.REMOVE, ~keep[rows])
 
 
 Frame = tuple[int, int, NDArray[np.float64]]
@@ -218,15 +216,15 @@ def apply(group: Sequence[SplatObject], parts: Sequence[Change]) -> Outcome:
     if an object would end up empty."""
     outcomes = []
     for checked, part in zip(group, parts, strict=True):
-        mesh_edit.check_deletable(checked.obj)
+        edit.check_deletable(checked.obj)
         if not part.keep.any():
             raise RefineError(
                 f"no splat of object '{checked.obj.name}' would be left; nothing was removed: "
                 "delete the object, or let more stay"
             )
         kept = int(np.count_nonzero(part.keep))
-        outcomes.append(Outcome.of(len(part.keep), kept, *mesh_attributes.file_size(checked)))
-    with mesh_edit.all_or_nothing(group):
+        outcomes.append(Outcome.of(len(part.keep), kept, *attributes.file_size(checked)))
+    with edit.all_or_nothing(group):
         for checked, part in zip(group, parts, strict=True):
             reduce_object(checked, part)
     return Outcome(*map(sum, zip(*outcomes, strict=True)))
@@ -240,11 +238,11 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
 def reduce_object(checked: SplatObject, change: Change) -> None:
     """Delete removed splats, store changed ones, drop floaters and the scores' record."""
     mesh = checked.mesh
-    mesh_edit.delete_vertices(checked.obj, ~change.keep)
-    mesh_attributes.write_columns(mesh, checked.layout, change.columns, change.rows)
-    if change.columns and mesh_drift.is_stamped(mesh) and mesh_drift.found(mesh) is None:
-        mesh_drift.stamp(mesh)  # not where others drifted before
-    mesh_attributes.remove_attribute(mesh, mesh_scores.REASON)
+    edit.delete_vertices(checked.obj, ~change.keep)
+    attributes.write_columns(mesh, checked.layout, change.columns, change.rows)
+    if change.columns and drift.is_stamped(mesh) and drift.found(mesh) is None:
+        drift.stamp(mesh)  # not where others drifted before
+    attributes.remove_attribute(mesh, mesh_scores.REASON)
     for record in (mesh_scores.FLOATERS, mesh_scores.RECORD):
         mesh.pop(record, None)
 
@@ -252,13 +250,13 @@ def reduce_object(checked: SplatObject, change: Change) -> None:
 def grade(checked: SplatObject, rows: NDArray[np.int64], matrix: NDArray[np.float64]) -> None:
     """Multiply the colours of an object's splats `rows`, (M,), by a (3, 3) matrix; all else stays,
     to the bit."""
-    mesh_edit.check_changeable(checked.obj)
-    splats = mesh_attributes.splats_from_object(checked).take(rows)
+    edit.check_changeable(checked.obj)
+    splats = attributes.splats_from_object(checked).take(rows)
     sh_dc, sh_rest = recolored(splats.sh_dc, splats.sh_rest, matrix)
     values = values_by_name(replace(splats, sh_dc=sh_dc, sh_rest=sh_rest))
     columns = {name: values[name] for name in values if name.startswith("f_")}
-    with mesh_edit.all_or_nothing([checked]):
-        mesh_attributes.write_columns(checked.mesh, checked.layout, columns, rows)
+    with edit.all_or_nothing([checked]):
+        attributes.write_columns(checked.mesh, checked.layout, columns, rows)
 
 
 def read_for_export(
@@ -267,13 +265,13 @@ def read_for_export(
     """Read an object; a thread-safe callable builds its PLY in memory, in the imported layout.
     `apply_transform` puts splats into the world, harmonics turned; not if the matrix is flat."""
     if not apply_transform:
-        return mesh_attributes.read_for_file(checked)
+        return attributes.read_for_file(checked)
     names, move = read_to_move(checked, world_matrix(checked.obj))
     if names:
         header = mesh_layout.VERTICAL_AXIS.sub("", checked.layout.header.decode("latin-1"))
         layout = replace(checked.layout, header=header.encode("latin-1"))
         checked = replace(checked, layout=layout)
-    return mesh_attributes.read_for_file(checked, names, lambda: move()[0])
+    return attributes.read_for_file(checked, names, lambda: move()[0])
 
 
 def export_notes(checked: SplatObject, *, apply_transform: bool = False) -> list[str]:
@@ -367,7 +365,7 @@ def prune_object(
     compares = method.name != "closed-form" or budget.psnr is not None or pictures is not None
     harmonics = True if method.changes else None if compares else False
     if save:
-        mesh_edit.check_deletable(checked.obj)
+        edit.check_deletable(checked.obj)
         if not bpy.data.filepath:
             raise RefineError(
                 "the scene is not saved in a .blend file yet: --save has nowhere to save to"
@@ -375,7 +373,7 @@ def prune_object(
 
     def saved(result: Result, exported: Path | None) -> None:
         (change,) = changes(frames_of([checked]), result)
-        with mesh_edit.all_or_nothing([checked]):
+        with edit.all_or_nothing([checked]):
             mesh_scores.store([checked], result.scores, method)
             reduce_object(checked, change)
             try:
@@ -410,8 +408,8 @@ def _scene(checked: SplatObject, demands: Demands, harmonics: bool | None) -> Sc
         checked.layout.file_bytes(len(checked)),
         gather([checked], whole=harmonics),
         demands.of_each([checked])[0],
-        lambda: replace(mesh_attributes.read_for_file(checked)(), axes=axes),
-        mesh_attributes.file_size(checked),
+        lambda: replace(attributes.read_for_file(checked)(), axes=axes),
+        attributes.file_size(checked),
         world_matrix(checked.obj),
         (*modifier_notes(checked.obj), *drift_notes(checked)),
     )

@@ -18,9 +18,7 @@ from ..core.affine import Move, baked, check_affine, is_flat, is_uniform, moved
 from ..core.execute import chunks, run_all
 from ..core.formats.ply_columns import values_by_name
 from ..core.splats import Splats, above_constant
-from ..mesh import attributes as mesh_attributes
-from ..mesh import drift as mesh_drift
-from ..mesh import edit as mesh_edit
+from ..mesh import attributes, drift, edit
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject, forget_axis, sh_degree
 
@@ -41,12 +39,12 @@ def read_to_move(
     Gives the properties that change (maybe none, or normals that it lacks), and a thread-safe
     callable for their values, (N,), and the number mended."""
     check_affine(matrix)
-    notes = mesh_drift.disturbed(checked.mesh) if mend else None
+    notes = drift.disturbed(checked.mesh) if mend else None
     if notes is None and np.array_equal(matrix, np.eye(4)):
         return set(), lambda: ({}, 0)
-    splats = mesh_attributes.splats_from_object(checked)
+    splats = attributes.splats_from_object(checked)
     names = {*values_by_name(splats), *_NORMALS} - {"opacity"}
-    normals = mesh_attributes.read_planes(checked, _NORMALS).T
+    normals = attributes.read_planes(checked, _NORMALS).T
     return names, partial(_moved, splats, normals, matrix, notes)
 
 
@@ -118,11 +116,11 @@ def write_moved(parts: Sequence[tuple[SplatObject, dict[str, NDArray[Any]]]]) ->
     """Store results of `read_to_move`: in all objects or none."""
     group = [checked for checked, _ in parts]
     for checked in group:
-        mesh_edit.check_changeable(checked.obj)
-    with mesh_edit.all_or_nothing(group):
+        edit.check_changeable(checked.obj)
+    with edit.all_or_nothing(group):
         for checked, columns in parts:
-            mesh_attributes.write_columns(checked.mesh, checked.layout, columns)
-            mesh_drift.stamp(checked.mesh)
+            attributes.write_columns(checked.mesh, checked.layout, columns)
+            drift.stamp(checked.mesh)
             if columns:
                 forget_axis(checked.mesh)
 
@@ -134,7 +132,7 @@ def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:
     notes, parts = [], []
     for checked in group:
         obj, label = checked.obj, f"object '{checked.obj.name}'"
-        mesh_edit.check_deletable(obj)
+        edit.check_deletable(obj)
         animated = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
         if animated or obj.constraints:
             what = "animated" if animated else "constrained"

@@ -26,7 +26,7 @@ from ..core.pictures import Layers, draw, seen_from
 from ..core.splats import Splats, drawable, joined
 from ..core.views import View, ViewSet, view_through
 from ..core.visibility.scene import scene_of
-from ..mesh import attributes as mesh_attributes
+from ..mesh import attributes
 from ..mesh.layout import SplatObject, check
 from ..objects.instances import placings
 from . import card, meshes
@@ -152,7 +152,7 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
             continue
         evaluated = SimpleNamespace(data=obj.data.evaluated_get(depsgraph))
         checked = SplatObject(evaluated, check(obj).layout)
-        splats = mesh_attributes.splats_from_object(checked)
+        splats = attributes.splats_from_object(checked)
         local = np.linalg.inv(matrix)
         splats = seen_from(splats, local[:3, :3] @ eye + local[:3, 3])
         parts.append(transformed(splats, matrix, rotate_sh=False))

@@ -15,7 +15,7 @@ from ..cameras import CameraChoice
 from ..core import RefineError
 from ..core.affine import QUARTERS
 from ..core.quality.curve import in_words
-from ..mesh import edit as mesh_edit
+from ..mesh import edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
@@ -76,7 +76,7 @@ class REFINE_OT_turn_cameras(Acting, bpy.types.Operator):
         roots = _roots(cameras, context.object)
         group = [mesh_layout.check(obj) for obj in splat_group.chosen(context.object)]
         for checked in group:
-            mesh_edit.check_writable(checked.obj)
+            edit.check_writable(checked.obj)
         turn = mathutils.Matrix(QUARTERS[self.quarters].tolist()).to_4x4()
         parent = None
         for root in roots:

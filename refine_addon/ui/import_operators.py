@@ -23,8 +23,7 @@ from ..core.formats.registry import INDEX_NAMES, READ_SUFFIXES, read_splats
 from ..core.formats.streamed_sog import INDEX
 from ..core.operations import by_cameras
 from ..core.quality.alignment import Alignment
-from ..mesh import attributes as mesh_attributes
-from ..mesh import drift as mesh_drift
+from ..mesh import attributes, drift
 from ..mesh import layout as mesh_layout
 from ..viewport import draw
 from . import properties
@@ -278,15 +277,15 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
         return [Path(bpy.path.abspath(self.filepath))]
 
     def _import(self, context: Context, file: SplatFile) -> bpy.types.Object:
-        mesh = mesh_attributes.mesh_from_file(file)
+        mesh = attributes.mesh_from_file(file)
         if file.axes:
             mesh[mesh_layout.AXES] = file.axes
-        mesh_drift.stamp(mesh)
+        drift.stamp(mesh)
         obj = bpy.data.objects.new(mesh.name, mesh)
         if self.upright:
             obj.matrix_world = mathutils.Matrix(QUARTER.tolist()).to_4x4()
         target_collection(context).objects.link(obj)
-        self.tell(mesh_attributes.import_notes(file))
+        self.tell(attributes.import_notes(file))
         return obj
 
 

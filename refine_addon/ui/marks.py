@@ -9,11 +9,9 @@ from bpy.types import Context
 
 from ..core import Cleaned, Cleaning, RefineError, clean
 from ..core.execute import Progress
-from ..mesh import attributes as mesh_attributes
-from ..mesh import edit as mesh_edit
+from ..mesh import attributes, edit, selection
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh import selection
 from ..objects import demands, splat_group
 from . import plans
 from .operator_bases import Acting, Answer, Job, Work, idle, on_splats, target_collection, tooltips
@@ -123,7 +121,7 @@ class REFINE_OT_drop_volume(Acting, bpy.types.Operator):
         plans.mark_again(self, context)
 
 
-_MARKS = {"STAY": mesh_edit.PROTECT, "GO": mesh_edit.MUST_GO}
+_MARKS = {"STAY": edit.PROTECT, "GO": edit.MUST_GO}
 
 _ITEMS = (
     ("STAY", "Stay", "Mark the selected splats to stay, whatever the budget"),
@@ -145,9 +143,9 @@ class REFINE_OT_protect(Acting, bpy.types.Operator):
         obj = context.object
         chosen = some(obj, selection.selected(obj))
         for mark, name in _MARKS.items():
-            before = mesh_attributes.attribute_if_any(obj.data, name, "BOOLEAN")
+            before = attributes.attribute_if_any(obj.data, name, "BOOLEAN")
             others = False if before is None else before
-            mesh_edit.mark(obj, name, np.where(chosen, mark == self.mark, others))
+            edit.mark(obj, name, np.where(chosen, mark == self.mark, others))
         plans.mark_again(self, context)
 
 
@@ -160,7 +158,7 @@ class REFINE_OT_find_floaters(Job, bpy.types.Operator):
     def work(self, context: Context) -> Work:
         """Find the floaters; store them, show them, report them."""
         checked, settings = mesh_layout.check(context.object), context.scene.refine
-        mesh_edit.check_writable(checked.obj)
+        edit.check_writable(checked.obj)
         cleaning = Cleaning(settings.to_reasons(), settings.views)
         masks = demands.Demands.of_scene(context.scene).masks([checked])
         splats, views = splat_group.gather([checked]), chosen_views(context)  # in the world

@@ -16,7 +16,7 @@ from bpy.types import Context
 from .. import main_thread
 from ..core.errors import RefineError, described
 from ..core.execute import Cancelled, Progress, TimeLeft, in_time, silent, within
-from ..mesh import attributes as mesh_attributes
+from ..mesh import attributes
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import SplatObject, check, looks_like_splats
 from ..viewport import draw as viewport_draw
@@ -100,7 +100,7 @@ class Target(NamedTuple):
     def of(cls, checked: SplatObject) -> Target:
         """An object's present state."""
         obj, mesh = checked.obj, checked.mesh
-        splats = mesh.session_uid, len(checked), mesh_attributes.digest(checked)
+        splats = mesh.session_uid, len(checked), attributes.digest(checked)
         return cls(obj.name, obj.session_uid, obj.mode, splats)
 
 

@@ -22,7 +22,7 @@ from ..core.prune import REFITTING, prune, score
 from ..core.quality.curve import in_words
 from ..core.report import scoring_notes, sizes_in_words
 from ..core.visibility import frustum
-from ..mesh import edit as mesh_edit
+from ..mesh import edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
@@ -64,7 +64,7 @@ class REFINE_OT_score(Job, bpy.types.Operator):
         method, views = settings.to_method(), chosen_views(context)
         group = splat_group.members(context.object)
         for member in group:
-            mesh_edit.check_writable(member.obj)
+            edit.check_writable(member.obj)
         quality = method.name != "closed-form" or settings.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
         masks = demands.refresh(context.scene, group)  # before `origin` reads the marks
@@ -115,7 +115,7 @@ class REFINE_OT_apply(Job, bpy.types.Operator):
         """Prune; delete removed splats, and change kept ones."""
         group = splat_group.members(context.object)
         for member in group:
-            mesh_edit.check_deletable(member.obj)
+            edit.check_deletable(member.obj)
         frames, form = splat_group.frames_of(group), context.scene.refine.to_form()
         reads = [splat_group.read_for_export(member) for member in group] if form else []
         arguments = apply_arguments(context, group)

@@ -12,7 +12,7 @@ from ..cameras import CameraChoice, known_turn
 from ..core.formats.ply import stated_model
 from ..core.quality.alignment import Alignment
 from ..core.report import size_in_words
-from ..mesh import edit as mesh_edit
+from ..mesh import edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, instances, splat_group
@@ -341,7 +341,7 @@ def _draw_plan(layout: bpy.types.UILayout, obj: Any, record: Any, plan: Any) -> 
 def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
     """Draw the display modes; those that need scores wait for them."""
     current, attributes = viewport_draw.mode(), obj.data.attributes if obj else ()
-    needs = {"HEAT": mesh_scores.RANK, "STAYS": mesh_edit.REMOVE, "GOES": mesh_edit.REMOVE}
+    needs = {"HEAT": mesh_scores.RANK, "STAYS": edit.REMOVE, "GOES": edit.REMOVE}
     grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
     for mode, text, _ in viewport_draw.MODES[1:]:
         cell = grid.row(align=True)

@@ -23,8 +23,7 @@ from ..core.scores import TELLING
 from ..core.selection import Budget, quality_of
 from ..core.splats import MODELS
 from ..core.volumes import Forced
-from ..mesh import attributes as mesh_attributes
-from ..mesh import edit as mesh_edit
+from ..mesh import attributes, edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
@@ -222,7 +221,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     form, uids = settings.to_form(), [member.mesh.session_uid for member in group]
     if form is not None:
         if (form, uids, count) != (_rows or [None])[0]:
-            files = [mesh_attributes.read_for_file(member)() for member in group]
+            files = [attributes.read_for_file(member)() for member in group]
             _rows[:] = [(form, uids, count), row_in(form, files)]
         arguments["sizes"] = (_rows[1], 0)
     predicted = budget.psnr is not None and way != "delete"
@@ -306,7 +305,7 @@ def _same(one: Any, other: Any, scale: float = 0.0) -> bool:
 
 
 def _marked(obj: bpy.types.Object, kind: int) -> list[int]:
-    force = mesh_attributes.attribute_if_any(obj.data, mesh_edit.FORCE, "INT")
+    force = attributes.attribute_if_any(obj.data, edit.FORCE, "INT")
     return mesh_scores.digest(None if force is None else force == kind)
 
 

@@ -12,11 +12,9 @@ from ..core import RefineError, picking
 from ..core.execute import Progress
 from ..core.spherical_harmonics import grading
 from ..core.splats import opacity
-from ..mesh import attributes as mesh_attributes
-from ..mesh import edit as mesh_edit
+from ..mesh import attributes, edit, selection
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh import selection
 from ..objects import splat_group
 from ..objects.demands import Demands
 from ..viewport import draw as viewport_draw
@@ -91,18 +89,18 @@ def taken(context: Context, checked: mesh_layout.SplatObject, what: str) -> NDAr
     if what == "SELECTED":
         return selection.selected(checked.obj)
     if what in {"FAINT", "LARGE"}:
-        splats = mesh_attributes.splats_from_object(checked, sh_rest=False)
+        splats = attributes.splats_from_object(checked, sh_rest=False)
         if what == "FAINT":
             return opacity(splats.opacity_logits) < settings.select_opacity
         return splats.log_scales.max(axis=1) > np.log(settings.select_size)
     if what == "FLOATERS":
         return mesh_scores.floater_mask(checked, settings.to_reasons())
     if what == "GOING":
-        if mesh_edit.REMOVE not in checked.mesh.attributes:
+        if edit.REMOVE not in checked.mesh.attributes:
             raise RefineError(
                 f"object '{checked.obj.name}': nothing goes yet; score the splats first"
             )
-        return mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
+        return attributes.read_attribute(checked.mesh, edit.REMOVE) > 0
     masks = Demands.of_scene(context.scene).masks([checked])
     mask = masks["protected" if what == "STAYING" else "removed"]
     return np.zeros(len(checked), np.bool_) if mask is None else mask
@@ -119,9 +117,9 @@ class REFINE_OT_grow_selection(Job, bpy.types.Operator):
     def work(self, context: Context) -> Work:
         """Grow or shrink the selection."""
         checked, shrink = mesh_layout.check(context.object), self.shrink
-        mesh_edit.check_writable(checked.obj)
+        edit.check_writable(checked.obj)
         chosen = some(checked.obj, selection.selected(checked.obj))
-        means = mesh_attributes.read_attribute(checked.mesh, "position")
+        means = attributes.read_attribute(checked.mesh, "position")
 
         def changed(progress: Progress) -> NDArray[np.bool_]:
             neighbours = picking.neighbours_of(means, progress=progress)
@@ -140,7 +138,7 @@ class REFINE_OT_separate_selected(Acting, bpy.types.Operator):
         """Copy the object, and delete from each the other's splats."""
         checked = mesh_layout.check(context.object)
         chosen = some(checked.obj, selection.selected(checked.obj))
-        mesh_edit.check_deletable(checked.obj)
+        edit.check_deletable(checked.obj)
         if chosen.all():
             raise RefineError(
                 f"object '{checked.obj.name}': all splats are selected; none would be left"

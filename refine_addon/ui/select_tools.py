@@ -23,9 +23,7 @@ from ..core.affine import transformed
 from ..core.execute import Progress
 from ..core.picking import Mode, Prepared, Sight, Surface
 from ..core.views import pinhole
-from ..mesh import attributes as mesh_attributes
-from ..mesh import edit as mesh_edit
-from ..mesh import selection
+from ..mesh import attributes, edit, selection
 from ..mesh.layout import SplatObject
 from ..viewport import draw as viewport_draw
 from ..viewport.view import Camera
@@ -77,7 +75,7 @@ class Stroke:
         matrix = world_matrix(obj)
         with selection.readable(obj) as checked:
             away, self.before = _not_drawn(checked), selection.selected(checked.obj)
-            digest = mesh_attributes.digest(checked)
+            digest = attributes.digest(checked)
             splats = (obj.data.session_uid, digest, matrix.tobytes(), away.tobytes())
             view = (splats, camera.key())
             source = _kept.get(view) or _kept.get(splats) or _drawn(checked, away)
@@ -152,7 +150,7 @@ class Stroke:
 
 def _drawn(checked: SplatObject, away: NDArray[np.bool_]) -> Splats:
     """An object's splats; those in `away`, (N,), get no opacity."""
-    splats = mesh_attributes.splats_from_object(checked, sh_rest=False)
+    splats = attributes.splats_from_object(checked, sh_rest=False)
     logits = np.where(away, np.float32(-np.inf), splats.opacity_logits)
     return replace(splats, opacity_logits=logits)
 
@@ -160,8 +158,8 @@ def _drawn(checked: SplatObject, away: NDArray[np.bool_]) -> Splats:
 def _not_drawn(checked: SplatObject) -> NDArray[np.bool_]:
     """Splats that views do not show, (N,): hidden ones, and those of other display modes."""
     away, mode = selection.hidden(checked.obj), viewport_draw.mode()
-    if mode in {"STAYS", "GOES"} and mesh_edit.REMOVE in checked.mesh.attributes:
-        going = mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
+    if mode in {"STAYS", "GOES"} and edit.REMOVE in checked.mesh.attributes:
+        going = attributes.read_attribute(checked.mesh, edit.REMOVE) > 0
         away |= going if mode == "STAYS" else ~going
     return away
 

@@ -15,8 +15,7 @@ from bpy.types import Context
 
 from ..core import RefineError
 from ..core.execute import Progress, run_all
-from ..mesh import drift as mesh_drift
-from ..mesh import edit as mesh_edit
+from ..mesh import drift, edit
 from ..mesh import layout as mesh_layout
 from ..objects import splat_group, transforms
 from . import plans, wrapped
@@ -56,12 +55,10 @@ class REFINE_OT_mend(Job, bpy.types.Operator):
     def work(self, context: Context) -> Work:
         """Mend those of the selected objects that drifted."""
         mesh_layout.check(context.object)
-        drifted = {
-            obj.data: obj for obj in splat_group.chosen(context.object) if mesh_drift.of(obj)
-        }
+        drifted = {obj.data: obj for obj in splat_group.chosen(context.object) if drift.of(obj)}
         group = [mesh_layout.check(obj) for obj in drifted.values()]
         for each in group:
-            mesh_edit.check_changeable(each.obj)
+            edit.check_changeable(each.obj)
         moves = [transforms.read_to_move(each, np.eye(4), mend=True)[1] for each in group]
 
         def moved(progress: Progress) -> list[Any]:
@@ -75,10 +72,10 @@ class REFINE_OT_mend(Job, bpy.types.Operator):
 
 def draw(layout: bpy.types.UILayout, objects: Sequence[bpy.types.Object]) -> None:
     """Draw the objects' drift, and the buttons that move splats."""
-    drifts = [drift for drift in map(mesh_drift.of, objects) if drift]
-    for sentence in dict.fromkeys(s for drift in drifts for s in drift.sentences):
+    drifts = list(filter(None, map(drift.of, objects)))
+    for sentence in dict.fromkeys(s for found in drifts for s in found.sentences):
         wrapped.label(layout, sentence, icon="ERROR")
-    if any(drift.mendable for drift in drifts):
+    if any(found.mendable for found in drifts):
         layout.operator("refine.mend", icon="MODIFIER")
     if len(objects) == 1 and objects[0].matrix_basis != mathutils.Matrix():
         layout.operator("refine.bake_transform", icon="OBJECT_ORIGIN")
@@ -93,19 +90,19 @@ def _draw_apply(menu: bpy.types.Menu, context: Context) -> None:
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Forget the drift of changed objects; stamp new splats soon."""
     for data in mesh_layout.changed_data(depsgraph):
-        mesh_drift.known.pop(data.session_uid, None)
+        drift.known.pop(data.session_uid, None)
         if _is_new(data):
             _stamp_soon()
 
 
 def _changed(*_: object) -> None:
     """Forget all drift after undo, redo and loading; stamp new splats soon."""
-    mesh_drift.known.clear()
+    drift.known.clear()
     _stamp_soon()
 
 
 def _is_new(data: mesh_layout.Data) -> bool:
-    return mesh_layout.holds_splats(data) and not (data.library or mesh_drift.is_stamped(data))
+    return mesh_layout.holds_splats(data) and not (data.library or drift.is_stamped(data))
 
 
 def _stamp_soon() -> None:
@@ -118,14 +115,14 @@ def _stamp() -> None:
     for obj in bpy.data.objects:
         if mesh_layout.looks_like_splats(obj) and _is_new(obj.data) and obj.mode != "EDIT":
             with contextlib.suppress(RefineError):  # it may only look like splats
-                mesh_drift.stamp(mesh_layout.check(obj).mesh)
+                drift.stamp(mesh_layout.check(obj).mesh)
 
 
 def unregister() -> None:
     """Stop the timer, and forget all drift."""
     if bpy.app.timers.is_registered(_stamp):
         bpy.app.timers.unregister(_stamp)
-    mesh_drift.known.clear()
+    drift.known.clear()
 
 
 MENUS = {"VIEW3D_MT_object_apply": _draw_apply}

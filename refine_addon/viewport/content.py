@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import RefineError
-from ..mesh import attributes as mesh_attributes
-from ..mesh import edit as mesh_edit
+from ..mesh import attributes, edit, selection
 from ..mesh import scores as mesh_scores
-from ..mesh import selection as mesh_selection
 from ..mesh.layout import SplatObject, check, looks_like_splats, rows_of, sh_degree
 from ..objects.instances import Key, Placing, placings
 from . import shader
@@ -150,7 +148,7 @@ class Content:
     def read_edited(self, obj: bpy.types.Object) -> None:
         """Read an object in edit mode; not while Blender draws, as this updates the mesh."""
         self._stale.discard(obj.data.session_uid)
-        with mesh_selection.readable(obj) as checked:
+        with selection.readable(obj) as checked:
             self._read(checked, obj.data.session_uid)
 
     def _read(self, checked: SplatObject, uid: int) -> None:
@@ -158,19 +156,19 @@ class Content:
         mesh = checked.mesh
         held = self._held.setdefault(uid, MeshSplats())
         held.read = Marks(
-            mesh_attributes.attribute_if_any(mesh, mesh_scores.RANK, "FLOAT"),
-            mesh_attributes.attribute_if_any(mesh, mesh_edit.REMOVE, "BOOLEAN"),
-            mesh_attributes.attribute_if_any(mesh, mesh_edit.FORCE, "INT"),
-            mesh_attributes.attribute_if_any(mesh, mesh_selection.name_of(mesh), "BOOLEAN"),
-            mesh_attributes.attribute_if_any(mesh, mesh_selection.HIDDEN, "BOOLEAN"),
+            attributes.attribute_if_any(mesh, mesh_scores.RANK, "FLOAT"),
+            attributes.attribute_if_any(mesh, edit.REMOVE, "BOOLEAN"),
+            attributes.attribute_if_any(mesh, edit.FORCE, "INT"),
+            attributes.attribute_if_any(mesh, selection.name_of(mesh), "BOOLEAN"),
+            attributes.attribute_if_any(mesh, selection.HIDDEN, "BOOLEAN"),
         )
-        signature = (len(checked), sh_degree(mesh), mesh_attributes.digest(checked))
+        signature = (len(checked), sh_degree(mesh), attributes.digest(checked))
         if signature != held.signature:
             equal = [one for one in self._held.values() if one.signature == signature]
             if packed := next((one.packed for one in equal if not one.future), None):
                 held.packed, held.future, held.important = packed, None, None
             else:
-                held.future = self.pool.submit(pack, mesh_attributes.splats_from_object(checked))
+                held.future = self.pool.submit(pack, attributes.splats_from_object(checked))
             held.signature = signature
         if held.future is None:
             self._mark(held)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import RefineError
-from ..mesh import drift as mesh_drift
+from ..mesh import drift
 from ..mesh.layout import changed_data, looks_like_splats, splat_count
 from ..objects.instances import placings
 from . import overlays, shader
@@ -161,7 +161,7 @@ def _draw_legend() -> None:
     warnings = [  # here too, as the panel may be closed
         f"'{obj.name}' was transformed by Blender's own tools: Mend Splats in the tab REFINE"
         for obj in bpy.context.visible_objects
-        if looks_like_splats(obj) and (drift := mesh_drift.of(obj)) and drift.mendable
+        if looks_like_splats(obj) and (found := drift.of(obj)) and found.mendable
     ]
     overlays.draw_legend(bpy.context, _state.mode, _state.content.marks(), warnings)
 

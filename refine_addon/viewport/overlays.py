@@ -17,7 +17,7 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Color, Vector
 from numpy.typing import NDArray
 
-from ..mesh import attributes as mesh_attributes
+from ..mesh import attributes
 from ..mesh.layout import looks_like_splats
 from .arrays import GOES, MARKS, STAYS, ramp
 
@@ -65,9 +65,9 @@ def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
     if (colors[:, 3] >= _OPAQUE).all():
         return
     mesh = obj.evaluated_get(context.evaluated_depsgraph_get()).data
-    places, corners = mesh_attributes.read_triangles(mesh)
-    slots = mesh_attributes.read_field(mesh.loop_triangles, "material_index", np.int32)
-    normals = mesh_attributes.read_field(mesh.loop_triangles, "normal", np.float32, 3)
+    places, corners = attributes.read_triangles(mesh)
+    slots = attributes.read_field(mesh.loop_triangles, "material_index", np.int32)
+    normals = attributes.read_field(mesh.loop_triangles, "normal", np.float32, 3)
     toward = context.region_data.view_rotation @ Vector((0.0, 0.0, 1.0))
     toward = (obj.matrix_world.to_3x3().transposed() @ toward).normalized()
     paint = colors[slots.clip(0, len(colors) - 1)]
