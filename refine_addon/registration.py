@@ -6,6 +6,7 @@ Every class of Blender's kinds in `MODULES` is registered; an operator's name is
 from __future__ import annotations
 
 import importlib
+from contextlib import ExitStack
 from functools import partial
 
 import bpy
@@ -37,7 +38,7 @@ _HANDLERS = [
     for event in events
 ]
 
-_commands: list[object] = []
+_undo = ExitStack()  # Undoes what `register` did, in reverse
 
 
 def register() -> None:
@@ -46,29 +47,22 @@ def register() -> None:
         if issubclass(cls, bpy.types.Operator):
             cls.bl_idname = cls.__name__.replace("REFINE_OT_", "refine.")
         bpy.utils.register_class(cls)
+        _undo.callback(bpy.utils.unregister_class, cls)
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
-    for name, entry in MENUS:
-        getattr(bpy.types, name).append(entry)
-    for handlers, handler in _HANDLERS:
-        handlers.append(handler)
+    _undo.callback(delattr, bpy.types.Scene, "refine")
+    menus = [(getattr(bpy.types, name), entry) for name, entry in MENUS]
+    for parts, part in [*menus, *_HANDLERS]:
+        parts.append(part)
+        _undo.callback(parts.remove, part)
     for module in MODULES:
-        if hasattr(module, "register"):
-            module.register()
+        getattr(module, "register", lambda: None)()
+        _undo.callback(getattr(module, "unregister", lambda: None))
     images.use(BlenderImages())
-    _commands.append(bpy.utils.register_cli_command("refine", partial(command.main, scene=True)))
+    _undo.callback(images.use, None)
+    added = bpy.utils.register_cli_command("refine", partial(command.main, scene=True))
+    _undo.callback(bpy.utils.unregister_cli_command, added)
 
 
 def unregister() -> None:
-    """Undo `register`, in reverse."""
-    bpy.utils.unregister_cli_command(_commands.pop())
-    images.use(None)
-    for module in reversed(MODULES):
-        if hasattr(module, "unregister"):
-            module.unregister()
-    for handlers, handler in _HANDLERS:
-        handlers.remove(handler)
-    for name, entry in MENUS:
-        getattr(bpy.types, name).remove(entry)
-    del bpy.types.Scene.refine
-    for cls in reversed(CLASSES):
-        bpy.utils.unregister_class(cls)
+    """Undo `register`."""
+    _undo.close()
