@@ -72,7 +72,7 @@ def painter(splats: Splats, view: View, layers: Layers | None) -> Callable[[], N
             return np.moveaxis(pixels[::-1], -1, 0).astype(np.float64)
 
         if layers is None:
-            return between(0)
+            return between(0).clip(0.0, 1.0)
         image, passed, left = np.zeros((4, *size)), 1.0, layers.left()
         for number, share in enumerate(left):  # the splats before each layer, and behind the last
             if (share > 0.0).any():

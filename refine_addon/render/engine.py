@@ -61,7 +61,6 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc]
 
     bl_idname = "REFINE_SPLATS"
     bl_label = "Splats"
-    bl_use_preview = False
     shared = Shared(stopped=True)  # between renders
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:

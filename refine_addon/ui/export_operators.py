@@ -69,7 +69,6 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     bl_label = "Export Splats"
     doing = "Writing splats"
 
-    filename_ext = ".ply"
     filter_glob: StringProperty(default=";".join(f"*{end}" for end in SUFFIXES), options={"HIDDEN"})
     suffix: EnumProperty(
         name="Format",
@@ -80,8 +79,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     spz_y_up: BoolProperty(**properties.SPZ_Y_UP)
     settled = _FORMATS[0][0]  # Format at the last `check`
 
-    @staticmethod
-    def new_name(obj: bpy.types.Object) -> str:
+    def new_name(self, obj: bpy.types.Object) -> str:
         """A name that no file beside the .blend has yet."""
         mesh = obj.data
         pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
@@ -125,12 +123,10 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
     bl_label = "Export Levels"
     doing = "Writing levels"
 
-    filename_ext = ""
     check_extension = None
     filter_glob: StringProperty(default=INDEX, options={"HIDDEN"})
 
-    @staticmethod
-    def new_name(obj: bpy.types.Object) -> str:
+    def new_name(self, obj: bpy.types.Object) -> str:
         """Name of a folder, which is made."""
         return f"{splat_group.levels_of(obj)[0].name}_levels"
 

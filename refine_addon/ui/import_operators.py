@@ -92,7 +92,6 @@ class REFINE_OT_import_cameras(_Importing, bpy.types.Operator):
     bl_label = "Import Cameras"
     doing = "Reading cameras"
 
-    filename_ext = ".json"
     filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
 
     def invoke(self, context: Context, _event: bpy.types.Event) -> Answer:
@@ -170,7 +169,6 @@ class REFINE_OT_import_ply(_Importing, bpy.types.Operator):
     bl_label = "Import Splats"
     doing = "Reading splats"
 
-    filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
     spz_y_up: BoolProperty(**properties.SPZ_Y_UP)
     cameras: BoolProperty(

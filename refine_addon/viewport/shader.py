@@ -100,9 +100,7 @@ void main()
   if (!disc) {
     xx += LOW_PASS;
     yy += LOW_PASS;
-  }
-  if (lower.z > 0.5 && !disc) {
-    paint.a *= sqrt(sharp / (xx * yy - xy * xy));
+    paint.a *= lower.z > 0.5 ? sqrt(sharp / (xx * yy - xy * xy)) : 1.0;
   }
   float reach = 2.0 * log(paint.a / ALPHA_CUT);
   if (!(reach > 0.0)) {
