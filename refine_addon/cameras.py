@@ -50,10 +50,10 @@ def view_from_camera(obj: bpy.types.Object) -> View:
         raise RefineError(f"camera '{obj.name}' is {kind}, expected a perspective one; {advice}")
     matrix = world_matrix(obj)
     source = _source(obj)
-    size, aspect = render_size(bpy.context.scene)
+    frame = render_size(bpy.context.scene)
     if source:
-        size, aspect = (source["width"], source["height"]), 1.0
-    lens, shown = _intrinsics(data, size, aspect), _shown(data, matrix)
+        frame = source["width"], source["height"], 1.0
+    lens, shown = _intrinsics(data, *frame), _shown(data, matrix)
     view = View(*pose(obj.name, matrix), *lens, *shown["clip"], _weight(obj), obj.name)
     if not source:
         return view
@@ -61,12 +61,12 @@ def view_from_camera(obj: bpy.types.Object) -> View:
     return replace(view, **{name: source[name] for name in same})
 
 
-def render_size(scene: bpy.types.Scene) -> tuple[tuple[int, int], float]:
+def render_size(scene: bpy.types.Scene) -> tuple[int, int, float]:
     """Width and height of renders, pixels, and a pixel's height over its width."""
     render = scene.render
     width = max(render.resolution_x * render.resolution_percentage // 100, 1)
     height = max(render.resolution_y * render.resolution_percentage // 100, 1)
-    return (width, height), render.pixel_aspect_y / render.pixel_aspect_x
+    return width, height, render.pixel_aspect_y / render.pixel_aspect_x
 
 
 def world_matrix(obj: bpy.types.Object) -> NDArray[np.float64]:
@@ -137,9 +137,8 @@ def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -
     return None
 
 
-def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) -> tuple[Any, ...]:
+def _intrinsics(data: bpy.types.Camera, width: int, height: int, aspect: float) -> tuple[Any, ...]:
     """Focal lengths, principal point and size in pixels, as Blender frames its renders."""
-    width, height = size
     fit = data.sensor_fit
     if fit == "AUTO":
         fit = "HORIZONTAL" if width >= height * aspect else "VERTICAL"

@@ -319,8 +319,8 @@ def _cameras(scene: bpy.types.Scene) -> list[Any]:
     chosen = ["SELECTED" if choice.source == "SELECTED" else "OTHERS", len(cameras)]
     if not cameras:
         return chosen
-    (width, height), aspect = render_size(scene)
-    numbers = np.array([_numbers(camera, (width, height, aspect)) for camera in cameras])
+    frame = render_size(scene)
+    numbers = np.array([_numbers(camera, frame) for camera in cameras])
     # Means and root mean squares, (2, C), which do not depend on the order of cameras.
     means = np.array([numbers.mean(axis=0), np.sqrt((numbers**2).mean(axis=0))])
     axes, place, rest = np.split(means, (9, 12), axis=1)
