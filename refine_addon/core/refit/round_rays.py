@@ -46,7 +46,9 @@ MANY_HITS, FEWER_HITS = 1 << 24, 64
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """Move of a view in a round, about: in distances to the next view; at most in scene sizes."""
 
-VALIDATION_VIEWS = 12  # about the most that validation rays go from
+VALIDATION_VIEWS, APART = 12, 6
+"""Validation rays go from about so many views, or from every sixth if these are more: near few
+cameras a view can gain or lose 10 dB by chance."""
 
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
 _EVERY = 2  # validation rays go through every second row of a round's rays
@@ -162,7 +164,7 @@ class RoundRays:
     def psnr(self, splats: Splats, progress: Progress) -> float:
         """Mean PSNR of kept splats on validation rays, weighted as the views are, dB."""
         if not self._validation:
-            step = -(-len(self.windows) // VALIDATION_VIEWS)
+            step = min(-(-len(self.windows) // VALIDATION_VIEWS), APART)
             windows = [window.moved(0) for window in self.windows[::step]]
             truth_of = partial(cast_truth, self.original, 0, None)
             truths = self._each(truth_of, windows, splats, part(progress, 0.0, 0.5))
