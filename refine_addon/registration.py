@@ -55,8 +55,9 @@ def register() -> None:
         parts.append(part)
         _undo.callback(parts.remove, part)
     for module in MODULES:
-        getattr(module, "register", lambda: None)()
-        _undo.callback(getattr(module, "unregister", lambda: None))
+        if hasattr(module, "register"):
+            module.register()
+            _undo.callback(module.unregister)
     images.use(BlenderImages())
     _undo.callback(images.use, None)
     added = bpy.utils.register_cli_command("refine", partial(command.main, scene=True))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,12 @@ Mask: TypeAlias = "NDArray[np.bool_] | None"
 _LEAF = 1 << 14  # pairs of point and triangle below which a group is not divided further
 
 
-Volume: TypeAlias = "Box | Sphere | Solid | MovedVolume"
-"""A part of space; `inside` says which points, (N, 3), lie in it, (N,): none that is not finite."""
+class Volume(Protocol):
+    """A part of space."""
+
+    def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which points, (N, 3), lie inside, (N,) bool; those that are not finite do not."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class Box:
                 )
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """See `Volume`."""
+        """See `Volume.inside`."""
         between = ((points >= self.low) & (points < self.high)).all(axis=1)
         return np.asarray(between & np.isfinite(points).all(axis=1))
 
@@ -70,7 +74,7 @@ class Sphere:
             raise RefineError(f"sphere has radius {self.radius:g}, expected more than 0")
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """See `Volume`."""
+        """See `Volume.inside`."""
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             away = (points - np.asarray(self.center, np.float64)) / self.radius
             return np.asarray(np.einsum("ij,ij->i", away, away) <= 1.0)
@@ -118,7 +122,7 @@ class Solid:
         self.turned = not np.bincount(edge, np.where(start < end, 1.0, -1.0)).any()
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """See `Volume`."""
+        """See `Volume.inside`."""
         inside = np.zeros(len(points), np.bool_)
         corners = self.vertices.T[:, self.triangles]
         low, high = corners.min(axis=2), corners.max(axis=2)  # (3, T) each
@@ -196,7 +200,7 @@ class MovedVolume:
             raise RefineError(f"is flat (scales {scales}), expected a volume")
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
-        """See `Volume`."""
+        """See `Volume.inside`."""
         return self.volume.inside(moved(points, np.linalg.inv(self.matrix)))
 
 

@@ -51,10 +51,14 @@ def test_only_neighbours_have_a_view_between_them():
     assert {2.0, 4.0, 6.0} < five < set(np.arange(9.0))
     assert transmittance(*shut, *views.centers) == pytest.approx(0.01, abs=1e-3)
     assert with_views_between(views, 5, *shut) == []
+    clear = []
     for one, near in ((each, views[each.name.endswith("8.0")].center) for each in beside):
-        ahead = one.center + 0.5 * np.linalg.norm(one.center - near) * one.rotation[2]
+        moved_by = np.linalg.norm(one.center - near) * one.rotation[2]
         assert (one.center[0] < 2.0) == (near[0] < 2.0)
-        assert transmittance(*shut, one.center, ahead) > 0.5
+        ahead = (one.center + share * moved_by for share in (0.5, 1.0))
+        clear.append([transmittance(*shut, one.center, place) > 0.5 for place in ahead])
+    assert np.all(clear, axis=0)[0]
+    assert np.sum(clear, axis=0)[1] >= 57  # the last of two steps counts, not both
 
 
 @pytest.mark.parametrize(
