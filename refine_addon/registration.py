@@ -57,6 +57,7 @@ def register() -> None:
     for module in MODULES:
         if hasattr(module, "register"):
             module.register()
+        if hasattr(module, "unregister"):
             _undo.callback(module.unregister)
     images.use(BlenderImages())
     _undo.callback(images.use, None)

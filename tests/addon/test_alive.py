@@ -180,6 +180,18 @@ def test_an_object_that_is_deleted_ends_the_work_at_once(start, gate, addon, obj
     assert bpy.ops.refine.import_ply.poll()
 
 
+def test_switching_the_extension_off_ends_the_work(start, gate, addon):
+    """Its thread, too, which scoring held back would keep."""
+    start()
+    (thread,) = (thread for thread in threading.enumerate() if thread.name == "refine")
+    addon.registration.unregister()
+    addon.registration.register()
+    thread.join(60.0)
+
+    assert not thread.is_alive()
+    assert addon.ui.operator_bases.now() is None
+
+
 def test_a_renamed_object_gets_its_result_once_edit_mode_is_left(start, gate, addon, obj):
     """Attributes cannot be written there. Another object has its name by then, and stays."""
     operator, context, _ = start()
