@@ -49,11 +49,6 @@ vec2 tilt_of(mat3 covariance, vec3 seen, float depth, vec2 focal, vec3 x, vec3 y
 
 void main()
 {
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); /* Outside, so that a return draws nothing. */
-  place = vec2(0.0);
-  axes = vec4(0.0);
-  plane = vec4(0.0);
-  paint = vec4(0.0);
   int row = int(value_at(order, gl_InstanceID).r + 0.5);
   vec4 mean = value_at(means, row);
   vec4 upper = value_at(covariances, row);
@@ -66,9 +61,6 @@ void main()
   vec3 seen = vec3(dot(row_x, local), dot(row_y, local), dot(row_z, local));
   bool perspective = view_projection[3][3] == 0.0;
   float depth = -seen.z;
-  if (!(depth > view_data.z)) {
-    return;
-  }
   paint = value_at(colors, row);
   float chosen = SELECTED_SHARE * step(0.5, value_at(selection, row).r);
   paint.rgb = mix(paint.rgb, SELECTED, chosen);
@@ -103,12 +95,8 @@ void main()
     paint.a *= lower.z > 0.5 ? sqrt(sharp / (xx * yy - xy * xy)) : 1.0;
   }
   float reach = 2.0 * log(paint.a / ALPHA_CUT);
-  if (!(reach > 0.0)) {
-    return;
-  }
-  if (view_data.w > 0.5) {
-    reach = 1.0;
-  }
+  bool shown = depth > view_data.z && reach > 0.0;
+  reach = view_data.w > 0.5 ? 1.0 : reach;
   if (view_data.w > 1.5) {
     disc = false;
     xx = CENTER * CENTER;
@@ -121,20 +109,20 @@ void main()
   float radius = length(vec2(0.5 * (xx - yy), xy));
   float longest = mean_square + radius;
   float shortest = disc ? sharp / max(longest, 1e-30) : (xx * yy - xy * xy) / longest;
-  if (disc) {
-    longest = max(longest, THINNEST);
-    shortest = max(shortest, THINNEST);
-  }
-  if (!(shortest > 0.0) || longest > 1e12) {
-    return;
-  }
+  float thinnest = disc ? THINNEST : 0.0;
+  longest = max(longest, thinnest);
+  shortest = max(shortest, thinnest);
+  shown = shown && shortest > 0.0 && longest <= 1e12;
   vec2 direction = vec2(1.0, 0.0);
   if (radius > 1e-6 * mean_square) {
     direction = xx > yy ? normalize(vec2(longest - yy, xy)) : normalize(vec2(xy, longest - xx));
   }
   vec2 along = sqrt(longest) * direction;
   vec2 beside = sqrt(shortest) * vec2(-direction.y, direction.x);
-  vec2 offset;
+  place = corner * sqrt(reach);
+  vec2 offset = place.x * along + place.y * beside;
+  axes = vec4(0.0);
+  plane = vec4(0.0);
   if (disc) {
     /* The ray meets the plane of the disc: see core/visibility/projection.py, _discs. */
     axes = vec4(along / longest, beside / shortest);
@@ -158,11 +146,8 @@ void main()
     }
     offset = mix(low, high, 0.5 * corner + 0.5);
     place = offset;
-  } else {
-    place = corner * sqrt(reach);
-    offset = place.x * along + place.y * beside;
   }
-  gl_Position = vec4(ndc.xy + offset / scale, ndc.z, 1.0);
+  gl_Position = shown ? vec4(ndc.xy + offset / scale, ndc.z, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
 }
 """
 
@@ -175,10 +160,7 @@ void main()
     vec2 hit = vec2(dot(axes.xy, place), dot(axes.zw, place)) / max(nearer, 1e-4);
     float blob = square / DISC_LOW_PASS;
     bool on_plane = nearer > 1e-4 && dot(hit, hit) <= blob;
-    if (on_plane && nearer > plane.z) {
-      discard;
-    }
-    square = on_plane ? dot(hit, hit) : blob;
+    square = !on_plane ? blob : nearer > plane.z ? 1e9 : dot(hit, hit);
   }
   float alpha = min(ALPHA_MAX, paint.a * exp(-0.5 * square));
   vec3 shade = paint.rgb;
