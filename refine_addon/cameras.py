@@ -123,20 +123,6 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     return obj
 
 
-def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -> int | None:
-    """Quarter turns about x after which an imported camera looks as in its file; None if by none.
-    `axes`: (3, 3) rotation to the world of an object with splats as in their file."""
-    source = _source(obj)
-    if not source:
-        return None
-    in_file = np.array(source["rotation"]) @ (QUARTER if source["upright"] else np.eye(3))
-    turn = axes @ in_file.T @ view.rotation  # from where the camera looks to where its file says
-    for number, quarter in QUARTERS.items():
-        if np.abs(turn - quarter).max() < SHEAR:
-            return number
-    return None
-
-
 def _intrinsics(data: bpy.types.Camera, width: int, height: int, aspect: float) -> tuple[Any, ...]:
     """Focal lengths, principal point and size in pixels, as Blender frames its renders."""
     fit = data.sensor_fit
@@ -318,8 +304,12 @@ def _turn(
     axes = linear / scale if scale else linear
     if np.abs(axes @ axes.T - np.eye(3)).max() > SHEAR:
         return None
-    pairs = zip(cameras, views, strict=True)
-    turns = [t for camera, view in pairs if (t := quarter_turn(camera, view, axes)) is not None]
+    turns = []
+    for camera, view in zip(cameras, views, strict=True):
+        if source := _source(camera):
+            in_file = np.array(source["rotation"]) @ (QUARTER if source["upright"] else np.eye(3))
+            turn = axes @ in_file.T @ view.rotation  # from where it looks to where its file says
+            turns += [n for n, quarter in QUARTERS.items() if np.abs(turn - quarter).max() < SHEAR]
     alike = len(set(turns)) == 1 and 2 * len(turns) >= len(cameras)
     return turns[0] if alike else None
 
