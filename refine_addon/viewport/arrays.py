@@ -158,17 +158,6 @@ def tinted(
     return mixed
 
 
-def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> NDArray[np.float32]:
-    """Colours, (M, 4), tinted where `force`, (M,), is one of `MARKS`."""
-    if force is None:
-        return rgba
-    mixed = rgba.copy()
-    for mark, tint in MARKS.items():
-        rows = force == mark
-        mixed[rows] = tinted(mixed[rows], tint, SHARES.get(mode, SHARE))
-    return mixed
-
-
 def colored(packed: Packed, eye: Eye | None, mode: str, marks: Marks) -> NDArray[np.float32]:
     """Colours in a mode with opacity, (M, 4); see `colors`. `marks`: of the M splats."""
     heated = mode == "HEAT" and marks.ranks is not None
@@ -176,7 +165,10 @@ def colored(packed: Packed, eye: Eye | None, mode: str, marks: Marks) -> NDArray
     if mode == "GOES":
         goes, forced = tinted(rgba, TINT, TINT_SHARE), marks.forced
         rgba = goes if forced is None else np.where((forced == GOES)[:, None], rgba, goes)
-    return marked(rgba, marks.forced, mode)
+    for mark, tint in MARKS.items() if marks.forced is not None else ():
+        rows = marks.forced == mark
+        rgba[rows] = tinted(rgba[rows], tint, SHARES.get(mode, SHARE))
+    return rgba
 
 
 def in_front(

@@ -119,10 +119,14 @@ def test_heat_goes_along_the_ramp_by_rank_and_a_tint_leaves_opacity_alone():
 @pytest.mark.parametrize("ground", [0.0, 0.5, 1.0])
 def test_tints_are_seen_on_black_grey_and_white(mode, mark, ground):
     """A channel changes by more than .15, 38 of 255; white, a tint before, changed no white."""
-    rgba = np.array([[ground, ground, ground, 1.0]], np.float32)
+    splats = cloud(1)
+    splats.sh_dc[:] = (ground - 0.5) / 0.28209479
+    packed = arrays.pack(splats)
+    rgba = arrays.colors(packed)
     selected = arrays.tinted(rgba, arrays.SELECTED, arrays.SELECTED_SHARE)
+    marked = arrays.colored(packed, None, mode, arrays.Marks(forced=np.array([mark])))
 
-    assert np.abs(arrays.marked(rgba, np.array([mark]), mode) - rgba).max() > 0.15
+    assert np.abs(marked - rgba).max() > 0.15
     assert np.abs(selected - rgba).max() > 0.25
 
 
