@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .. import main_thread
 from ..cameras import active_camera
-from ..core import Cancelled
+from ..core.execute import Cancelled, chunks
 from ..core.images import read_exr
 from ..core.pictures import Layers, in_order
 from ..mesh import layout as mesh_layout
@@ -165,12 +165,10 @@ class Meshes:
         """Linear colours, (3, H, W) each, after the scene's view transform.
         Blender applies it only where it saves an image. Each band of rows takes it 0.1 s."""
         tall = np.concatenate(pictures, axis=1)
-        rows = max(_PIXELS // tall.shape[2], 1)
-        bands = []
-        for start in range(0, tall.shape[1], rows):
+        for band in chunks(tall.shape[1], max(_PIXELS // tall.shape[2], 1)):
             yield
-            bands.append(self._band_shown(tall[:, start : start + rows]))
-        return np.split(np.concatenate(bands, axis=1), len(pictures), axis=1)
+            tall[:, band] = self._band_shown(tall[:, band])
+        return np.split(tall, len(pictures), axis=1)
 
     def _band_shown(self, band):
         """A band, (3, h, W), after the view transform: by a 16-bit PNG, as fast as possible."""
