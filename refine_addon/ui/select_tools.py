@@ -184,8 +184,6 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
     shape: EnumProperty(name="Shape", description="Shape of the stroke", items=SHAPES)
     mode: EnumProperty(name="Mode", description="How they combine with the selection", items=MODES)
 
-    _stroke: Stroke | None = None
-
     def invoke(self, context: Context, event: bpy.types.Event) -> Answer:
         """Begin a stroke."""
         try:
@@ -203,7 +201,7 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
     def modal(self, context: Context, event: bpy.types.Event) -> Answer:
         """Follow the mouse until the button is released and the view is computed."""
         stroke = self._stroke
-        if stroke is None or event.type in {"ESC", "RIGHTMOUSE"}:
+        if event.type in {"ESC", "RIGHTMOUSE"}:
             return self._over(context, kept=False)
         if event.type == "MOUSEMOVE" and not stroke.released:
             stroke.path.append(_place(context, event))
@@ -231,12 +229,9 @@ class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
         if context.area is not None:
             context.area.header_text_set(None)
             context.area.tag_redraw()
-        stroke, self._stroke = self._stroke, None
-        if stroke is None:
-            return {"CANCELLED"}
         context.window_manager.event_timer_remove(self._timer)
         bpy.types.SpaceView3D.draw_handler_remove(self._drawn, "WINDOW")
-        stroke.end(kept=kept)
+        self._stroke.end(kept=kept)
         return {"FINISHED"} if kept else {"CANCELLED"}
 
 
