@@ -10,11 +10,9 @@ from dataclasses import replace
 from typing import Any
 
 import bpy
-import gpu
 import numpy as np
 from bpy.props import EnumProperty
 from bpy.types import Context
-from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
 from ..cameras import world_matrix
@@ -26,6 +24,7 @@ from ..core.views import pinhole
 from ..mesh import attributes, edit, selection
 from ..mesh.layout import SplatObject
 from ..viewport import draw as viewport_draw
+from ..viewport import overlays
 from ..viewport.view import Camera
 from .operator_bases import FAILURES, Answer, Needing, Worker, fail, idle, on_splats
 from .plans import cached
@@ -166,8 +165,7 @@ def _not_drawn(checked: SplatObject) -> NDArray[np.bool_]:
 
 def _circle(middle: tuple[float, float], radius: float) -> list[tuple[float, float]]:
     """Points of a circle, closed."""
-    turns = np.linspace(0.0, 2.0 * np.pi, 49)
-    return (np.stack([np.cos(turns), np.sin(turns)], axis=1) * radius + middle).tolist()
+    return (overlays.CIRCLE * radius + middle).tolist()
 
 
 def _in_view(context: Context) -> str:
@@ -248,11 +246,9 @@ def _draw(stroke: Stroke, region: int) -> None:
 
 def _line(places: list[tuple[float, float]]) -> None:
     """Draw a line, black beside white, visible on both."""
-    program = gpu.shader.from_builtin("UNIFORM_COLOR")
     for shift, shade in ((1.0, 0.0), (0.0, 1.0)) if places else ():
-        beside = [(x + shift, y - shift) for x, y in places]
-        program.uniform_float("color", (shade, shade, shade, 1.0))
-        batch_for_shader(program, "LINE_STRIP", {"pos": beside}).draw(program)
+        colors = [(shade, shade, shade, 1.0)] * len(places)
+        overlays.shape("LINE_STRIP", np.add(places, (shift, -shift)), colors)()
 
 
 def _key(name: str, kind: str, *values: tuple[str, Any], **held: bool) -> tuple[Any, ...]:

@@ -35,6 +35,7 @@ _GAP = 6  # between the bar and the words above it
 _WHITE, _BLACK = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
 _WARNING = (1.0, 0.8, 0.2, 1.0)
 _TURN = np.linspace(0.0, 2.0 * np.pi, 49)
+CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # Points of a circle, closed, (49, 2)
 
 
 def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
@@ -54,7 +55,7 @@ def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
             colors = np.tile((*_COLORS[item.role], 1.0), (len(lines), 1))
             with gpu.matrix.push_pop():
                 gpu.matrix.multiply_matrix(obj.matrix_world)
-                _shape("LINES", lines * obj.empty_display_size, colors)()
+                shape("LINES", lines * obj.empty_display_size, colors)()
 
 
 def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
@@ -75,17 +76,17 @@ def _mix(context: bpy.types.Context, obj: bpy.types.Object) -> None:
     seen = paint[:, 3] < _OPAQUE
     if not seen.any():
         return
-    shape = _shape("TRIS", places[corners[seen].ravel()], np.repeat(paint[seen], 3, axis=0))
+    faces = shape("TRIS", places[corners[seen].ravel()], np.repeat(paint[seen], 3, axis=0))
     gpu.state.depth_mask_set(True)
     with gpu.matrix.push_pop():
         gpu.matrix.multiply_matrix(obj.matrix_world)
         gpu.state.color_mask_set(False, False, False, False)
         gpu.state.depth_test_set("LESS_EQUAL")
-        shape()
+        faces()
         gpu.state.color_mask_set(True, True, True, True)
         gpu.state.depth_test_set("EQUAL")
         gpu.state.blend_set("ALPHA")
-        shape()
+        faces()
     gpu.state.blend_set("NONE")
     gpu.state.depth_mask_set(False)
     gpu.state.depth_test_set("NONE")
@@ -113,7 +114,7 @@ def _color(
 def _edges(shape: str) -> NDArray[np.float64]:
     """End points of a cube's edges, (24, 3), or of the segments of three circles, (288, 3)."""
     if shape == "SPHERE":
-        circle = np.stack([np.cos(_TURN), np.sin(_TURN), np.zeros_like(_TURN)], axis=1)
+        circle = np.pad(CIRCLE, ((0, 0), (0, 1)))
         pieces = np.stack([circle[:-1], circle[1:]], axis=1).reshape(-1, 3)
     else:
         signs = (-1.0, 1.0)
@@ -170,10 +171,11 @@ def _bar(x: float, y: float, wide: float, high: float, colors: Any) -> None:
         (x + wide * k / (len(colors) - 1), y + up) for k in range(len(colors)) for up in (0, high)
     ]
     painted = np.repeat(np.pad(colors, ((0, 0), (0, 1)), constant_values=1.0), 2, axis=0)
-    _shape("TRI_STRIP", places, painted)()
+    shape("TRI_STRIP", places, painted)()
 
 
-def _shape(kind: str, places: Any, colors: Any) -> Callable[[], None]:
+def shape(kind: str, places: Any, colors: Any) -> Callable[[], None]:
+    """What draws a shape of one of Blender's kinds, with a colour at each of its places."""
     program = gpu.shader.from_builtin("SMOOTH_COLOR")
     content = {"pos": np.asarray(places, np.float32), "color": np.asarray(colors, np.float32)}
     return partial(batch_for_shader(program, kind, content).draw, program)

@@ -79,7 +79,7 @@ def test_edges_of_volumes_are_violet_only_where_the_inside_goes(addon, monkeypat
     overlays, drawn = addon.viewport.overlays, []
     monkeypatch.setattr(overlays, "gpu", MagicMock())  # there is no graphics card
     shape = lambda _kind, _ends, colors: lambda: drawn.append(tuple(colors[0, :3]))  # noqa: E731
-    monkeypatch.setattr(overlays, "_shape", shape)
+    monkeypatch.setattr(overlays, "shape", shape)
     for role in ("PROTECT", "REMOVE", "KEEP"):
         volume(empty((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), role)
     areas = (area for screen in bpy.data.screens for area in screen.areas)
