@@ -235,9 +235,7 @@ def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
     outcome = splat_group.Outcome.of(count, counts["kept"], *map(int, arguments["sizes"]))
     gone = left - outcome.kept
     share = gone / left
-    becomes = way
-    if way != "delete" and (curve is None or curve.as_good(share, way)):
-        becomes = "delete"
+    becomes = "delete" if curve is None or curve.as_good(share, way) else way
     closed = record.get("method") == ClosedForm.name
     remark, seconds, views = "", {}, {}
     if curve is None:
