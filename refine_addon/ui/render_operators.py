@@ -129,11 +129,10 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _begin(self, context: bpy.types.Context) -> None:
         scene = context.scene
-        chosen = [scene.frame_current]
-        if self.animation:
-            chosen = [*range(scene.frame_start, scene.frame_end + 1, scene.frame_step)]
-        self._shared, self._frames = engine.Shared(card=card.available()), chosen
-        self._steps = engine.steps(scene, chosen, self._shared, write=self.animation)
+        every = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        self._frames = every if self.animation else [scene.frame_current]
+        self._shared = engine.Shared(card=card.available())
+        self._steps = engine.steps(scene, self._frames, self._shared, write=self.animation)
         self._started, self._done = time.monotonic(), 0
         self._next: meshes.Step | None = None
 
