@@ -7,9 +7,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -187,8 +187,7 @@ def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
         raise RefineError(f"camera '{obj.name}': {problem}; {advice}") from None
 
 
-@dataclass(frozen=True)
-class CameraChoice:
+class CameraChoice(NamedTuple):
     """Which cameras of a scene decide; `source`: VISIBLE, ACTIVE, SELECTED, COLLECTION or FRAMES.
     COLLECTION uses `collection` with its children, hidden or not; FRAMES uses `frames`."""
 

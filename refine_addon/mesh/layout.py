@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -90,8 +90,7 @@ _TYPES = ("MESH", "POINTCLOUD")
 Data = bpy.types.Mesh | bpy.types.PointCloud
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """Columns of a splat mesh in file order, and the file's header."""
 
     columns: tuple[Column, ...]
@@ -265,7 +264,7 @@ def layout_of(obj: bpy.types.Object) -> Layout:
     layout = _remembered(obj.data) or _standard(obj)
     model = obj.data.get(MODEL)
     if model in MODELS and THIRD_SCALE in (column.name for column in layout.columns):
-        return replace(layout, header=with_model(layout.header, model))
+        return layout._replace(header=with_model(layout.header, model))
     return layout
 
 

@@ -6,10 +6,9 @@ import hashlib
 import json
 import pickle
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -30,8 +29,7 @@ _MOST_MASKS = 16  # Most cached masks; 1 MB each at a million splats
 _masks: dict[bytes, NDArray[np.bool_]] = {}  # Points in each volume, by a digest of both
 
 
-@dataclass(frozen=True, eq=False)
-class Demands:
+class Demands(NamedTuple):
     """Protected splats and those removed by the user; `zones`: volumes in the world.
     `names`: protecting vertex groups and attributes, besides `PROTECT` of `mesh.edit`."""
 

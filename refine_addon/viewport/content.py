@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import gpu
@@ -42,8 +42,7 @@ class MeshSplats:
     kinds: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Slot:
+class Slot(NamedTuple):
     """An object's splats in the textures: `count` in `rows`."""
 
     held: MeshSplats
