@@ -175,11 +175,7 @@ def _tree(kind: str, name: str, data_type: str, target: str) -> tuple[Any, bpy.t
     if hasattr(node, "data_type"):
         node.data_type = data_type
     read.inputs["Name"].default_value = name
-
-    def socket(sockets: Any, wanted: str) -> bpy.types.NodeSocket:
-        return next(each for each in sockets if each.name == wanted and each.enabled)
-
     tree.links.new(start.outputs[0], node.inputs[0])
-    tree.links.new(socket(read.outputs, "Attribute"), socket(node.inputs, target))
+    tree.links.new(read.outputs[0], node.inputs[target])
     tree.links.new(node.outputs[0], end.inputs[0])
     return tree, node
