@@ -247,11 +247,9 @@ def _show(context: Context, images: list[bpy.types.Image]) -> None:
 
 def _fit(names: list[str]) -> None:
     """Fit images into their editors; called once by Blender's timer."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            space = area.spaces.active
-            if area.type != "IMAGE_EDITOR" or not space.image or space.image.name not in names:
-                continue
-            region = next(each for each in area.regions if each.type == "WINDOW")
-            with bpy.context.temp_override(window=window, area=area, region=region):
+    windows = {window.screen: window for window in bpy.context.window_manager.windows}
+    for area in viewport_draw.areas(bpy.context, "IMAGE_EDITOR"):
+        image, place = area.spaces.active.image, {"area": area, "region": area.regions[-1]}
+        if image and image.name in names:
+            with bpy.context.temp_override(window=windows[area.id_data], **place):
                 bpy.ops.image.view_all(fit_view=True)
