@@ -172,8 +172,6 @@ def _tree(kind: str, name: str, data_type: str, target: str) -> tuple[Any, bpy.t
     kinds = ("NodeGroupInput", kind, "GeometryNodeInputNamedAttribute", "NodeGroupOutput")
     start, node, read, end = map(tree.nodes.new, kinds)
     node.domain, read.data_type = "POINT", data_type
-    if hasattr(node, "data_type"):
-        node.data_type = data_type
     read.inputs["Name"].default_value = name
     tree.links.new(start.outputs[0], node.inputs[0])
     tree.links.new(read.outputs[0], node.inputs[target])

@@ -269,8 +269,7 @@ def read_for_export(
     names, move = read_to_move(checked, world_matrix(checked.obj))
     if names:
         header = mesh_layout.VERTICAL_AXIS.sub("", checked.layout.header.decode("latin-1"))
-        layout = checked.layout._replace(header=header.encode("latin-1"))
-        checked = replace(checked, layout=layout)
+        checked = replace(checked, layout=checked.layout._replace(header=header.encode("latin-1")))
     return attributes.read_for_file(checked, names, lambda: move()[0])
 
 
