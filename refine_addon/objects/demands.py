@@ -18,8 +18,7 @@ from ..cameras import world_matrix
 from ..core import RefineError
 from ..core.affine import moved
 from ..core.volumes import Box, Forced, MovedVolume, Role, Solid, Sphere, Zone, any_of, forced
-from ..mesh import attributes, edit
-from ..mesh import scores as mesh_scores
+from ..mesh import attributes, edit, scores
 from ..mesh.layout import Data, SplatObject, recorded, splat_count
 
 RECORD = "refine_forced"  # Custom property: numbers of protected and removed splats, or error, JSON
@@ -139,10 +138,10 @@ def _mark(checked: SplatObject, forced: Forced, reasons: Collection[str]) -> Non
         if mask is not None:
             force[mask] = number
     edit.mark(checked.obj, edit.FORCE, force)
-    if mesh_scores.record(mesh) is None:
-        going, searched = force == 2, mesh_scores.floaters(mesh) is not None
+    if scores.record(mesh) is None:
+        going, searched = force == 2, scores.floaters(mesh) is not None
         if searched:
-            going |= (force != 1) & mesh_scores.floater_mask(checked, reasons)
+            going |= (force != 1) & scores.floater_mask(checked, reasons)
         if searched or removed is not None:
             edit.mark(checked.obj, edit.REMOVE, going)
         else:

@@ -24,9 +24,7 @@ from ..core.operations import Scene, prune_scene, run, score_scene, to_size
 from ..core.pictures import PictureFiles
 from ..core.spherical_harmonics import recolored
 from ..core.splats import Splats, joined
-from ..mesh import attributes, drift, edit
-from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
+from ..mesh import attributes, drift, edit, layout, scores
 from ..mesh.layout import SplatObject, rows_of
 from .demands import NONE, Demands, Masks
 from .transforms import read_to_move, uneven_notes
@@ -56,7 +54,7 @@ class Outcome(NamedTuple):
 def chosen(active: bpy.types.Object) -> list[bpy.types.Object]:
     """Selected splat objects by name, or the active one if not selected. Quick enough to draw."""
     objects = bpy.context.view_layer.objects
-    selected = [obj for obj in objects.selected if mesh_layout.looks_like_splats(obj)]
+    selected = [obj for obj in objects.selected if layout.looks_like_splats(obj)]
     if active not in selected:
         return [active]
     return sorted(selected, key=lambda obj: obj.name)
@@ -64,7 +62,7 @@ def chosen(active: bpy.types.Object) -> list[bpy.types.Object]:
 
 def members(active: bpy.types.Object) -> Members:
     """Checked objects of `chosen`; `RefineError` if two share their data."""
-    group = [mesh_layout.check(obj) for obj in chosen(active)]
+    group = [layout.check(obj) for obj in chosen(active)]
     owners: dict[bpy.types.Mesh, str] = {}
     for member in group:
         other = owners.setdefault(member.mesh, member.obj.name)
@@ -142,7 +140,7 @@ def stored_arguments(
         "views": views,
         "budget": budget,
         "method": method,
-        "scores": mesh_scores.stored_scores(group, masks["removed"]),
+        "scores": scores.stored_scores(group, masks["removed"]),
         **masks,
         # The longest row counts, so that the file is never larger than the budget.
         "sizes": (max(row for row, _ in sizes), sum(fixed for _, fixed in sizes)),
@@ -188,7 +186,7 @@ class Change(NamedTuple):
 
 def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
     """Read what `changes` needs of each object."""
-    return [(len(one), mesh_layout.sh_degree(one.mesh), world_matrix(one.obj)) for one in group]
+    return [(len(one), layout.sh_degree(one.mesh), world_matrix(one.obj)) for one in group]
 
 
 def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
@@ -242,8 +240,8 @@ def reduce_object(checked: SplatObject, change: Change) -> None:
     attributes.write_columns(mesh, checked.layout, change.columns, change.rows)
     if change.columns and drift.is_stamped(mesh) and drift.found(mesh) is None:
         drift.stamp(mesh)  # not where others drifted before
-    attributes.remove_attribute(mesh, mesh_scores.REASON)
-    for record in (mesh_scores.FLOATERS, mesh_scores.RECORD):
+    attributes.remove_attribute(mesh, scores.REASON)
+    for record in (scores.FLOATERS, scores.RECORD):
         mesh.pop(record, None)
 
 
@@ -268,7 +266,7 @@ def read_for_export(
         return attributes.read_for_file(checked)
     names, move = read_to_move(checked, world_matrix(checked.obj))
     if names:
-        header = mesh_layout.VERTICAL_AXIS.sub("", checked.layout.header.decode("latin-1"))
+        header = layout.VERTICAL_AXIS.sub("", checked.layout.header.decode("latin-1"))
         checked = replace(checked, layout=checked.layout._replace(header=header.encode("latin-1")))
     return attributes.read_for_file(checked, names, lambda: move()[0])
 
@@ -283,7 +281,7 @@ def find(name: str) -> bpy.types.Object:
     """The object of that name; else `RefineError` lists those with splats."""
     obj = bpy.context.scene.objects.get(name)
     if obj is None:
-        names = [o.name for o in bpy.context.scene.objects if mesh_layout.looks_like_splats(o)]
+        names = [o.name for o in bpy.context.scene.objects if layout.looks_like_splats(o)]
         listed = ", ".join(names[:8]) or "none"
         raise RefineError(
             f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {listed})"
@@ -306,7 +304,7 @@ def add_levels(
             copy.data = checked.obj.data.copy()
             copy.name = copy.data.name = f"{name}_lod{level.number}"
             bpy.context.view_layer.update()  # its place in the world
-            group = [mesh_layout.check(copy)]
+            group = [layout.check(copy)]
             apply(group, changes(frames_of(group), level.result))
             stats = {**level.facts(), "distance": distance}
             copy[LEVEL_STATS] = {key: value for key, value in stats.items() if value is not None}
@@ -357,7 +355,7 @@ def prune_object(
     """Prune an object of the open scene, export the result, save the .blend (`save`); the report.
     See `core.operations.prune_file`; `how`: `overwrite`, `progress`. On an error the object is
     unchanged; a file that was exported before it stays."""
-    checked = mesh_layout.check(find(name))
+    checked = layout.check(find(name))
     save = save and not dry_run
     method = possible([checked], method)
     # None: an uneven scale is not refused, since only the pictures would need harmonics.
@@ -373,7 +371,7 @@ def prune_object(
     def saved(result: Result, exported: Path | None) -> None:
         (change,) = changes(frames_of([checked]), result)
         with edit.all_or_nothing([checked]):
-            mesh_scores.store([checked], result.scores, method)
+            scores.store([checked], result.scores, method)
             reduce_object(checked, change)
             try:
                 bpy.ops.wm.save_mainfile()
@@ -395,13 +393,13 @@ def score_object(
 ) -> dict[str, Any]:
     """Score an object of the open scene into a PLY, the scene unchanged; see `prune_object`.
     `how`: `output`, `overwrite`, `progress`."""
-    checked = mesh_layout.check(find(name))
+    checked = layout.check(find(name))
     return run(lambda: _scene(checked, demands, None), score_scene(views, method), **how).report
 
 
 def _scene(checked: SplatObject, demands: Demands, harmonics: bool | None) -> Scene:
     """The object in the world, which is also the views' frame."""
-    axes = checked.mesh.get(mesh_layout.AXES, "")
+    axes = checked.mesh.get(layout.AXES, "")
     return Scene(
         f"{bpy.data.filepath}#{checked.obj.name}",
         checked.layout.file_bytes(len(checked)),

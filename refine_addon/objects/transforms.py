@@ -18,8 +18,7 @@ from ..core.affine import Move, baked, check_affine, is_flat, is_uniform, moved
 from ..core.execute import chunks, run_all
 from ..core.formats.ply_columns import values_by_name
 from ..core.splats import Splats, above_constant
-from ..mesh import attributes, drift, edit
-from ..mesh import scores as mesh_scores
+from ..mesh import attributes, drift, edit, scores
 from ..mesh.layout import SplatObject, forget_axis, sh_degree
 
 _NORMALS = ("nx", "ny", "nz")
@@ -166,5 +165,5 @@ def _reset(obj: bpy.types.Object, *, location: bool) -> None:
     for child in obj.children:
         back = obj.matrix_world.inverted() @ before
         child.matrix_parent_inverse = back @ child.matrix_parent_inverse
-    mesh_scores.move_origin(obj.data, np.array(before), np.array(obj.matrix_world))
+    scores.move_origin(obj.data, np.array(before), np.array(obj.matrix_world))
     bpy.context.view_layer.update()

@@ -22,7 +22,7 @@ from ..cameras import active_camera
 from ..core.execute import Cancelled, chunks
 from ..core.images import read_exr
 from ..core.pictures import Layers, in_order
-from ..mesh import layout as mesh_layout
+from ..mesh import layout
 
 COPY_OF = "refine_render"  # Custom property of a copy: its original scene
 
@@ -58,8 +58,8 @@ Steps = Generator[Step | None, None, Callable[[], Layers] | None]
 
 def drawn_by_us(obj: bpy.types.Object) -> bool:
     """Whether an object holds splats that Blender does not draw as such."""
-    return mesh_layout.looks_like_splats(obj) and not (
-        obj.type == "POINTCLOUD" and getattr(obj.data, "type", "") == mesh_layout.NATIVE
+    return layout.looks_like_splats(obj) and not (
+        obj.type == "POINTCLOUD" and getattr(obj.data, "type", "") == layout.NATIVE
     )
 
 

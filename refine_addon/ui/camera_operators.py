@@ -15,9 +15,8 @@ from ..cameras import CameraChoice
 from ..core import RefineError
 from ..core.affine import QUARTERS
 from ..core.quality.curve import in_words
-from ..mesh import edit
+from ..mesh import edit, scores
 from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
 from .operator_bases import Acting
 from .wrapped import counted
@@ -91,7 +90,7 @@ class REFINE_OT_turn_cameras(Acting, bpy.types.Operator):
             parent.matrix_world = turn
         context.view_layer.update()
         for checked in group:
-            mesh_scores.forget(checked)  # the cameras stood elsewhere
+            scores.forget(checked)  # the cameras stood elsewhere
         self.report({"INFO"}, f"Turned {counted(len(cameras), 'camera')}; score again")
 
 

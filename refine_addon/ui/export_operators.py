@@ -19,8 +19,7 @@ from ..core.formats import registry, sog
 from ..core.formats.registry import SUFFIXES, losses, write_splats
 from ..core.formats.streamed_sog import INDEX, StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
-from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
+from ..mesh import layout, scores
 from ..objects import splat_group
 from . import properties
 from .operator_bases import Answer, Job, Work
@@ -57,7 +56,7 @@ class Exporting(Job, ExportHelper):
 
     def read(self, *objects: bpy.types.Object) -> tuple[list[Any], list[str]]:
         """For each object a call that builds its file, and notes."""
-        group, moved = [mesh_layout.check(obj) for obj in objects], self.apply_transform
+        group, moved = [layout.check(obj) for obj in objects], self.apply_transform
         files = [splat_group.read_for_export(each, apply_transform=moved) for each in group]
         notes = [splat_group.export_notes(each, apply_transform=moved) for each in group]
         return files, list(dict.fromkeys(itertools.chain(*notes)))
@@ -82,7 +81,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     def new_name(self, obj: bpy.types.Object) -> str:
         """A name that no file beside the .blend has yet."""
         mesh = obj.data
-        pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
+        pruned = scores.RANK in mesh.attributes and scores.record(mesh) is None
         name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
         names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
         folder = Path(bpy.path.abspath("//"))  # where the file browser starts
@@ -104,7 +103,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         target, overwrite = expanded(bpy.path.abspath(self.filepath)), self.overwrite
         refuse_existing(target, overwrite=overwrite)
         (read,), notes = self.read(context.object)
-        axes = AXES[0] if self.spz_y_up else context.object.data.get(mesh_layout.AXES, "")
+        axes = AXES[0] if self.spz_y_up else context.object.data.get(layout.AXES, "")
 
         def write(progress: Progress) -> list[str]:
             report(progress, 0.0, target.name)
@@ -132,7 +131,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
 
     def work(self, context: Context) -> Work:
         """Write the levels, finest first."""
-        objects = splat_group.levels_of(mesh_layout.check(context.object).obj)
+        objects = splat_group.levels_of(layout.check(context.object).obj)
         files, notes = self.read(*objects)
         width = objects[1][splat_group.LEVEL_STATS].get("distance", np.inf)
         if not self.apply_transform:  # in the object's own unit

@@ -9,9 +9,7 @@ from bpy.types import Context
 
 from ..core import Cleaned, Cleaning, RefineError, clean
 from ..core.execute import Progress
-from ..mesh import attributes, edit, selection
-from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
+from ..mesh import attributes, edit, layout, scores, selection
 from ..objects import demands, splat_group
 from . import plans
 from .operator_bases import Acting, Answer, Job, Work, idle, on_splats, target_collection, tooltips
@@ -67,13 +65,13 @@ class REFINE_OT_add_volume(Acting, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         """Add it, and select it to be moved; the splats stay active."""
-        checked, new = mesh_layout.check(context.object), self.shape != "SELECTED"
+        checked, new = layout.check(context.object), self.shape != "SELECTED"
         for obj in [self._new_empty(context, checked)] if new else _selected_volumes(context):
             item = context.scene.refine.volumes.add()
             item.role = self.role
             item.object = obj
 
-    def _new_empty(self, context: Context, checked: mesh_layout.SplatObject) -> bpy.types.Object:
+    def _new_empty(self, context: Context, checked: layout.SplatObject) -> bpy.types.Object:
         """A new empty around the middle half of the splats, or nearly all if they are kept."""
         means = demands.finite_means(checked)
         share = _OUTSIDE_KEPT if self.role == "KEEP" else _OUTSIDE
@@ -99,7 +97,7 @@ def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Selected objects not listed yet; raises `RefineError` if none fits."""
     listed = {item.object for item in context.scene.refine.volumes}
     objects = [obj for obj in context.selected_objects if obj not in listed]
-    objects = [obj for obj in objects if not mesh_layout.looks_like_splats(obj)]
+    objects = [obj for obj in objects if not layout.looks_like_splats(obj)]
     if not objects:
         raise RefineError("no volume: select closed meshes or empties, and the splats last")
     for obj in objects:
@@ -157,7 +155,7 @@ class REFINE_OT_find_floaters(Job, bpy.types.Operator):
 
     def work(self, context: Context) -> Work:
         """Find the floaters; store them, show them, report them."""
-        checked, settings = mesh_layout.check(context.object), context.scene.refine
+        checked, settings = layout.check(context.object), context.scene.refine
         edit.check_writable(checked.obj)
         cleaning = Cleaning(settings.to_reasons(), settings.views)
         masks = demands.Demands.of_scene(context.scene).masks([checked])
@@ -167,7 +165,7 @@ class REFINE_OT_find_floaters(Job, bpy.types.Operator):
             return clean(splats, views, cleaning, **masks, progress=progress)
 
         (checked,), found = yield [checked], cleaned
-        mesh_scores.store_floaters(checked, found)
+        scores.store_floaters(checked, found)
         plans.refresh(context)
         self.report({"INFO"}, f"Floaters: {found.in_words()}")
 
@@ -199,7 +197,7 @@ class REFINE_OT_delete(Acting, bpy.types.Operator):
     def invoke(self, context: Context, event: bpy.types.Event) -> Answer:
         """Of floaters, say which go, and ask."""
         reasons = context.scene.refine.to_reasons()
-        text = mesh_scores.floaters_in_words(context.object.data, reasons)
+        text = scores.floaters_in_words(context.object.data, reasons)
         if self.what != "FLOATERS" or text.startswith("0 "):
             return self.execute(context)
         words = {"title": "Clean", "message": text, "confirm_text": "Delete"}
@@ -207,7 +205,7 @@ class REFINE_OT_delete(Acting, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> None:
         """Delete them, except protected ones, and report their number."""
-        checked = mesh_layout.check(context.object)
+        checked = layout.check(context.object)
         going = taken(context, checked, self.what) & ~taken(context, checked, "STAYING")
         if not going.any():
             what = f"no splat {_WORDS[self.what]}, or all of these must stay"

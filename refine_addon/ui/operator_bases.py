@@ -16,8 +16,7 @@ from bpy.types import Context
 from .. import main_thread
 from ..core.errors import RefineError, described
 from ..core.execute import Cancelled, Progress, TimeLeft, in_time, silent, within
-from ..mesh import attributes
-from ..mesh import scores as mesh_scores
+from ..mesh import attributes, scores
 from ..mesh.layout import SplatObject, check, looks_like_splats
 from ..viewport import draw as viewport_draw
 
@@ -247,7 +246,7 @@ def out_of_edit_mode(context: Context) -> str:
 
 def scored(context: Context) -> str:
     """A need: the active object has scores."""
-    return "" if mesh_scores.record(context.object.data) else "Score the splats first"
+    return "" if scores.record(context.object.data) else "Score the splats first"
 
 
 def target_collection(context: Context) -> bpy.types.Collection:

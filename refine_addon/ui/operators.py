@@ -22,8 +22,7 @@ from ..core.prune import REFITTING, prune, score
 from ..core.quality.curve import in_words
 from ..core.report import scoring_notes, sizes_in_words
 from ..core.visibility import frustum
-from ..mesh import edit
-from ..mesh import layout as mesh_layout
+from ..mesh import edit, layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
@@ -161,7 +160,7 @@ class REFINE_OT_levels(Job, bpy.types.Operator):
 
     def work(self, context: Context) -> Work:
         """Make the objects, and report each level's cost."""
-        group, settings = [mesh_layout.check(context.object)], context.scene.refine
+        group, settings = [layout.check(context.object)], context.scene.refine
         method, wanted = settings.to_method(), settings.to_levels()
         splats = splat_group.gather(group, whole=True if method.changes else None)
         masks, views = demands.Demands.of_scene(context.scene).masks(group), chosen_views(context)

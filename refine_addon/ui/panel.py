@@ -12,9 +12,8 @@ from ..cameras import CameraChoice, known_turn
 from ..core.formats.ply import stated_model
 from ..core.quality.alignment import Alignment
 from ..core.report import size_in_words
-from ..mesh import edit
+from ..mesh import edit, scores
 from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
 from ..objects import demands, instances, splat_group
 from ..viewport import draw as viewport_draw
 from . import camera_operators, images, operators, plans, render_operators, transforms, wrapped
@@ -119,7 +118,7 @@ class REFINE_PT_cameras(InSidebar, bpy.types.Panel):
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
             return
-        record = mesh_scores.record(obj.data)
+        record = scores.record(obj.data)
         if record is None:
             turn = plans.cached("turn", lambda: known_turn(context, obj))
             alignment = Alignment(turn, known=True)
@@ -141,7 +140,7 @@ class REFINE_PT_prune(InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the methods with their price, the budget, and the buttons."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
-        record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        record = scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         plan = plans.shown(context) if record else None
         column = layout.column(align=True)
         for (name, text, _), hint in zip(METHODS, HINTS, strict=True):
@@ -175,7 +174,7 @@ class REFINE_PT_clean(InSidebar, bpy.types.Panel):
         layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.row(align=True).prop(settings, "strength", expand=True)
         layout.operator("refine.find_floaters", text="Clean", icon="VIEWZOOM")
-        if text := mesh_scores.floaters_in_words(obj and obj.data, settings.to_reasons()):
+        if text := scores.floaters_in_words(obj and obj.data, settings.to_reasons()):
             wrapped.label(layout, text, icon="INFO")
             layout.operator_context = "EXEC_DEFAULT"
             text = "Delete Floaters"
@@ -315,12 +314,12 @@ def _draw_objects(layout: bpy.types.UILayout, objects: Sequence[bpy.types.Object
 
 def _draw_plan(layout: bpy.types.UILayout, obj: Any, record: Any, plan: Any) -> None:
     if record is None:
-        lost = mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes
+        lost = mesh_layout.looks_like_splats(obj) and scores.RANK in obj.data.attributes
         text = "Splats were deleted: score again" if lost else "Score to see what it costs"
         wrapped.label(layout, text, icon="INFO")
         return
     objects = splat_group.chosen(obj)
-    question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
+    question = ("changes", tuple(each.data.get(scores.RECORD) for each in objects))
     if changed := plans.cached(question, lambda: plans.stale(*objects)):
         wrapped.label(layout, f"Score again: {', '.join(changed)}", icon="ERROR")
     if plan is None:
@@ -341,7 +340,7 @@ def _draw_plan(layout: bpy.types.UILayout, obj: Any, record: Any, plan: Any) -> 
 def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
     """Draw the display modes; those that need scores wait for them."""
     current, attributes = viewport_draw.mode(), obj.data.attributes if obj else ()
-    needs = {"HEAT": mesh_scores.RANK, "STAYS": edit.REMOVE, "GOES": edit.REMOVE}
+    needs = {"HEAT": scores.RANK, "STAYS": edit.REMOVE, "GOES": edit.REMOVE}
     grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
     for mode, text, _ in viewport_draw.MODES[1:]:
         cell = grid.row(align=True)

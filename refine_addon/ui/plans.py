@@ -23,8 +23,7 @@ from ..core.scores import TELLING
 from ..core.selection import Budget, quality_of
 from ..core.splats import MODELS
 from ..core.volumes import Forced
-from ..mesh import attributes, edit
-from ..mesh import layout as mesh_layout
+from ..mesh import attributes, edit, layout
 from ..mesh import scores as mesh_scores
 from ..objects import demands, splat_group
 from . import images, operator_bases
@@ -70,7 +69,7 @@ def mark_again(_settings: Any, context: bpy.types.Context) -> None:
     """Renew the marks on protected and removed splats soon: of the active object or the first
     visible one, and of all that are selected, marked, scored, or searched for floaters."""
     active = getattr(context, "object", None)
-    objects = [obj for obj in context.scene.objects if mesh_layout.looks_like_splats(obj)]
+    objects = [obj for obj in context.scene.objects if layout.looks_like_splats(obj)]
     first = [active] if active in objects else [obj for obj in objects if obj.visible_get()][:1]
     noted = {demands.RECORD, mesh_scores.RECORD, mesh_scores.FLOATERS}
     others = [obj for obj in objects if obj.select_get() or noted & set(obj.data.keys())]
@@ -152,13 +151,13 @@ def _can_have(obj: bpy.types.Object) -> bool:
 
 
 def _is_ours(obj: bpy.types.Object) -> bool:
-    ours = mesh_layout.looks_like_splats(obj) and obj.mode != "EDIT"
+    ours = layout.looks_like_splats(obj) and obj.mode != "EDIT"
     return ours and not obj.data.library and not obj.library
 
 
 def _key(obj: bpy.types.Object, settings: Any) -> Any:
     meshes = [each.data for each in splat_group.chosen(obj)]
-    counts = [mesh_layout.splat_count(mesh) for mesh in meshes]
+    counts = [layout.splat_count(mesh) for mesh in meshes]
     scorings = [(mesh.session_uid, mesh.get(mesh_scores.RECORD)) for mesh in meshes], counts
     volumes = [
         (item.role, item.object.session_uid, *map(tuple, item.object.matrix_world))
@@ -206,7 +205,7 @@ def _refresh(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> Non
             _last[:] = [(_key(obj, scene.refine), plan)]
         elif _is_ours(obj):
             with contextlib.suppress(RefineError):  # the panel shows it
-                demands.refresh(scene, [mesh_layout.check(obj)])
+                demands.refresh(scene, [layout.check(obj)])
 
 
 def _plan(scene: bpy.types.Scene, obj: bpy.types.Object) -> dict[str, Any]:
@@ -264,7 +263,7 @@ def origin(obj: bpy.types.Object) -> dict[str, Any]:
         "frame": scene.frame_current,
         "cameras": _cameras(scene),
         "must_go": _marked(obj, 2),
-        "model": obj.data.get(mesh_layout.MODEL, MODELS[0]),
+        "model": obj.data.get(layout.MODEL, MODELS[0]),
         # All methods but the closed form score by occlusion.
         "settings": [method.name == "closed-form", method.views, method.exact],
     }
@@ -371,7 +370,7 @@ def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
     for update in depsgraph.updates if volumes else ():
         original = update.id.original
         moved = update.is_updated_transform and isinstance(original, bpy.types.Object)
-        if original in shapes or (moved and mesh_layout.looks_like_splats(original)):
+        if original in shapes or (moved and layout.looks_like_splats(original)):
             mark_again(None, bpy.context)
             return
 

@@ -12,9 +12,7 @@ from ..core import RefineError, picking
 from ..core.execute import Progress
 from ..core.spherical_harmonics import grading
 from ..core.splats import opacity
-from ..mesh import attributes, edit, selection
-from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
+from ..mesh import attributes, edit, layout, scores, selection
 from ..objects import splat_group
 from ..objects.demands import Demands
 from ..viewport import draw as viewport_draw
@@ -76,14 +74,14 @@ class REFINE_OT_select_by(Acting, bpy.types.Operator):
 
     def act(self, context: Context) -> None:
         """Select them."""
-        checked = mesh_layout.check(context.object)
+        checked = layout.check(context.object)
         chosen = taken(context, checked, self.what) & ~selection.hidden(checked.obj)
         before = selection.selected(checked.obj)
         selection.select(checked.obj, picking.combined(before, chosen, self.mode))
         self.report({"INFO"}, f"{selection.count(checked.obj):,} splats are selected")
 
 
-def taken(context: Context, checked: mesh_layout.SplatObject, what: str) -> NDArray[np.bool_]:
+def taken(context: Context, checked: layout.SplatObject, what: str) -> NDArray[np.bool_]:
     """Splats of one of `SETS`, or of `marks.WHAT`, (N,)."""
     settings = context.scene.refine
     if what == "SELECTED":
@@ -94,7 +92,7 @@ def taken(context: Context, checked: mesh_layout.SplatObject, what: str) -> NDAr
             return opacity(splats.opacity_logits) < settings.select_opacity
         return splats.log_scales.max(axis=1) > np.log(settings.select_size)
     if what == "FLOATERS":
-        return mesh_scores.floater_mask(checked, settings.to_reasons())
+        return scores.floater_mask(checked, settings.to_reasons())
     if what == "GOING":
         if edit.REMOVE not in checked.mesh.attributes:
             raise RefineError(
@@ -116,7 +114,7 @@ class REFINE_OT_grow_selection(Job, bpy.types.Operator):
 
     def work(self, context: Context) -> Work:
         """Grow or shrink the selection."""
-        checked, shrink = mesh_layout.check(context.object), self.shrink
+        checked, shrink = layout.check(context.object), self.shrink
         edit.check_writable(checked.obj)
         chosen = some(checked.obj, selection.selected(checked.obj))
         means = attributes.read_attribute(checked.mesh, "position")
@@ -136,7 +134,7 @@ class REFINE_OT_separate_selected(Acting, bpy.types.Operator):
 
     def act(self, context: Context) -> None:
         """Copy the object, and delete from each the other's splats."""
-        checked = mesh_layout.check(context.object)
+        checked = layout.check(context.object)
         chosen = some(checked.obj, selection.selected(checked.obj))
         edit.check_deletable(checked.obj)
         if chosen.all():
@@ -148,15 +146,15 @@ class REFINE_OT_separate_selected(Acting, bpy.types.Operator):
         for collection in checked.obj.users_collection:
             collection.objects.link(apart)
         try:
-            splat_group.delete_splats(mesh_layout.check(apart), chosen)
+            splat_group.delete_splats(layout.check(apart), chosen)
             splat_group.delete_splats(checked, ~chosen)
         except BaseException:
             bpy.data.batch_remove([apart.data, apart])
             raise
-        selection.select(apart, np.zeros(mesh_layout.splat_count(apart.data), np.bool_))
+        selection.select(apart, np.zeros(layout.splat_count(apart.data), np.bool_))
         apart.select_set(False)  # selected objects are pruned together
         plans.refresh(context)
-        self.report({"INFO"}, f"'{apart.name}' has {mesh_layout.splat_count(apart.data):,} splats")
+        self.report({"INFO"}, f"'{apart.name}' has {layout.splat_count(apart.data):,} splats")
 
 
 class REFINE_OT_grade(Acting, bpy.types.Operator):
@@ -183,7 +181,7 @@ class REFINE_OT_grade(Acting, bpy.types.Operator):
 
     def act(self, context: Context) -> None:
         """Grade them."""
-        checked = mesh_layout.check(context.object)
+        checked = layout.check(context.object)
         chosen = selection.selected(checked.obj)
         rows = np.flatnonzero(chosen if chosen.any() else ~chosen)
         splat_group.grade(checked, rows, grading(self.exposure, self.tint, self.saturation))

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import RefineError
-from ..mesh import attributes, edit, selection
-from ..mesh import scores as mesh_scores
+from ..mesh import attributes, edit, scores, selection
 from ..mesh.layout import SplatObject, check, looks_like_splats, rows_of, sh_degree
 from ..objects.instances import Key, Placing, placings
 from . import shader
@@ -155,7 +154,7 @@ class Content:
         mesh = checked.mesh
         held = self._held.setdefault(uid, MeshSplats())
         held.read = Marks(
-            attributes.attribute_if_any(mesh, mesh_scores.RANK, "FLOAT"),
+            attributes.attribute_if_any(mesh, scores.RANK, "FLOAT"),
             attributes.attribute_if_any(mesh, edit.REMOVE, "BOOLEAN"),
             attributes.attribute_if_any(mesh, edit.FORCE, "INT"),
             attributes.attribute_if_any(mesh, selection.name_of(mesh), "BOOLEAN"),
