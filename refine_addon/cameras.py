@@ -50,14 +50,10 @@ def view_from_camera(obj: bpy.types.Object) -> View:
         raise RefineError(f"camera '{obj.name}' is {kind}, expected a perspective one; {advice}")
     matrix = world_matrix(obj)
     source = _source(obj)
-    frame = render_size(bpy.context.scene)
-    if source:
-        frame = source["width"], source["height"], 1.0
+    frame = (source["width"], source["height"], 1.0) if source else render_size(bpy.context.scene)
     lens, shown = _intrinsics(data, *frame), _shown(data, matrix)
     view = View(*pose(obj.name, matrix), *lens, *shown["clip"], _weight(obj), obj.name)
-    if not source:
-        return view
-    same = [name for key, names in _SHOWN.items() if shown[key] == source[key] for name in names]
+    same = [n for key, names in _SHOWN.items() if shown[key] == source.get(key) for n in names]
     return replace(view, **{name: source[name] for name in same})
 
 
@@ -174,9 +170,10 @@ def _shown(data: bpy.types.Camera, matrix: NDArray[np.float64]) -> dict[str, lis
     return {"matrix": matrix.tolist(), "lens": lens, "clip": [data.clip_start, data.clip_end]}
 
 
-def _source(obj: bpy.types.Object) -> dict[str, Any] | None:
+def _source(obj: bpy.types.Object) -> dict[str, Any]:
+    """The view that a camera was imported from, by `_FIELDS`; empty if it was not imported."""
     if SOURCE not in obj:
-        return None
+        return {}
     try:
         source = json.loads(obj[SOURCE])
         far = math.inf if source["far"] is None else source["far"]
@@ -203,16 +200,13 @@ class CameraChoice(NamedTuple):
 
     def cameras(self, context: bpy.types.Context) -> list[bpy.types.Object]:
         """The cameras, of any lens type; for FRAMES all of the scene. Cheap enough to draw."""
-        layer = context.view_layer
-        if self.source == "ACTIVE":
-            objects = [context.scene.camera]
-        elif self.source == "COLLECTION":
-            objects = self.collection.all_objects if self.collection else []
-        else:
-            objects = layer.objects
+        layer, collection = context.view_layer, self.collection
+        objects = {
+            "ACTIVE": [context.scene.camera],
+            "SELECTED": layer.objects.selected,
+            "COLLECTION": collection.all_objects if collection else [],
+        }.get(self.source, layer.objects)
         cameras = [obj for obj in objects if obj and obj.type == "CAMERA"]
-        if self.source == "SELECTED":
-            return [camera for camera in cameras if camera.select_get(view_layer=layer)]
         if self.source == "VISIBLE":
             return [camera for camera in cameras if camera.visible_get(view_layer=layer)]
         return cameras
