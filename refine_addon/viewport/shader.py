@@ -113,10 +113,8 @@ void main()
   longest = max(longest, thinnest);
   shortest = max(shortest, thinnest);
   shown = shown && shortest > 0.0 && longest <= 1e12;
-  vec2 direction = vec2(1.0, 0.0);
-  if (radius > 1e-6 * mean_square) {
-    direction = xx > yy ? normalize(vec2(longest - yy, xy)) : normalize(vec2(xy, longest - xx));
-  }
+  vec2 direction = xx > yy ? vec2(longest - yy, xy) : vec2(xy, longest - xx);
+  direction = radius > 1e-6 * mean_square ? normalize(direction) : vec2(1.0, 0.0);
   vec2 along = sqrt(longest) * direction;
   vec2 beside = sqrt(shortest) * vec2(-direction.y, direction.x);
   place = corner * sqrt(reach);
