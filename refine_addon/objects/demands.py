@@ -85,8 +85,7 @@ def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
 
 def world_means(checked: SplatObject) -> NDArray[np.float64]:
     """Centres of an object's splats in the world, (N, 3)."""
-    means = attributes.read_attribute(checked.mesh, "position")
-    return moved(means, world_matrix(checked.obj))
+    return moved(attributes.read_attribute(checked.mesh, "position"), world_matrix(checked.obj))
 
 
 def finite_means(checked: SplatObject) -> NDArray[np.float64]:

@@ -41,8 +41,7 @@ CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # Points of a circle,
 def draw(context: bpy.types.Context, *, mixed: bool, has_depths: bool) -> None:
     """Draw edges of volumes into a view, and if `mixed` see-through meshes.
     Without `has_depths` the view's depths are cleared first; see `view.View`."""
-    shading = context.space_data.shading
-    if mixed and shading.type != "WIREFRAME":
+    if mixed and context.space_data.shading.type != "WIREFRAME":
         if not has_depths:
             gpu.state.active_framebuffer_get().clear(depth=1.0)
         for obj in context.visible_objects:

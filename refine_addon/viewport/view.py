@@ -101,8 +101,7 @@ class View:
         moving = self._moves(camera.key() + matrices)
         full = (atlas, content.changes, mode, matrices, camera.perspective, camera.near)
         self._take()
-        by_card = gpu.platform.device_type_get() != "SOFTWARE"
-        few, wide = BY_CARD if by_card else BY_PROCESSOR
+        few, wide = BY_PROCESSOR if gpu.platform.device_type_get() == "SOFTWARE" else BY_CARD
         if self._order_key[0] is not atlas:
             self._order, self._order_key, self._colors = None, (None,), None
         if moving and self._order_key != (*full, few):
