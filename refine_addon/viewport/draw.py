@@ -77,27 +77,18 @@ def untint() -> None:
 
 
 def show(wanted: str) -> None:
-    """Draw splats in all 3D views, or stop."""
-    if wanted == "OFF":
-        stop()
-        return
+    """Draw splats in all 3D views, or stop and free everything."""
     if _state.mode == "OFF":
+        if wanted == "OFF":
+            return
         _state.failure = ""
     _state.mode = wanted
-    _hide_points()
-    _redraw()
-
-
-def stop() -> None:
-    """Stop drawing and free everything."""
-    if _state.mode == "OFF":
-        return
-    _state.mode = "OFF"
-    for timer in (_tick, _read_edited):
-        if bpy.app.timers.is_registered(timer):
-            bpy.app.timers.unregister(timer)
-    _forget()
-    shader.program.cache_clear()
+    if wanted == "OFF":
+        for timer in (_tick, _read_edited):
+            if bpy.app.timers.is_registered(timer):
+                bpy.app.timers.unregister(timer)
+        _forget()
+        shader.program.cache_clear()
     _hide_points()
     _redraw()
 
@@ -111,7 +102,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Stop drawing and undo `register`."""
-    stop()
+    show("OFF")
     while _state.handles:
         bpy.types.SpaceView3D.draw_handler_remove(_state.handles.pop(), "WINDOW")
 
@@ -130,7 +121,7 @@ def _guarded(work: Callable[[], None]) -> None:
     except Exception as error:
         traceback.print_exc()
         _state.failure = f"Splats cannot be drawn here: {error}"
-        bpy.app.timers.register(stop, first_interval=0.0)
+        bpy.app.timers.register(partial(show, "OFF"), first_interval=0.0)
 
 
 def _draw() -> None:
