@@ -96,10 +96,8 @@ def _color(
 ) -> tuple[float, ...]:
     color, opacity = (0.8, 0.8, 0.8, 1.0), 1.0
     if shading.type == "SOLID":
-        if shading.color_type == "OBJECT":
-            color = obj.color
-        elif shading.color_type == "MATERIAL" and material is not None:
-            color = material.diffuse_color
+        colors = {"OBJECT": obj.color, "MATERIAL": material and material.diffuse_color}
+        color = colors.get(shading.color_type) or color
         opacity = color[3] * (shading.xray_alpha if shading.show_xray else 1.0)
     elif material is not None and material.surface_render_method == "BLENDED":
         color, opacity = material.diffuse_color, 0.5
