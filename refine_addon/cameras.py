@@ -274,8 +274,13 @@ def views_from_frames(
         for frame in frames:
             scene.frame_set(frame)
             view = view_from_camera(active_camera(scene))
-            if now is not None:
-                view = _against(view, splats, now, world_matrix(splats))
+            if now is not None and not np.array_equal(then := world_matrix(splats), now):
+                motion = now @ np.linalg.inv(then)  # that puts the splats where they are now
+                if np.abs(motion[:3, :3].T @ motion[:3, :3] - np.eye(3)).max() > SHEAR:
+                    animated = f"object '{splats.name}': its scale is animated"
+                    why = "the views of different frames then see different splats"
+                    raise RefineError(f"{animated}; {why}: choose one frame")
+                view = view.turned(motion[:3, :3], motion[:3, 3])
             views.append(replace(view, name=f"{view.name}, frame {frame}"))
     finally:
         scene.frame_set(before[0], subframe=before[1])
@@ -327,16 +332,3 @@ def active_camera(scene: bpy.types.Scene) -> bpy.types.Object:
         problem = f"no active camera at frame {scene.frame_current}"
         raise RefineError(f"{problem}: make a camera the active one")
     return scene.camera
-
-
-def _against(
-    view: View, obj: bpy.types.Object, now: NDArray[np.float64], then: NDArray[np.float64]
-) -> View:
-    """A view of another frame, moved so that it sees the object where it is `now`."""
-    if np.array_equal(now, then):
-        return view
-    motion = now @ np.linalg.inv(then)
-    if np.abs(motion[:3, :3].T @ motion[:3, :3] - np.eye(3)).max() > SHEAR:
-        why = "the views of different frames then see different splats"
-        raise RefineError(f"object '{obj.name}': its scale is animated; {why}: choose one frame")
-    return view.turned(motion[:3, :3], motion[:3, 3])
