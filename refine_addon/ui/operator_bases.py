@@ -348,20 +348,12 @@ class Job(Acting):
         """Wait for the thread, then put its result."""
         if (running := now()) is None:
             return {"CANCELLED"}
-        if event.type == "TIMER":
-            return self._check(context, running)
-        if event.type != "ESC" or event.value != "PRESS":
+        if event.type == "ESC" and event.value == "PRESS":
+            running.worker.cancel()
+            return {"RUNNING_MODAL"}
+        if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        running.worker.cancel()
-        return {"RUNNING_MODAL"}
-
-    def cancel(self, _context: Context) -> None:
-        """End the thread when Blender ends the operator, closing its window or file."""
-        _end()
-
-    def _check(self, context: Context, running: Running) -> Answer:
-        """Put the result if the thread is done; Blender prints errors that are no `FAILURES`."""
-        try:
+        try:  # Blender prints errors that are no `FAILURES`
             main_thread.serve()
             if not running.done():
                 running.tell(context)
@@ -376,6 +368,10 @@ class Job(Acting):
             self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
             return {"CANCELLED"}
         return {"FINISHED"}
+
+    def cancel(self, _context: Context) -> None:
+        """End the thread when Blender ends the operator, closing its window or file."""
+        _end()
 
 
 def _end(*_: object) -> None:
