@@ -118,9 +118,8 @@ def write_columns(
         components = values.reshape(len(values), -1)
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # float64 to float32
             for column in own:
-                new, coding = columns[column.name], column.coding
-                new = coding.to_attribute(new) if coding else new
-                components[rows, column.component] = new
+                coded = column.coding.to_attribute(columns[column.name])
+                components[rows, column.component] = coded
         if kind == "QUATERNION":
             values[rows] = single_unit_quaternions(values[rows])
         write_attribute(mesh, attribute, kind, values)
@@ -195,10 +194,8 @@ def read_columns(
     for attribute, columns in checked.layout.by_attribute(names).items():
         values = read_attribute(checked.mesh, attribute)
         for column in columns:
-            coding, own = column.coding, values
-            if values.ndim > 1:
-                own = values[:, column.component].copy()  # alone in memory
-            own = coding.to_file(own) if coding else own
+            alone = values[:, column.component].copy() if values.ndim > 1 else values  # in memory
+            own = column.coding.to_file(alone)
             yield column.name, own.view(np.uint32) if column.dtype[1:] == "u4" else own
 
 

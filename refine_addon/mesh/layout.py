@@ -38,20 +38,21 @@ class Coding(NamedTuple):
     to_attribute: Callable[[NDArray[Any]], NDArray[Any]]
 
 
+_AS_IN_FILE = Coding(np.asarray, np.asarray)
 _LOG = Coding(single_log_scales, scales)
 _LOGIT = Coding(single_logits, opacity)
 
 
 class Column(NamedTuple):
     """A PLY property, its type in the file as in ``"<f4"``, and its place: attribute, vector
-    component (0 for scalars), allowed attribute types, coding (None if stored as in the file)."""
+    component (0 for scalars), allowed attribute types, coding."""
 
     name: str
     dtype: str
     attribute: str
     component: int
     kinds: tuple[str, ...]
-    coding: Coding | None = None
+    coding: Coding = _AS_IN_FILE
 
 
 Place = tuple[Any, ...]  # The last fields of `Column`, from `attribute`
