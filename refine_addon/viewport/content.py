@@ -195,21 +195,16 @@ class Content:
         drawn = {key: slot.packed for key, slot in self.atlas.slots.items()}
         if all(drawn.get(key) is self._held[key[1]].packed for key in wanted):
             return
-        keys = sorted(wanted | (drawn.keys() & _existing()))
+        splats = filter(looks_like_splats, bpy.data.objects)
+        existing = {((obj.session_uid,), obj.data.session_uid) for obj in splats}
+        for window in bpy.context.window_manager.windows:  # instances, too
+            existing.update(place.key for place in placings(window.view_layer.depsgraph))
+        keys = sorted(wanted | (drawn.keys() & existing))
         meshes = {mesh for _, mesh in keys}
         self._held = {
             mesh: held for mesh, held in self._held.items() if mesh in meshes or held.future
         }
         self.atlas = _atlas(keys, self._held)
-
-
-def _existing() -> set[Key]:
-    """Keys of all objects of the file, and of the instances in all windows."""
-    splats = filter(looks_like_splats, bpy.data.objects)
-    keys: set[Key] = {((obj.session_uid,), obj.data.session_uid) for obj in splats}
-    for window in bpy.context.window_manager.windows:
-        keys.update(place.key for place in placings(window.view_layer.depsgraph))
-    return keys
 
 
 def _atlas(keys: list[Key], held: dict[int, MeshSplats]) -> Atlas:
