@@ -100,7 +100,12 @@ class View:
         matrices = b"".join(matrix.tobytes() for _, matrix in shown)
         moving = self._moves(camera.key() + matrices)
         full = (atlas, content.changes, mode, matrices, camera.perspective, camera.near)
-        self._take()
+        if self._job and self._job[2].done():
+            (order_key, colors_key, future), self._job = self._job, None
+            order, count, painted = future.result()
+            self._keep(order_key, order, count)
+            if painted is not None:
+                self._colors_key, self._colors = colors_key, shader.texture(painted, 4, "RGBA16F")
         few, wide = BY_PROCESSOR if gpu.platform.device_type_get() == "SOFTWARE" else BY_CARD
         if self._order_key[0] is not atlas:
             self._order, self._order_key, self._colors = None, (None,), None
@@ -123,17 +128,6 @@ class View:
             self._changed = now if self._camera_key else 0.0
             self._camera_key = key
         return now - self._changed < REST
-
-    def _take(self) -> None:
-        """Take order and colours from the thread if it is done."""
-        if self._job is None or not self._job[2].done():
-            return
-        order_key, colors_key, future = self._job
-        self._job = None
-        order, count, painted = future.result()
-        self._keep(order_key, order, count)
-        if painted is not None:
-            self._colors_key, self._colors = colors_key, shader.texture(painted, 4, "RGBA16F")
 
     def _start(self, pool, key, parts, near, mode, few):
         """Start the thread that sorts all splats, and colours them if colours changed.
