@@ -123,10 +123,6 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             self._running.tell(context)
         return {"PASS_THROUGH"}
 
-    def cancel(self, context: bpy.types.Context) -> None:
-        """Clean up when Blender ends the operator, closing its window or file."""
-        self._over(context)
-
     def _begin(self, context: bpy.types.Context) -> None:
         scene = context.scene
         every = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
@@ -192,7 +188,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _finished(self, context: bpy.types.Context) -> Answer:
         self._show()
-        self._over(context)
+        self.cancel(context)
         shared, seconds = self._shared, time.monotonic() - self._started
         what = counted(len(shared.frames), "frame") if self.animation else "Rendered"
         among = f" among what {shared.engine} rendered" if shared.engine else ""
@@ -201,13 +197,14 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         return {"FINISHED"}
 
     def _stopped(self, context: bpy.types.Context, error: BaseException) -> Answer:
-        self._over(context)
+        self.cancel(context)
         if not isinstance(error, Cancelled):
             return fail(self, error, RuntimeError)  # Blender's own
         self.report({"INFO"}, "Render cancelled")
         return {"CANCELLED"}
 
-    def _over(self, context: bpy.types.Context) -> None:
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Clean up, also when Blender ends the operator, closing its window or file."""
         _watched.clear()
         self._steps.close()
         if _NEEDS_WINDOW and not bpy.app.background:
