@@ -234,9 +234,7 @@ def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
     """Quarter turns about x that the deciding cameras need to fit the splats (`ViewSet.turn`), from
     how both were imported; 0 if unknown or for FRAMES. The context must be evaluated."""
     choice = CameraChoice.of_scene(context.scene)
-    if choice.source == "FRAMES":
-        return 0
-    cameras = choice.cameras(context)
+    cameras = [] if choice.source == "FRAMES" else choice.cameras(context)
     cameras = cameras[:: len(cameras) // _FEW + 1]
     try:
         return _turn(cameras, [*map(view_from_camera, cameras)], splats) or 0
