@@ -230,7 +230,12 @@ def _whole(scene: bpy.types.Scene, what: str) -> str:
     copy = meshes.copied(scene, what)
     copy.render.engine = REFINE_engine.bl_idname
     copy.render.use_overwrite, copy.render.use_placeholder = True, False  # see `_is_there`
-    meshes.show_as_stored(copy)
+    view = copy.view_settings  # a view transform that only encodes colours as sRGB
+    view.view_transform, view.look = "Standard", "None"
+    view.exposure, view.gamma, view.use_curve_mapping = 0.0, 1.0, False
+    if hasattr(view, "use_white_balance"):  # since 4.3
+        view.use_white_balance = False
+    copy.render.image_settings.color_management = "FOLLOW_SCENE"
     return str(copy.name)
 
 

@@ -306,16 +306,6 @@ def write_exr(scene: bpy.types.Scene, path: Path) -> None:
     render.use_crop_to_border = True
 
 
-def show_as_stored(scene: bpy.types.Scene) -> None:
-    """Give a copied scene the view transform that only encodes colours as sRGB."""
-    view = scene.view_settings
-    view.view_transform, view.look = "Standard", "None"
-    view.exposure, view.gamma, view.use_curve_mapping = 0.0, 1.0, False
-    if hasattr(view, "use_white_balance"):  # since 4.3
-        view.use_white_balance = False
-    scene.render.image_settings.color_management = "FOLLOW_SCENE"
-
-
 def _set_format(settings: bpy.types.ImageFormatSettings, media_type: str, file_format: str) -> None:
     if hasattr(settings, "media_type"):  # since 5.0
         settings.media_type = media_type
