@@ -78,8 +78,7 @@ def test_deleting_floaters_takes_those_and_asks_for_new_scores(addon, polluted):
     scores, delete = addon.mesh.scores, bpy.ops.refine.delete
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()
-    reasons = bpy.context.scene.refine.to_reasons()
-    goes = scores.floater_mask(addon.mesh.layout.check(obj), reasons)
+    goes = scores.floater_mask(addon.mesh.layout.check(obj), bpy.context.scene.refine.to_reasons())
     opacities = read(addon, obj, "opacity")
     addon.mesh.edit.mark(obj, addon.mesh.edit.PROTECT, goes)
     with pytest.raises(RuntimeError, match="no splat floats, or all of these must stay"):

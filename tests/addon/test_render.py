@@ -128,8 +128,7 @@ def test_meshes_hide_splats_by_depth_and_alpha(addon, shot, quarter):
     before = settings(shot)
 
     def through(alpha):
-        mix = pane.data.materials[0].node_tree.nodes["Mix Shader"]
-        mix.inputs[0].default_value = alpha
+        pane.data.materials[0].node_tree.nodes["Mix Shader"].inputs[0].default_value = alpha
         return rendered()[..., :3]
 
     apart = through(0.3) - 0.7 * plain[..., :3]

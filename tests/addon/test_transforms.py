@@ -198,8 +198,7 @@ def test_splats_that_are_bent_and_what_is_no_splat_are_named(addon, imported):
     assert told_of(addon, imported) == []
     for share, said in ((0.005, []), (0.5, ["4,970 splats were moved one by one"])):
         which = np.arange(COUNT) < share * COUNT
-        bent = places + which[:, None] * np.sin(7.0 * places[:, ::-1])
-        set_places(imported, bent)
+        set_places(imported, places + which[:, None] * np.sin(7.0 * places[:, ::-1]))
         before = addon.mesh.attributes.digest(checked)
         assert [told.partition(", as by")[0] for told in told_of(addon, imported)] == said
         bpy.ops.refine.mend()
