@@ -70,7 +70,7 @@ class Content:
         self.pool = ThreadPoolExecutor(1, "refine-view")
         self.atlas = Atlas({}, {}, 0)
         self.changes = self.selections = 0
-        self._tints = True
+        self._untinted = -1  # `selections` at the last `untint`
         self._selection: tuple[object, gpu.types.GPUTexture] | None = None
         self._held: dict[int, MeshSplats] = {}
         self._stale: set[int] = set()
@@ -92,19 +92,18 @@ class Content:
             held.read = held.read._replace(selected=chosen)
             held.marks = held.marks._replace(selected=chosen[held.packed.vertices])
             self.selections += 1
-            self._tints = True
 
     def untint(self) -> None:
         """Show selected splats in their own colours until the selection changes."""
-        self._tints = False
         self.selections += 1
+        self._untinted = self.selections
 
     def selection(self) -> gpu.types.GPUTexture:
         """Texture with a texel for each row of the atlas: 1 if tinted as selected, else 0."""
         key = (self.atlas, self.selections)
         if self._selection is None or self._selection[0] != key:
             flags = np.zeros(self.atlas.rows, np.float32)
-            for slot in self.atlas.slots.values() if self._tints else ():
+            for slot in self.atlas.slots.values() if self.selections != self._untinted else ():
                 if slot.held.marks.selected is not None:
                     flags[slot.rows] = slot.held.marks.selected[: slot.count]
             self._selection = key, shader.texture(as_texture(flags), 1, "R8")
@@ -179,7 +178,6 @@ class Content:
         # Two `None` are equal for `np.array_equal`, too.
         if not np.array_equal(before.selected, marks.selected):
             self.selections += 1
-            self._tints = True
         if not np.array_equal(before.forced, marks.forced):
             held.marked += 1
             held.kinds = tuple(k for k in MARKS if marks.forced is not None and k in marks.forced)
