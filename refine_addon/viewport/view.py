@@ -98,7 +98,11 @@ class View:
             return
         shown = [(atlas.slots[key], camera.view @ matrix) for key, matrix in places.items()]
         matrices = b"".join(matrix.tobytes() for _, matrix in shown)
-        moving = self._moves(camera.key() + matrices)
+        key = camera.key() + matrices
+        if key != self._camera_key:  # the view or an object in it moved
+            self._changed = time.monotonic() if self._camera_key else 0.0
+            self._camera_key = key
+        moving = time.monotonic() - self._changed < REST
         full = (atlas, content.changes, mode, matrices, camera.perspective, camera.near)
         if self._job and self._job[2].done():
             (order_key, colors_key, future), self._job = self._job, None
@@ -120,14 +124,6 @@ class View:
         style = STYLES.get(mode, 0)
         self._paint(content, shown, camera, 1 if self.complete else wide, solid, style)
         _put(self._picture)
-
-    def _moves(self, key: bytes) -> bool:
-        """Whether the view or an object in it moved within `REST` seconds."""
-        now = time.monotonic()
-        if key != self._camera_key:
-            self._changed = now if self._camera_key else 0.0
-            self._camera_key = key
-        return now - self._changed < REST
 
     def _start(self, pool, key, parts, near, mode, few):
         """Start the thread that sorts all splats, and colours them if colours changed.
