@@ -192,13 +192,11 @@ def frames_of(group: Sequence[SplatObject]) -> list[Frame]:
 def changes(frames: Sequence[Frame], result: Result) -> list[Change]:
     """Change of each object's splats, from the result for all; arrays only."""
     parts, first, merged = [], 0, result.merged
-    slices = rows_of(count for count, *_ in frames)
-    for (_, degree, matrix), rows in zip(frames, slices, strict=True):
-        keep = result.keep[rows]
+    keeps = [result.keep[rows] for rows in rows_of(count for count, *_ in frames)]
+    if merged is None:
+        return list(map(Change, keeps))
+    for (_, degree, matrix), keep in zip(frames, keeps, strict=True):
         start, first = first, first + int(np.count_nonzero(keep))
-        if merged is None:
-            parts.append(Change(keep))
-            continue
         changing = np.flatnonzero(merged.changed[start:first])
         splats = merged.splats.take(start + changing).up_to_degree(degree)
         if not np.array_equal(matrix, np.eye(4)):
