@@ -65,6 +65,4 @@ def register() -> None:
     _undo.callback(bpy.utils.unregister_cli_command, added)
 
 
-def unregister() -> None:
-    """Undo `register`."""
-    _undo.close()
+unregister = _undo.close
