@@ -73,7 +73,11 @@ class Stroke:
         obj, camera = self.obj, Camera.of(context)
         matrix = world_matrix(obj)
         with selection.readable(obj) as checked:
-            away, self.before = _not_drawn(checked), selection.selected(checked.obj)
+            self.before = selection.selected(checked.obj)
+            away, mode = selection.hidden(checked.obj), viewport_draw.mode()  # what views show not
+            if mode in {"STAYS", "GOES"} and edit.REMOVE in checked.mesh.attributes:
+                going = attributes.read_attribute(checked.mesh, edit.REMOVE) > 0
+                away |= going if mode == "STAYS" else ~going
             digest = attributes.digest(checked)
             splats = (obj.data.session_uid, digest, matrix.tobytes(), away.tobytes())
             view = (splats, camera.key())
@@ -152,15 +156,6 @@ def _drawn(checked: SplatObject, away: NDArray[np.bool_]) -> Splats:
     splats = attributes.splats_from_object(checked, sh_rest=False)
     logits = np.where(away, np.float32(-np.inf), splats.opacity_logits)
     return replace(splats, opacity_logits=logits)
-
-
-def _not_drawn(checked: SplatObject) -> NDArray[np.bool_]:
-    """Splats that views do not show, (N,): hidden ones, and those of other display modes."""
-    away, mode = selection.hidden(checked.obj), viewport_draw.mode()
-    if mode in {"STAYS", "GOES"} and edit.REMOVE in checked.mesh.attributes:
-        going = attributes.read_attribute(checked.mesh, edit.REMOVE) > 0
-        away |= going if mode == "STAYS" else ~going
-    return away
 
 
 def _circle(middle: tuple[float, float], radius: float) -> list[tuple[float, float]]:
