@@ -71,7 +71,13 @@ class REFINE_OT_turn_cameras(Acting, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> None:
         """Turn them, or the parents that animate them."""
         context.view_layer.update()  # or what a script just made stands at the origin
-        cameras = _deciding(context)
+        scene, choice = context.scene, CameraChoice.of_scene(context.scene)
+        cameras = choice.cameras(context)
+        if choice.source == "FRAMES":  # all of a shot
+            shot = [*(marker.camera for marker in scene.timeline_markers), scene.camera]
+            cameras = list(dict.fromkeys(camera for camera in shot if camera))
+        if not cameras:
+            raise RefineError("no cameras: choose those that decide, or add a ring of cameras")
         roots = _roots(cameras, context.object)
         group = [mesh_layout.check(obj) for obj in splat_group.chosen(context.object)]
         for checked in group:
@@ -86,7 +92,7 @@ class REFINE_OT_turn_cameras(Acting, bpy.types.Operator):
             else:
                 root.matrix_world = turn @ root.matrix_world
         if parent:
-            context.scene.collection.objects.link(parent)
+            scene.collection.objects.link(parent)
             parent.matrix_world = turn
         context.view_layer.update()
         for checked in group:
@@ -127,18 +133,6 @@ class REFINE_OT_add_ring(Acting, bpy.types.Operator):
             ring.objects.link(camera)
         _join(context, ring)
         self.report({"INFO"}, f"Added {self.count} cameras in '{ring.name}'; score again")
-
-
-def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Deciding cameras, of a shot all of it; raises `RefineError` without one."""
-    scene, choice = context.scene, CameraChoice.of_scene(context.scene)
-    cameras = choice.cameras(context)
-    if choice.source == "FRAMES":
-        shot = [*(marker.camera for marker in scene.timeline_markers), scene.camera]
-        cameras = list(dict.fromkeys(camera for camera in shot if camera))
-    if not cameras:
-        raise RefineError("no cameras: choose those that decide, or add a ring of cameras")
-    return cameras
 
 
 def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> list[bpy.types.Object]:
