@@ -356,8 +356,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
         names.remove(THIRD_SCALE)
     columns = _floats(names, places)
     columns += _further_columns(obj.data, {*names, *(c.attribute for c in columns)})
-    header = new_header(_row(columns), splat_count(obj.data))
-    return Layout(tuple(columns), header)
+    return Layout(tuple(columns), new_header(_row(columns), splat_count(obj.data)))
 
 
 def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
@@ -377,16 +376,15 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
     """Add an attribute for each property of a file, and store the layout; the layout."""
     columns = []
     for name in rows.names or ():
-        kind = rows[name].str
-        if name in PLACES:
-            columns.append(Column(name, kind, *PLACES[name]))
-            continue
-        plain = name not in _TAKEN and not name.startswith((".", "refine_"))
-        plain = plain and len(name.encode()) <= _LONGEST_NAME
-        other = f"ply_{name}".encode()[:_LONGEST_NAME].decode(errors="ignore")
-        attribute = mesh.attributes.new(name if plain else other, STORAGE[kind[1:]], "POINT")
-        attribute = attribute or mesh.attributes.new(other, STORAGE[kind[1:]], "POINT")
-        columns.append(Column(name, kind, *_plain(kind, attribute.name)))
+        kind, place = rows[name].str, PLACES.get(name)
+        if place is None:
+            plain = name not in _TAKEN and not name.startswith((".", "refine_"))
+            plain = plain and len(name.encode()) <= _LONGEST_NAME
+            other = f"ply_{name}".encode()[:_LONGEST_NAME].decode(errors="ignore")
+            attribute = mesh.attributes.new(name if plain else other, STORAGE[kind[1:]], "POINT")
+            attribute = attribute or mesh.attributes.new(other, STORAGE[kind[1:]], "POINT")
+            place = _plain(kind, attribute.name)
+        columns.append(Column(name, kind, *place))
     record = [[c.name, c.dtype, c.attribute, c.component] for c in columns]
     text = vertex_header(header).decode("latin-1")
     mesh[LAYOUT] = json.dumps({"header": text, "columns": record})

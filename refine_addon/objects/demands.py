@@ -76,11 +76,7 @@ def _as_one(each: Sequence[Forced], group: Sequence[SplatObject]) -> Masks:
 
 def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
     """Volumes listed and still in the scene: the list keeps deleted objects alive."""
-    return [
-        item
-        for item in scene.refine.volumes
-        if item.object is not None and scene in item.object.users_scene
-    ]
+    return [one for one in scene.refine.volumes if one.object and scene in one.object.users_scene]
 
 
 def world_means(checked: SplatObject) -> NDArray[np.float64]:
@@ -205,10 +201,9 @@ def _inside(label: str, make: partial[Any], points: NDArray[Any]) -> NDArray[np.
     key = digest.digest()
     if key not in _masks:
         try:
-            mask = make().inside(points)
+            _masks[key] = make().inside(points)
         except RefineError as error:
             raise RefineError(f"{label}: {error}") from error
-        while len(_masks) >= _MOST_MASKS:
+        if len(_masks) > _MOST_MASKS:
             del _masks[next(iter(_masks))]  # the oldest
-        _masks[key] = mask
     return _masks[key]
