@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Generator
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import bpy
 import numpy as np
@@ -206,11 +208,20 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
     def cancel(self, context: bpy.types.Context) -> None:
         """Clean up, also when Blender ends the operator, closing its window or file."""
         _watched.clear()
-        self._steps.close()
+        if (later := _close(self._steps)) is not None:
+            bpy.app.timers.register(partial(_close, self._steps), first_interval=later)
         if _NEEDS_WINDOW and not bpy.app.background:
             bpy.app.timers.register(_draw_whole, first_interval=_SETTLED)
         if self._running is not None:
             self._running.over(context)
+
+
+def _close(steps: Generator[Any, None, None]) -> float | None:
+    """End the steps of a render, or say when to try again: Blender's render needs their engine."""
+    if bpy.app.is_job_running("RENDER"):
+        return 0.1
+    steps.close()
+    return None
 
 
 def _draw_whole() -> None:

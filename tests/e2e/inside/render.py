@@ -67,6 +67,14 @@ def main(pictures):
         found["alike"].append(settings(scene) == before)
     found["stopped"] = bpy.data.images[IMAGE].size[:] == shown
 
+    bpy.ops.wm.window_new()
+    before = settings(scene)
+    invoke(bpy.ops.refine.render, window=-1, animation=True)
+    yield 1.0
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[-1]):
+        bpy.ops.wm.window_close()
+    yield from until(lambda: not rendering() and settings(scene) == before, "its window is gone")
+
     scene.render.resolution_percentage = 100
     invoke(bpy.ops.render.render)
     yield 1.0
@@ -157,9 +165,9 @@ def prolong(scene):
     scene.render.resolution_percentage, scene.frame_end = 400, 99
 
 
-def invoke(operator, *, animation=False):
-    """Start a render as its button does."""
-    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+def invoke(operator, *, window=0, animation=False):
+    """Start a render as its button does, in one of the windows."""
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[window]):
         operator("INVOKE_DEFAULT", animation=animation)
 
 
