@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import io
+import re
 import struct
 import warnings
 import zlib
@@ -27,6 +28,8 @@ _EXR = 20000630
 _MULTI_PART = 0x1000  # flag of the version
 _LINE_HEAD = 8  # bytes: number and size of a line
 _TYPES = {1: "<f2", 2: "<f4"}  # of numbers in a channel
+_ATTRIBUTE = re.compile(rb"([^\0]+)\0[^\0]*\0(.{4})", re.DOTALL)  # name, type, bytes that follow
+_CHANNEL = re.compile(rb"([^\0]+)\0(.).{15}", re.DOTALL)  # name, type of its numbers
 _JPEG_START = b"\xff\xd8"
 _MOST_SEGMENTS = 4096  # segments and fill bytes of a JPEG skipped at most; cameras write fewer
 _FILL = 0xFF
@@ -76,31 +79,18 @@ def _channels(data):
     if magic != _EXR or version & _MULTI_PART:
         raise ValueError(f"it begins with {magic}, version {version:#x}")
     header, at = {}, 8
-    while data[at]:
-        name, at = _text(data, at)
-        _, at = _text(data, at)  # its type
-        (size,) = struct.unpack_from("<i", data, at)
-        header[name] = data[at + 4 : at + 4 + size]
-        at += 4 + size
-    if header["compression"] != b"\0":
-        raise ValueError(f"its compression is number {header['compression'][0]}")
-    left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
+    while attribute := _ATTRIBUTE.match(data, at):
+        at = attribute.end() + int.from_bytes(attribute[2], "little")
+        header[attribute[1]] = data[attribute.end() : at]
+    if header[b"compression"] != b"\0":
+        raise ValueError(f"its compression is number {header[b'compression'][0]}")
+    left, top, right, bottom = struct.unpack("<4i", header[b"dataWindow"])
     width, height = right - left + 1, bottom - top + 1
-    parts: list[Any] = [("head", f"V{_LINE_HEAD}")]
-    listed, place = header["channels"], 0
-    while listed[place]:  # in the order of the channels in a line
-        name, place = _text(listed, place)
-        (kind,) = struct.unpack_from("<i", listed, place)
-        parts.append((name, _TYPES[kind], (width,)))
-        place += 16
+    parts: list[Any] = [("head", f"V{_LINE_HEAD}")]  # then channels, in the order of a line
+    for name, kind in _CHANNEL.findall(header[b"channels"]):
+        parts.append((name.decode(errors="replace"), _TYPES[kind[0]], (width,)))
     lines = np.frombuffer(data, np.dtype(parts), height, at + 1 + 8 * height)
     return {name: lines[name].astype(np.float32) for name, *_ in parts[1:]}
-
-
-def _text(data: bytes, start: int) -> tuple[str, int]:
-    """Text that begins at byte `start`, and the byte after its end."""
-    end = data.index(b"\0", start)
-    return data[start:end].decode(errors="replace"), end + 1
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
