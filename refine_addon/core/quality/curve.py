@@ -122,9 +122,7 @@ class Quality:
             return 0.0
         if psnr <= values[-1]:
             return float(self.shares[-1])
-        right = sum(value >= psnr for value in values) - 1  # the last point that is good enough
-        step = (values[right] - psnr) / (values[right] - values[right + 1])
-        place = odds[right] + step * (odds[right + 1] - odds[right])
+        place = np.interp(-psnr, np.negative(values), odds)  # of equal values behind the last
         return float(1.0 / (1.0 + np.exp(-place)))
 
     def _curve(self, way):
