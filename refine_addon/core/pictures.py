@@ -213,7 +213,7 @@ def compare(
             for view, each in zip(views, rest, strict=True)
         ])  # fmt: skip
     return [
-        Comparison(view, _rounded(one), _rounded(other), _psnr(other, one, view))
+        Comparison(view, _rounded(one), _rounded(other), psnr_of(other, one, view))
         for view, one, other in zip(views, *pictures, strict=True)
     ]
 
@@ -236,10 +236,6 @@ def fitted(view: View, scene_size: float) -> View:
 def _rounded(picture):
     """A picture (3, H, W) of 0..1 as (H, W, 3) uint8."""
     return np.ascontiguousarray(np.rint(picture * 255.0).astype(np.uint8).transpose(1, 2, 0))
-
-
-def _psnr(after, before, view):
-    return psnr_of(after.reshape(3, -1), before.reshape(3, -1), view)
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,12 @@ without them it was up to 1.6 dB too high."""
 
 
 def psnr_of(colors: NDArray[Any], truth: NDArray[Any], view: View) -> float:
-    """PSNR of a view, dB, at most `PSNR_CAP`, by (3, P) colours (docs/method.md, section 5).
+    """PSNR of a view, dB, at most `PSNR_CAP`, by (3, ...) colours (docs/method.md, section 5).
 
     The logarithm of a mean is too low by half its squared relative error, which is corrected; the
     variance is that between neighbouring rays, so that parts of the picture may differ.
     """
-    errors = np.mean((colors - truth) ** 2, axis=0, dtype=np.float64)
+    errors = np.mean((colors - truth) ** 2, axis=0, dtype=np.float64).ravel()
     mean, count = float(np.mean(errors)), len(errors)
     if mean <= 10.0 ** (-PSNR_CAP / 10.0):
         return PSNR_CAP
@@ -48,8 +48,7 @@ def psnr_kept(sample: RaySample, keep: NDArray[np.bool_]) -> float | None:
     """Mean PSNR of all views, dB, if only splats `keep`, (N,), stay; None if too little is seen."""
     if not _enough(sample):
         return None
-    removing = _removing(sample, keep.astype(np.int64)[sample.splat_rows], [1])
-    return float(_of_views(sample, removing, sample.seeing(), silent)[1][0])
+    return float(_removing(sample, keep, [1])[1][0])
 
 
 def with_quality(
@@ -78,10 +77,6 @@ def with_quality(
     place = np.empty(len(order), np.int64)  # of each splat in the order of removal
     place[order] = np.arange(len(order))
 
-    def removing(rays_of, progress):
-        compare = _removing(rays_of, place[rays_of.splat_rows], removed)
-        return _of_views(rays_of, compare, rays_of.seeing(), progress)
-
     def gaining(number, rays):
         view, colors = sample.views[number][0], sample.colors(number, rays)
         truth, gains, place_of_hit = sample.truths[number], [], place[sample.splat_rows[rays.hit]]
@@ -92,7 +87,7 @@ def with_quality(
             gains.append(psnr_of(stood_in, truth, view) - psnr_of(deleted, truth, view))
         return gains
 
-    of_views, mean = removing(sample, part(progress, 0.0, 0.5))
+    of_views, mean = _removing(sample, place, removed, part(progress, 0.0, 0.5))
     _, gains = _of_views(sample, gaining, sample.validating(), part(progress, 0.5, 1.0))
     psnr = np.minimum.accumulate(mean)
     names = [sample.views[number][0].name for number in sample.seeing()]
@@ -106,7 +101,7 @@ def with_quality(
     )
     between = scores.between if scores.tells else None
     if between is not None and _enough(between):
-        _, mean = removing(between, silent)
+        _, mean = _removing(between, place, removed)
         curve = replace(curve, between=np.minimum.accumulate(mean))
     return replace(scores, quality=curve)
 
@@ -137,20 +132,21 @@ def _enough(sample):
     return sum(len(rays.counts()) for rays in sample.rays if rays) >= MIN_RAYS_WITH_HITS
 
 
-def _removing(sample, place, counts):
-    """Callable: PSNR of a view, (L,) dB, without places, (M,), below each of ascending counts."""
+def _removing(sample, place, counts, progress=silent):
+    """`_of_views`, dB, without splats whose place, (N,), is below each of L ascending counts."""
+    places = place[sample.splat_rows]
 
     def compare(number, rays):
         view, colors = sample.views[number][0], sample.colors(number, rays)
         truth = sample.truths[number] = rays.colors(colors)
-        psnr, place_of_hit = [], place.take(rays.hit)
+        psnr, place_of_hit = [], places.take(rays.hit)
         for count in counts:
             # What is removed stays removed: the lists of hits grow shorter.
             rays = rays.keeping(place_of_hit >= count)
             psnr.append(psnr_of(rays.colors(colors), truth, view))
         return psnr
 
-    return compare
+    return _of_views(sample, compare, sample.seeing(), progress)
 
 
 def _of_views(sample, compare, numbers, progress):
