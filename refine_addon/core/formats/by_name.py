@@ -133,22 +133,19 @@ def _parts(level, limits, section, data):
     stored = data[section.rows : section.rows + section.splats * dtype.itemsize].view(dtype)
     centers, buckets = _buckets(section, data) if level else np.empty((2, 0))
     step = section.block / 2.0 / section.middle
+    ends = [3 * above_constant(band) for band in range(1, section.degree)]
     for piece in pieces(section.splats):
         rows = stored[piece]
         means, logs = rows["mean"], np.log(rows["scale"].astype(np.float64))
         if level:
             means = (means - float(section.middle)) * step + centers[buckets[piece]]
-        values, at = rows["rest"].astype(np.float32), 0
+        values = rows["rest"].astype(np.float32)
         if level == 2:
             values = limits[0] + values / np.float32(255.0) * (limits[1] - limits[0])
-        rest = np.empty((len(rows), values.shape[1] // 3, 3), np.float32)
-        for band in range(1, section.degree + 1):  # each is red, then green, then blue
-            width = 2 * band + 1
-            one = values[:, 3 * at : 3 * (at + width)].reshape(-1, 3, width)
-            rest[:, at : at + width] = one.swapaxes(1, 2)
-            at += width
+        bands = np.split(values, ends, axis=1)  # each is red, then green, then blue
+        rest = [band.reshape(len(rows), 3, -1).swapaxes(1, 2) for band in bands]
         turns, colors = unit_quaternions(rows["rotation"]), from_colors(rows["color"] / 255.0)
-        yield Splats(means, logs, turns, *colors, rest)
+        yield Splats(means, logs, turns, *colors, np.concatenate(rest, axis=1))
 
 
 def _buckets(section, data):
