@@ -200,7 +200,7 @@ def lod(
                 assert result.scores is not None
                 rest = splats if gone is None else splats.take(~gone)
                 origin = Origin(rest, result.scores)
-            origin, whole = replace(origin, psnr=result.report["estimated_psnr"]), result
+            origin, whole = origin._replace(psnr=result.report["estimated_psnr"]), result
         kept = int(np.count_nonzero(result.keep))
         if kept < fewest:
             number, fewest = number + 1, kept

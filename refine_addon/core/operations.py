@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,7 @@ CLOSE, AIM = 0.98, 0.99  # least share of a size that is used, and that the next
 PROPERTY = "refine_score"  # the property of a PLY that holds the scores
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(NamedTuple):
     """Splats in memory, those that are protected or removed, and the rows that are written."""
 
     name: str  # in the report
@@ -135,7 +134,7 @@ def run(
             if source is not None:
                 refuse_mapped(written, source)
         form = None if output is None else format_named(output)
-        scene = replace(read(), form=form)
+        scene = read()._replace(form=form)
         clock.lap("read_s")
         count = len(scene.splats)
         drawing = 0.0 if pictures is None else seconds("draw", count, 6)

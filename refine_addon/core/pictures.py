@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,8 +181,7 @@ def _weights(pixel, alpha, log_left):
     return np.where(log_front > LOG_OPAQUE, alpha * np.exp(log_front), 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(NamedTuple):
     """Pictures of a view before and after a change."""
 
     view: View  # in the size of the pictures
@@ -238,8 +237,7 @@ def _rounded(picture):
     return np.ascontiguousarray(np.rint(picture * 255.0).astype(np.uint8).transpose(1, 2, 0))
 
 
-@dataclass(frozen=True)
-class PictureFiles:
+class PictureFiles(NamedTuple):
     """Folder for the pictures of a prune; file names begin with `name`, that of the splats."""
 
     folder: Path

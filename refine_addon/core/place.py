@@ -7,9 +7,8 @@ import stat
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn, Self, TypeGuard
+from typing import Any, NamedTuple, NoReturn, Self, TypeGuard
 
 from .errors import RefineError
 from .whole_file import Url, mode_of
@@ -23,8 +22,7 @@ SPZ = b"NGSP"  # the first bytes of what an SPZ file holds
 _ZIP = b"PK\x03\x04"
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """A file and a place in it, such as "camera 3"; "" for the whole file.
 
     Each method that checks a JSON value returns it, or raises `RefineError` with the file, the

@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,8 +205,7 @@ _Chosen = tuple[NDArray[np.bool_], "float | None", "float | None"]
 """Splats that deletion keeps, (N,), and the PSNR in views that decided and between, dB."""
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
+class Outcome(NamedTuple):
     """Result of merging, and of refitting, if asked."""
 
     merged: Merged  # before refitting; by deletion where that is better to begin with
@@ -425,7 +424,7 @@ class _Prune:
         outcome = self._refitted(outcome, scores.deciding or used, refitting)
         if outcome.refitted is None or outcome.stopped is not None:
             return outcome
-        return replace(outcome, psnr=outcome.psnr | {"refit": estimated(outcome.refitted.splats)})
+        return outcome._replace(psnr=outcome.psnr | {"refit": estimated(outcome.refitted.splats)})
 
     def _to_psnr(
         self, goal: float, scores: Scores, measurement: Measured, progress: Progress
@@ -444,7 +443,7 @@ class _Prune:
             keep = select(scores, Budget(keep=count), protected=self.protected)
             outcome = self._to_count(keep, scores, measurement, of_try)
             if outcome.stopped is not None:
-                return replace(best or outcome, stopped=outcome.stopped)
+                return (best or outcome)._replace(stopped=outcome.stopped)
             if outcome.reached is None:
                 return outcome
             tried[count] = outcome.reached
@@ -480,11 +479,11 @@ class _Prune:
             stopped = stop.with_traceback(None)  # which holds the arrays of the round
             if done is None or not done.rounds:
                 stop.add_note("refitting was stopped before its first round was done")
-                return replace(outcome, stopped=stopped)
+                return outcome._replace(stopped=stopped)
             stop.add_note(f"refitting was stopped after round {done.rounds}")
         assert done is not None  # the merged splats are yielded first
-        return replace(
-            outcome, done="refit", psnr=outcome.psnr | {"refit": done.psnr}, refitted=done,
+        return outcome._replace(
+            done="refit", psnr=outcome.psnr | {"refit": done.psnr}, refitted=done,
             seconds=time.perf_counter() - start, stopped=stopped,
         )  # fmt: skip
 

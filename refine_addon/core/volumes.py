@@ -9,8 +9,8 @@ divided into groups, and one ray decides for a group if no triangle touches its 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, TypeAlias
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -246,8 +246,7 @@ class Zone:
     idle: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Forced:
+class Forced(NamedTuple):
     """Which of N splats volumes, or the user otherwise, protect and remove."""
 
     protected: Mask = None
@@ -267,7 +266,7 @@ class Forced:
     def of(self, rows: NDArray[np.bool_]) -> Forced:
         """The same for the splats in `rows`, (N,) bool."""
         masks: dict[str, Any] = {n: None if m is None else m[rows] for n, m in self.masks.items()}
-        return replace(self, **masks)
+        return self._replace(**masks)
 
 
 def forced(

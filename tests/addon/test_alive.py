@@ -2,7 +2,6 @@
 
 import threading
 import time
-from dataclasses import replace
 from types import SimpleNamespace
 
 import bpy
@@ -239,7 +238,7 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, tmp_path, monke
         begun.set()
         free.wait(600.0)
 
-    held = replace(form, write=write)
+    held = form._replace(write=write)
     monkeypatch.setattr(addon.core.formats.registry, "format_named", lambda _path: held)
     export, out = addon.ui.export_operators.REFINE_OT_export_ply, tmp_path / "out.splat"
     options = {"filepath": str(out), "overwrite": False, "apply_transform": False}

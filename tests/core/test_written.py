@@ -65,7 +65,7 @@ def test_a_file_in_another_frame_is_moved_to_that_of_the_views(source, tmp_path)
 
     def psnr(matrix):
         """Of the other file, as told of the first."""
-        scene = replace(operations.read_scene(aside), matrix=matrix)
+        scene = operations.read_scene(aside)._replace(matrix=matrix)
         decided = replace(result, keep=np.ones(len(moved), np.bool_), report=dict(result.report))
         how = {"overwrite": True, "views": cameras()}
         done = operations.run(lambda: scene, lambda *_: decided, tmp_path / "b.glb", **how)
