@@ -274,11 +274,6 @@ def to_size(
     ``pruned(sizes, scores=..., progress=...)`` and its progress, the cheapest first: what follows
     begins with as many splats. `RefineError` if nothing fits.
     """
-
-    def written(changes):
-        pairs = zip(files, changes, strict=True)
-        return sum(registry.written_size(file, form, *each) for file, each in pairs)
-
     limit = math.floor(1e6 * (budget.max_mb or 0.0))
     goal = AIM * limit / row_in(form, files)
     for pruned, progress in ways:
@@ -288,7 +283,8 @@ def to_size(
             told = part(progress, done, (1.0 + done) / 2.0)
             result = pruned((limit / goal, 0), scores=scores, progress=told)
             fewer, kept = kept, int(np.count_nonzero(result.keep))
-            less, size = size, written(changed(result))
+            pairs = zip(files, changed(result), strict=True)
+            less, size = size, sum(registry.written_size(file, form, *each) for file, each in pairs)
             best = result if size <= limit or result.stopped else best
             enough = best is result and (size >= CLOSE * limit or kept == len(result.keep))
             if enough or kept == fewer:
