@@ -10,7 +10,7 @@ import itertools
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -229,8 +229,7 @@ class Outcome(NamedTuple):
         return replace(self.merged, splats=self.refitted.splats, changed=changed)
 
 
-@dataclass(frozen=True, eq=False)
-class _Prune:
+class _Prune(NamedTuple):
     """One prune; fields as the arguments of `prune`."""
 
     splats: Any  # Splats, or None where scores are given
@@ -253,8 +252,7 @@ class _Prune:
     def without(self, gone: NDArray[np.bool_]) -> _Prune:
         """Prune of the rest once some splats, (N,) bool, are gone."""
         rest = ~gone
-        return replace(
-            self,
+        return self._replace(
             splats=None if self.splats is None else self.splats.take(rest),
             budget=self.budget.after(int(np.count_nonzero(gone)), len(gone)),
             protected=None if self.protected is None else self.protected[rest],
@@ -277,16 +275,9 @@ class _Prune:
         report(progress, 0.94, "selecting")
         return self._result(scores, self._select(scores))
 
-    def _result(
-        self,
-        scores: Scores,
-        chosen: _Chosen,
-        measured: Estimates | None = None,
-        outcome: Outcome | None = None,
-        tried: Estimates | None = None,
-    ) -> Result:
-        """Result of deletion, or the `outcome` of merging; `tried` if deletion was as good."""
-        summary = reports.of_prune(self, scores, chosen, measured, outcome, tried)
+    def _result(self, scores: Scores, chosen: _Chosen, outcome=None, tried=None) -> Result:
+        """Result of deletion, or the `Outcome` of merging; `tried` if deletion was as good."""
+        summary = reports.of_prune(self, scores, chosen, outcome, tried)
         merged = None if outcome is None or outcome.done == "delete" else outcome.final
         return Result(chosen[0], summary, scores, merged, getattr(outcome, "stopped", None))
 
@@ -340,10 +331,10 @@ class _Prune:
             if goal is not None:
                 scores = with_quality(scores, self.protected)
             return self._result(scores, self._select(scores), tried=tried)
-        # Where a PSNR is asked for, deletion keeps another number of splats.
-        measured = outcome.psnr if goal is not None else {"delete": plain, **outcome.psnr}
+        if goal is None:  # else deletion keeps another number of splats
+            outcome = outcome._replace(psnr={"delete": plain, **outcome.psnr})
         chosen = outcome.merged.keep, outcome.reached, between
-        return self._result(scores, chosen, measured, outcome)
+        return self._result(scores, chosen, outcome)
 
     def _first(self, scores: Scores) -> Origin:
         """The splats before any merging prune, with which results are compared."""

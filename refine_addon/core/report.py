@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cleaning.clean import Cleaned
-from .methods import ClosedForm
+from .methods import ClosedForm, Refit
 from .quality.curve import FEWEST, Way, expected, expected_seconds, in_words, out_of_reach, parted
 from .scores import Scores
 from .volumes import Forced
@@ -94,7 +94,6 @@ def of_prune(
     run: Any,
     scores: Scores,
     chosen: tuple[NDArray[np.bool_], float | None, float | None],
-    measured: Mapping[Way, float | None] | None = None,
     outcome: Any = None,
     tried: Mapping[Way, float | None] | None = None,
 ) -> dict[str, Any]:
@@ -102,12 +101,13 @@ def of_prune(
 
     `run` has budget, method, sizes, clock, and scores if these were given: else the clock timed
     them, from which other methods' times are predicted. `chosen` are the kept splats, (N,), and the
-    PSNR, dB, in views that decided and in between; `measured` is that on rays by method. `outcome`
-    is that of merging, `tried` its PSNR if deletion was as good.
+    PSNR, dB, in views that decided and in between. `outcome` is that of merging, `tried` its PSNR
+    if deletion was as good.
     """
     keep, psnr, between = chosen
     budget, method, clock = run.budget, run.method, run.clock
-    count, curve, measured = len(keep), scores.quality, measured or {"delete": psnr}
+    count, curve = len(keep), scores.quality
+    measured: Any = {"delete": psnr} if outcome is None else outcome.psnr
     report: dict[str, Any] = {**seen_by(scores, Forced())}
     report["splats"] |= kept_and_removed(keep)
     report["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
@@ -130,20 +130,17 @@ def of_prune(
     if parted(psnr, between):
         more = "how much is not known" if told is None else in_words(told)
         notes.append(f"views between these lose more, {more}: add cameras, or remove less")
-    estimates = dict(measured)
-    if tried is not None and budget.psnr is None:  # of as many kept splats
-        estimates = {**tried, **estimates}
+    alike = tried if tried is not None and budget.psnr is None else {}  # of as many kept splats
     if outcome is not None:
         if outcome.refitted is not None:
             notes.append(outcome.refitted.note(outcome.seconds))
-        began, merge = outcome.psnr.get("delete"), outcome.psnr.get("merge")
-        if began is not None and merge is not None and not outcome.merged.merged:
+        began, merge = measured.get("delete"), measured.get("merge")
+        if isinstance(method, Refit) and None not in (began, merge) and not outcome.merged.merged:
             both = f"{in_words(began)}, merging {in_words(merge)}"
             notes.append(f"refitting began with plain deletion: {both}")
         notes += getattr(outcome.stopped, "__notes__", ())
-        plain = measured.get("delete")
-        if outcome.done == "merge" and plain is not None and plain > (psnr or plain):
-            notes.append(f"plain deletion reaches more in these views: {in_words(plain)}")
+        if outcome.done == "merge" and began is not None and began > (psnr or began):
+            notes.append(f"plain deletion reaches more in these views: {in_words(began)}")
     if method.changes and outcome is None and removed:
         notes.append(deleted_note(psnr, None if tried is None else tried["merge"]))
     deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
@@ -160,7 +157,7 @@ def of_prune(
         "method": {
             "asked": method.name,
             "done": deletes if outcome is None or outcome.done == "delete" else outcome.done,
-            **_predicted(scores, share, estimates, took, once=method.changes),
+            **_predicted(scores, share, {**alike, **measured}, took, once=method.changes),
         },
         "quality": None if curve is None else curve.facts(),
         "budget_remark": why,
