@@ -83,7 +83,8 @@ def measure(folder: Path, ratios: Sequence[float], turns: int) -> None:
             known = occlusion.score(scene.splats, used, rounds=1)
             for place, ratio in enumerate(ratios):
                 left = len(scene.splats) - int(ratio * len(scene.splats))
-                made = merge_down(scene.splats, used, left, scored=known).splats
+                began = len(scene.splats)
+                made = merge_down(scene.splats, left, scored=known, began=began).splats
                 found[turn, place] = psnr_against(sample, made, scene.test)
         print(f"{folder.name} turn {turn}:", *(f"{x:.2f}" for x in found[turn]), flush=True)
     print(f"{folder.name} {'removed':>10} {'mean':>6} {'sd':>6} {'range':>6}")

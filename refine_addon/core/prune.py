@@ -397,7 +397,7 @@ class _Prune(NamedTuple):
         rays: Any = first.scores.ray_sample
         estimated = partial(psnr_against, rays, views=used)
         merged = merge_down(
-            self.splats, used, left, scored=(scores, measurement), protected=self.protected,
+            self.splats, left, scored=(scores, measurement), protected=self.protected,
             began=len(first.splats), progress=merging_progress,
         )  # fmt: skip
         psnr = estimated(merged.splats, progress=comparing)
@@ -493,23 +493,21 @@ def _share_between(tried: Mapping[int, float], goal: float, total: int) -> float
 
 def merge_down(
     splats: Splats,
-    views: ViewSet,
     count: int,
     *,
     scored: tuple[Scores, Measured],
-    began: int | None = None,
+    began: int,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
 ) -> Merged:
-    """Merge splats until `count` are left, by `views` and those between; errors as by `score`.
+    """Merge splats until `count` are left, by the views that decided; errors as by `score`.
 
     `scored` comes from `occlusion.score`. `began` is the number before earlier merges:
     deletion before merging, and the merge penalty, depend on the share removed since then.
     """
     total = len(splats)
     scores, measured = scored
-    views = scores.deciding or views
-    began = total if began is None else began
+    views: Any = scores.deciding
     # How many of all are deleted before any are merged, and how many of those are still there.
     deleted = max(min(math.floor(FIRST * began), began - count), 0)
     first = max(deleted - (began - total), 0)
