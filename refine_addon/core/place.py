@@ -7,6 +7,7 @@ import stat
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, NoReturn, Self, TypeGuard
 
@@ -92,13 +93,10 @@ class Place(NamedTuple):
         if not steps or name.startswith("/") or ".." in steps or not set("\\:\0").isdisjoint(name):
             self.fail(f"{described(name)}, expected a file in this folder or one below")
         path = self.path.parent.joinpath(*steps)
-        try:
-            mode = mode_of(path)
-        except (OSError, ValueError):  # a name too long, a folder that may not be entered
-            mode = 0
-        if not stat.S_ISREG(mode):
-            self.fail(f"{described(name)} is not there")
-        return path
+        with suppress(OSError, ValueError):  # a name too long, a folder that may not be entered
+            if stat.S_ISREG(mode_of(path)):
+                return path
+        self.fail(f"{described(name)} is not there")
 
     def parsed(self, text: bytes | str) -> Any:
         """Value of a JSON text; `RefineError` with line and column if it is none."""
@@ -161,13 +159,9 @@ def named_json(end: str) -> Callable[[Path, bytes], bool]:
 
 def is_spz(head: bytes) -> bool:
     """Whether these are the first bytes of an SPZ file, plain or in gzip."""
-    if head.startswith(SPZ):
-        return True
-    try:
-        beginning = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(SPZ))
-    except zlib.error:
-        return False
-    return beginning.startswith(SPZ)
+    with suppress(zlib.error):
+        head = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(SPZ))
+    return head.startswith(SPZ)
 
 
 def is_sog(path: Path | Url, head: bytes) -> bool:

@@ -67,10 +67,9 @@ def expanded(path: Path | str) -> Path:
 
 def mode_of(path: Path) -> int:
     """``st_mode`` of `path`, 0 if it is missing; unlike in `pathlib`, other errors are raised."""
-    try:
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
         return path.stat().st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        return 0
+    return 0
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:

@@ -11,6 +11,7 @@ import io
 import re
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, NoReturn
@@ -382,14 +383,12 @@ def _parsed(lines: Sequence[bytes], dtype: np.dtype[Any]) -> NDArray[Any] | None
     if not lines:
         return np.empty(0, dtype)
     text = (line.translate(_NO_SPACES).decode("ascii") for line in lines)
-    with warnings.catch_warnings():
+    with suppress(ValueError, DeprecationWarning), warnings.catch_warnings():
         # NumPy only deprecates 1.5 for an integer property.
         warnings.simplefilter("error", DeprecationWarning)
-        try:
-            whole = all(map(bytes.strip, lines))
-            return np.loadtxt(text, dtype, comments=None, ndmin=1) if whole else None
-        except (ValueError, DeprecationWarning):
-            return None
+        if all(map(bytes.strip, lines)):
+            return np.loadtxt(text, dtype, comments=None, ndmin=1)
+    return None
 
 
 def shown(word: bytes | str) -> str:
