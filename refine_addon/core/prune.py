@@ -27,7 +27,7 @@ from .quality.alignment import alignment
 from .quality.curve import AS_GOOD, FARTHER, PLAIN, Way, deletion_will_do, left_to_lose, needed
 from .quality.psnr import psnr_against, psnr_kept, with_quality
 from .refit.refit import Refitted, expected_rounds, refit_rounds
-from .report import Clock
+from .report import Chosen, Clock, Estimates
 from .result import Origin, Result
 from .scores import Scores
 from .scoring import closed_form, occlusion
@@ -198,13 +198,6 @@ def prune(
     return replace(result, source=file or splats)
 
 
-Estimates = dict[Way, "float | None"]
-"""Estimated PSNR by what was done, dB; None if too little is seen."""
-
-_Chosen = tuple[NDArray[np.bool_], "float | None", "float | None"]
-"""Splats that deletion keeps, (N,), and the PSNR in views that decided and between, dB."""
-
-
 class Outcome(NamedTuple):
     """Result of merging, and of refitting, if asked."""
 
@@ -275,7 +268,7 @@ class _Prune(NamedTuple):
         report(progress, 0.94, "selecting")
         return self._result(scores, self._select(scores))
 
-    def _result(self, scores: Scores, chosen: _Chosen, outcome=None, tried=None) -> Result:
+    def _result(self, scores: Scores, chosen: Chosen, outcome=None, tried=None) -> Result:
         """Result of deletion, or the `Outcome` of merging; `tried` if deletion was as good."""
         summary = reports.of_prune(self, scores, chosen, outcome, tried)
         merged = None if outcome is None or outcome.done == "delete" else outcome.final
@@ -300,7 +293,7 @@ class _Prune(NamedTuple):
         if goal is not None:
             scores = with_quality(scores, self.protected)
         self.clock.lap("score_s")
-        chosen: _Chosen = np.ones(count, np.bool_), None, None
+        chosen: Chosen = np.ones(count, np.bool_), None, None
         if not (refits and goal is not None):
             report(making, 0.0, "selecting")
             chosen = self._select(scores)
@@ -350,7 +343,7 @@ class _Prune(NamedTuple):
         # Protected splats are passed over, wherever in the order they are.
         return None if gone is None or gone + spared >= total else gone + spared
 
-    def _select(self, scores: Scores) -> _Chosen:
+    def _select(self, scores: Scores) -> Chosen:
         keep = select(
             scores, self.budget, protected=self.protected,
             row_bytes=self.sizes[0], fixed_bytes=self.sizes[1],

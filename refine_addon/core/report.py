@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,12 @@ NOT_PREDICTED = (
 MANY_UNSEEN = 0.05  # share of unseen splats from which the command says how many were removed
 
 PRICED = (0.3, 0.5, 0.7, 0.9)  # shares removed whose cost a scoring predicts
+
+Chosen = tuple[NDArray[np.bool_], "float | None", "float | None"]
+"""Kept splats, (N,), and the PSNR in views that decided and between, dB."""
+
+Estimates = dict[Way, "float | None"]
+"""Estimated PSNR by what was done, dB; None if too little is seen."""
 
 
 class Clock:
@@ -91,18 +96,13 @@ def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
 
 
 def of_prune(
-    run: Any,
-    scores: Scores,
-    chosen: tuple[NDArray[np.bool_], float | None, float | None],
-    outcome: Any = None,
-    tried: Mapping[Way, float | None] | None = None,
+    run: Any, scores: Scores, chosen: Chosen, outcome: Any = None, tried: Estimates | None = None
 ) -> dict[str, Any]:
     """Report of a prune as plain JSON values; it shares the clock's times, later laps too.
 
     `run` has budget, method, sizes, clock, and scores if these were given: else the clock timed
-    them, from which other methods' times are predicted. `chosen` are the kept splats, (N,), and the
-    PSNR, dB, in views that decided and in between. `outcome` is that of merging, `tried` its PSNR
-    if deletion was as good.
+    them, from which other methods' times are predicted. `outcome` is that of merging, `tried` its
+    PSNR if deletion was as good.
     """
     keep, psnr, between = chosen
     budget, method, clock = run.budget, run.method, run.clock
