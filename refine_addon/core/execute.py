@@ -279,13 +279,12 @@ def run(
         return
     threads = min(default_threads() if threads is None else threads, max(len(todo), 1))
     if _worth(cost, threads):
-        try:
+        with suppress(_LostError):  # no room for a process or a file: threads need neither
             for result in _in_processes(work, todo, threads, tell):
                 yield result
                 done += 1
             return
-        except _LostError:  # no room for a process or a file: threads need neither
-            before = done
+        before = done
     left = todo[before:]
     if threads <= 1 or len(left) <= 1:
         yield from _in_turn(work, left, tell)
@@ -296,16 +295,15 @@ def run(
 def _in_turn(work, items, tell):
     step, reported = max(len(items) // 100, 1), 0.0  # enough reports for a progress bar
 
-    def check():
+    def check(least=_INTERVAL):
         nonlocal reported
-        if time.monotonic() - reported >= _INTERVAL:
+        if time.monotonic() - reported >= least:
             reported = time.monotonic()
             tell(done)
 
     for done, item in enumerate(items):
         if done % step == 0:
-            reported = -math.inf
-            check()
+            check(-math.inf)
         with within(check=check), np.errstate(under="ignore"):
             result = work(item)
         yield result

@@ -13,6 +13,7 @@ import re
 import struct
 import warnings
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -95,16 +96,14 @@ def _channels(data):
 
 def image_size(path: Path) -> tuple[int, int] | None:
     """Width and height of a PNG or JPEG in pixels, before any EXIF rotation; None for others."""
-    try:
-        if not path.is_file():  # opening a pipe would wait for a writer
-            return None
-        with path.open("rb") as stream:
-            head = stream.read(24)
-            if head.startswith(_PNG) and head[12:16] == b"IHDR":
-                return struct.unpack(">II", head[16:24])
-            return _jpeg_size(stream) if head.startswith(_JPEG_START) else None
-    except (OSError, ValueError, struct.error):
-        return None
+    with suppress(OSError, ValueError, struct.error):
+        if path.is_file():  # opening a pipe would wait for a writer
+            with path.open("rb") as stream:
+                head = stream.read(24)
+                if head.startswith(_PNG) and head[12:16] == b"IHDR":
+                    return struct.unpack(">II", head[16:24])
+                return _jpeg_size(stream) if head.startswith(_JPEG_START) else None
+    return None
 
 
 def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:

@@ -65,9 +65,7 @@ def _read_folder(folder: Path) -> ViewSet:
             f"no cameras in this folder, expected {', '.join(JSON_NAMES)}, or a COLMAP model "
             "(cameras and images, both .bin or both .txt) in it, sparse/0 or sparse"
         )
-    if colmap and sources == [colmap[0]]:
-        return read_colmap(*colmap)
-    views = _read_json_cameras(sources[0])
+    views = read_colmap(*colmap) if colmap and not sources[1:] else _read_json_cameras(sources[0])
     others = [
         f"COLMAP model in {each.relative_to(folder).as_posix()}" if is_folder(each) else each.name
         for each in sources[1:]

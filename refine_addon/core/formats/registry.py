@@ -184,9 +184,7 @@ def held_splats(path: Path, form: Format, file: SplatFile, keep: Keep, columns: 
     return turned(splats, AXES[0]) if form is spz.FORMAT and file.axes == AXES[0] else splats
 
 
-def written_size(
-    file: SplatFile, form: Format | None, keep: NDArray[np.bool_], columns: Changes = None
-) -> int:
+def written_size(file: SplatFile, form: Format | None, keep: Keep, columns: Changes = None) -> int:
     """Bytes that `write_splats` would write; but for a plain PLY they are written and dropped."""
     if form is None or form.write is None:
         return file.size(keep, columns)

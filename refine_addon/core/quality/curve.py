@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
@@ -153,19 +154,17 @@ class Quality:
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Quality | None:
         """Inverse of `facts`; None if they are malformed."""
-        try:
+        with suppress(AttributeError, KeyError, TypeError, ValueError):
             held, array = dict(facts or {}), partial(np.array, dtype=np.float64)
             shares, psnr, merged = map(array, (held["shares"], held["psnr"], held["merged"]))
             views = {str(name): array(each) for name, each in (held.get("views") or {}).items()}
             between = None if held.get("between") is None else array(held["between"])
             last = [] if between is None else [between]
             every = np.stack([shares, psnr, merged, *views.values(), *last])  # of one length
-            if every.ndim != 2 or not every.size:
-                return None
             hits, foretold = float(held.get("hits", REFIT_HITS)), bool(held.get("foretold", True))
-        except (AttributeError, KeyError, TypeError, ValueError):
-            return None
-        return cls(shares, psnr, merged, foretold, views, hits, between)
+            if every.ndim == 2 and every.size:
+                return cls(shares, psnr, merged, foretold, views, hits, between)
+        return None
 
 
 def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.float64]:
