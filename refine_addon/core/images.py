@@ -72,26 +72,22 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
         data = path.read_bytes()
     wanted = "expected an OpenEXR image in one part, without compression"
     with explained(path, wanted, errors=(ValueError, KeyError, IndexError, struct.error)):
-        return _channels(data)
-
-
-def _channels(data):
-    magic, version = struct.unpack_from("<II", data)
-    if magic != _EXR or version & _MULTI_PART:
-        raise ValueError(f"it begins with {magic}, version {version:#x}")
-    header, at = {}, 8
-    while attribute := _ATTRIBUTE.match(data, at):
-        at = attribute.end() + int.from_bytes(attribute[2], "little")
-        header[attribute[1]] = data[attribute.end() : at]
-    if header[b"compression"] != b"\0":
-        raise ValueError(f"its compression is number {header[b'compression'][0]}")
-    left, top, right, bottom = struct.unpack("<4i", header[b"dataWindow"])
-    width, height = right - left + 1, bottom - top + 1
-    parts: list[Any] = [("head", f"V{_LINE_HEAD}")]  # then channels, in the order of a line
-    for name, kind in _CHANNEL.findall(header[b"channels"]):
-        parts.append((name.decode(errors="replace"), _TYPES[kind[0]], (width,)))
-    lines = np.frombuffer(data, np.dtype(parts), height, at + 1 + 8 * height)
-    return {name: lines[name].astype(np.float32) for name, *_ in parts[1:]}
+        magic, version = struct.unpack_from("<II", data)
+        if magic != _EXR or version & _MULTI_PART:
+            raise ValueError(f"it begins with {magic}, version {version:#x}")
+        header, at = {}, 8
+        while attribute := _ATTRIBUTE.match(data, at):
+            at = attribute.end() + int.from_bytes(attribute[2], "little")
+            header[attribute[1]] = data[attribute.end() : at]
+        if header[b"compression"] != b"\0":
+            raise ValueError(f"its compression is number {header[b'compression'][0]}")
+        left, top, right, bottom = struct.unpack("<4i", header[b"dataWindow"])
+        width, height = right - left + 1, bottom - top + 1
+        parts: list[Any] = [("head", f"V{_LINE_HEAD}")]  # then channels, in the order of a line
+        for name, kind in _CHANNEL.findall(header[b"channels"]):
+            parts.append((name.decode(errors="replace"), _TYPES[kind[0]], (width,)))
+        lines = np.frombuffer(data, np.dtype(parts), height, at + 1 + 8 * height)
+        return {name: lines[name].astype(np.float32) for name, *_ in parts[1:]}
 
 
 def image_size(path: Path) -> tuple[int, int] | None:

@@ -1,7 +1,6 @@
 """The panel draws in every state, and computes nothing while it does; what a budget costs."""
 
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import bpy
@@ -244,11 +243,11 @@ def test_each_method_has_its_price(addon):
     Estimates above 60 dB are all the same; without an estimate there is no price."""
     price, psnr = addon.ui.plans.price, np.array([50.0, 40.0, 30.0])
     curve = addon.core.quality.curve.Quality(np.array([0.2, 0.5, 0.8]), psnr, psnr + 6.0)
-    between = replace(curve, between=curve.psnr - 2.0)
+    between = curve._replace(between=curve.psnr - 2.0)
     seconds = {"delete": 0.0, "merge": 17.0, "refit": 60.0}
     plan = {"quality": between, "share": 0.5, "closed": False, "seconds": seconds}
-    few = plan | {"quality": replace(curve, foretold=False)}
-    seen = plan | {"quality": replace(curve, psnr=np.full(3, 70.0)), "seconds": {}}
+    few = plan | {"quality": curve._replace(foretold=False)}
+    seen = plan | {"quality": curve._replace(psnr=np.full(3, 70.0)), "seconds": {}}
 
     assert price(plan, "closed-form") == price(None, "merge") == price({"error": ""}, "merge") == ""
     assert price(plan, "occlusion") == "about 40 dB, 38 between"

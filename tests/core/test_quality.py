@@ -163,7 +163,7 @@ def test_on_a_ray_the_nearest_kept_hit_stands_in():
 def test_a_curve_comes_back_from_json():
     """That of a file which an older version wrote has nothing to tell of between."""
     views, between = {"a": np.array([51.0, 41.0, 31.004])}, np.array([48.0, 36.0, 25.0])
-    facts = json.loads(json.dumps(replace(CURVE, views=views, between=between).facts()))
+    facts = json.loads(json.dumps(CURVE._replace(views=views, between=between).facts()))
     again = Quality.from_facts(facts)
     old = Quality.from_facts({key: value for key, value in facts.items() if key != "between"})
     for name in ("shares", "psnr", "merged"):
@@ -210,7 +210,7 @@ def test_the_report_has_the_estimate_and_the_curve():
 @pytest.mark.slow
 def test_what_merging_would_reach_is_told_of_many_splats_alone(merges):
     few = score(cloud(), ring(), Occlusion())
-    many = replace(few, quality=replace(few.quality, foretold=True))
+    many = replace(few, quality=few.quality._replace(foretold=True))
     few_told, many_told = (
         prune(None, None, Budget(ratio=0.5), Occlusion(), scores=scores).report["method"]
         for scores in (few, many)
@@ -330,5 +330,5 @@ def test_it_comes_back_from_json_and_tells_what_to_do():
         assert Alignment.from_facts(wrong).turn == 0
     assert "imported upright; turn the cameras a quarter about X" in KNOWN.turned()
     assert "2.5 times as fine" in measured.turned()
-    assert "99.0 times" in replace(measured, fineness=(0.0, 0.25, 0.0, 0.0)).turned()
+    assert "99.0 times" in measured._replace(fineness=(0.0, 0.25, 0.0, 0.0)).turned()
     assert "2 cameras see the splats from so far away" in " ".join(measured.notes())

@@ -738,7 +738,7 @@ def test_a_killed_worker_changes_no_byte(tmp_path, workers, moment, method, monk
 
     def progress(_fraction, what):
         if what == moment and not killed:
-            killed.append(next(iter(workers._client.run(os.getpid).values())))
+            killed.append(next(iter(workers.client.run(os.getpid).values())))
             os.kill(killed[0], signal.SIGKILL)
 
     run(tiles, tmp_path / "out", method, workers=workers, progress=progress)
@@ -757,7 +757,7 @@ def test_what_workers_began_one_process_ends(tmp_path, monkeypatch, workers):
     urls, out = [f"file://{path}" for path in store.tiles], f"file://{store.out}"
     with pytest.raises(KeyboardInterrupt):
         run(urls, out, workers=workers, progress=stopping("writing"))
-    client = workers._client  # each worker does one thing at a time: wait until it has ended that
+    client = workers.client  # each worker does one thing at a time: wait until it has ended that
     client.gather([client.submit(len, "", workers=[name]) for name in client.nthreads()])
     run(urls, out)
     assert store.made() == store.once()

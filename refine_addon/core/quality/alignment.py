@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +64,7 @@ SMALL = 0.02
 """A view is distant if its splats, without a tenth on each side, fill less of width and height."""
 
 
-@dataclass(frozen=True)
-class Alignment:
+class Alignment(NamedTuple):
     """Whether the views are to be turned, and which are far away from the splats."""
 
     turn: int = 0  # quarters about x (`affine.QUARTERS`) to turn the views by: 0, 1, -1 or 2
@@ -105,7 +104,7 @@ class Alignment:
     def facts(self) -> dict[str, Any]:
         """Its fields as plain JSON values."""
         rounded = [round(value, 4) for value in self.fineness]
-        return {**vars(self), "fineness": rounded, "far": list(self.far)}
+        return {**self._asdict(), "fineness": rounded, "far": list(self.far)}
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Alignment:
@@ -128,7 +127,7 @@ def alignment(splats: Splats, views: ViewSet, used: ViewSet | None = None) -> Al
         seen = [(view, in_picture(means, view)) for view in views if view.weight]
         unturned = Alignment(far=tuple(view.name for view, points in seen if _is_far(points, view)))
         if views.turn is not None:
-            return replace(unturned, turn=views.turn, known=True)
+            return unturned._replace(turn=views.turn, known=True)
         one_way = np.linalg.norm(views.rotations[:, 2].mean(axis=0)) >= ONE_WAY
         in_pictures = sum(points.shape[1] for _, points in seen)
         if used is None or one_way or in_pictures >= WHOLE * (len(means) * len(seen)):
@@ -136,7 +135,7 @@ def alignment(splats: Splats, views: ViewSet, used: ViewSet | None = None) -> Al
         fineness = _fineness(splats, used.spread(VIEWS))
     best = list(QUARTERS)[int(np.argmax(fineness))]
     turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
-    return replace(unturned, turn=turn, fineness=fineness)
+    return unturned._replace(turn=turn, fineness=fineness)
 
 
 def _spread_rows(splats, count):

@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,8 +81,7 @@ REFITTING = (20.0, 17.0, 8.5, 10.5, 7.5, 5.0)
 _LEAST_SHARE = 1e-6  # stands for 0, whose log-odds are infinite
 
 
-@dataclass(frozen=True, eq=False)
-class Quality:
+class Quality(NamedTuple):
     """Estimated PSNR, dB, never rising, at L shares of the splats removed.
 
     >>> curve = Quality(np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0]), np.zeros(3))
@@ -95,7 +93,7 @@ class Quality:
     psnr: NDArray[np.float64]  # (L,), with the lowest scores deleted
     merged: NDArray[np.float64]  # (L,), predicted for merging
     foretold: bool = True  # whether `merged` is accurate enough to be shown
-    views: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # by name, if rays hit
+    views: dict[str, NDArray[np.float64]] = {}  # by name, if rays hit
     hits: float = REFIT_HITS  # mean number of splats that a ray hits
     between: NDArray[np.float64] | None = None  # (L,), `psnr` of views in between
 

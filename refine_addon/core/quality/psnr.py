@@ -102,7 +102,7 @@ def with_quality(
     between = scores.between if scores.tells else None
     if between is not None and _enough(between):
         _, mean = _removing(between, place, removed)
-        curve = replace(curve, between=np.minimum.accumulate(mean))
+        curve = curve._replace(between=np.minimum.accumulate(mean))
     return replace(scores, quality=curve)
 
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ...version import VERSION
 from ..errors import RefineError
@@ -87,11 +87,10 @@ def _block_ctrl_c() -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
-class Cluster:
+class Cluster(NamedTuple):
     """The workers of a Dask cluster; see `execute.within`."""
 
-    def __init__(self, client: Any) -> None:
-        self._client = client
+    client: Any
 
     def check(self, job: Path, tiles: Sequence[Tile], kind: Any = RefineError) -> None:
         """Raise an error of a `kind` if a worker lacks files or the version, or there is none.
@@ -100,8 +99,8 @@ class Cluster:
         """
         for _ in range(_TRIES):
             try:
-                self._client.wait_for_workers(1, timeout=_CONNECT)
-                answers = self._client.run(_answer, VERSION, job, tiles, on_error="return")
+                self.client.wait_for_workers(1, timeout=_CONNECT)
+                answers = self.client.run(_answer, VERSION, job, tiles, on_error="return")
             except TimeoutError as error:
                 raise kind("the scheduler has no workers") from error
             except Exception as error:
@@ -123,7 +122,7 @@ class Cluster:
         from distributed import CancelledError, KilledWorker
         from distributed.comm import CommClosedError
 
-        threads = max(sum(self._client.nthreads().values()), 1)
+        threads = max(sum(self.client.nthreads().values()), 1)
         size = max(1, min(_TOGETHER, len(items) // (_TURNS * threads)))
         groups, seen = [items[each] for each in chunks(len(items), size)], time.monotonic()
 
@@ -131,14 +130,14 @@ class Cluster:
             nonlocal seen
             tell(done * size)
             alone = time.monotonic() - seen
-            if alone > _ALONE / 10.0 and self._client.nthreads():
+            if alone > _ALONE / 10.0 and self.client.nthreads():
                 seen = time.monotonic()
             elif alone > _ALONE:
                 raise Interrupted("all workers were lost")
 
-        submit = functools.partial(self._client.submit, _run, packed, pure=False)
+        submit = functools.partial(self.client.submit, _run, packed, pure=False)
         try:
-            for results in sent_ahead(submit, groups, _AHEAD * threads, look, self._client.cancel):
+            for results in sent_ahead(submit, groups, _AHEAD * threads, look, self.client.cancel):
                 yield from results
                 seen = time.monotonic()
         except (KilledWorker, CancelledError, CommClosedError) as error:
