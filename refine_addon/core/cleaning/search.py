@@ -80,7 +80,7 @@ class Suspects(NamedTuple):
     doubted: NDArray[np.bool_]  # (M,), as are giant to width: of low support in some round
     giant: NDArray[np.bool_]
     needle: NDArray[np.bool_]
-    small: NDArray[np.bool_]  # in a small cluster
+    every: NDArray[np.bool_]  # all suspects: these, and those in a small cluster
     shown: NDArray[np.bool_]  # have a footprint in any view
     views: NDArray[np.float64]  # number of views that hold the centre
     width: NDArray[np.float64]  # largest of `Hits.width`
@@ -91,11 +91,6 @@ class Suspects(NamedTuple):
     def large(self) -> NDArray[np.bool_]:
         """Giants and needles, (M,) bool."""
         return self.giant | self.needle
-
-    @property
-    def every(self) -> NDArray[np.bool_]:
-        """All suspects, (M,) bool."""
-        return self.doubted | self.giant | self.needle | self.small
 
 
 class Search:
@@ -132,7 +127,7 @@ class Search:
         for number, sums in enumerate(of_groups):
             by_part[:, number % VIEW_PARTS] += sums[-2:]
         return Suspects(
-            doubted, giant, needle, small, self.shown, views, width, Evidence(*evidence), by_part
+            doubted, giant, needle, absent, self.shown, views, width, Evidence(*evidence), by_part
         )
 
     def _first_look(self, progress: Progress) -> NDArray[np.float64]:
