@@ -78,16 +78,12 @@ class Scores:
         """Scores of the splats in `rest`, (N,) bool; `RefineError` if some were not scored."""
         self.refuse_unscored(rest)
         count = int(np.count_nonzero(rest))
-        # Rays hold for one set of splats only.
-        ray_sample, between = (
-            None if rays is None or len(rays.splats) != count else rays
-            for rays in (self.ray_sample, self.between)
-        )
         settled = None if self.settled is None else max(self.settled - (len(rest) - count), 0)
-        return replace(
-            self, values=self.values[rest], seen=self.seen[rest], ray_sample=ray_sample,
-            between=between, settled=settled, scored=None,
-        )  # fmt: skip
+        values, seen = self.values[rest], self.seen[rest]
+        scores = replace(self, values=values, seen=seen, settled=settled, scored=None)
+        if self.ray_sample is not None and len(self.ray_sample.splats) == count:
+            return scores
+        return replace(scores, ray_sample=None, between=None)  # rays hold for one set of splats
 
     def refuse_unscored(self, rest: NDArray[np.bool_] | None = None) -> None:
         """Raise `RefineError` if splats in `rest`, (N,) bool, by default all, have no score."""
