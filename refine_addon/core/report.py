@@ -131,9 +131,15 @@ def of_prune(
         more = "how much is not known" if told is None else in_words(told)
         notes.append(f"views between these lose more, {more}: add cameras, or remove less")
     alike = tried if tried is not None and budget.psnr is None else {}  # of as many kept splats
+    deletes, made = "closed-form" if isinstance(method, ClosedForm) else "occlusion", {}
     if outcome is not None:
+        made["merged"] = outcome.merged.facts()
         if outcome.refitted is not None:
             notes.append(outcome.refitted.note(outcome.seconds))
+            made["refitted"] = {
+                "began": "merge" if outcome.merged.merged else deletes,
+                **outcome.refitted.facts(outcome.seconds),
+            }
         began, merge = measured.get("delete"), measured.get("merge")
         if isinstance(method, Refit) and None not in (began, merge) and not outcome.merged.merged:
             both = f"{in_words(began)}, merging {in_words(merge)}"
@@ -143,9 +149,8 @@ def of_prune(
             notes.append(f"plain deletion reaches more in these views: {in_words(began)}")
     if method.changes and outcome is None and removed:
         notes.append(deleted_note(psnr, None if tried is None else tried["merge"]))
-    deletes = "closed-form" if isinstance(method, ClosedForm) else "occlusion"
     took = None if deletes == "closed-form" or run.scores is not None else clock.timings["score_s"]
-    report |= {
+    return report | {
         "budget": {budget.kind: getattr(budget, budget.kind)},
         "settings": method.facts(),
         "weights": scores.facts,
@@ -162,15 +167,8 @@ def of_prune(
         "quality": None if curve is None else curve.facts(),
         "budget_remark": why,
         "notes": [words for words in notes if words],
+        **made,
     }
-    if outcome is not None:
-        report["merged"] = outcome.merged.facts()
-        if outcome.refitted is not None:
-            report["refitted"] = {
-                "began": "merge" if outcome.merged.merged else deletes,
-                **outcome.refitted.facts(outcome.seconds),
-            }
-    return report
 
 
 def deleted_note(plain: float | None, tried: float | None) -> str:
