@@ -148,7 +148,7 @@ def run(
         report(silent if stopped else writing, 0.0, "writing")
         file = scene.file()
         result = replace(result, source=file, matrix=scene.matrix)
-        keep, columns = result.keep, result.changed()
+        keep, columns, told = result.keep, result.changed(), result.report
         if written is not None:
             write_splats(written, file, keep, columns=columns, overwrite=overwrite, threads=threads)
         dry = (file, form, keep, columns)
@@ -160,12 +160,12 @@ def run(
             if written is not None:
                 stopped.add_note(f"{written} is written with what that had reached")
             raise stopped
-        missing, told = registry.losses(file, form, keep)
+        missing, said = registry.losses(file, form, keep)
         left = int(np.count_nonzero(keep)) - missing
         counts = {"written": None if written is None else left, "left_out": missing}
-        result.report["splats"] |= counts
-        result.report["notes"] += [*told, *scene.notes]
-        result.report["files"] = {
+        told["splats"] |= counts
+        told["notes"] += [*said, *scene.notes]
+        told["files"] = {
             "input": scene.name, "output": None if written is None else str(written),
             "input_bytes": scene.bytes, "output_bytes": size,
         }  # fmt: skip
@@ -178,21 +178,19 @@ def run(
             if lossy is not None and views is not None and result.scores:
                 psnr = None
                 if rays is not None and after is not None:
-                    used = views.spread(result.report["settings"]["views"])
+                    used = views.spread(told["settings"]["views"])
                     psnr = psnr_against(rays, after, used)
-                result.report["written_psnr"] = None if psnr is None else round(psnr, 2)
+                told["written_psnr"] = None if psnr is None else round(psnr, 2)
             if pictures is not None and views is not None:
                 if after is None:
                     after = replace(result, source=scene.splats).splats
-                result.report["pictures"] = pictures.write(
-                    scene.splats, after, views, progress=comparing
-                )
+                told["pictures"] = pictures.write(scene.splats, after, views, progress=comparing)
                 clock.lap("pictures_s")
         except (Cancelled, KeyboardInterrupt) as stop:
             if written is not None:
                 stop.add_note(f"{written} is written, its pictures and report are not")
             raise
-    result.report["timings"] = clock.stop()
+    told["timings"] = clock.stop()
     return result
 
 
@@ -217,14 +215,12 @@ def prune_scene(
     def decide(scene: Scene, clock: Clock, progress: Progress) -> Result:
         demands, splats, left = scene.demands, scene.splats, None
         if cleaning is not None:
-            cleaned = clean_splats(
-                splats, views, cleaning, **demands.masks, progress=part(progress, 0.0, 0.3)
-            )
+            first, progress = stages(progress, 0.3, 0.7)
+            cleaned = clean_splats(splats, views, cleaning, **demands.masks, progress=first)
             clock.lap("clean_s")
             # The budget counts what the user removed, so that is not cleaned away.
             left = cleaned.keep if demands.removed is None else cleaned.keep | demands.removed
             splats, demands = splats.take(left), demands.of(left)
-            progress = part(progress, 0.3, 1.0)
 
         fits = budget.max_mb is not None and scene.form is not None
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import RefineError
-from .execute import Progress, chunks, part, run_all, silent, stages
+from .execute import Progress, chunks, run_all, silent, stages
 from .images import png
 from .quality.psnr import psnr_of
 from .splats import NEAR_RELATIVE, SH_C0, Splats
@@ -88,10 +88,9 @@ def draw(
     Red, green and blue are display-referred and premultiplied; the layers' background does not add
     to alpha. `scene` is the frame to compute in, by default that of splats and view.
     """
-    gaussians, scene, _ = projection.prepare(
-        splats, ViewSet((view,)), scene, progress=part(progress, 0.0, 0.1)
-    )
-    return _drawn(splats, gaussians, scene, view, layers, part(progress, 0.1, 1.0))
+    preparing, drawing = stages(progress, 0.1, 0.9)
+    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)), scene, progress=preparing)
+    return _drawn(splats, gaussians, scene, view, layers, drawing)
 
 
 def seen_from(splats: Splats, center: NDArray[np.float64]) -> Splats:
@@ -201,12 +200,11 @@ def compare(
 ) -> list[Comparison]:
     """Draw two states of a scene in each view, at most `LONGEST` pixels long; see `draw`."""
     pictures: list[list[NDArray[np.float64]]] = []
-    for splats, start in ((before, 0.0), (after, 0.5)):
-        preparing = part(progress, start, start + 0.1)
+    for splats, half in zip((before, after), stages(progress, 1.0, 1.0), strict=True):
+        preparing, *rest = stages(half, 0.2, *[0.8 / len(views)] * len(views))
         gaussians, scene, _ = projection.prepare(splats, views, progress=preparing)
         if not pictures:
             views = ViewSet(tuple(fitted(view, scene.size) for view in views))
-        rest = stages(part(progress, start + 0.1, start + 0.5), *[1.0] * len(views))
         pictures.append([
             _drawn(splats, gaussians, scene, view, None, each)[:3]
             for view, each in zip(views, rest, strict=True)
