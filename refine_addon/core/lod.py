@@ -347,11 +347,9 @@ def lod_file(
     RefineError, Cancelled : then new files are deleted, and a streamed SOG is as it was
     """
     clock, path, file = Clock(), whole_file.expanded(target), whole_file.expanded(source)
-    output = (
-        _streamed(path, views, overwrite)
-        if path.name == INDEX
-        else _into_folder(file, path, len(levels), overwrite)
-    )
+    output = _into_folder(file, path, len(levels), overwrite)
+    if path.name == INDEX:
+        output = _streamed(path, views, overwrite)
     with output as (add, finish):
         scene = read_scene(source, zones, model, axes=axes, views=views)
         clock.lap("read_s")

@@ -73,7 +73,7 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
     """Write arrays by name to a folder, replaced whole or not at all; `Interrupted` on errors."""
     unfinished = folder.with_name(f"{folder.name}-{secrets.token_hex(4)}.tmp")
     files: dict[str, BinaryIO] = {}
-    kinds: dict[str, tuple[Any, int, tuple[int, ...]]] = {}  # type, rows, further axes
+    kinds: dict[str, tuple[Any, tuple[int, ...]]] = {}  # type and shape
     try:
         # Closing writes what is buffered.
         with explained(folder, "cannot be written", Interrupted), contextlib.ExitStack() as held:
@@ -83,18 +83,15 @@ def write(folder: Path, pieces: Iterable[Mapping[str, NDArray[Any]]]) -> dict[st
                         unfinished.mkdir(parents=True, exist_ok=True)
                         files[name] = held.enter_context((unfinished / name).open("wb"))
                     files[name].write(np.ascontiguousarray(values).data)
-                    dtype, rows, further = kinds.get(name, (values.dtype, 0, values.shape[1:]))
-                    kinds[name] = dtype, rows + len(values), further
+                    dtype, (rows, *more) = kinds.get(name, (values.dtype, (0, *values.shape[1:])))
+                    kinds[name] = dtype, (rows + len(values), *more)
         with explained(folder, "cannot be written", Interrupted):
             if folder.exists():
                 shutil.rmtree(folder)
             unfinished.rename(folder)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-    return {
-        name: Mapped(folder / name, dtype, (rows, *further))
-        for name, (dtype, rows, further) in kinds.items()
-    }
+    return {name: Mapped(folder / name, *kind) for name, kind in kinds.items()}
 
 
 @contextlib.contextmanager

@@ -281,10 +281,8 @@ class _Prune(NamedTuple):
         refits = isinstance(self.method, Refit)
         gone = self.budget.removals(count, *self.sizes)
         left = count // 2 if gone is None else count - gone
-        expected = sum(self._expected_seconds(left))
-        scoring, making = stages(
-            progress, seconds("measure", count, views), expected * (2.2 if goal else 1.0)
-        )
+        expected = sum(self._expected_seconds(left)) * (2.2 if goal else 1.0)
+        scoring, making = stages(progress, seconds("measure", count, views), expected)
         scores, measurement = occlusion.score(
             self.splats, self.used, rounds=1, few_views=goal is None,
             most_between=self.method.between(self.used), progress=scoring,
@@ -438,10 +436,9 @@ class _Prune(NamedTuple):
                 best = outcome
             if abs(outcome.reached - goal) <= CLOSE:
                 break
-            gone = 1.0 - len(outcome.merged.splats) / total
-            gone = _share_between(tried, goal, total) or curve.share(
-                goal - outcome.reached + curve.at(gone, way), way
-            )
+            kept = len(outcome.merged.splats)
+            wanted = goal - outcome.reached + curve.at(1.0 - kept / total, way)
+            gone = _share_between(tried, goal, total) or curve.share(wanted, way)
         assert best is not None  # every try gives one
         return best
 
