@@ -17,7 +17,7 @@ from .affine import AXES, UNKNOWN_AXES, is_uniform, transformed
 from .cleaning.clean import Cleaning
 from .cleaning.clean import clean as clean_splats
 from .errors import RefineError
-from .execute import Cancelled, Progress, part, report, seconds, silent, stages, within
+from .execute import Cancelled, Progress, report, seconds, silent, stages, within
 from .formats import registry
 from .formats.format import Format
 from .formats.ply import SplatFile, refuse_other_models
@@ -162,8 +162,7 @@ def run(
             raise stopped
         missing, said = registry.losses(file, form, keep)
         left = int(np.count_nonzero(keep)) - missing
-        counts = {"written": None if written is None else left, "left_out": missing}
-        told["splats"] |= counts
+        told["splats"] |= {"written": None if written is None else left, "left_out": missing}
         told["notes"] += [*said, *scene.notes]
         told["files"] = {
             "input": scene.name, "output": None if written is None else str(written),
@@ -176,10 +175,8 @@ def run(
             if lossy is not None and (rays or pictures):
                 after = _reread(lossy, file.axes.strip(UNKNOWN_AXES), scene.matrix)
             if lossy is not None and views is not None and result.scores:
-                psnr = None
-                if rays is not None and after is not None:
-                    used = views.spread(told["settings"]["views"])
-                    psnr = psnr_against(rays, after, used)
+                used = views.spread(told["settings"]["views"])
+                psnr = None if rays is None or after is None else psnr_against(rays, after, used)
                 told["written_psnr"] = None if psnr is None else round(psnr, 2)
             if pictures is not None and views is not None:
                 if after is None:
@@ -274,10 +271,8 @@ def to_size(
     goal = AIM * limit / row_in(form, files)
     for pruned, progress in ways:
         kept, size, best, scores = 0, 0, None, None
-        for number in range(TRIES):
-            done = 1.0 - 0.5**number
-            told = part(progress, done, (1.0 + done) / 2.0)
-            result = pruned((limit / goal, 0), scores=scores, progress=told)
+        for trying in stages(progress, *(0.5**number for number in range(TRIES))):
+            result = pruned((limit / goal, 0), scores=scores, progress=trying)
             fewer, kept = kept, int(np.count_nonzero(result.keep))
             pairs = zip(files, changed(result), strict=True)
             less, size = size, sum(registry.written_size(file, form, *each) for file, each in pairs)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RefineError
-from ..execute import Progress, part, run_all, silent
+from ..execute import Progress, part, run_all, silent, stages
 from ..merging.graph import nearest
 from ..visibility import projection
 from ..visibility.cast import aimed, cast, depth_complexity, pixels
@@ -261,9 +261,8 @@ def small_clusters(
 ) -> NDArray[np.bool_]:
     """Which of the Gaussians `solid`, (M,), are in a small cluster, linked by touch, (M,)."""
     small = np.zeros(len(solid), np.bool_)
-    for number, least in enumerate(SOLID):
+    for least, half in zip(SOLID, stages(progress, *[1.0] * len(SOLID)), strict=True):
         rows = np.flatnonzero(solid & (gaussians.alphas >= least))
-        half = part(progress, number / len(SOLID), (number + 1) / len(SOLID))
         near, touch = touching(gaussians.take(rows), np.arange(len(rows)), half)
         one, other = np.nonzero(touch)
         labels = connected(len(rows), one, near[one, other])
