@@ -101,9 +101,11 @@ def score(
     used, count = views.spread(method.views), len(splats)
     by_formula = isinstance(method, ClosedForm)
     kind = "closed form" if by_formula else "measure"
+    most = 0 if by_formula else method.between(used)
     cast = seconds("cast", count, len(used)) if quality or not by_formula else 0.0
+    deciding = occlusion.expected_views(len(used), most)
     scoring, casting, estimating = stages(
-        progress, 1.35 * seconds(kind, count, len(used)), cast if by_formula else 0.0, cast
+        progress, 1.35 * seconds(kind, count, deciding), cast if by_formula else 0.0, cast
     )
     # Numbers that underflow to 0 are negligible in all sums.
     with np.errstate(under="ignore"), within(cores=threads):
@@ -114,7 +116,7 @@ def score(
                 scores = replace(scores, ray_sample=rays)
         else:
             scores, _ = occlusion.score(
-                splats, used, settled=settled, most_between=method.between(used), progress=scoring
+                splats, used, settled=settled, most_between=most, progress=scoring
             )
         scores = _with_views(scores, splats, views, used)
         return with_quality(scores, protected, estimating)
@@ -276,16 +278,16 @@ class _Prune(NamedTuple):
 
     def merge(self, progress: Progress) -> Result:
         """Merge down to the budget, refit if asked; delete where that is as good."""
-        views, goal = len(self.used), self.budget.psnr
-        count = len(self.splats)
+        most, goal, count = self.method.between(self.used), self.budget.psnr, len(self.splats)
+        views = occlusion.expected_views(len(self.used), most)
         refits = isinstance(self.method, Refit)
         gone = self.budget.removals(count, *self.sizes)
         left = count // 2 if gone is None else count - gone
-        expected = sum(self._expected_seconds(left)) * (2.2 if goal else 1.0)
+        expected = sum(self._expected_seconds(left, views)) * (2.2 if goal else 1.0)
         scoring, making = stages(progress, seconds("measure", count, views), expected)
         scores, measurement = occlusion.score(
             self.splats, self.used, rounds=1, few_views=goal is None,
-            most_between=self.method.between(self.used), progress=scoring,
+            most_between=most, progress=scoring,
         )  # fmt: skip
         scores = _with_views(scores, self.splats, self.views, self.used)
         if goal is not None:
@@ -371,20 +373,22 @@ class _Prune(NamedTuple):
         missed = reached < self.budget.psnr - CLOSE and reached < plain
         return missed or np.count_nonzero(keep) <= len(outcome.merged.splats)
 
-    def _expected_seconds(self, left: int) -> tuple[float, float, float]:
+    def _expected_seconds(self, left: int, views: int) -> tuple[float, float, float]:
         """Expected seconds of merging to `left` splats, of the estimate then, and of refitting."""
-        count, views = len(self.splats), len(self.used)
+        count = len(self.splats)
         counts = stage_counts(max(math.ceil((1.0 - FIRST) * count), left), left)
         refit = 0.0
         if isinstance(self.method, Refit):
             rounds = expected_rounds(left, self.method.rounds)
             refit = rounds * seconds("refit", count + left, views)
-        return sum(stage_seconds(count, counts, views)), seconds("compare", left, views), refit
+        compared = seconds("compare", left, len(self.used))
+        return sum(stage_seconds(count, counts, views)), compared, refit
 
     def _to_count(self, keep, scores: Scores, measurement: Measured, progress: Progress) -> Outcome:
         """Merge until as many are left as deletion keeps, (N,); refit if asked."""
         first, used, left = self._first(scores), self.used, int(np.count_nonzero(keep))
-        merging_progress, comparing, refitting = stages(progress, *self._expected_seconds(left))
+        expected = self._expected_seconds(left, len(scores.deciding or used))
+        merging_progress, comparing, refitting = stages(progress, *expected)
         rays: Any = first.scores.ray_sample
         estimated = partial(psnr_against, rays, views=used)
         merged = merge_down(

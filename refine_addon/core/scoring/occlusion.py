@@ -99,10 +99,12 @@ def score(
         raise RefineError("there are no splats to score")
     execute.start(SECONDS * count * len(views))
     kept = _kept_after_rounds(count, rounds, settled)
-    preparing, closed, looking, weighing, casting, ranking = stages(
+    others = expected_views(len(views), most_between) - len(views)
+    preparing, closed, looking, weighing, beside, casting, ranking = stages(
         progress, seconds("read", count), seconds("closed form", count, len(views)),
         seconds("measure", count, len(views)), 5e-6 * min(count, coverage.SAMPLE),
-        seconds("cast", count, min(BETWEEN, len(views))),
+        seconds("measure", count, others),
+        seconds("cast", count, TOLD if others else min(BETWEEN, len(views))),
         sum(seconds("order", left, len(views)) for left in (count, *kept)),
     )  # fmt: skip
     gaussians, scene, good = projection.prepare(splats, views, progress=preparing)
@@ -123,12 +125,12 @@ def score(
             f"{len(ordered)} views; check that cameras and splats share their frame and unit"
         )
     some, worth = measured.take(sample, axis=1), prior[index[sample]]
-    folds = _folds(some, of_groups, errors, worth, part(weighing, 0.0, 0.5))
+    folds = _folds(some, of_groups, errors, worth, weighing)
     weights, left_out = coverage.floor_weights(folds, _with_floors(some, worth))
     if most_between and left_out > LEFT_OUT:
         near, lost = partial(views_beside, views, gaussians, scene), left_out / USUAL
         more = with_views_between(views, most_between, gaussians, scene)
-        more += near(lost**1.5, EACH * len(views), 0)
+        more += near(lost**1.5, EACH * len(views), 0, progress=part(beside, 0.0, 0.1))
         told = near(lost**2, TOLD, 1)
     else:
         more, told = [], views_between(views, BETWEEN)
@@ -138,7 +140,7 @@ def score(
             scoring.extend(every)
         of_more, *_ = measure(
             gaussians, scene, every, [range(len(ordered), len(every))],
-            ray_samples=samples[1:], progress=part(weighing, 0.5, 1.0),
+            ray_samples=samples[1:], progress=part(beside, 0.1, 1.0),
         )  # fmt: skip
         measured[:2] *= share
         measured[:2] += of_more[:2]
@@ -158,6 +160,11 @@ def score(
     )  # fmt: skip
     result = scores, measured
     return result if job is None else note(job, stage, result)
+
+
+def expected_views(count: int, most_between: int) -> int:
+    """Views that decide, of `count` given; where they may be few, as if they are."""
+    return count * (1 + EACH) + most_between if most_between else count
 
 
 @np.errstate(under="ignore")

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..execute import run_all
+from ..execute import Progress, run_all, silent
 from ..splats import rotation_matrices, unit_quaternions
 from ..views import View, ViewSet
 from . import projection
@@ -76,15 +76,24 @@ def with_views_between(
 
 
 def views_beside(
-    views: ViewSet, gaussians: Gaussians, scene: Scene, far: float, most: int, seed: int
+    views: ViewSet,
+    gaussians: Gaussians,
+    scene: Scene,
+    far: float,
+    most: int,
+    seed: int,
+    *,
+    progress: Progress = silent,
 ) -> list[View]:
     """At most `most` views two steps and turns away from `views`, several each, in free space.
 
     Steps and turns are `far` times `FAR` and `TURNED`. They face no wall near.
     """
-    centers, found = views.centers, []
+    centers = views.centers
     starts = [view for view, _ in views.spread(most).by_distance()]
-    for number, view in enumerate((starts * most)[:most]):
+
+    def beside(numbered: tuple[int, View]) -> View | None:
+        number, view = numbered
         away = np.sort(np.linalg.norm(centers - view.center, axis=1))[1:4]
         longest = min([BESIDE * scene.size, *(far * FAR * away[-1:])])
         random, taken = np.random.default_rng([seed, number]), 0
@@ -100,9 +109,11 @@ def views_beside(
             if all(transmittance(gaussians, scene, *path) > CLEAR for path in paths[: taken + 1]):
                 view, taken = moved, taken + 1
                 if taken == _STEPS:
-                    found.append(replace(view, name=f"{number} beside {view.name}"))
-                    break
-    return found
+                    return replace(view, name=f"{number} beside {view.name}")
+        return None
+
+    numbered = enumerate((starts * most)[:most])
+    return [*filter(None, run_all(beside, numbered, progress=progress, what="scoring"))]
 
 
 def transmittance(
