@@ -288,11 +288,12 @@ def test_where_nothing_is_seen_merging_is_deleting_the_lowest_errors():
         np.testing.assert_array_equal(found, kept)
 
 
-def cheapest_first(field, penalty, goal):
+def cheapest_first(field, penalty, unseen, goal):
     """Who goes into whom, None for nobody, one operation at a time, every pair priced."""
     alive, done = list(range(len(field.means))), []
     while len(alive) > goal:
-        operations = [(field.error[row], row, None) for row in alive]
+        dearer = np.where(unseen, merge_graph.UNSEEN, 1.0) * field.error
+        operations = [(dearer[row], row, None) for row in alive]
         for pair in itertools.combinations(alive, 2):
             cost = merging.price(field, *(np.array([row]) for row in pair)).cost[0]
             operations.append((penalty * cost, *pair))
@@ -309,7 +310,7 @@ def cheapest_first(field, penalty, goal):
 @pytest.mark.parametrize("penalty", [1.0, 0.2])
 @pytest.mark.parametrize("seed", range(8))
 def test_the_cheapest_of_all_operations_is_next_each_time(seed, penalty, monkeypatch):
-    """Seven splats are all neighbours; rounds are of one operation each."""
+    """Seven splats are all neighbours, some unseen; rounds are of one operation each."""
     monkeypatch.setattr(merge_graph, "BATCH", 0.0)
     rng = np.random.default_rng(seed)
     field = flat(
@@ -317,12 +318,25 @@ def test_the_cheapest_of_all_operations_is_next_each_time(seed, penalty, monkeyp
         colors=rng.uniform(size=(7, 3)),
     )  # fmt: skip
     field.error *= rng.uniform(0.02, 1.0, 7)
-    graph = MergeGraph(field.take(np.arange(7)), SCENE, penalty)
+    unseen = rng.uniform(size=7) < 0.5
+    graph = MergeGraph(field.take(np.arange(7)), SCENE, penalty, unseen)
     graph.reduce(2)
-    expected = cheapest_first(field, penalty, 2)
+    expected = cheapest_first(field, penalty, unseen, 2)
     merges = [(gone[0], into[0]) for into, gone, _ in graph.merges if len(into)]
     assert merges == [(gone, into) for gone, into in expected if into is not None]
     assert set(np.flatnonzero(~graph.alive).tolist()) == {gone for gone, _ in expected}
+
+
+@pytest.mark.parametrize("seen", [1.0, 1e-9])
+def test_what_no_view_shows_is_rather_merged_than_deleted(seen, monkeypatch):
+    """Those hidden count by their bias; where all are seen, nothing changes."""
+    splats, views = cloud(400), around()
+    sums = measure(splats) * np.where(np.arange(400) % 2, seen, 1.0)
+    merged = merge(splats, views, sums, measure, 300)
+    monkeypatch.setattr(merge_graph, "UNSEEN", 1.0)
+    plain = merge(splats, views, sums, measure, 300)
+    assert (merged.deleted < plain.deleted) == (seen < 1.0)
+    assert (merged.keep == plain.keep).all() == (seen == 1.0)
 
 
 @pytest.mark.slow
@@ -334,7 +348,7 @@ def test_copies_of_a_splat_do_not_merge_one_by_one(monkeypatch, hidden):
     field = flat([0.2] * 2000, np.zeros((2000, 3)), np.ones((2000, 3)))
     seen = (1.0 - hidden) ** np.arange(2000)
     field = replace(field, contribution=field.contribution * seen, error=field.error * seen)
-    graph = MergeGraph(field, SCENE, 1.0)
+    graph = MergeGraph(field, SCENE, 1.0, np.zeros(2000, np.bool_))
     graph.reduce(1000)
     assert np.count_nonzero(graph.alive) == 1000
     assert len(rounds) <= 92 + 46
@@ -346,7 +360,8 @@ def test_splats_of_unknown_error_go_last_and_exactly_as_many_as_asked_stay(unkno
     """Errors .01 and .02 are known: rows 3 and 1 go first, then the rest in their order."""
     places = np.outer(np.arange(6) * 100.0, [1, 0, 0])
     error = [unknown, 0.02, unknown, 0.01, unknown, unknown]
-    graph = MergeGraph(flat([0.5] * 6, places, np.ones((6, 3)), error=error), SCENE, 1.0)
+    field = flat([0.5] * 6, places, np.ones((6, 3)), error=error)
+    graph = MergeGraph(field, SCENE, 1.0, np.zeros(6, np.bool_))
     graph.reduce(goal)
     assert np.flatnonzero(graph.alive).tolist() == sorted([3, 1, 0, 2, 4, 5][6 - goal :])
     assert (~graph.alive).sum() - sum(len(gone) for _, gone, _ in graph.merges) >= 4 - goal

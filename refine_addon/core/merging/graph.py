@@ -35,6 +35,11 @@ DISC_PENALTY = 0.5
 """Factor on the merge cost of discs (2DGS): on `room_small` at 50 %, 1.0 is 1.6 dB worse, 0.25 or
 0.7 is 0.1 dB worse."""
 
+UNSEEN = 4.0
+"""Factor on the cost of deleting what views hardly saw: that of neighbours deleted together adds up
+before it is squared, and none is measured there. In four houses at 50 % the worst of 24 other
+pictures gains 1.1 to 2.3 dB, their mean 0.2; with 16 it is the same."""
+
 CONNECTING = 0.65  # share of a stage's time until its pairs are priced
 
 CURVES = np.array(
@@ -57,11 +62,14 @@ class MergeGraph:
     """N splats, the pairs of near ones that may merge, and the costs of merges and deletions.
 
     `field`, (N,), is changed: merged splats replace one of their two. `penalty` is
-    `merge.merge_penalty`; for discs it is multiplied by `DISC_PENALTY`.
+    `merge.merge_penalty`; for discs it is multiplied by `DISC_PENALTY`. Deleting `unseen` splats,
+    (N,), costs `UNSEEN` times as much.
     """
 
-    def __init__(self, field: Field, scene: Scene, penalty: float) -> None:
-        self.field, self.scene = field, scene
+    def __init__(
+        self, field: Field, scene: Scene, penalty: float, unseen: NDArray[np.bool_]
+    ) -> None:
+        self.field, self.scene, self.unseen = field, scene, unseen
         self.penalty = penalty * (DISC_PENALTY if field.model == "2dgs" else 1.0)
         # A splat of unknown error is not merged: without contribution it gets no pairs.
         field.contribution[~np.isfinite(field.error)] = 0.0
@@ -128,7 +136,7 @@ class MergeGraph:
         def price(piece: slice) -> None:
             rows = edges[piece]
             first, second = self.first[rows], self.second[rows]
-            least = np.minimum(self.field.error.take(first), self.field.error.take(second))
+            least = np.minimum(self._deleting(first), self._deleting(second))
             cost = pricing.costs(self.field, first, second, least / self.penalty)
             self.cost[rows] = self.penalty * cost
 
@@ -169,10 +177,15 @@ class MergeGraph:
         self._carry_out(doomed[order[~is_merge]], chosen[order[is_merge] - len(doomed)], progress)
         return len(order)
 
+    def _deleting(self, rows: Index | slice) -> Array:
+        """Costs of deleting splats by their rows."""
+        error: Array = self.field.error[rows] * np.where(self.unseen[rows], UNSEEN, 1.0)
+        return error
+
     def _errors(self) -> Costs:
         """Costs of deleting splats, (N,) float32; infinite for NaN, which no comparison chooses."""
         with np.errstate(over="ignore", under="ignore"):
-            error = self.field.error.astype(np.float32)
+            error = self._deleting(slice(None)).astype(np.float32)
         error[~self.alive | np.isnan(error)] = np.inf
         return error
 

@@ -191,7 +191,11 @@ class _Stage:
 
     def graph(self, measured, whole):
         """Graph of measured splats; `whole` is `MeasuredField.seen_and_whole` of all splats."""
-        return MergeGraph(measured.with_bias(whole), self.scene, self.penalty)
+        field = measured.with_bias(whole)
+        unseen = (
+            field.contribution > 2.0 * measured.field.contribution
+        )  # by more than a half biased
+        return MergeGraph(field, self.scene, self.penalty, unseen)
 
     def reduced(self, rows, graph, keep_count, progress):
         """Kept splats, at least `keep_count`; which they are, (N,); members; predicted sums."""
