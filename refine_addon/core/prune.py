@@ -242,7 +242,8 @@ class _Prune(NamedTuple):
     def used(self) -> ViewSet:
         if self.views is None or self.splats is None:
             raise RefineError("expected splats and views: scoring and merging need both")
-        return self.views.spread(self.method.views)
+        used = self.views.spread(self.method.views)
+        return replace(used, exact=used.exact or self.method.exact)
 
     def without(self, gone: NDArray[np.bool_]) -> _Prune:
         """Prune of the rest once some splats, (N,) bool, are gone."""

@@ -145,7 +145,7 @@ def test_merging_changes_what_others_are_merged_into(addon, cloud):
     """The rest is equal to the bit, though logarithms are taken and undone."""
     addon.mesh.edit.delete_vertices(cloud, np.arange(COUNT) % 3 != 0)
     settings = bpy.context.scene.refine
-    settings.method, settings.ratio, settings.views = "merge", 0.6, 4
+    settings.method, settings.ratio, settings.views = "merge", 0.6, 8
     store(cloud, "number", "INT", np.arange(3313, dtype=np.int32))
     bpy.ops.refine.score()
     names = ("position", "scale", "rotation", "radiance:base", "radiance:sh_0", "radiance:sh_14")

@@ -217,7 +217,7 @@ def test_who_changes_all_of_a_splat_is_left_alone(addon, imported, room_cameras,
     """Merging, by which splats move and grow; another add-on that transforms sizes as well."""
     addon.mesh.edit.delete_vertices(imported, np.arange(COUNT) % 3 > 0)
     settings = bpy.context.scene.refine
-    settings.method, settings.ratio, settings.views = "merge", 0.6, 4
+    settings.method, settings.ratio, settings.views = "merge", 0.6, 8
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     assert "were merged" in capfd.readouterr().out

@@ -192,9 +192,8 @@ class _Stage:
     def graph(self, measured, whole):
         """Graph of measured splats; `whole` is `MeasuredField.seen_and_whole` of all splats."""
         field = measured.with_bias(whole)
-        unseen = (
-            field.contribution > 2.0 * measured.field.contribution
-        )  # by more than a half biased
+        hardly = field.contribution > 2.0 * measured.field.contribution  # more than half is bias
+        unseen = hardly & (not self.views.exact)
         return MergeGraph(field, self.scene, self.penalty, unseen)
 
     def reduced(self, rows, graph, keep_count, progress):
