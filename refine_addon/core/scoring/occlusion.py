@@ -163,7 +163,11 @@ def score(
 
 
 def expected_views(count: int, most_between: int) -> int:
-    """Views that decide, of `count` given; where they may be few, as if they are."""
+    """Views that decide, of `count` given; where they may be few, as if they are.
+
+    >>> expected_views(12, 24), expected_views(64, 0)
+    (72, 64)
+    """
     return count * (1 + EACH) + most_between if most_between else count
 
 
