@@ -136,8 +136,11 @@ class MergeGraph:
         def price(piece: slice) -> None:
             rows = edges[piece]
             first, second = self.first[rows], self.second[rows]
-            least = np.minimum(self._deleting(first), self._deleting(second))
-            cost = pricing.costs(self.field, first, second, least / self.penalty)
+            deleting = (
+                self.field.error.take(each) * np.where(self.unseen.take(each), UNSEEN, 1.0)
+                for each in (first, second)
+            )
+            cost = pricing.costs(self.field, first, second, np.minimum(*deleting) / self.penalty)
             self.cost[rows] = self.penalty * cost
 
         pieces = chunks(len(edges), _CHUNK)
@@ -177,15 +180,11 @@ class MergeGraph:
         self._carry_out(doomed[order[~is_merge]], chosen[order[is_merge] - len(doomed)], progress)
         return len(order)
 
-    def _deleting(self, rows: Index | slice) -> Array:
-        """Costs of deleting splats by their rows."""
-        error: Array = self.field.error[rows] * np.where(self.unseen[rows], UNSEEN, 1.0)
-        return error
-
     def _errors(self) -> Costs:
         """Costs of deleting splats, (N,) float32; infinite for NaN, which no comparison chooses."""
         with np.errstate(over="ignore", under="ignore"):
-            error = self._deleting(slice(None)).astype(np.float32)
+            error = self.field.error.astype(np.float32)
+            error[self.unseen] *= np.float32(UNSEEN)
         error[~self.alive | np.isnan(error)] = np.inf
         return error
 
