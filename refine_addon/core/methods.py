@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar
 
 from .errors import RefineError
@@ -29,10 +29,15 @@ class Method:
         if self.views < 0:
             raise RefineError(f"views is {self.views}, expected 0 (all) or more")
 
+    def used(self, views: ViewSet) -> ViewSet:
+        """Those of `views` that decide; exact if the method is."""
+        used = views.spread(self.views)
+        return replace(used, exact=used.exact or self.exact)
+
     def between(self, used: ViewSet) -> int:
         """Most views halfway between those used that may decide, too: two for each."""
         fewer = max((self.views or Method.views) - len(used), 0)
-        return 0 if self.exact or used.exact else min(2 * len(used), fewer)
+        return 0 if used.exact else min(2 * len(used), fewer)
 
     def deleting(self) -> Occlusion:
         """Occlusion with the same settings."""

@@ -98,7 +98,7 @@ def score(
             quality=quality, settled=settled, progress=progress, threads=threads,
         )  # fmt: skip
         return scores.for_all(rest)
-    used, count = views.spread(method.views), len(splats)
+    used, count = method.used(views), len(splats)
     by_formula = isinstance(method, ClosedForm)
     kind = "closed form" if by_formula else "measure"
     most = 0 if by_formula else method.between(used)
@@ -242,8 +242,7 @@ class _Prune(NamedTuple):
     def used(self) -> ViewSet:
         if self.views is None or self.splats is None:
             raise RefineError("expected splats and views: scoring and merging need both")
-        used = self.views.spread(self.method.views)
-        return replace(used, exact=used.exact or self.method.exact)
+        return self.method.used(self.views)
 
     def without(self, gone: NDArray[np.bool_]) -> _Prune:
         """Prune of the rest once some splats, (N,) bool, are gone."""
@@ -279,18 +278,19 @@ class _Prune(NamedTuple):
 
     def merge(self, progress: Progress) -> Result:
         """Merge down to the budget, refit if asked; delete where that is as good."""
-        most, goal, count = self.method.between(self.used), self.budget.psnr, len(self.splats)
-        views = occlusion.expected_views(len(self.used), most)
+        used, goal, count = self.used, self.budget.psnr, len(self.splats)
+        most = self.method.between(used)
+        views = occlusion.expected_views(len(used), most)
         refits = isinstance(self.method, Refit)
         gone = self.budget.removals(count, *self.sizes)
         left = count // 2 if gone is None else count - gone
         expected = sum(self._expected_seconds(left, views)) * (2.2 if goal else 1.0)
         scoring, making = stages(progress, seconds("measure", count, views), expected)
         scores, measurement = occlusion.score(
-            self.splats, self.used, rounds=1, few_views=goal is None,
+            self.splats, used, rounds=1, few_views=goal is None,
             most_between=most, progress=scoring,
         )  # fmt: skip
-        scores = _with_views(scores, self.splats, self.views, self.used)
+        scores = _with_views(scores, self.splats, self.views, used)
         if goal is not None:
             scores = with_quality(scores, self.protected)
         self.clock.lap("score_s")
@@ -311,7 +311,7 @@ class _Prune(NamedTuple):
         self.clock.lap("merge_s")
         between, rays = None, self._first(scores).scores.between
         if rays is not None and outcome.stopped is None:
-            between = psnr_against(rays, outcome.final.splats, self.used)
+            between = psnr_against(rays, outcome.final.splats, used)
         pairs = [(plain, outcome.reached)]
         if beside is not None and between is not None:
             pairs.append((beside, between + FARTHER * (scores.views_between > 0)))

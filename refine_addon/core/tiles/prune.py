@@ -21,6 +21,7 @@ from ..mapped import Interrupted, note, noted, on_disk, once, pieces, write
 from ..methods import DEFAULT, Method
 from ..prune import prune
 from ..report import Clock
+from ..scoring.occlusion import expected_views
 from ..selection import Budget
 from ..splats import Model
 from ..views import ViewSet
@@ -91,7 +92,8 @@ def prune_tiles(
             note(job, "begun", None)
             workers.check(job, tiles, Interrupted if goes_on else RefineError)
         count, size = sum(tile.splats for tile in tiles), sum(tile.size for tile in tiles)
-        scoring = seconds("measure", count, len(views.spread(method.views)))
+        used = method.used(views)
+        scoring = seconds("measure", count, expected_views(len(used), method.between(used)))
         reading, deciding, writing = stages(
             progress, seconds("read", count), scoring, seconds("write", count)
         )
