@@ -130,8 +130,8 @@ def score(
     if most_between and left_out > LEFT_OUT:
         near, lost = partial(views_beside, views, gaussians, scene), left_out / USUAL
         more = with_views_between(views, most_between, gaussians, scene)
-        more += near(lost**1.5, EACH * len(views), 0, progress=part(beside, 0.0, 0.1))
-        told = near(lost**2, TOLD, 1)
+        more += near(lost**1.5, EACH * len(views), 0, progress=part(beside, 0.0, 0.07))
+        told = near(lost**2, TOLD, 1, progress=part(beside, 0.07, 0.1))
     else:
         more, told = [], views_between(views, BETWEEN)
     if more:
